@@ -1,0 +1,199 @@
+"""Child processes that we own: native code may crash, hang or eat memory there, and costs one item.
+
+A child runs calls one after another, so that slow imports and compiled kernels are paid once. It
+has limits on memory and on wall time, is replaced after a number of calls, ignores Ctrl-C (the
+parent decides), and dies with its parent even if that is killed with SIGKILL: its direct parent is
+the fork server, which ends when the main process does, and the kernel then ends the child.
+"""
+
+import ctypes
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
+
+from storage.errors import Rejected, TrilightError
+
+Result = TypeVar("Result")
+
+_PR_SET_PDEATHSIG = 1
+_START_UP_S = 180.0
+
+
+class ChildFailed(Exception):
+    """The child died, hung, or raised something unexpected: the environment's fault, or a bug.
+
+    Attributes:
+        reason: `crashed_signal_N`, `killed`, `timeout_wall`, `out_of_memory` or `exception`.
+        message: one sentence with what is known.
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(f"{reason}: {message}")
+        self.reason = reason
+        self.message = message
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChildLimits:
+    """What one child may use."""
+
+    memory_bytes: int
+    """Address space; an allocation beyond it fails inside the child."""
+    wall_s: float
+    """Seconds for one call; a child that takes longer is killed."""
+    calls_per_child: int
+    """A fresh child is started after this many calls, so that leaks stay bounded."""
+
+
+class IsolatedChild:
+    """One child process at a time, started when first needed and replaced when it ends."""
+
+    def __init__(
+        self, *, limits: ChildLimits, setup: Callable[..., None], setup_args: tuple[Any, ...] = ()
+    ) -> None:
+        """Remember how to start a child.
+
+        Args:
+            limits: what it may use.
+            setup: an importable function that prepares a new child, such as loading a library.
+            setup_args: its arguments; they must survive the way into another process.
+        """
+        self._limits = limits
+        self._setup = (setup, setup_args)
+        self._process: Any = None
+        self._connection: Connection | None = None
+        self._calls_left = 0
+
+    def call(self, function: Callable[..., Result], *args: Any) -> Result:
+        """Run an importable function in the child and return its result.
+
+        Raises:
+            Rejected, TrilightError: as the function raised them.
+            ChildFailed: the child died, took too long, ran out of memory, or the function raised
+                anything else. The next call starts a fresh child.
+        """
+        try:
+            if self._connection is None or self._calls_left == 0:
+                self._start()
+            self._calls_left -= 1
+            return self._exchange((function, args), self._limits.wall_s)
+        except ChildFailed:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End the child at once; a later call starts another."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            assert self._connection is not None
+            self._connection.close()
+        self._process = self._connection = None
+
+    def _start(self) -> None:
+        self.close()
+        context = multiprocessing.get_context("forkserver")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(theirs, self._limits.memory_bytes), daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        self._calls_left = self._limits.calls_per_child
+        function, args = self._setup
+        self._exchange((function, args), _START_UP_S)
+
+    def _exchange(self, request: tuple[Callable[..., Any], tuple[Any, ...]], wall_s: float) -> Any:
+        assert self._connection is not None
+        try:
+            self._connection.send(request)
+            if not self._connection.poll(wall_s):
+                raise ChildFailed("timeout_wall", f"no answer within {wall_s:.0f} s")
+            kind, *payload = self._connection.recv()
+        except (EOFError, OSError) as error:
+            raise self._death() from error
+        if kind == "result":
+            return payload[0]
+        if kind == "rejected":
+            raise Rejected(*payload)
+        if kind == "mistake":
+            raise TrilightError(*payload)
+        raise ChildFailed(kind, *payload)
+
+    def _death(self) -> ChildFailed:
+        self._process.join(10)
+        code = self._process.exitcode
+        if code is not None and code < 0:
+            if -code == signal.SIGKILL:
+                return ChildFailed("killed", "ended by SIGKILL; the system may be out of memory")
+            return ChildFailed(
+                f"crashed_signal_{-code}", f"native code ended by {signal.Signals(-code).name}"
+            )
+        return ChildFailed("crashed", f"the child ended with status {code}")
+
+
+def preload(modules: list[str]) -> None:
+    """Import modules once in the fork server, so that every new child has them at once.
+
+    Only for libraries that start no threads when imported. Call before the first child starts.
+    """
+    multiprocessing.get_context("forkserver").set_forkserver_preload(modules)
+
+
+def die_with_parent() -> None:
+    """Ask the kernel to kill this process when its parent ends, whatever ends it (Linux only)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _serve(connection: Connection, memory_bytes: int) -> None:
+    """Answer calls until the parent closes the connection."""
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    while True:
+        try:
+            function, args = connection.recv()
+        except EOFError:
+            os._exit(0)  # the parent is gone: nobody waits for destructors of native libraries
+        connection.send(_answer(function, args))
+
+
+def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, ...]:
+    try:
+        return ("result", function(*args))
+    except Rejected as rejection:
+        return ("rejected", rejection.reason, rejection.message)
+    except TrilightError as mistake:
+        return ("mistake", str(mistake))
+    except MemoryError:
+        return ("out_of_memory", "an allocation went over the limit of the child")
+    except Exception:
+        return ("exception", traceback.format_exc(limit=-4).strip())
+
+
+def call_with_retries(
+    child: IsolatedChild, function: Callable[..., Result], *args: Any, tries: int = 3
+) -> Result:
+    """Call in a child, and again in a fresh one where the environment failed, `tries` times.
+
+    Raises:
+        ChildFailed: the last failure, after `tries` of them.
+    """
+    for failures in range(1, tries + 1):
+        try:
+            return child.call(function, *args)
+        except ChildFailed:
+            if failures == tries:
+                raise
+            time.sleep(0.1 * failures)  # what passed by itself, such as a lack of memory, has time
+    raise AssertionError("unreachable: tries is at least 1")

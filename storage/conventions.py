@@ -1,0 +1,99 @@
+"""Units, frames and colour: what the numbers mean, and the only conversions between meanings.
+
+World: right-handed, +Z up, metres; the nominal shell of a scene is the cube [-0.5, 0.5]^3.
+Colour: linear, Rec.709 primaries, scene-referred radiance. Only PNG previews are sRGB-encoded.
+Camera: `c2w` [4, 4] maps camera to world; it looks along -Z with +Y up (Blender, OpenGL, USD).
+`fov_deg` is the full angle, equal in width and height because pictures are square.
+Pictures: row 0 is the top, pixel (i, j) covers the square around its centre (j + 0.5, i + 0.5).
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+SCHEMA_VERSION = 1
+"""Version of everything that Trilight stores; a change of meaning needs a new one."""
+
+SPLITS = ("train", "validation", "test")
+
+MATERIAL_WIDTH = 10
+DIFFUSE = slice(0, 3)
+SPECULAR = slice(3, 6)
+ROUGHNESS = 6
+EMISSION = slice(7, 10)
+"""Columns of a material row: albedos in [0, 1], roughness in [0, 1], emission as radiance."""
+
+HALF_FLOAT_MAX = 65504.0
+"""The largest finite value of a stored picture."""
+
+
+def alpha_ggx(roughness: ArrayLike) -> NDArray:
+    """Return the GGX width of a roughness: alpha = roughness^2, as in Blender and USD."""
+    return np.square(np.asarray(roughness))
+
+
+def look_at_c2w(*, eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
+    """Return the pose of a camera at `eye` that looks at `target`.
+
+    Args:
+        eye, target, up: [3] in world units; `up` need not be unit or orthogonal.
+
+    Returns:
+        c2w, float64 [4, 4]. Undefined (not finite) where the view direction is parallel to `up`
+        or has no length: callers choose other vectors.
+    """
+    eye64, up64 = np.asarray(eye, np.float64), np.asarray(up, np.float64)
+    backward = eye64 - np.asarray(target, np.float64)
+    backward = backward / np.linalg.norm(backward)
+    right = np.cross(up64, backward)
+    right = right / np.linalg.norm(right)
+    c2w = np.eye(4)
+    c2w[:3, 0], c2w[:3, 1], c2w[:3, 2] = right, np.cross(backward, right), backward
+    c2w[:3, 3] = eye64
+    return c2w
+
+
+def focal_px(fov_deg: ArrayLike, resolution: int) -> NDArray[np.float64]:
+    """Return the focal length in pixels of a square picture `resolution` pixels wide."""
+    return 0.5 * resolution / np.tan(np.radians(np.asarray(fov_deg, np.float64)) / 2)
+
+
+def camera_rays(
+    c2w: ArrayLike, fov_deg: float, resolution: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rays through the pixel centres of one camera, in world space.
+
+    Args:
+        c2w: [4, 4].
+        fov_deg: full field of view in degrees.
+        resolution: width and height in pixels.
+
+    Returns:
+        origin [3] and unit directions [resolution, resolution, 3] (row 0 on top), float64.
+    """
+    pose = np.asarray(c2w, np.float64)
+    offset = np.arange(resolution) + 0.5 - 0.5 * resolution
+    x, y = np.meshgrid(offset, -offset)
+    local = np.stack([x, y, np.full_like(x, -focal_px(fov_deg, resolution))], axis=-1)
+    directions = local @ pose[:3, :3].T
+    return pose[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def log10_radiance(radiance_rgb: ArrayLike) -> NDArray:
+    """Return log10(1 + radiance), the space of the network's output and of the noise floor."""
+    return np.log10(1.0 + np.asarray(radiance_rgb))
+
+
+def radiance_from_log10(log10_rgb: ArrayLike) -> NDArray:
+    """Return the radiance of values in the network's output space."""
+    return np.power(10.0, np.asarray(log10_rgb)) - 1.0
+
+
+def preview_srgb8(radiance_rgb: ArrayLike) -> NDArray[np.uint8]:
+    """Return a picture for people: log2(1 + radiance) clamped to [0, 1], sRGB-encoded, 8 bits.
+
+    The curve is the tone map of RenderFormer's perceptual loss (Zeng et al. 2025, section 4), so
+    what a person sees is what the loss sees. It is not invertible: values above 1 are clipped.
+    """
+    mapped = np.clip(np.log2(1.0 + np.maximum(np.asarray(radiance_rgb, np.float64), 0)), 0, 1)
+    encoded = np.where(mapped <= 0.0031308, 12.92 * mapped, 1.055 * mapped ** (1 / 2.4) - 0.055)
+    return np.round(encoded * 255).astype(np.uint8)

@@ -1,0 +1,98 @@
+"""Where things are in a dataset folder, and the lock that keeps two makers out of it.
+
+What stands beside the shards is the dataset. `.staging` holds what is not finished; it may be
+deleted at any time, and then it is made again.
+"""
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from storage.atomic import write_error
+from storage.errors import TrilightError
+
+
+@dataclass(frozen=True)
+class DatasetFolder:
+    """The paths of one dataset."""
+
+    root: Path
+    """The folder that users name."""
+
+    @property
+    def manifest(self) -> Path:
+        return self.root / "manifest.json"
+
+    @property
+    def objects_lock(self) -> Path:
+        return self.root / "objects.lock.jsonl"
+
+    @property
+    def failures(self) -> Path:
+        return self.root / "failures.jsonl"
+
+    @property
+    def attribution(self) -> Path:
+        return self.root / "attribution.csv"
+
+    @property
+    def contact_sheet(self) -> Path:
+        return self.root / "contact_sheet.png"
+
+    @property
+    def logs(self) -> Path:
+        return self.root / "logs"
+
+    @property
+    def staging(self) -> Path:
+        return self.root / ".staging"
+
+    @property
+    def staged_objects(self) -> Path:
+        """Built-in objects, written out as files."""
+        return self.staging / "objects"
+
+    @property
+    def staged_assets(self) -> Path:
+        """Prepared assets, named by what they were made from."""
+        return self.staging / "assets"
+
+    @property
+    def staged_failures(self) -> Path:
+        """Rejections of shards that are packed but not yet in the manifest."""
+        return self.staging / "failures"
+
+    def staged_shard(self, name: str) -> Path:
+        """Folder of the finished samples of an unfinished shard."""
+        return self.staging / "samples" / name
+
+    def shard(self, name: str) -> Path:
+        return self.root / name
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder for one maker; the lock dies with the process that holds it.
+
+        Raises:
+            TrilightError: the folder cannot be written, or another process is at work in it.
+        """
+        lock = self.staging / "lock"
+        try:
+            self.staging.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise write_error(lock, error) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise TrilightError(
+                f"{self.root}: another process is making this dataset. Wait for it, or choose "
+                "another --out."
+            ) from error
+        else:
+            yield
+        finally:
+            os.close(descriptor)

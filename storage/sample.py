@@ -1,0 +1,117 @@
+"""A sample: one scene with its pictures, as the members that it takes in a shard.
+
+    000000123.scene.safetensors   the arrays of the scene
+    000000123.json                schema version, objects, provenance, one record per view
+    000000123.0.exr ...           linear radiance of each view, half-float RGB
+
+The key is everything before the first dot, as WebDataset reads names.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from storage.conventions import SCHEMA_VERSION
+from storage.digests import canonical_json
+from storage.errors import TrilightError
+from storage.exr import decode_exr, encode_exr
+from storage.safe_read import read_safetensors
+from storage.scene import ARRAY_FIELDS, Scene, SceneObject
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRecord:
+    """How one picture was made, and how far to trust it."""
+
+    spp: int
+    """Samples per pixel that were spent."""
+    noise_floor_db: float
+    """Measured error of the picture as psnr_log_db (storage.metrics)."""
+    noise_floor_linear_db: float
+    """The same error as psnr_linear_db."""
+    at_cap: bool
+    """Whether sampling ended at the cap before the target was reached."""
+    seed: int
+    """Seed of the view's samples."""
+    camera_attempt: int
+    """How many cameras were rejected before this one."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sample:
+    """One scene with its views."""
+
+    key: str
+    """The scene's index, nine digits."""
+    scene: Scene
+    """What the pictures show."""
+    radiance_rgb: NDArray[np.float32]
+    """[C, R, R, 3] linear radiance, one picture per camera of the scene."""
+    views: tuple[ViewRecord, ...]
+    """One record per camera."""
+
+
+def sample_key(scene_index: int) -> str:
+    """Return the key of a scene: its index in nine digits, so that names sort as numbers."""
+    return f"{scene_index:09d}"
+
+
+def encode_sample(sample: Sample) -> dict[str, bytes]:
+    """Return the members of a sample by suffix; equal samples give equal bytes."""
+    scene = sample.scene
+    arrays = {name: np.ascontiguousarray(getattr(scene, name)) for name in ARRAY_FIELDS}
+    record = {
+        "schema_version": SCHEMA_VERSION,
+        "objects": [dataclasses.asdict(entry) for entry in scene.objects],
+        "provenance": dict(scene.provenance),
+        "views": [dataclasses.asdict(view) for view in sample.views],
+    }
+    members = {"scene.safetensors": save(arrays), "json": canonical_json(record)}
+    for view, picture in enumerate(sample.radiance_rgb):
+        members[f"{view}.exr"] = encode_exr(picture)
+    return members
+
+
+def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
+    """Return the sample of its members (suffix to bytes).
+
+    Raises:
+        TrilightError: a member is missing, unreadable or of another schema version. The laws of
+            the scene are not checked here: readers trust what `trilight verify` has passed.
+    """
+    for suffix in ("json", "scene.safetensors"):
+        if suffix not in members:
+            raise TrilightError(f"sample {key}: member {key}.{suffix} is missing.")
+    record = _decode_record(key, members["json"])
+    try:
+        views = tuple(ViewRecord(**view) for view in record["views"])
+        objects = tuple(SceneObject(**entry) for entry in record["objects"])
+        arrays, _ = read_safetensors(members["scene.safetensors"])
+        fields = {name: arrays[name] for name in ARRAY_FIELDS}
+        scene = Scene(objects=objects, provenance=record["provenance"], **fields)
+        pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(views))]
+        radiance_rgb = np.stack(pictures)
+    except KeyError as error:
+        raise TrilightError(f"sample {key}: {error} is missing.") from error
+    except (TypeError, ValueError) as error:
+        raise TrilightError(f"sample {key}: {error}") from error
+    return Sample(key=key, scene=scene, radiance_rgb=radiance_rgb, views=views)
+
+
+def _decode_record(key: str, data: bytes) -> dict[str, Any]:
+    try:
+        record = json.loads(data)
+    except ValueError as error:
+        raise TrilightError(f"sample {key}: member {key}.json is not JSON ({error}).") from error
+    version = record.get("schema_version") if isinstance(record, dict) else None
+    if version != SCHEMA_VERSION:
+        raise TrilightError(
+            f"sample {key}: schema version {version}; this Trilight reads {SCHEMA_VERSION}."
+        )
+    return record

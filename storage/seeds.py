@@ -1,0 +1,33 @@
+"""Randomness by name: every draw depends on what it is for, never on who drew before it.
+
+A stage asks for the generator of (seed, purpose, index, attempt, ...). Scene 7 is therefore the
+same scene whether it is made first, last, alone, or on another machine. Seed 0 is an ordinary seed.
+"""
+
+import hashlib
+
+import numpy as np
+
+
+def rng_for(seed: int, purpose: str, *indices: int) -> np.random.Generator:
+    """Return the generator that belongs to one purpose.
+
+    Args:
+        seed: the seed of the whole dataset, any integer from 0.
+        purpose: what the numbers are for, such as "scene" or "camera".
+        indices: what tells this use from others, such as scene index and attempt.
+
+    Returns:
+        An independent PCG64 generator; equal arguments always give equal streams.
+    """
+    return np.random.default_rng(np.frombuffer(_name_digest(seed, purpose, indices), np.uint32))
+
+
+def seed_for(seed: int, purpose: str, *indices: int) -> int:
+    """Return a 31-bit seed for libraries that want a number, by the same rule as `rng_for`."""
+    return int.from_bytes(_name_digest(seed, purpose, indices)[:4], "little") & 0x7FFFFFFF
+
+
+def _name_digest(seed: int, purpose: str, indices: tuple[int, ...]) -> bytes:
+    name = "/".join([str(int(seed)), purpose, *(str(int(index)) for index in indices)])
+    return hashlib.sha256(name.encode()).digest()

@@ -1,0 +1,84 @@
+"""Which split an object and a scene belong to, from nothing but themselves.
+
+An object's split is a hash of its cleaned geometry: copies under other names stay together, and
+adding objects moves none. A scene's split is that of its shard, by the shard's number, so a longer
+dataset begins with exactly the scenes of a shorter one.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from storage.conventions import SPLITS
+from storage.errors import TrilightError
+
+_VALIDATION_SLOT, _TEST_SLOT = 2, 5
+"""Places in a cycle of shards: early, so that a small dataset has all three splits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitSettings:
+    """How objects and scenes are divided."""
+
+    scenes_per_shard: int
+    """Scenes in every shard; a shard holds one split."""
+    shards_per_cycle: int = 8
+    """Of this many shards in a row one is for validation and one is for testing."""
+    held_out_objects: float = 0.125
+    """Share of objects kept for validation, and again for testing."""
+
+    def __post_init__(self) -> None:
+        if self.scenes_per_shard < 1:
+            raise TrilightError(
+                f"scenes_per_shard is {self.scenes_per_shard}; expected at least 1."
+            )
+        if self.shards_per_cycle <= _TEST_SLOT:
+            raise TrilightError(
+                f"shards_per_cycle is {self.shards_per_cycle}; expected at least {_TEST_SLOT + 1}, "
+                "so that each cycle has its validation and its test shard."
+            )
+        if not 0 < self.held_out_objects < 0.5:
+            raise TrilightError(
+                f"held_out_objects is {self.held_out_objects}; expected a share between 0 and 0.5."
+            )
+
+
+def split_of_object(geometry_sha256: str, settings: SplitSettings) -> str:
+    """Return the split of an object from the digest of its cleaned geometry (64 hex digits)."""
+    position = int(geometry_sha256[:16], 16) / 2**64
+    if position < settings.held_out_objects:
+        return "validation"
+    return "test" if position < 2 * settings.held_out_objects else "train"
+
+
+def split_of_shard(shard_index: int, settings: SplitSettings) -> str:
+    """Return the split of a shard from its number."""
+    slot = shard_index % settings.shards_per_cycle
+    return {_VALIDATION_SLOT: "validation", _TEST_SLOT: "test"}.get(slot, "train")
+
+
+def shard_name(shard_index: int, settings: SplitSettings) -> str:
+    """Return the file name of a shard, such as `train-000003.tar`."""
+    return f"{split_of_shard(shard_index, settings)}-{shard_index:06d}.tar"
+
+
+def scenes_of_shard(shard_index: int, settings: SplitSettings) -> range:
+    """Return the indices of the scenes of a shard."""
+    first = shard_index * settings.scenes_per_shard
+    return range(first, first + settings.scenes_per_shard)
+
+
+def shards_for(num_scenes: int, settings: SplitSettings) -> int:
+    """Return how many whole shards hold at least `num_scenes` scenes."""
+    return -(-num_scenes // settings.scenes_per_shard)
+
+
+def require_objects(num_by_split: Mapping[str, int], needed: set[str]) -> None:
+    """Raise TrilightError where a split that is needed has no object to draw from."""
+    empty = [split for split in SPLITS if split in needed and not num_by_split.get(split)]
+    if empty:
+        total = sum(num_by_split.values())
+        raise TrilightError(
+            f"split {empty[0]!r}: none of the {total} accepted objects falls into it; expected at "
+            "least 1, for which about 30 different objects are enough. Add objects (for example "
+            "mix in `builtin:`), or make fewer scenes."
+        )
