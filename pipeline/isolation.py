@@ -2,11 +2,12 @@
 
 A child runs calls one after another, so that slow imports and compiled kernels are paid once. It
 has limits on memory and on wall time, is replaced after a number of calls, ignores Ctrl-C (the
-parent decides), and dies with its parent even if that is killed with SIGKILL: its direct parent is
-the fork server, which ends when the main process does, and the kernel then ends the child.
+parent decides), and dies with its owner even if that is killed with SIGKILL while native code holds
+the child: the kernel itself watches the pipe between the two, no thread of Python is needed.
 """
 
 import ctypes
+import fcntl
 import multiprocessing
 import os
 import resource
@@ -24,6 +25,7 @@ from storage.errors import Rejected, TrilightError
 Result = TypeVar("Result")
 
 _PR_SET_PDEATHSIG = 1
+_F_SETSIG = 10  # Linux; Python's fcntl module does not name it
 _START_UP_S = 180.0
 
 
@@ -39,6 +41,10 @@ class ChildFailed(Exception):
         super().__init__(f"{reason}: {message}")
         self.reason = reason
         self.message = message
+
+
+class ChildClosed(Exception):
+    """The owner of a child has closed it while somebody was still calling: the run is over."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +77,7 @@ class IsolatedChild:
         self._process: Any = None
         self._connection: Connection | None = None
         self._calls_left = 0
+        self._closed = False
 
     def call(self, function: Callable[..., Result], *args: Any) -> Result:
         """Run an importable function in the child and return its result.
@@ -79,18 +86,26 @@ class IsolatedChild:
             Rejected, TrilightError: as the function raised them.
             ChildFailed: the child died, took too long, ran out of memory, or the function raised
                 anything else. The next call starts a fresh child.
+            ChildClosed: `close` was called, perhaps by another thread.
         """
+        if self._closed:
+            raise ChildClosed
         try:
             if self._connection is None or self._calls_left == 0:
                 self._start()
             self._calls_left -= 1
             return self._exchange((function, args), self._limits.wall_s)
         except ChildFailed:
-            self.close()
+            self._stop()
             raise
 
     def close(self) -> None:
-        """End the child at once; a later call starts another."""
+        """End the child at once and for good; safe to call while another thread waits in `call`."""
+        self._closed = True
+        if self._process is not None:
+            self._process.kill()
+
+    def _stop(self) -> None:
         if self._process is not None:
             self._process.kill()
             self._process.join()
@@ -99,7 +114,7 @@ class IsolatedChild:
         self._process = self._connection = None
 
     def _start(self) -> None:
-        self.close()
+        self._stop()
         context = multiprocessing.get_context("forkserver")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(
@@ -154,9 +169,29 @@ def die_with_parent() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
+def _die_with_owner() -> None:
+    """Ask the kernel to kill this child when the process that owns it ends.
+
+    A child's direct parent is the fork server, which lives on while it has children, so that
+    `die_with_parent` would wait for ever. What ends with the owner is the sentinel pipe that
+    multiprocessing gives every child: its end sends SIGIO, which is turned into SIGKILL here.
+    Elsewhere than on Linux a child only notices its owner's end when its call returns.
+    """
+    if sys.platform != "linux":
+        return
+    owner = multiprocessing.parent_process()
+    assert owner is not None
+    sentinel = owner.sentinel
+    fcntl.fcntl(sentinel, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(sentinel, _F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(sentinel, fcntl.F_SETFL, fcntl.fcntl(sentinel, fcntl.F_GETFL) | os.O_ASYNC)
+    if not owner.is_alive():
+        os._exit(1)
+
+
 def _serve(connection: Connection, memory_bytes: int) -> None:
     """Answer calls until the parent closes the connection."""
-    die_with_parent()
+    _die_with_owner()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))

@@ -88,6 +88,10 @@ class Scene:
         """Return the same scene seen by other cameras ([C, 4, 4] and [C])."""
         return dataclasses.replace(self, c2w=c2w, fov_deg=fov_deg)
 
+    def with_provenance(self, provenance: Mapping[str, Any]) -> "Scene":
+        """Return the same scene with another record of its origin."""
+        return dataclasses.replace(self, provenance=provenance)
+
     def check(self) -> None:
         """Raise TrilightError at the first broken law.
 
@@ -196,7 +200,7 @@ def _require(law: NDArray[np.bool_], name: str, values: NDArray, expected: str) 
     if law.all():
         return
     index = tuple(int(i) for i in np.argwhere(~law)[0])
-    found = np.array2string(values[index], threshold=16)
+    found = " ".join(np.array2string(values[index], threshold=16).split())
     _broken(f"{name}{list(index)} is {found}", expected)
 
 

@@ -78,6 +78,6 @@ def _checked_name(path: Path, member: tarfile.TarInfo) -> tuple[str, str]:
 def _require_end(path: Path, archive: tarfile.TarFile) -> None:
     """A tar ends in two empty blocks; a file cut between two members has none."""
     with path.open("rb") as stream:
-        stream.seek(archive.offset - tarfile.BLOCKSIZE)
-        if stream.read(tarfile.BLOCKSIZE) != bytes(tarfile.BLOCKSIZE):
+        stream.seek(archive.offset)
+        if stream.read(2 * tarfile.BLOCKSIZE) != bytes(2 * tarfile.BLOCKSIZE):
             raise TrilightError(f"{path.name}: the end of the shard is missing; it is cut short.")

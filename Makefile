@@ -1,0 +1,53 @@
+# Two commands on a fresh machine: `make dataset` and `make test`. Both do all the set-up themselves.
+# Prerequisites: python3 (3.11 or later) with venv, make, git.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+export PATH := $(abspath $(BIN)):$(PATH)
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: setup setup-all dataset test test-slow train lint lock third-party clean
+
+setup: $(VENV)/.dataset-ready  ## what making data needs
+
+setup-all: $(VENV)/.all-ready  ## that, torch, and the tools of the tests
+
+dataset: setup  ## 24 scenes of built-in objects, verified
+	trilight generate smoke --objects builtin: --out data/smoke --scenes 24
+	trilight verify data/smoke
+
+test: setup-all  ## the tests that take minutes
+	python -m pytest
+
+test-slow: setup-all  ## the others
+	python -m pytest -m slow
+
+train: setup-all  ## the smoke model on what `make dataset` made
+	trilight train smoke --data data/smoke --out runs/smoke
+
+lint: setup-all  ## format, style, types, layers
+	ruff format --check .
+	ruff check .
+	mypy
+	lint-imports
+
+lock: setup-all  ## write the lock files anew from requirements/*.in
+	infra/setup/lock.sh
+
+third-party: setup-all  ## write docs/third_party.md anew
+	python -m infra.setup.third_party
+
+clean:  ## everything that make has made, except data/ and runs/
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache *.egg-info
+
+$(VENV)/.dataset-ready: requirements/dataset.txt pyproject.toml infra/setup/system_libraries.sh
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	infra/setup/system_libraries.sh
+	$(BIN)/python -m pip install --quiet --requirement requirements/dataset.txt
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $@
+
+$(VENV)/.all-ready: requirements/all.txt $(VENV)/.dataset-ready
+	$(BIN)/python -m pip install --quiet --requirement requirements/all.txt
+	touch $@

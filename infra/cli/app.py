@@ -1,0 +1,51 @@
+"""The command `trilight`: one file per subcommand, one way to report a mistake."""
+
+import os
+import signal
+import sys
+from types import FrameType
+from typing import NoReturn
+
+import typer
+
+from infra.cli import bench, doctor, generate, inspect, train, verify
+from storage.errors import TrilightError
+
+app = typer.Typer(
+    name="trilight",
+    help="Triangles in, light out: make data for, train and judge RenderFormer-style renderers.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.command("doctor")(doctor.doctor)
+app.command("generate")(generate.generate)
+app.command("verify")(verify.verify)
+app.command("inspect")(inspect.inspect)
+app.command("train")(train.train)
+app.command("bench")(bench.bench)
+
+
+def main() -> None:
+    """Run the command line; a mistake of the user is one line on stderr and exit status 1."""
+    signal.signal(signal.SIGINT, _interrupted)
+    try:
+        app()
+    except TrilightError as mistake:
+        _leave(f"trilight: {mistake}", 1)
+
+
+def _interrupted(signal_number: int, frame: FrameType | None) -> None:
+    _leave("trilight: interrupted. What was finished is safe; the same command goes on.", 130)
+
+
+def _leave(message: str, status: int) -> NoReturn:
+    """End at once: every child ends with its parent, and every file is whole or absent."""
+    sys.stdout.flush()
+    sys.stderr.write(f"\n{message}\n")
+    sys.stderr.flush()
+    os._exit(status)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""`trilight generate`: objects to shards."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.progress import Progress as Bars
+
+from infra.cli.console import console, print_json, print_rows, progress_bars
+from pipeline.flows.prefect_server import prefect_server, quiet_prefect
+from storage.failures import count_by_reason, read_failures
+from storage.layout import DatasetFolder
+from storage.progress import read_progress
+
+if TYPE_CHECKING:
+    from pipeline.flows.generate_scenes import Outcome
+
+_POLL_S = 0.5
+
+
+def generate(
+    build: Annotated[str, typer.Argument(help="named settings, such as smoke")],
+    objects: Annotated[str, typer.Option(help="folder of 3D objects, or builtin:")] = "builtin:",
+    out: Annotated[Path, typer.Option(help="folder of the dataset")] = Path("data/smoke"),
+    scenes: Annotated[int, typer.Option(help="scenes, rounded up to whole shards")] = 24,
+    seed: Annotated[int | None, typer.Option(help="seed of every draw")] = None,
+    resolution: Annotated[int | None, typer.Option(help="picture width in pixels")] = None,
+    noise_floor: Annotated[
+        float | None, typer.Option("--noise-floor", help="target in dB (psnr_log_db)")
+    ] = None,
+    allow_licence: Annotated[
+        list[str] | None, typer.Option(help="allow this licence too; may be repeated")
+    ] = None,
+    workers: Annotated[int, typer.Option(help="render processes that share the cores")] = 1,
+    failure_budget: Annotated[
+        float, typer.Option(help="share of scenes that may be given up")
+    ] = 0.1,
+    accept_environment: Annotated[
+        bool, typer.Option(help="go on with a dataset begun with other library versions")
+    ] = False,
+    json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
+) -> None:
+    """Turn objects into a verified, resumable dataset; run it again to go on after any stop."""
+    quiet_prefect()
+    folder = DatasetFolder(out)
+    started = time.monotonic()
+    with prefect_server():
+        from pipeline.flows.generate_scenes import generate_scenes  # after Prefect is quiet
+
+        with _progress(folder):
+            outcome = generate_scenes(
+                build=build,
+                objects=objects,
+                out=str(out),
+                scenes=scenes,
+                seed=seed,
+                resolution=resolution,
+                noise_floor_db=noise_floor,
+                allow_licences=allow_licence,
+                workers=workers,
+                failure_budget=failure_budget,
+                accept_environment=accept_environment,
+            )
+    _report(folder, outcome, time.monotonic() - started, as_json=json)
+
+
+@contextlib.contextmanager
+def _progress(folder: DatasetFolder) -> Iterator[None]:
+    """Draw progress bars from the files of the dataset while the block runs."""
+    ended = threading.Event()
+    with progress_bars() as bars:
+        watcher = threading.Thread(target=_watch, args=(folder, bars, ended), daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            watcher.join()
+
+
+def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event) -> None:
+    objects = bars.add_task("objects", total=None, note="")
+    scenes = bars.add_task("scenes", total=None, start=False, note="")
+    already: int | None = None
+    last = False
+    while not last:
+        last = ended.wait(_POLL_S)
+        with contextlib.suppress(OSError, ValueError):  # a file may vanish between two looks
+            now = read_progress(folder)
+            bars.update(objects, completed=now.objects_done, total=now.objects_planned or None)
+            if not now.scenes_planned:
+                continue
+            if already is None:
+                already = now.scenes_done
+            # rate and ETA count what this run makes, not what it found
+            bars.update(
+                scenes,
+                completed=now.scenes_done - already,
+                total=now.scenes_planned - already,
+                note=f"({already} were there)" if already else "",
+            )
+            if now.objects_done >= now.objects_planned > 0 or last:
+                bars.start_task(scenes) if not bars.tasks[scenes].started else None
+
+
+def _report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json: bool) -> None:
+    rejected = count_by_reason(read_failures(folder.failures))
+    statistics = outcome.statistics
+    if as_json:
+        print_json(
+            {
+                "out": str(folder.root),
+                "dataset_digest": outcome.digest,
+                "objects_found": outcome.num_objects_found,
+                "objects_used": outcome.num_objects_used,
+                "scenes": statistics.num_scenes,
+                "views": statistics.num_views,
+                "bytes": statistics.num_bytes,
+                "scenes_given_up": outcome.num_scenes_given_up,
+                "rejections": [list(row) for row in rejected],
+                "seconds": round(seconds, 1),
+            }
+        )
+        return
+    used = f"{outcome.num_objects_used} of {outcome.num_objects_found}"
+    rows = [("objects used", used), *statistics.lines()]
+    if outcome.num_scenes_given_up:
+        rows.append(("scenes given up", str(outcome.num_scenes_given_up)))
+    rows += [("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in rejected]
+    rows += [
+        ("dataset digest", outcome.digest),
+        ("wall time", f"{seconds:.0f} s"),
+        ("look at", str(folder.contact_sheet)),
+        ("shards, manifest", str(folder.root)),
+        ("why rejected", str(folder.failures)),
+    ]
+    print_rows("Dataset finished", rows)
+    console.print(f"\nNext: trilight verify {folder.root}", style="bold")
+    console.print(f"      trilight train smoke --data {folder.root}", style="bold")

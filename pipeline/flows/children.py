@@ -1,0 +1,31 @@
+"""A pool of isolated children that task threads borrow one at a time."""
+
+import contextlib
+import queue
+from collections.abc import Callable, Iterator
+
+from pipeline.isolation import IsolatedChild
+
+
+class ChildPool:
+    """At most `size` children, each with its compiled kernels warm for the next task."""
+
+    def __init__(self, make_child: Callable[[], IsolatedChild], size: int) -> None:
+        self._children = [make_child() for _ in range(size)]
+        self._free: queue.SimpleQueue[IsolatedChild] = queue.SimpleQueue()
+        for child in self._children:
+            self._free.put(child)
+
+    @contextlib.contextmanager
+    def borrow(self) -> Iterator[IsolatedChild]:
+        """Lend a free child; waits while all are lent."""
+        child = self._free.get()
+        try:
+            yield child
+        finally:
+            self._free.put(child)
+
+    def close(self) -> None:
+        """End all children at once."""
+        for child in self._children:
+            child.close()

@@ -1,0 +1,155 @@
+"""One attempt at one scene, inside a render child: compose it, render its views, encode it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.flows.settings import BuildSettings
+from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
+from pipeline.renders.variant import Variant, activate
+from pipeline.scenes.compose import compose_scene, next_camera
+from pipeline.scenes.pool import PooledAsset
+from storage.asset import decode_asset
+from storage.errors import Rejected
+from storage.layout import DatasetFolder
+from storage.records import Failure, LockedObject
+from storage.sample import Sample, ViewRecord, sample_key
+from storage.scene import Scene
+from storage.seeds import seed_for
+
+MAX_ATTEMPTS = 16
+"""Attempts at a scene before it is given up."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSource:
+    """What a render child needs to know once."""
+
+    settings: BuildSettings
+    """The build."""
+    variant: Variant
+    """What Mitsuba runs on."""
+    threads: int
+    """Threads of this child."""
+    folder: DatasetFolder
+    """Where the prepared assets are."""
+    objects: tuple[tuple[LockedObject, str], ...]
+    """Every locked object with the name of its staged asset file."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneAttempt:
+    """What became of one attempt."""
+
+    sample: Sample | None
+    """The finished sample, or nothing where the attempt was rejected."""
+    failures: list[Failure]
+    """The rejection of the attempt, and of cameras on the way to a sample."""
+
+
+class _ChildState:
+    """The assets of a render child by split, read once."""
+
+    source: SceneSource
+    pool: dict[str, Sequence[PooledAsset]]
+
+
+_state = _ChildState()
+
+
+def set_up_child(source: SceneSource) -> None:
+    """Prepare a render child: Mitsuba's variant, its threads, and the assets."""
+    activate(source.variant)
+    set_threads(source.threads)
+    _state.source = source
+    _state.pool = {}
+
+
+def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
+    """Make one attempt at a scene; equal arguments give equal results in every child."""
+    key = sample_key(scene_index)
+    settings = _state.source.settings
+    failures: list[Failure] = []
+    stage = "scenes"
+    try:
+        scene = compose_scene(
+            settings.scenes,
+            _assets_of(split),
+            seed=settings.seed,
+            scene_index=scene_index,
+            attempt=attempt,
+        )
+        stage = "renders"
+        sample = _render_sample(key, scene, settings, failures)
+    except Rejected as rejection:
+        failures.append(_failure(stage, key, rejection, attempt))
+        return SceneAttempt(sample=None, failures=failures)
+    return SceneAttempt(sample=sample, failures=failures)
+
+
+def _assets_of(split: str) -> Sequence[PooledAsset]:
+    if split not in _state.pool:
+        source = _state.source
+        _state.pool[split] = [
+            PooledAsset(
+                locked=locked,
+                asset=decode_asset((source.folder.staged_assets / file_name).read_bytes()),
+            )
+            for locked, file_name in sorted(source.objects, key=lambda pair: pair[0].uid)
+            if locked.split == split
+        ]
+    return _state.pool[split]
+
+
+def _render_sample(
+    key: str, scene: Scene, settings: BuildSettings, failures: list[Failure]
+) -> Sample:
+    """Render every view, replacing the cameras of rejected ones by their next attempts."""
+    renderer = SceneRenderer(scene, settings.renders)
+    pictures, records = [], []
+    for view in range(scene.num_views):
+        while True:
+            camera_attempt = int(scene.provenance["camera_attempts"][view])
+            seed = seed_for(settings.seed, "samples", int(key), view, camera_attempt)
+            try:
+                rendered = renderer.render_view(scene.c2w[view], float(scene.fov_deg[view]), seed)
+                break
+            except Rejected as rejection:
+                failures.append(_failure("renders", f"{key}.{view}", rejection, camera_attempt))
+                scene = next_camera(scene, settings.scenes, view=view)
+        pictures.append(rendered.radiance_rgb)
+        records.append(_record(rendered, seed, camera_attempt))
+    scene.check()
+    return Sample(
+        key=key,
+        scene=_with_digest(scene, settings),
+        radiance_rgb=np.stack(pictures),
+        views=tuple(records),
+    )
+
+
+def _with_digest(scene: Scene, settings: BuildSettings) -> Scene:
+    provenance = {**scene.provenance, "settings_sha256": settings.digest}
+    return scene.with_provenance(provenance)
+
+
+def _record(rendered: RenderedView, seed: int, camera_attempt: int) -> ViewRecord:
+    return ViewRecord(
+        spp=rendered.spp,
+        noise_floor_db=round(rendered.noise_floor_db, 3),
+        noise_floor_linear_db=round(rendered.noise_floor_linear_db, 3),
+        at_cap=rendered.at_cap,
+        seed=seed,
+        camera_attempt=camera_attempt,
+    )
+
+
+def _failure(stage: str, item: str, rejection: Rejected, attempt: int) -> Failure:
+    return Failure(
+        stage=stage,
+        item=item,
+        reason=rejection.reason,
+        message=rejection.message,
+        attempt=attempt,
+    )

@@ -1,0 +1,107 @@
+"""A private Prefect server for runs that nobody has started a server for.
+
+Prefect's own temporary server outlives a parent that is killed. This one asks the kernel to end
+with its parent, keeps its database in Trilight's cache, binds to loopback, and is quiet. Where
+PREFECT_API_URL is set (a served deployment, a team's server) that server is used instead.
+"""
+
+import contextlib
+import fcntl
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+from pipeline.isolation import die_with_parent
+from storage.cache import cache_folder
+from storage.errors import TrilightError
+
+_START_UP_S = 120.0
+_LOG_NAME = "server.log"
+
+
+def quiet_prefect() -> None:
+    """Set what Prefect reads when it is imported: no telemetry, a private home, no chatter.
+
+    Call before the first import of prefect. What the user has set already is kept.
+    """
+    quiet = {
+        "DO_NOT_TRACK": "1",
+        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        "PREFECT_HOME": str(cache_folder("prefect")),
+        "PREFECT_LOGGING_LEVEL": "CRITICAL",
+        "PREFECT_CLI_PROMPT": "false",
+        "PREFECT_SHOW_BANNER": "false",
+    }
+    for name, value in quiet.items():
+        os.environ.setdefault(name, value)
+
+
+@contextlib.contextmanager
+def prefect_server() -> Iterator[str]:
+    """Provide the URL of a Prefect API for the block, and set PREFECT_API_URL to it.
+
+    Raises:
+        TrilightError: the private server does not start.
+    """
+    if given := os.environ.get("PREFECT_API_URL"):
+        yield given
+        return
+    home = Path(os.environ["PREFECT_HOME"])
+    home.mkdir(parents=True, exist_ok=True)
+    with (home / "start.lock").open("w") as lock, (home / _LOG_NAME).open("ab") as log:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # two first starts at once would both migrate the database
+        port = _free_port()
+        server = subprocess.Popen(
+            [sys.executable, "-m", "pipeline.flows.prefect_server", str(port)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd=Path(__file__).parents[2],
+        )
+        url = f"http://127.0.0.1:{port}/api"
+        try:
+            _wait_until_healthy(url, server, home / _LOG_NAME)
+            fcntl.flock(lock, fcntl.LOCK_UN)
+            os.environ["PREFECT_API_URL"] = url
+            yield url
+        finally:
+            os.environ.pop("PREFECT_API_URL", None)
+            server.kill()  # its records are a display, not the truth: nothing is waited for
+            server.wait()
+
+
+def _wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -> None:
+    deadline = time.monotonic() + _START_UP_S
+    while time.monotonic() < deadline and server.poll() is None:
+        with contextlib.suppress(urllib.error.URLError, OSError):
+            with urllib.request.urlopen(f"{url}/health", timeout=2):
+                return
+        time.sleep(0.1)
+    raise TrilightError(
+        f"Prefect: the private server did not start within {_START_UP_S:.0f} s; see {log}, and try "
+        "`trilight doctor`."
+    )
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _serve(port: str) -> None:
+    die_with_parent()
+    from prefect.cli import app
+
+    sys.argv = ["prefect", "server", "start", "--host", "127.0.0.1", "--port", port]
+    app()
+
+
+if __name__ == "__main__":
+    _serve(sys.argv[1])

@@ -1,0 +1,73 @@
+"""`BuildSettings`: everything that decides what a dataset holds, except how many scenes."""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.renders.settings import RenderSettings
+from scene_templates.settings import SceneSettings
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+from storage.splits import SplitSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildSettings:
+    """The settings of one dataset. They stand in its manifest and never change."""
+
+    build: str
+    """Name of the build that they come from."""
+    seed: int
+    """Seed of every draw; any integer from 0."""
+    allowed_licences: tuple[str, ...]
+    """Licences of objects that may be used."""
+    assets: AssetSettings
+    """How objects become meshes."""
+    scenes: SceneSettings
+    """How meshes become scenes."""
+    renders: RenderSettings
+    """How scenes become pictures."""
+    splits: SplitSettings
+    """How objects and scenes are divided into splits and shards."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise TrilightError(f"seed is {self.seed}; expected an integer from 0.")
+        if not self.allowed_licences:
+            raise TrilightError("allowed_licences is empty; expected at least one licence.")
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the settings as JSON values."""
+        plain = dataclasses.asdict(self)
+        return typing.cast(dict[str, Any], _plain(plain))
+
+    @property
+    def digest(self) -> str:
+        """sha256 of the settings."""
+        return sha256_hex(canonical_json(self.as_json()))
+
+
+def differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
+    """Yield (dotted name, value before, value now) for each setting that differs."""
+    for name in sorted({*before, *now}):
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            yield from differences(old, new, f"{prefix}{name}.")
+        elif old != new:
+            yield f"{prefix}{name}", old, new
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON would give it back: tuples become lists."""
+    if isinstance(value, Mapping):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    assert isinstance(value, str | int | float | bool | types.NoneType), value
+    return value

@@ -1,0 +1,53 @@
+"""Stage "shards": the staged scenes of one shard become its tar file."""
+
+from pathlib import Path
+
+from storage.failures import write_failures
+from storage.layout import DatasetFolder
+from storage.manifest import ShardEntry, index_shard
+from storage.records import Failure
+from storage.sample import sample_key
+from storage.shard_writer import write_shard
+from storage.staging import read_staged_scene
+
+
+def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardEntry:
+    """Write a shard from its staged scenes and return its manifest entry.
+
+    The rejections are written before the shard, so that whoever sees the shard can find them, and
+    the staged scenes are deleted after it: a kill in between loses nothing and repeats little.
+
+    Args:
+        folder: the dataset.
+        name: file name of the shard.
+        scene_indices: its scenes, all of which are staged.
+
+    Raises:
+        TrilightError: the disk is full or the folder cannot be written.
+    """
+    staged_folder = folder.staged_shard(name)
+    failures: list[Failure] = []
+    samples: list[tuple[str, dict[str, bytes]]] = []
+    for index in scene_indices:
+        staged = read_staged_scene(staged_folder, index)
+        failures.extend(staged.failures)
+        if staged.members:
+            samples.append((sample_key(index), staged.members))
+    write_failures(rejections_of_shard(folder, name), failures)
+    path = folder.shard(name)
+    write_shard(path, samples)
+    remove_staged(staged_folder)
+    return index_shard(path)
+
+
+def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
+    """Return the file with the rejections of a packed shard."""
+    return folder.staged_failures / f"{name}.jsonl"
+
+
+def remove_staged(staged_folder: Path) -> None:
+    """Delete the staged scenes of a shard that is packed."""
+    for staged in sorted(staged_folder.glob("*")):
+        staged.unlink(missing_ok=True)
+    if staged_folder.exists():
+        staged_folder.rmdir()

@@ -1,0 +1,54 @@
+"""How far a dataset is, from its files alone: anybody may look, from any process."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+from storage.layout import DatasetFolder
+from storage.manifest import read_manifest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Counts of what is finished and of what is planned; 0 planned where it is not known yet."""
+
+    objects_done: int
+    """Objects that are prepared or rejected."""
+    objects_planned: int
+    """Objects to prepare."""
+    scenes_done: int
+    """Scenes in shards or waiting for their shard."""
+    scenes_planned: int
+    """Scenes to make."""
+
+
+def announce_objects(folder: DatasetFolder, num_objects: int) -> None:
+    """Write down how many objects the asset stage will look at."""
+    write_atomically(_plan(folder), json.dumps({"objects": num_objects}).encode())
+
+
+def read_progress(folder: DatasetFolder) -> Progress:
+    """Count files; cheap enough to be called twice a second."""
+    try:
+        manifest = read_manifest(folder.manifest)
+        scenes_planned, in_shards = manifest.num_scenes, manifest.num_samples
+    except TrilightError:
+        scenes_planned = in_shards = 0
+    plan = json.loads(_plan(folder).read_bytes()) if _plan(folder).exists() else {"objects": 0}
+    staged = sum(1 for _ in (folder.staging / "samples").glob("*/*.tar"))
+    return Progress(
+        objects_done=min(_count(folder.staged_assets), plan["objects"]),
+        objects_planned=plan["objects"],
+        scenes_done=in_shards + staged,
+        scenes_planned=scenes_planned,
+    )
+
+
+def _plan(folder: DatasetFolder) -> Path:
+    return folder.staging / "plan.json"
+
+
+def _count(path: Path) -> int:
+    return sum(1 for entry in path.glob("*") if not entry.name.endswith(".part"))

@@ -1,0 +1,89 @@
+"""What a dataset holds, from the JSON members of its samples alone: no picture is decoded."""
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.dataset import Dataset
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Statistics:
+    """Counts and distributions of a dataset."""
+
+    num_scenes: int
+    """Scenes in all shards."""
+    scenes_by_split: Mapping[str, int]
+    """Scenes per split."""
+    scenes_by_template: Mapping[str, int]
+    """Scenes per layout template."""
+    num_bytes: int
+    """Bytes of all shards."""
+    spp: NDArray[np.int64]
+    """[views] samples per pixel."""
+    noise_floor_db: NDArray[np.float64]
+    """[views] psnr_log_db."""
+    at_cap: NDArray[np.bool_]
+    """[views] whether sampling ended at the cap."""
+
+    @property
+    def num_views(self) -> int:
+        return len(self.spp)
+
+    def lines(self) -> Sequence[tuple[str, str]]:
+        """Return (name, value) rows for people."""
+        if not self.num_views:
+            return [("scenes", "0")]
+        median, low = np.percentile(self.noise_floor_db, [50, 5])
+        return [
+            ("scenes", f"{self.num_scenes} ({_counts(self.scenes_by_split)})"),
+            ("templates", _counts(self.scenes_by_template)),
+            ("views", f"{self.num_views}"),
+            ("noise floor", f"median {median:.1f} dB, 5th percentile {low:.1f} dB (psnr_log_db)"),
+            ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),
+            ("samples per pixel", f"median {np.median(self.spp):.0f}, most {self.spp.max()}"),
+            ("size", f"{self.num_bytes / 1e6:.1f} MB, {self.bytes_per_scene / 1e3:.0f} kB a scene"),
+        ]
+
+    @property
+    def bytes_per_scene(self) -> float:
+        return self.num_bytes / max(self.num_scenes, 1)
+
+
+def dataset_statistics(dataset: Dataset) -> Statistics:
+    """Read the JSON member of every sample through the manifest's index.
+
+    Raises:
+        TrilightError, OSError: a shard is missing or shorter than its index.
+    """
+    splits: Counter[str] = Counter()
+    templates: Counter[str] = Counter()
+    views: list[Any] = []
+    for shard in dataset.manifest.shards:
+        with dataset.folder.shard(shard.name).open("rb") as stream:
+            for name, offset, num_bytes in shard.members:
+                if not name.endswith(".json"):
+                    continue
+                stream.seek(offset)
+                record = json.loads(stream.read(num_bytes))
+                splits[shard.split] += 1
+                templates[record["provenance"]["template"]] += 1
+                views.extend(record["views"])
+    return Statistics(
+        num_scenes=dataset.manifest.num_samples,
+        scenes_by_split=splits,
+        scenes_by_template=templates,
+        num_bytes=dataset.manifest.num_bytes,
+        spp=np.array([view["spp"] for view in views], np.int64),
+        noise_floor_db=np.array([view["noise_floor_db"] for view in views], np.float64),
+        at_cap=np.array([view["at_cap"] for view in views], np.bool_),
+    )
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))

@@ -1,0 +1,43 @@
+"""What must start fast must not load what is heavy; looked at in a fresh process each."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import ROOT
+
+HEAVY = ("torch", "mitsuba", "pxr", "prefect", "trimesh", "pymeshlab", "webdataset", "matplotlib")
+
+
+def _loaded_by(statement: str) -> set[str]:
+    code = f"import sys, json; {statement}; print(json.dumps(sorted(sys.modules)))"
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return set(json.loads(result.stdout.splitlines()[-1]))
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import storage",
+        "import storage.dataset, storage.verify, storage.staging, storage.shard_writer",
+        "import scene_templates.registry, scene_templates.settings",
+    ],
+)
+def test_the_waist_and_the_templates_are_light(statement: str) -> None:
+    assert not _loaded_by(statement) & set(HEAVY)
+
+
+def test_settings_are_light() -> None:
+    assert not _loaded_by("import pipeline.flows.builds") & set(HEAVY)
+
+
+def test_help_needs_no_heavy_library() -> None:
+    assert not _loaded_by("import infra.cli.app") & {"torch", "mitsuba", "prefect", "pymeshlab"}
+
+
+def test_making_data_needs_no_torch() -> None:
+    assert "torch" not in _loaded_by("import pipeline.flows.generate_scenes")

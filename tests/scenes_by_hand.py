@@ -1,0 +1,69 @@
+"""Small scenes made by hand, for tests that need a valid scene and not a sampled one."""
+
+from typing import Any
+
+import numpy as np
+
+from storage.conventions import look_at_c2w
+from storage.sample import Sample, ViewRecord
+from storage.scene import Scene, SceneObject
+
+FLOOR, LIGHT = 0, 1
+
+
+def tiny_scene(**changes: Any) -> Scene:
+    """Return a floor of two triangles below one white light, seen by two cameras."""
+    positions = np.array(
+        [
+            [-1, -1, 0],
+            [1, -1, 0],
+            [1, 1, 0],
+            [-1, 1, 0],
+            [-0.1, -0.1, 2],
+            [0, 0.1, 2],
+            [0.1, -0.1, 2],
+        ],
+        np.float32,
+    )
+    normals = np.array([[0, 0, 1]] * 4 + [[0, 0, -1]] * 3, np.float32)
+    materials = np.zeros((2, 10), np.float32)
+    materials[FLOOR] = [0.5, 0.4, 0.3, 0.2, 0.2, 0.2, 0.5, 0, 0, 0]
+    materials[LIGHT, 6:] = [1, 100, 100, 100]
+    poses = [look_at_c2w(eye=eye, target=[0, 0, 0], up=[0, 0, 1]) for eye in ([2, 0, 1], [0, 2, 1])]
+    fields: dict[str, Any] = {
+        "vertex_positions": positions,
+        "vertex_normals": normals,
+        "faces": np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]], np.uint32),
+        "material_index": np.array([FLOOR, FLOOR, LIGHT], np.uint16),
+        "materials": materials,
+        "object_index": np.array([FLOOR, FLOOR, LIGHT], np.uint16),
+        "c2w": np.stack(poses).astype(np.float32),
+        "fov_deg": np.array([45, 40], np.float32),
+        "objects": (
+            SceneObject(name="floor", kind="shell"),
+            SceneObject(name="light", kind="emitter"),
+        ),
+        "provenance": {"template": "plane", "scene_index": 0, "attempt": 0, "seed": 0},
+    }
+    return Scene(**{**fields, **changes})
+
+
+def tiny_sample(key: str = "000000000", resolution: int = 16, seed: int = 0) -> Sample:
+    """Return a sample of the tiny scene with random pictures that half floats hold exactly."""
+    rng = np.random.default_rng(seed)
+    scene = tiny_scene()
+    radiance = rng.random((scene.num_views, resolution, resolution, 3)).astype(np.float16)
+    view = ViewRecord(
+        spp=128,
+        noise_floor_db=41.5,
+        noise_floor_linear_db=33.25,
+        at_cap=False,
+        seed=7,
+        camera_attempt=0,
+    )
+    return Sample(
+        key=key,
+        scene=scene,
+        radiance_rgb=radiance.astype(np.float32),
+        views=(view,) * scene.num_views,
+    )

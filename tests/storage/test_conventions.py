@@ -1,0 +1,56 @@
+"""Frames and units, against geometry that can be checked by hand."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from storage.conventions import (
+    camera_rays,
+    focal_px,
+    log10_radiance,
+    look_at_c2w,
+    preview_srgb8,
+    radiance_from_log10,
+)
+
+angles = st.floats(1, 170)
+
+
+def test_a_camera_looks_along_minus_z_with_y_up() -> None:
+    c2w = look_at_c2w(eye=[0, -3, 0], target=[0, 0, 0], up=[0, 0, 1])
+    assert np.allclose(c2w @ [0, 0, -1, 0], [0, 1, 0, 0])
+    assert np.allclose(c2w @ [0, 1, 0, 0], [0, 0, 1, 0])
+    assert np.allclose(c2w @ [1, 0, 0, 0], [1, 0, 0, 0])
+
+
+@given(fov_deg=angles, resolution=st.integers(2, 64))
+def test_the_outer_pixel_edges_span_the_field_of_view(fov_deg: float, resolution: int) -> None:
+    half_width = 0.5 * resolution / focal_px(fov_deg, resolution)
+    assert np.isclose(2 * np.degrees(np.arctan(half_width)), fov_deg)
+
+
+@given(fov_deg=angles)
+def test_rays_are_unit_and_turn_with_the_picture(fov_deg: float) -> None:
+    c2w = look_at_c2w(eye=[1, 2, 3], target=[0, 0, 0], up=[0, 0, 1])
+    origin, directions = camera_rays(c2w, fov_deg, 8)
+    assert np.allclose(origin, [1, 2, 3])
+    assert np.allclose(np.linalg.norm(directions, axis=-1), 1)
+    up, right = c2w[:3, 1], c2w[:3, 0]
+    assert (np.diff(directions @ up, axis=0) < 0).all()  # row 0 is the top
+    assert (np.diff(directions @ right, axis=1) > 0).all()
+    middle = directions[3:5, 3:5].mean(axis=(0, 1))
+    assert np.allclose(middle / np.linalg.norm(middle), -c2w[:3, 2])
+
+
+@given(st.floats(0, 6e4))
+def test_the_output_space_is_inverted(radiance: float) -> None:
+    # float64 rounding grows with the exponent: relative 1e-12 plus what 1 + L loses near 0
+    assert np.isclose(radiance_from_log10(log10_radiance(radiance)), radiance, 1e-12, 1e-15)
+
+
+def test_a_preview_is_monotone_and_ends_at_white() -> None:
+    ramp = np.linspace(0, 2, 200)[:, None, None]
+    preview = preview_srgb8(ramp).astype(int).ravel()
+    assert preview[0] == 0
+    assert (np.diff(preview) >= 0).all()
+    assert (preview[100:] == 255).all()  # radiance 1 and above

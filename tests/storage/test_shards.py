@@ -1,0 +1,156 @@
+"""Shards: reproducible bytes, atomic appearance, and a reader that trusts nothing."""
+
+import io
+import tarfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+from storage.atomic import atomic_writer, remove_leftovers
+from storage.digests import sha256_of_file
+from storage.errors import TrilightError
+from storage.manifest import index_shard
+from storage.sample import encode_sample
+from storage.shard_reader import iterate_samples
+from storage.shard_writer import write_shard
+from tests.scenes_by_hand import tiny_sample
+
+MEMBERS = {"json": b"{}", "scene.safetensors": b"abc", "0.exr": b"x" * 1000}
+
+
+def _tar(path: Path, entries: Iterable[tarfile.TarInfo | tuple[str, bytes]]) -> Path:
+    with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as archive:
+        for entry in entries:
+            if isinstance(entry, tarfile.TarInfo):
+                archive.addfile(entry)
+            else:
+                info = tarfile.TarInfo(entry[0])
+                info.size = len(entry[1])
+                archive.addfile(info, io.BytesIO(entry[1]))
+    return path
+
+
+def test_equal_samples_give_equal_files(tmp_path: Path) -> None:
+    samples = [(f"{i:09d}", encode_sample(tiny_sample(seed=i))) for i in range(3)]
+    for name in ("a.tar", "b.tar"):
+        write_shard(tmp_path / name, [(key, dict(reversed(m.items()))) for key, m in samples])
+    assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
+    assert [key for key, _ in iterate_samples(tmp_path / "a.tar")] == [key for key, _ in samples]
+    assert list(iterate_samples(tmp_path / "a.tar")) == samples
+
+
+def test_bytes_are_pinned(tmp_path: Path) -> None:
+    """A new library that writes other bytes would change every dataset digest: notice it here."""
+    write_shard(tmp_path / "pinned.tar", [("000000000", MEMBERS)])
+    assert sha256_of_file(tmp_path / "pinned.tar") == PINNED
+
+
+PINNED = "34fe3b8b9ef7e13f706ad65041b050257f8fafe56d80fb5364e220a7f4e3a41c"
+
+
+def test_stock_webdataset_reads_a_shard(tmp_path: Path) -> None:
+    import webdataset
+
+    sample = tiny_sample()
+    write_shard(tmp_path / "train-000000.tar", [(sample.key, encode_sample(sample))])
+    (read,) = webdataset.WebDataset(str(tmp_path / "train-000000.tar"), shardshuffle=False)
+    assert read["__key__"] == sample.key
+    assert {"json", "scene.safetensors", "0.exr", "1.exr"} <= set(read)
+
+
+def test_the_index_finds_every_member(tmp_path: Path) -> None:
+    path = tmp_path / "train-000000.tar"
+    write_shard(path, [("000000000", MEMBERS), ("000000001", MEMBERS)])
+    entry = index_shard(path)
+    data = path.read_bytes()
+    assert (entry.split, entry.num_samples, entry.num_bytes) == ("train", 2, len(data))
+    found = {name: data[at : at + size] for name, at, size in entry.members}
+    assert found == {f"00000000{i}.{suffix}": d for i in range(2) for suffix, d in MEMBERS.items()}
+
+
+@pytest.mark.parametrize("kept_blocks", range(1, 20))
+def test_a_shard_cut_at_any_block_is_refused(tmp_path: Path, kept_blocks: int) -> None:
+    whole, cut = tmp_path / "whole.tar", tmp_path / "cut.tar"
+    write_shard(whole, [("000000000", MEMBERS), ("000000001", MEMBERS)])
+    content = whole.read_bytes().rstrip(b"\0")
+    cut.write_bytes(content[: min(kept_blocks * 512, len(content))])
+    with pytest.raises(TrilightError, match=r"cut\.tar"):
+        list(iterate_samples(cut))
+
+
+def _link(kind: bytes) -> tarfile.TarInfo:
+    info = tarfile.TarInfo("000000000.json")
+    info.type, info.linkname = kind, "/etc/passwd"
+    return info
+
+
+HOSTILE = {
+    "path": [("../000000000.json", b"{}")],
+    "absolute path": [("/tmp/000000000.json", b"{}")],
+    "folder": [("a/000000000.json", b"{}")],
+    "no suffix": [("README", b"")],
+    "symbolic link": [_link(tarfile.SYMTYPE)],
+    "hard link": [_link(tarfile.LNKTYPE)],
+    "device": [_link(tarfile.CHRTYPE)],
+    "member twice": [("000000000.json", b"{}"), ("000000000.json", b"{}")],
+    "sample in two places": [("0.json", b"{}"), ("1.json", b"{}"), ("0.exr", b"")],
+}
+
+
+@pytest.mark.parametrize("entries", HOSTILE.values(), ids=HOSTILE.keys())
+def test_hostile_members_are_refused(
+    tmp_path: Path, entries: list[tarfile.TarInfo | tuple[str, bytes]]
+) -> None:
+    with pytest.raises(TrilightError, match="refused|twice"):
+        list(iterate_samples(_tar(tmp_path / "hostile.tar", entries)))
+
+
+def test_a_member_that_claims_too_much_is_refused(tmp_path: Path) -> None:
+    info = tarfile.TarInfo("000000000.json")
+    info.size = 1 << 40
+    (tmp_path / "bomb.tar").write_bytes(info.tobuf(tarfile.GNU_FORMAT) + b"{}")
+    with pytest.raises(TrilightError, match="claims"):
+        list(iterate_samples(tmp_path / "bomb.tar"))
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"before")
+    with pytest.raises(ZeroDivisionError), atomic_writer(path) as stream:
+        stream.write(b"half")
+        raise ZeroDivisionError
+    assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    leftover, finished = tmp_path / "folder" / "a.tar.123.part", tmp_path / "folder" / "a.tar"
+    leftover.write_bytes(b"half")
+    finished.write_bytes(b"whole")
+    remove_leftovers(tmp_path)
+    assert not leftover.exists()
+    assert finished.exists()
+
+
+@pytest.mark.parametrize("place", ["/proc/nowhere/file", "/dev/null/file"])
+def test_an_unwritable_place_is_one_clear_line(place: str) -> None:
+    with pytest.raises(TrilightError, match="cannot write file"), atomic_writer(Path(place)):
+        pass
+
+
+def test_a_full_disk_is_one_clear_line() -> None:
+    """/dev/full refuses every write as a full disk does."""
+    with pytest.raises(TrilightError, match="disk is full.*safe"):
+        _write_through_full_device()
+
+
+def _write_through_full_device() -> None:
+    from storage.atomic import write_error
+
+    try:
+        with Path("/dev/full").open("wb", buffering=0) as stream:
+            stream.write(b"x")
+    except OSError as error:
+        raise write_error(Path("/somewhere/shard.tar"), error) from error
