@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar, cast
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
@@ -32,6 +33,8 @@ from storage.errors import TrilightError
 from storage.layout import DatasetFolder
 from storage.manifest import ShardEntry
 from storage.statistics import Statistics, dataset_statistics
+
+Argument = TypeVar("Argument")
 
 _RENDER_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=200)
 """A scene at 4096 samples and 512 pixels takes minutes; a render child holds below 1 GiB."""
@@ -105,9 +108,9 @@ def generate_scenes(
             scenes,
             accept_environment=accept_environment,
         )
-        accepted = prepare_assets_task(objects, quote(settings), quote(publication), workers)
+        accepted = prepare_assets_task(objects, _whole(settings), _whole(publication), workers)
         _make_shards(settings, variant, publication, accepted, workers, failure_budget)
-        statistics = write_documents_task(quote(publication), quote(accepted))
+        statistics = write_documents_task(_whole(publication), _whole(accepted))
     return Outcome(
         digest=publication.manifest.dataset_digest,
         num_objects_found=accepted.num_found,
@@ -192,7 +195,7 @@ def _in_window(missing: list[int], job: _ShardJob, *, window: int) -> Iterator[S
     running: list[PrefectFuture[ShardEntry]] = []
     while True:
         for shard_index in waiting:
-            running.append(make_shard_task.submit(shard_index, quote(job)))
+            running.append(make_shard_task.submit(shard_index, _whole(job)))
             if len(running) == window:
                 break
         if not running:
@@ -200,6 +203,11 @@ def _in_window(missing: list[int], job: _ShardJob, *, window: int) -> Iterator[S
         done = next(iter(as_completed(running)))
         running.remove(done)
         yield done.result()
+
+
+def _whole(argument: Argument) -> Argument:
+    """Hand an argument to a task as it is; Prefect otherwise searches all of it for futures."""
+    return cast(Argument, quote(argument))
 
 
 def _require_within_budget(publication: Publication, failure_budget: float) -> None:

@@ -1,0 +1,201 @@
+"""What this machine has, what it lacks, what is then slower, and the one command that mends it."""
+
+import contextlib
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+from pipeline.renders.variant import choose_variant
+from storage.cache import cache_folder
+
+State = Literal["ok", "slower", "missing"]
+
+_PROBE_S = 120
+_APT = "apt-get install"
+_MIN_FREE_BYTES = 5 << 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One line of the report."""
+
+    name: str
+    """What was looked at."""
+    state: State
+    """`ok`; `slower` where work goes on without it; `missing` where some work cannot be done."""
+    found: str
+    """What is there."""
+    consequence: str = ""
+    """What is slower or impossible; empty when all is well."""
+    mend: str = ""
+    """The one command that mends it."""
+
+
+def examine() -> list[Finding]:
+    """Look at everything; probes that may crash run in processes of their own."""
+    return [check() for check in CHECKS]
+
+
+def _machine() -> Finding:
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    text = (
+        f"{os.cpu_count()} cores, {memory:.0f} GiB, {platform.system()} {platform.machine()}, "
+        f"Python {platform.python_version()}"
+    )
+    return Finding(name="machine", state="ok", found=text)
+
+
+def _disk() -> Finding:
+    free = shutil.disk_usage(Path.cwd()).free
+    found = f"{free / 2**30:.0f} GiB free here"
+    if free >= _MIN_FREE_BYTES:
+        return Finding(name="disk", state="ok", found=found)
+    return Finding(
+        name="disk",
+        state="slower",
+        found=found,
+        consequence="a dataset of ten thousand scenes takes more",
+        mend="choose another disk with --out",
+    )
+
+
+def _renderer() -> Finding:
+    variant = choose_variant()
+    found = f"mitsuba {metadata.version('mitsuba')}, {variant.name}"
+    if variant.libllvm:
+        return Finding(name="renderer", state="ok", found=f"{found}, {variant.libllvm}")
+    return Finding(
+        name="renderer",
+        state="slower",
+        found=found,
+        consequence=variant.note,
+        mend=f"{_APT} libllvm19",
+    )
+
+
+def _denoiser() -> Finding:
+    code = "import pyoidn; d = pyoidn.Device(); d.commit()"
+    return _probe(
+        "denoiser",
+        code,
+        found=f"pyoidn {metadata.version('pyoidn')} (CPU)",
+        consequence="pictures cannot be denoised",
+        mend="make setup",
+    )
+
+
+def _mesh_filters() -> Finding:
+    code = (
+        "from pipeline.assets.environment import missing_filters; m = missing_filters(); "
+        "raise SystemExit(', '.join(m) if m else 0)"
+    )
+    return _probe(
+        "mesh filters",
+        code,
+        found=f"pymeshlab {metadata.version('pymeshlab')}",
+        consequence="meshes cannot be decimated",
+        mend=f"{_APT} libgl1 libopengl0",
+    )
+
+
+def _orchestrator() -> Finding:
+    return _probe(
+        "orchestrator",
+        "import prefect.server.api.server",
+        found=f"prefect {metadata.version('prefect')}, fastapi {metadata.version('fastapi')}",
+        consequence="no flow can run",
+        mend="make setup",
+    )
+
+
+def _learning() -> Finding:
+    if importlib.util.find_spec("torch") is None:
+        return Finding(
+            name="learning",
+            state="missing",
+            found="no torch",
+            consequence="data can be made, but nothing can be trained",
+            mend="make setup-all",
+        )
+    return Finding(name="learning", state="ok", found=f"torch {metadata.version('torch')}")
+
+
+def _accelerator() -> Finding:
+    smi = shutil.which("nvidia-smi")
+    names = ""
+    if smi is not None:
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+            command = [smi, "--query-gpu=name", "--format=csv,noheader"]
+            result = subprocess.run(
+                command, capture_output=True, text=True, timeout=_PROBE_S, check=False
+            )
+            names = ", ".join(result.stdout.split("\n")).strip(", ")
+    if names:
+        return Finding(name="GPU", state="ok", found=names)
+    return Finding(
+        name="GPU",
+        state="slower",
+        found="none",
+        consequence="rendering and training use the processor",
+        mend="run on a machine with an NVIDIA GPU",
+    )
+
+
+def _cache() -> Finding:
+    folder = cache_folder("")
+    existing = next(place for place in [folder, *folder.parents] if place.exists())
+    if os.access(existing, os.W_OK):
+        return Finding(name="cache", state="ok", found=str(folder))
+    return Finding(
+        name="cache",
+        state="missing",
+        found=f"{folder} cannot be written",
+        consequence="the orchestrator has no place for its records",
+        mend="export TRILIGHT_CACHE=/a/writable/folder",
+    )
+
+
+def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> Finding:
+    """Run code in a process of its own; a non-zero end, a crash or a hang is `missing`."""
+    try:
+        result = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=Path(__file__).parents[1],
+            capture_output=True,
+            text=True,
+            timeout=_PROBE_S,
+            check=False,
+        )
+        problem = "" if result.returncode == 0 else _last_line(result.stderr, result.returncode)
+    except subprocess.TimeoutExpired:
+        problem = f"no answer within {_PROBE_S} s"
+    if not problem:
+        return Finding(name=name, state="ok", found=found)
+    found = f"{found}: {problem}"
+    return Finding(name=name, state="missing", found=found, consequence=consequence, mend=mend)
+
+
+def _last_line(text: str, status: int) -> str:
+    return text.strip().splitlines()[-1] if text.strip() else f"ended with status {status}"
+
+
+CHECKS: Sequence[Callable[[], Finding]] = (
+    _machine,
+    _disk,
+    _cache,
+    _renderer,
+    _denoiser,
+    _mesh_filters,
+    _orchestrator,
+    _learning,
+    _accelerator,
+)
+"""What `examine` looks at, in the order of the report."""

@@ -1,0 +1,66 @@
+"""One Prefect server for all tests of a session, and the command line as a process."""
+
+import os
+import subprocess
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline.flows.prefect_server import prefect_server, quiet_prefect
+
+Trilight = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="session")
+def prefect_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A server with a database of its own, shared to save each test the start."""
+    os.environ["PREFECT_HOME"] = str(tmp_path_factory.mktemp("prefect"))
+    quiet_prefect()
+    with prefect_server() as url:
+        yield url
+
+
+@pytest.fixture
+def trilight(prefect_url: str, tmp_path: Path) -> Trilight:
+    """Run `trilight` with arguments in an empty folder, as a user does."""
+
+    def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
+        return subprocess.run(
+            command(*arguments),
+            cwd=tmp_path,
+            env={**os.environ, "PREFECT_API_URL": prefect_url},
+            capture_output=True,
+            text=True,
+            timeout=600,
+            check=False,
+        )
+
+    return run
+
+
+def command(*arguments: str) -> list[str]:
+    """Return the command of the installed distribution, wherever the tests run."""
+    return [str(Path(sys.executable).parent / "trilight"), *arguments]
+
+
+def marked_environment() -> tuple[str, dict[str, str]]:
+    """Return a mark, and an environment by which every descendant can be recognised."""
+    mark = f"TRILIGHT_TEST_MARK={uuid.uuid4()}"
+    name, value = mark.split("=")
+    return mark, {**os.environ, name: value}
+
+
+def processes_with(mark: str) -> list[str]:
+    """Return the command lines of all living processes that carry the mark."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            alive = (folder / "stat").read_text().rsplit(")")[-1].split()[0] != "Z"
+            if alive and mark.encode() in (folder / "environ").read_bytes():
+                found.append((folder / "cmdline").read_text().replace("\0", " "))
+        except OSError:
+            continue
+    return found

@@ -1,0 +1,90 @@
+"""From objects to shards to a training model with the commands of the README, small."""
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from storage.dataset import open_dataset
+from storage.failures import read_failures
+from tests.end_to_end.conftest import Trilight
+
+SMALL = ("--resolution", "32", "--noise-floor", "20", "--scenes", "12")
+"""A dozen scenes: three shards, the last of which is for validation."""
+
+
+def test_objects_to_shards_to_a_model(trilight: Trilight, tmp_path: Path) -> None:
+    made = trilight("generate", "smoke", "--objects", "builtin:", "--out", "set", *SMALL, "--json")
+    assert made.returncode == 0, made.stderr
+    outcome = json.loads(made.stdout[made.stdout.index("{") :])
+    assert outcome["scenes"] == 12
+    assert outcome["views"] == 48
+
+    verified = trilight("verify", "set", "--json")
+    assert verified.returncode == 0, verified.stdout
+    assert json.loads(verified.stdout)["dataset_digest"] == outcome["dataset_digest"]
+
+    with Image.open(tmp_path / "set" / "contact_sheet.png") as sheet:
+        assert min(sheet.size) > 400
+        assert len(sheet.getcolors(1 << 24) or []) > 1000  # pictures, not an empty sheet
+    assert trilight("inspect", "set").returncode == 0
+
+    trained = trilight("train", "smoke", "--data", "set", "--out", "run", "--steps", "4")
+    assert trained.returncode == 1
+    assert "resolution" in trained.stderr  # the smoke run needs 64 pixels, and says so
+
+    again = trilight("generate", "smoke", "--objects", "builtin:", "--out", "set", *SMALL, "--json")
+    assert json.loads(again.stdout[again.stdout.index("{") :])["seconds"] < outcome["seconds"]
+
+
+def test_real_objects_with_their_licences(trilight: Trilight, shared: Path, tmp_path: Path) -> None:
+    source = str(shared / "objects")
+    small = (*SMALL[:-1], "4")
+    made = trilight("generate", "smoke", "--objects", source, "--out", "set", *small)
+    assert made.returncode == 0, made.stderr
+    dataset = open_dataset(str(tmp_path / "set"))
+    refused = [f for f in read_failures(dataset.folder.failures) if f.stage == "objects"]
+    assert len(refused) == 5
+    assert {failure.reason for failure in refused} == {"licence_refused"}
+    used = {o.licence for s in dataset.manifest.shards for x in dataset.read_shard(s)
+            for o in x.scene.objects}  # fmt: skip
+    assert used == {"CC0-1.0"}
+
+
+BAD_INPUT = [
+    (("generate", "nonsense"), "build 'nonsense' is unknown; expected one of smoke"),
+    (("generate", "smoke", "--objects", "nowhere"), "nowhere"),
+    (("generate", "smoke", "--objects", "empty"), "empty"),
+    (("generate", "smoke", "--objects", "broken"), "none was accepted"),
+    (("generate", "smoke", "--objects", "twice"), "twice"),
+    (("generate", "smoke", "--out", "/proc/nowhere"), "cannot write"),
+    (("generate", "smoke", "--resolution", "100"), "resolution"),
+    (("generate", "smoke", "--scenes", "0"), "scenes is 0"),
+    (("generate", "smoke", "--workers", "0"), "workers is 0"),
+    (("verify", "empty"), "no manifest.json"),
+    (("inspect", "empty"), "no manifest.json"),
+    (("train", "smoke", "--data", "empty"), "no manifest.json"),
+    (("train", "nonsense", "--data", "empty"), "'nonsense'"),
+    (("bench", "nonsense"), "benchmark 'nonsense' is unknown"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_INPUT)
+def test_bad_input_is_one_clear_line(
+    trilight: Trilight, tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "torn.stl").write_bytes(b"solid nothing")
+    (tmp_path / "twice").mkdir()
+    row = {"uid": "a", "path": "a.stl", "title": "", "licence": "CC0-1.0", "attribution": "",
+           "source_url": ""}  # fmt: skip
+    (tmp_path / "twice" / "a.stl").write_bytes(b"solid nothing")
+    (tmp_path / "twice" / "objects.jsonl").write_text(2 * (json.dumps(row) + "\n"))
+    result = trilight(*arguments)
+    assert result.returncode == 1, result.stdout
+    lines = [line for line in result.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("trilight: ")
+    assert message in lines[0]

@@ -1,0 +1,201 @@
+"""A dataset is begun once, refuses to become another, and grows without changing what is there."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from pipeline.flows.builds import BUILDS, named_build
+from pipeline.flows.publication import Publication, begin
+from pipeline.flows.settings import BuildSettings, differences
+from pipeline.shards.pack import pack_shard
+from storage.errors import TrilightError
+from storage.failures import read_failures
+from storage.layout import DatasetFolder
+from storage.manifest import read_manifest
+from storage.records import Failure, LockedObject
+from storage.sample import Sample, sample_key
+from storage.splits import scenes_of_shard, shard_name
+from storage.staging import stage_scene
+from storage.verify import verify_dataset
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}
+
+
+def _build() -> BuildSettings:
+    build = named_build("smoke", resolution=16)
+    return dataclasses.replace(build, scenes=dataclasses.replace(build.scenes, num_views=2))
+
+
+def _begin(root: Path, build: BuildSettings, scenes: int = 4, **environment: str) -> Publication:
+    return begin(
+        DatasetFolder(root), build, {**ENVIRONMENT, **environment}, scenes, accept_environment=False
+    )
+
+
+def _locked() -> LockedObject:
+    return LockedObject(
+        uid="a",
+        asset_sha256="0" * 64,
+        split="train",
+        licence="CC0-1.0",
+        title="A",
+        attribution="",
+        source_url="",
+    )
+
+
+def _sample(index: int) -> Sample:
+    return dataclasses.replace(tiny_sample(seed=index), key=sample_key(index))
+
+
+def _make_shard(publication: Publication, build: BuildSettings, index: int) -> None:
+    folder, name = publication.folder, shard_name(index, build.splits)
+    for scene in scenes_of_shard(index, build.splits):
+        failure = Failure(stage="scenes", item=sample_key(scene), reason="no_camera", message="x")
+        stage_scene(folder.staged_shard(name), scene, _sample(scene), [failure])
+    publication.add_shard(pack_shard(folder, name, scenes_of_shard(index, build.splits)))
+
+
+def _dataset(root: Path, scenes: int = 8) -> Publication:
+    build = _build()
+    publication = _begin(root, build, scenes)
+    publication.lock_objects([_locked()])
+    for index in publication.missing_shards():
+        _make_shard(publication, build, index)
+    return publication
+
+
+def test_a_finished_dataset_verifies(tmp_path: Path) -> None:
+    publication = _dataset(tmp_path)
+    found = verify_dataset(tmp_path)
+    assert found.problems == []
+    assert found.num_samples == 8
+    assert read_manifest(tmp_path / "manifest.json") == publication.manifest
+    assert len(read_failures(publication.folder.failures)) == 8
+
+
+def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
+    forwards = _dataset(tmp_path / "a").manifest
+    build = _build()
+    backwards = _begin(tmp_path / "b", build, 8)
+    backwards.lock_objects([_locked()])
+    for index in (1, 0):
+        _make_shard(backwards, build, index)
+    assert backwards.manifest.dataset_digest == forwards.dataset_digest
+    assert backwards.manifest == forwards
+
+
+def test_growing_keeps_the_shards(tmp_path: Path) -> None:
+    before = _dataset(tmp_path, 4).manifest
+    grown = _dataset(tmp_path, 12).manifest
+    assert grown.shards[0] == before.shards[0]
+    assert len(grown.shards) == 3
+    assert _begin(tmp_path, _build(), 4).manifest == grown  # asking for fewer takes nothing away
+    assert verify_dataset(tmp_path).problems == []
+
+
+def test_scenes_are_rounded_up_to_whole_shards(tmp_path: Path) -> None:
+    assert _begin(tmp_path, _build(), 5).manifest.num_scenes == 8
+
+
+def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
+    _dataset(tmp_path)
+    other = named_build("smoke", resolution=32, seed=3)
+    other = dataclasses.replace(other, scenes=_build().scenes)
+    with pytest.raises(TrilightError, match=r"renders.resolution was 16, now 32 \(and 1 more\)"):
+        _begin(tmp_path, other)
+
+
+def test_another_environment_is_refused_unless_accepted(tmp_path: Path) -> None:
+    _dataset(tmp_path)
+    with pytest.raises(TrilightError, match="mitsuba_variant was 'llvm_ad_rgb', now 'scalar_rgb'"):
+        _begin(tmp_path, _build(), mitsuba_variant="scalar_rgb")
+    other = {**ENVIRONMENT, "mitsuba_variant": "scalar_rgb"}
+    begin(DatasetFolder(tmp_path), _build(), other, 4, accept_environment=True)
+
+
+def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:
+    """A kill between the shard's rename and the manifest's leaves it so."""
+    whole = _dataset(tmp_path).manifest
+    build = _build()
+    forgetful = _begin(tmp_path, build, 8)
+    forgetful.manifest = dataclasses.replace(forgetful.manifest, shards=whole.shards[:1])
+    assert forgetful.missing_shards() == []
+    assert forgetful.manifest == whole
+
+
+def test_a_deleted_shard_is_made_again(tmp_path: Path) -> None:
+    whole = _dataset(tmp_path).manifest
+    (tmp_path / whole.shards[1].name).unlink()
+    assert any("missing" in problem for problem in verify_dataset(tmp_path).problems)
+    assert _dataset(tmp_path).manifest == whole
+    assert verify_dataset(tmp_path).problems == []
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_damage_is_named(tmp_path: Path, fast: bool) -> None:
+    name = _dataset(tmp_path).manifest.shards[0].name
+    data = bytearray((tmp_path / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / name).write_bytes(data)
+    problems = verify_dataset(tmp_path, fast=fast).problems
+    assert fast == (not problems)  # a changed byte is seen only by its hash
+    assert all(problem.startswith(name) for problem in problems)
+    (tmp_path / name).write_bytes(data[:-512])
+    assert verify_dataset(tmp_path, fast=fast).problems
+
+
+def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
+    publication = _dataset(tmp_path, 4)
+    publication.lock_objects([dataclasses.replace(_locked(), split="test")])
+    assert verify_dataset(tmp_path).problems == []  # the tiny scenes use no object
+    scene = tiny_scene()
+    used = dataclasses.replace(scene.objects[0], kind="object", uid="a")
+    sample = dataclasses.replace(_sample(0), scene=tiny_scene(objects=(used, *scene.objects[1:])))
+    name = publication.manifest.shards[0].name
+    folder = publication.folder.staged_shard(name)
+    for index in range(4):
+        stage_scene(folder, index, dataclasses.replace(sample, key=sample_key(index)), [])
+    publication.add_shard(pack_shard(publication.folder, name, range(4)))
+    assert "belongs to split test" in verify_dataset(tmp_path).problems[0]
+
+
+def test_two_makers_are_kept_apart(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    with folder.locked():
+        with pytest.raises(TrilightError, match="another process"), folder.locked():
+            pass
+    with folder.locked():
+        pass
+
+
+def test_shards_without_a_manifest_are_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "train-000000.tar").write_bytes(b"")
+    with pytest.raises(TrilightError, match=r"shards but no manifest\.json"):
+        _begin(tmp_path, _build())
+
+
+@pytest.mark.parametrize("name", BUILDS)
+def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
+    build = named_build(name)
+    assert build.build == name
+    assert build.digest == named_build(name).digest
+    assert list(differences(build.as_json(), named_build(name, seed=5).as_json())) == [
+        ("seed", build.seed, 5)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"name": "nonsense"}, "build 'nonsense' is unknown; expected one of smoke"),
+        ({"name": "smoke", "seed": -1}, "seed is -1"),
+        ({"name": "smoke", "resolution": 100}, "resolution"),
+        ({"name": "smoke", "noise_floor_db": -3.0}, "noise_floor_db"),
+    ],
+)
+def test_wrong_settings_are_named(arguments: dict, message: str) -> None:  # type: ignore[type-arg]
+    with pytest.raises(TrilightError, match=message):
+        named_build(**arguments)
