@@ -1,17 +1,19 @@
 """`trilight train`: a named run on the shards of a dataset."""
 
 import dataclasses
-import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
-from infra.cli.console import console, print_json, print_rows, progress_bars
+from infra.cli.console import console, print_rows, progress_bars
 from storage.errors import TrilightError
+
+if TYPE_CHECKING:
+    from train.run import TrainResult
 
 
 class _BarProgress:
@@ -20,20 +22,30 @@ class _BarProgress:
     def __init__(self, bars: Bars) -> None:
         self._bars = bars
         self._task: TaskID = bars.add_task("steps", total=None, start=False, note="")
+        self._first_step = 0
 
-    def begin(self, *, step: int, num_steps: int, num_parameters: int, message: str) -> None:
-        self._bars.print(message)
+    def begin(
+        self, *, step: int, num_steps: int, num_parameters: int, median_scores: Mapping[str, float]
+    ) -> None:
+        rival = median_scores["log_l1"]
+        console.print(
+            f"{num_parameters / 1e6:.2f} M parameters; the median picture scores {rival:.4f} "
+            "log L1 on the validation split"
+        )
+        self._first_step = step
         self._bars.update(self._task, total=num_steps - step)
-        self._first = step
         self._bars.start_task(self._task)
 
     def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
         note = f"loss {loss:.4f}, {views_per_s:.1f} views/s"
-        self._bars.update(self._task, completed=step - self._first, note=note)
+        self._bars.update(self._task, completed=step - self._first_step, note=note)
 
     def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
-        text = ", ".join(f"{name} {value:.4g}" for name, value in scores.items())
-        self._bars.print(f"step {step}: validation {text}")
+        console.print(
+            f"step {step}: validation log L1 {scores['log_l1']:.4f}, median "
+            f"{scores['psnr_log_db_median']:.2f} dB log, {scores['psnr_linear_db_median']:.2f} dB "
+            "linear"
+        )
 
 
 def train(
@@ -56,17 +68,38 @@ def train(
     if steps is not None:
         settings = dataclasses.replace(settings, num_steps=steps)
     folder = out or Path("runs") / run
-    started = time.monotonic()
     with progress_bars() as bars:
         result = train_run(
-            settings, data=data, out=folder, resume=resume, report=_BarProgress(bars)
+            settings, data=data, out=folder, resume=resume, progress=_BarProgress(bars)
         )
     if json:
-        print_json(dataclasses.asdict(result) | {"seconds": time.monotonic() - started})
-        return
-    print_rows("Training finished", [*result.lines(), ("wall time", _minutes(started))])
-    console.print(f"\nLook at {result.sheet}", style="bold")
+        console.file.write(result.folder.summary.read_text())
+    else:
+        _report(result)
 
 
-def _minutes(started: float) -> str:
-    return f"{(time.monotonic() - started) / 60:.1f} min"
+def _report(result: "TrainResult") -> None:
+    scores, rival = result.scores, result.median_scores
+    better = "beats it" if result.beats_median else "does not beat it"
+    rows = [
+        (
+            "training loss",
+            f"{result.loss_at_start:.4f} at the start, {result.loss_at_end:.4f} at end",
+        ),
+        (
+            "validation log L1",
+            f"{scores['log_l1']:.4f}; the median picture of the training views scores "
+            f"{rival['log_l1']:.4f}: the network {better}",
+        ),
+        (
+            "validation PSNR",
+            f"median {scores['psnr_log_db_median']:.2f} dB log "
+            f"({rival['psnr_log_db_median']:.2f}), {scores['psnr_linear_db_median']:.2f} dB linear "
+            f"({rival['psnr_linear_db_median']:.2f})",
+        ),
+        ("steps", f"{result.num_steps}, of which {result.skipped_steps} not finite and skipped"),
+        ("wall time", f"{result.seconds / 60:.1f} min"),
+        ("weights", str(result.folder.weights)),
+    ]
+    print_rows("Training finished", rows)
+    console.print(f"\nLook at {result.folder.sheet}", style="bold")

@@ -4,29 +4,24 @@ An outcome is stored under a name made of what it depends on: the bytes of the s
 and the recipe. A run that was killed finds the finished ones again, and copies of a file share one.
 """
 
+import contextlib
 import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from pathlib import Path
 
+from pipeline.assets.recipe import METHODS, RECIPE
 from pipeline.assets.settings import AssetSettings
-from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
+from pipeline.assets.source_file import read_source
+from pipeline.isolation import ChildFailed, IsolatedChild
 from storage.asset import Asset, decode_asset, encode_asset
 from storage.atomic import write_atomically
-from storage.digests import canonical_json, sha256_hex, sha256_of_file
+from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 from storage.layout import DatasetFolder
 from storage.records import Failure, ObjectRecord
-
-RECIPE_VERSION = 1
-"""Counts up with every change of the recipe that changes its results."""
-
-_LIBRARIES = ("trimesh", "pymeshlab", "libigl", "numpy", "scipy")
-_TRIES = 2
-"""A mesh that crashes native code twice in fresh children will do so again."""
 
 _MAY_PASS = ("killed", "out_of_memory")
 """What may go better on the next run, so that it is not remembered as a property of the object."""
@@ -77,6 +72,8 @@ def _prepare_once(
 ) -> PreparedAsset | Failure:
     try:
         key = _outcome_key(Path(record.path), settings)
+    except Rejected as rejection:
+        return _failure(record, rejection.reason, rejection.message)
     except OSError as error:
         return _failure(record, "unreadable_file", f"cannot be read ({error.strerror})")
     path = folder.staged_assets / f"{key}.safetensors"
@@ -86,7 +83,7 @@ def _prepare_once(
     if not path.exists():
         try:
             with borrow_child() as child:
-                asset = call_with_retries(child, prepare_in_child, record, settings, tries=_TRIES)
+                asset = _prepare_by_any_method(child, record, settings)
         except (Rejected, ChildFailed) as error:
             outcome = {"reason": error.reason, "message": error.message}
             if error.reason not in _MAY_PASS:
@@ -96,11 +93,21 @@ def _prepare_once(
     return _prepared(record, path)
 
 
-def prepare_in_child(record: ObjectRecord, settings: AssetSettings) -> Asset:
+def _prepare_by_any_method(
+    child: IsolatedChild, record: ObjectRecord, settings: AssetSettings
+) -> Asset:
+    """Try the methods in turn, each in a fresh child after one that killed its own."""
+    for method in METHODS[:-1]:
+        with contextlib.suppress(ChildFailed):
+            return child.call(prepare_in_child, record, settings, method)
+    return child.call(prepare_in_child, record, settings, METHODS[-1])
+
+
+def prepare_in_child(record: ObjectRecord, settings: AssetSettings, method: str) -> Asset:
     """Run the recipe; only here are the mesh libraries imported, and only children come here."""
     from pipeline.assets.prepare import prepare_asset
 
-    return prepare_asset(record, settings)
+    return prepare_asset(record, settings, method)
 
 
 def _prepared(record: ObjectRecord, path: Path) -> PreparedAsset:
@@ -114,9 +121,9 @@ def _prepared(record: ObjectRecord, path: Path) -> PreparedAsset:
 
 
 def _outcome_key(path: Path, settings: AssetSettings) -> str:
-    versions = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
-    identity = [sha256_of_file(path), path.suffix, asdict(settings), RECIPE_VERSION, versions]
-    return sha256_hex(canonical_json(identity))[:32]
+    """Name an outcome by what it depends on; raises Rejected where the pre-flight refuses."""
+    source = read_source(path, settings)
+    return sha256_hex(canonical_json([source.kind, source.sha256, asdict(settings), RECIPE]))[:32]
 
 
 def _failure(record: ObjectRecord, reason: str, message: str) -> Failure:

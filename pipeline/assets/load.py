@@ -1,0 +1,58 @@
+"""From bytes to triangles: trimesh reads every format, and its silent failures become reasons."""
+
+import io
+
+import numpy as np
+import trimesh
+
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.source_file import SourceFile
+from storage.errors import Rejected
+
+
+def load_mesh(source: SourceFile) -> TriangleMesh:
+    """Return all triangles of a source in its own units, node transforms applied.
+
+    The vertices are as the file has them: unwelded, some unused, possibly not finite.
+
+    Raises:
+        Rejected: load_error, index_range, point_cloud, no_faces.
+    """
+    try:
+        scene = trimesh.load_scene(
+            io.BytesIO(source.data),
+            file_type=source.kind,
+            resolver=dict(source.buffers),
+            process=False,
+            skip_materials=True,
+        )
+        _check_geometries(scene)
+        mesh = scene.to_mesh()
+    except (MemoryError, Rejected):
+        raise
+    except Exception as error:
+        # Readers of other people's files fail in every way that Python knows.
+        reason = "index_range" if isinstance(error, IndexError) else "load_error"
+        raise Rejected(reason, f"trimesh: {type(error).__name__}: {error!s:.200}") from error
+    if len(mesh.faces) == 0:
+        raise Rejected("no_faces", "the file holds no triangles, or no node places them")
+    return TriangleMesh(
+        positions=np.asarray(mesh.vertices, np.float64), faces=np.asarray(mesh.faces, np.int64)
+    )
+
+
+def _check_geometries(scene: trimesh.Scene) -> None:
+    """Raise Rejected for what joining the geometries would hide."""
+    meshes = [part for part in scene.geometry.values() if isinstance(part, trimesh.Trimesh)]
+    if not any(len(part.faces) for part in meshes):
+        if any(isinstance(part, trimesh.PointCloud) for part in scene.geometry.values()):
+            raise Rejected("point_cloud", "the file holds points without triangles")
+        raise Rejected("no_faces", "the file holds no triangles")
+    for part in meshes:
+        faces = np.asarray(part.faces)
+        if len(faces) and not (0 <= faces.min() and faces.max() < len(part.vertices)):
+            raise Rejected(
+                "index_range",
+                f"a face names vertex {faces.min() if faces.min() < 0 else faces.max()} "
+                f"of {len(part.vertices)}",
+            )

@@ -1,0 +1,74 @@
+"""Reading a source: one bounded read of one regular file, and of the buffers that a glTF names.
+
+Everything that is read of an object is read here. The mesh library is given bytes, never a path,
+so that no file can make it open another one.
+"""
+
+import hashlib
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.assets.gltf_tree import buffer_paths, check_tree, read_tree
+from pipeline.assets.headers import check_header
+from pipeline.assets.settings import AssetSettings
+from storage.errors import Rejected
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+"""Formats that we read. The suffix decides: a file that lies about it is refused or fails to load,
+and is never handed to the loader of another format."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceFile:
+    """The bytes of a source, checked as far as its header goes."""
+
+    kind: str
+    """Suffix without the dot, in lower case."""
+    data: bytes
+    """The file."""
+    buffers: Mapping[str, bytes]
+    """Buffers of a glTF by the URI that names them; empty for other formats."""
+    sha256: str
+    """Digest of the file and of its buffers in the order of their names."""
+
+
+def read_source(path: Path, settings: AssetSettings) -> SourceFile:
+    """Return a source after the checks that need no mesh library.
+
+    Raises:
+        Rejected: missing_file, unsupported_format, too_large_bytes, archive_refused,
+            header_size_mismatch, too_many_faces, unsupported_primitive, unsupported_extension,
+            unsupported_accessor, scene_cycle, too_many_instances, external_uri, load_error.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise Rejected("unsupported_format", f"suffix {suffix!r}; expected one of {SUFFIXES}")
+    data = _read_regular(path, settings.max_source_bytes)
+    check_header(data, suffix, settings.max_source_faces)
+    buffers: dict[str, bytes] = {}
+    if suffix in (".glb", ".gltf"):
+        tree = read_tree(data, suffix)
+        check_tree(tree, settings)
+        left = settings.max_source_bytes - len(data)
+        for uri, target in buffer_paths(tree, path.parent).items():
+            buffers[uri] = _read_regular(target, left)
+            left -= len(buffers[uri])
+    digest = hashlib.sha256(data)
+    for uri in sorted(buffers):
+        digest.update(buffers[uri])
+    return SourceFile(kind=suffix[1:], data=data, buffers=buffers, sha256=digest.hexdigest())
+
+
+def _read_regular(path: Path, max_bytes: int) -> bytes:
+    """Read a file that is one: a pipe or a device would never end."""
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise Rejected("missing_file", "the path is not a regular file")
+        if status.st_size > max_bytes:
+            raise Rejected("too_large_bytes", f"{status.st_size} bytes; expected <= {max_bytes}")
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise Rejected("missing_file", "there is no such file") from error

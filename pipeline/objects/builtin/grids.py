@@ -1,0 +1,44 @@
+"""Closed surfaces as grids of vertices: a torus, or a sphere with two poles.
+
+Every built-in family is one such grid with its vertices moved, so it is closed by construction.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
+"""Positions [V, 3] and faces [F, 3], counter-clockwise from outside."""
+
+
+def torus_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """Return the faces of a grid [rows, columns] that is periodic both ways: 2 rows columns.
+
+    They face the side from which rows run upwards and columns to the left.
+    """
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    above, beside = (row + 1) % rows, (column + 1) % columns
+    corners = np.stack(
+        [
+            row * columns + column,
+            above * columns + column,
+            above * columns + beside,
+            row * columns + beside,
+        ],
+        axis=1,
+    )
+    return corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+
+def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
+    """Return the faces of rings [rings, columns] between two poles: 2 rings columns.
+
+    The first pole is vertex rings * columns, the last one follows it. They face the side from which
+    rings run upwards and columns to the right: outwards, for columns counter-clockwise from above.
+    """
+    body = torus_faces(rings, columns)[: 2 * (rings - 1) * columns]
+    column = np.arange(columns)
+    beside = (column + 1) % columns
+    first, last, start = rings * columns, rings * columns + 1, (rings - 1) * columns
+    bottom = np.stack([np.full(columns, first), column, beside], axis=1)
+    top = np.stack([np.full(columns, last), start + beside, start + column], axis=1)
+    return np.concatenate([bottom, body, top])[:, ::-1]

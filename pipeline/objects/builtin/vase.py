@@ -1,0 +1,84 @@
+"""Lathed vases: a wall of even thickness around a smooth profile, plain, fluted or swirled.
+
+Open vessels show what closed bodies cannot: light that enters, and an inside that shades itself.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.objects.builtin.grids import Mesh, sphere_faces
+
+
+@dataclass(frozen=True, kw_only=True)
+class VaseParams:
+    """Shape of one vase."""
+
+    height: float
+    """From foot to lip."""
+    radii: tuple[float, ...]
+    """Outer radii at equal heights from foot to lip, joined by a smooth curve; all positive."""
+    wall: float
+    """Thickness of wall and bottom; smaller than every radius."""
+    flutes: int
+    """Folds around the vase; 0 is plain."""
+    flute_depth: float
+    """Depth of the folds as a share of the radius, in [0, 1)."""
+    swirl_rad: float
+    """Turn of the folds from foot to lip."""
+    rings: int
+    """Rings from foot to lip."""
+    columns: int
+    """Vertices of a ring; a multiple of the flutes makes them all alike."""
+
+
+def vase(params: VaseParams) -> Mesh:
+    """Return the closed surface (outside, lip, inside) of 4 rings columns triangles."""
+    level = np.linspace(0, 1, params.rings)
+    outer = _smooth(np.array(params.radii), level)
+    inner_height = params.wall + (params.height - params.wall) * level
+    inner = _smooth(np.array(params.radii), inner_height / params.height) - params.wall
+    radius = np.concatenate([outer, inner[::-1]])
+    height = np.concatenate([params.height * level, inner_height[::-1]])
+    turn = 2 * np.pi * np.arange(params.columns) / params.columns
+    phase = params.flutes * (turn[None] + params.swirl_rad * height[:, None] / params.height)
+    fold = 1 - params.flute_depth * (0.5 - 0.5 * np.cos(phase)) * bool(params.flutes)
+    rings = radius[:, None] * fold
+    upright = np.broadcast_to(height[:, None], rings.shape)
+    grid = np.stack([rings * np.cos(turn), rings * np.sin(turn), upright], axis=-1)
+    poles = [[0.0, 0.0, 0.0], [0.0, 0.0, params.wall]]
+    positions = np.concatenate([grid.reshape(-1, 3), poles])
+    return positions, sphere_faces(2 * params.rings, params.columns)
+
+
+def vase_rand(rng: np.random.Generator) -> Mesh:
+    """Return a random vase."""
+    radii = rng.uniform(0.16, 0.55, int(rng.integers(4, 7)))
+    flutes = int(rng.choice([0, 0, 5, 6, 8, 10]))
+    columns = int(rng.integers(28, 45))
+    return vase(
+        VaseParams(
+            height=float(rng.uniform(0.7, 1.6)),
+            radii=tuple(radii.tolist()),
+            wall=float(rng.uniform(0.025, 0.06)),
+            flutes=flutes,
+            flute_depth=float(rng.uniform(0.1, 0.35)),
+            swirl_rad=float(rng.uniform(-0.8, 0.8)),
+            rings=int(rng.integers(14, 21)),
+            columns=columns - columns % max(flutes, 1),
+        )
+    )
+
+
+def _smooth(values: NDArray[np.float64], where: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a Catmull-Rom curve through `values` at equal steps, at places in [0, 1].
+
+    It may swing beyond them by an eighth of their differences; callers leave room for that.
+    """
+    padded = np.concatenate([[2 * values[0] - values[1]], values, [2 * values[-1] - values[-2]]])
+    place = np.clip(where, 0, 1) * (len(values) - 1)
+    left = np.minimum(place.astype(np.int64), len(values) - 2)
+    step = (place - left)[:, None] ** np.arange(4)
+    basis = 0.5 * np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]])
+    return np.einsum("nk,kj,nj->n", step, basis, padded[left[:, None] + np.arange(4)])

@@ -1,0 +1,77 @@
+"""`builtin:`: procedural objects as files, so that a new user needs no download.
+
+The files are made anew on every run (milliseconds each) and written only where they differ, so the
+stages after this one read files and nothing else, and a damaged file is mended.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.objects.builtin.families import FAMILIES
+from pipeline.objects.builtin.grids import Mesh
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+from storage.records import ObjectRecord
+from storage.seeds import rng_for
+
+PREFIX = "builtin:"
+DEFAULT_COUNT = 64
+MAX_COUNT = 100_000
+
+
+def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
+    """Write the objects of `builtin:` or `builtin:N` below `work_dir`; return their records.
+
+    Object i does not depend on N, so a larger N keeps the smaller set.
+
+    Raises:
+        TrilightError: N is no number from 1 to MAX_COUNT, or `work_dir` cannot be written.
+    """
+    names = list(FAMILIES)
+    records = []
+    for index in range(_count(source)):
+        family, number = names[index % len(names)], index // len(names)
+        path = work_dir / "builtin" / f"{family}-{number:05d}.ply"
+        data = encode_ply(FAMILIES[family](rng_for(0, f"builtin/{family}", number)))
+        if not path.is_file() or path.read_bytes() != data:
+            write_atomically(path, data)
+        records.append(
+            ObjectRecord(
+                uid=f"builtin/{path.stem}",
+                path=str(path.resolve()),
+                title=f"{family.replace('_', ' ')} {number}",
+                licence="CC0-1.0",
+                attribution="Trilight built-in objects",
+                source_url="",
+            )
+        )
+    return records
+
+
+def encode_ply(mesh: Mesh) -> bytes:
+    """Return a mesh as binary PLY: float32 positions, triangles."""
+    positions, faces = mesh
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(positions)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+    rows["count"], rows["corners"] = 3, faces
+    return header.encode() + positions.astype("<f4").tobytes() + rows.tobytes()
+
+
+def _count(source: str) -> int:
+    text = source.removeprefix(PREFIX)
+    if not text:
+        return DEFAULT_COUNT
+    count = int(text) if text.isascii() and text.isdigit() and len(text) <= 9 else 0
+    if not 1 <= count <= MAX_COUNT:
+        raise TrilightError(
+            f"objects is {source!r}; expected builtin:N with N from 1 to {MAX_COUNT}, such as "
+            f"{PREFIX}{DEFAULT_COUNT}."
+        )
+    return count

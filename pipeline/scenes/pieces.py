@@ -1,0 +1,129 @@
+"""Pieces of a scene - floor, walls, objects, emitters - and how they join into its arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.scenes.posing import posed, without_slivers
+from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
+from scene_templates.layout import Emitter, Floor, ObjectPlacement, ShellPart, Surface
+from storage.asset import Level
+from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, ROUGHNESS, SPECULAR
+from storage.errors import Rejected
+from storage.scene import SceneObject
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Piece:
+    """One row of `Scene.objects` with its triangles and materials."""
+
+    entry: SceneObject
+    """Identity and rights."""
+    mesh: ShadedMesh
+    """In world space."""
+    materials: NDArray[np.float32]
+    """[M, 10]."""
+    material_index: NDArray[np.int64]
+    """[T] row of `materials`."""
+
+
+def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: float) -> Piece:
+    """Return a floor or wall; where it has many colours, one per triangle drawn from `rng`."""
+    positions = part.positions.astype(np.float32)
+    mesh = _shaded(positions, part.faces, part.surface, smooth_angle_deg)
+    return _surfaced(
+        SceneObject(name=part.name, kind="shell"),
+        mesh,
+        part.surface,
+        np.arange(len(mesh.faces)),
+        rng,
+    )
+
+
+def object_piece(
+    entry: SceneObject,
+    level: Level,
+    placement: ObjectPlacement,
+    floor: Floor,
+    rng: np.random.Generator,
+    smooth_angle_deg: float,
+) -> Piece:
+    """Return an object in its place; where it has many colours, one per shading group.
+
+    Raises:
+        Rejected: "no_faces" where no triangle is left.
+    """
+    positions = posed(level.positions, placement, floor)
+    faces = without_slivers(positions, level.faces)
+    if len(faces) == 0:
+        raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
+    mesh = _shaded(positions, faces, placement.surface, smooth_angle_deg)
+    return _surfaced(entry, mesh, placement.surface, mesh.groups, rng)
+
+
+def emitter_piece(emitter: Emitter, row: int) -> Piece:
+    """Return an emitter. It reflects nothing, and its material says so."""
+    mesh = flat_shaded(emitter.triangle.astype(np.float32), np.array([[0, 1, 2]], np.uint32))
+    materials = np.zeros((1, MATERIAL_WIDTH), np.float32)
+    materials[:, ROUGHNESS] = 1.0
+    materials[:, EMISSION] = emitter.radiance
+    entry = SceneObject(name=f"emitter{row}", kind="emitter")
+    return Piece(entry=entry, mesh=mesh, materials=materials, material_index=np.zeros(1, np.int64))
+
+
+def _shaded(
+    positions: NDArray[np.float32],
+    faces: NDArray[np.uint32],
+    surface: Surface,
+    smooth_angle_deg: float,
+) -> ShadedMesh:
+    if surface.smooth:
+        return smooth_shaded(positions, faces, smooth_angle_deg)
+    return flat_shaded(positions, faces)
+
+
+def _surfaced(
+    entry: SceneObject,
+    mesh: ShadedMesh,
+    surface: Surface,
+    colour_groups: NDArray[np.int64],
+    rng: np.random.Generator,
+) -> Piece:
+    """Give a mesh its materials: one row, or one per colour group."""
+    if surface.coloured:
+        rows = colour_groups
+        diffuse = surface.diffuse_scale * rng.random((int(rows.max()) + 1, 3))
+    else:
+        rows = np.zeros(len(mesh.faces), np.int64)
+        diffuse = np.array([surface.diffuse_rgb])
+    materials = np.zeros((len(diffuse), MATERIAL_WIDTH), np.float32)
+    materials[:, DIFFUSE] = diffuse
+    materials[:, SPECULAR] = surface.specular
+    materials[:, ROUGHNESS] = surface.roughness
+    return Piece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
+
+
+def joined(pieces: Sequence[Piece]) -> dict[str, NDArray]:
+    """Return the geometry and material arrays of a Scene, in the order of the pieces."""
+    vertex_start = _starts([len(piece.mesh.positions) for piece in pieces])
+    material_start = _starts([len(piece.materials) for piece in pieces])
+    rows = range(len(pieces))
+    counts = [len(piece.mesh.faces) for piece in pieces]
+    return {
+        "vertex_positions": np.concatenate([piece.mesh.positions for piece in pieces]),
+        "vertex_normals": np.concatenate([piece.mesh.normals for piece in pieces]),
+        "faces": np.concatenate(
+            [pieces[row].mesh.faces + np.uint32(vertex_start[row]) for row in rows]
+        ),
+        "material_index": np.concatenate(
+            [pieces[row].material_index + material_start[row] for row in rows]
+        ).astype(np.uint16),
+        "materials": np.concatenate([piece.materials for piece in pieces]),
+        "object_index": np.repeat(np.arange(len(pieces)), counts).astype(np.uint16),
+    }
+
+
+def _starts(counts: Sequence[int]) -> list[int]:
+    return [sum(counts[:row]) for row in range(len(counts))]

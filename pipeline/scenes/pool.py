@@ -1,0 +1,16 @@
+"""What scenes are made of: the accepted objects of one split, with their meshes."""
+
+from dataclasses import dataclass
+
+from storage.asset import Asset
+from storage.records import LockedObject
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PooledAsset:
+    """An object as the lock file names it, and its meshes."""
+
+    locked: LockedObject
+    """Identity, split and rights."""
+    asset: Asset
+    """Meshes at falling budgets."""

@@ -1,0 +1,120 @@
+"""Shading normals and shading groups.
+
+Flat faces get three vertices each. Smooth shading joins faces across edges below an angle into
+shading groups; a vertex has one normal per group, so that a cube stays a cube and a sphere becomes
+round. Normals weigh each face by its angle at the vertex, which makes them independent of how a
+flat region is cut into triangles.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+LEAST_FACING = 0.1
+"""Cosine between the normals of a corner and of its face below which the face's own is used: seen
+from in front, such a corner would be shaded as if from behind."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShadedMesh:
+    """A mesh with one normal per vertex."""
+
+    positions: NDArray[np.float32]
+    """[V, 3]."""
+    normals: NDArray[np.float32]
+    """[V, 3] unit."""
+    faces: NDArray[np.uint32]
+    """[T, 3]."""
+    groups: NDArray[np.int64]
+    """[T] shading group, numbered from 0; all 0 where the mesh is flat."""
+
+
+def flat_shaded(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> ShadedMesh:
+    """Return the mesh with the geometric normal on every face; faces must have an area."""
+    normals = face_normals(positions, faces)
+    return ShadedMesh(
+        positions=positions[faces].reshape(-1, 3),
+        normals=np.repeat(normals, 3, axis=0).astype(np.float32),
+        faces=np.arange(3 * len(faces), dtype=np.uint32).reshape(-1, 3),
+        groups=np.zeros(len(faces), np.int64),
+    )
+
+
+def smooth_shaded(
+    positions: NDArray[np.float32], faces: NDArray[np.uint32], angle_deg: float
+) -> ShadedMesh:
+    """Return the mesh with normals interpolated across edges of at most `angle_deg`."""
+    normals = face_normals(positions, faces)
+    groups = shading_groups(faces, normals, angle_deg)
+    corner_key = groups[:, None] * len(positions) + faces
+    angles = _corner_angles(positions, faces)
+    corner_normals = _summed(corner_key, normals[:, None] * angles[..., None])
+    length = np.sqrt(np.sum(np.square(corner_normals), axis=-1))
+    facing = np.einsum("tci,ti->tc", corner_normals, normals)
+    turned_away = facing <= LEAST_FACING * length
+    length[turned_away] = 1.0
+    corner_normals = corner_normals / length[..., None]
+    corner_normals[turned_away] = np.repeat(normals[:, None], 3, axis=1)[turned_away]
+    # Such a corner becomes a vertex of its own, with a key that no other corner has.
+    own_keys = corner_key.max() + 1 + np.arange(corner_key.size).reshape(-1, 3)
+    keys = np.where(turned_away, own_keys, corner_key)
+    _, first, vertex = np.unique(keys, return_index=True, return_inverse=True)
+    return ShadedMesh(
+        positions=positions[faces.ravel()[first]],
+        normals=corner_normals.reshape(-1, 3)[first].astype(np.float32),
+        faces=vertex.reshape(-1, 3).astype(np.uint32),
+        groups=groups,
+    )
+
+
+def face_normals(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Return unit geometric normals [T, 3]; not finite for faces without area."""
+    corners = positions.astype(np.float64)[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return cross / np.sqrt(np.sum(np.square(cross), axis=1, keepdims=True))
+
+
+def shading_groups(
+    faces: NDArray[np.uint32], normals: NDArray[np.float64], angle_deg: float
+) -> NDArray[np.int64]:
+    """Return the group [T] of each face: connected through shared edges of at most `angle_deg`.
+
+    An edge of more than two faces, or of two that disagree on what is outside, is always sharp.
+    """
+    directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    ends = np.sort(directed.astype(np.int64), axis=1)
+    _, edge, count = np.unique(
+        ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1], return_inverse=True, return_counts=True
+    )
+    order = np.argsort(edge, kind="stable")
+    pairs = (order[count[edge[order]] == 2] // 3).reshape(-1, 2)
+    cosine = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1)
+    joined = pairs[cosine >= math.cos(math.radians(angle_deg))]
+    graph = coo_matrix((np.ones(len(joined)), joined.T), shape=(len(faces), len(faces)))
+    _, groups = connected_components(graph, directed=False)
+    return groups.astype(np.int64)
+
+
+def _corner_angles(
+    positions: NDArray[np.float32], faces: NDArray[np.uint32]
+) -> NDArray[np.float64]:
+    """Return the inner angle [T, 3] of each corner, radians."""
+    corners = positions.astype(np.float64)[faces]
+    forward = np.roll(corners, -1, axis=1) - corners
+    backward = np.roll(corners, 1, axis=1) - corners
+    across = np.sqrt(np.sum(np.square(np.cross(forward, backward)), axis=-1))
+    return np.arctan2(across, np.sum(forward * backward, axis=-1))
+
+
+def _summed(keys: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return, for every corner, the sum of `values` [T, 3, 3] over all corners of the same key."""
+    _, row = np.unique(keys.ravel(), return_inverse=True)
+    flat = values.reshape(-1, 3)
+    sums = np.zeros((int(row.max()) + 1, 3))
+    for axis in range(3):
+        sums[:, axis] = np.bincount(row, weights=flat[:, axis])
+    return sums[row].reshape(values.shape)

@@ -1,0 +1,113 @@
+"""What a camera sees of a scene: ray casting on a coarse grid, without materials.
+
+Embree answers in single precision, in its robust mode, in which no ray slips between two triangles
+of one edge. A grid of 32 x 32 rays costs about a millisecond, and says whether a picture is worth
+rendering, not what is in it: what is smaller than a grid cell may be missed.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
+
+from storage.conventions import camera_rays
+from storage.scene import Scene
+
+SHADOW_OFFSET = 1e-4
+"""Where shadow rays start above a surface; hits in single precision are good to about 1e-6."""
+
+LIT_STEP = 2
+"""Light is looked for at every second row and column of the grid: eight emitters ask for eight
+rays per hit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewFacts:
+    """What one camera sees."""
+
+    coverage: float
+    """Share of the rays that meet an object first."""
+    shell_back: float
+    """Share of the rays that meet a floor or wall first, from behind."""
+    lit: float
+    """Share of what is met that at least one emitter's centre shines upon, on the side seen."""
+    depth: float
+    """Distance to the nearest thing: what a ray meets, or the bounding box of an object."""
+
+
+class Sight:
+    """A scene prepared for ray casting. Emitters are left out: no camera sees them."""
+
+    def __init__(self, scene: Scene) -> None:
+        solid = ~scene.triangle_emits
+        kinds = np.array([entry.kind for entry in scene.objects])[scene.object_index]
+        self._face_is_object = kinds[solid] == "object"
+        self._embree = EmbreeScene(robust=True)
+        TriangleMesh(self._embree, scene.vertex_positions, scene.faces[solid])
+        self._lights = scene.vertex_positions[scene.faces[~solid]].mean(axis=1)
+        self._boxes = _object_boxes(scene)
+
+    def facts(self, c2w: NDArray[np.float32], fov_deg: float, grid: int) -> ViewFacts:
+        """Judge one camera, c2w [4, 4], by the rays of a picture of `grid` x `grid` pixels."""
+        origin, directions = camera_rays(c2w, fov_deg, grid)
+        toward = directions.reshape(-1, 3).astype(np.float32)
+        start = np.tile(origin.astype(np.float32), (len(toward), 1))
+        hits = self._embree.run(start, toward, output=True)
+        met = hits["primID"] >= 0
+        is_object = met.copy()
+        is_object[met] = self._face_is_object[hits["primID"][met]]
+        behind = met & (np.sum(hits["Ng"] * toward, axis=1) > 0)
+        nearest = float(hits["tfar"][met].min(initial=np.inf))
+        return ViewFacts(
+            coverage=float(is_object.mean()),
+            shell_back=float((behind & ~is_object).mean()),
+            lit=self._lit(start, toward, hits, met, grid),
+            depth=min(nearest, _distance_to_boxes(origin, self._boxes)),
+        )
+
+    def _lit(
+        self,
+        start: NDArray[np.float32],
+        toward: NDArray[np.float32],
+        hits: dict[str, Any],
+        met: NDArray[np.bool_],
+        grid: int,
+    ) -> float:
+        row, column = np.divmod(np.arange(grid * grid), grid)
+        asked = np.flatnonzero(met & (row % LIT_STEP == 0) & (column % LIT_STEP == 0))
+        if len(asked) == 0:
+            return 0.0
+        geometric = hits["Ng"][asked]
+        normal = geometric / np.sqrt(np.sum(np.square(geometric), axis=1, keepdims=True))
+        normal *= np.where(np.sum(normal * toward[asked], axis=1, keepdims=True) > 0, -1, 1)
+        point = start[asked] + hits["tfar"][asked, None] * toward[asked] + SHADOW_OFFSET * normal
+        ray = self._lights[None] - point[:, None]
+        distance = np.sqrt(np.sum(np.square(ray), axis=-1))
+        on_side = np.sum(ray * normal[:, None], axis=-1) > 0
+        answer = self._embree.run(
+            np.repeat(point, len(self._lights), axis=0).astype(np.float32),
+            (ray / distance[..., None]).reshape(-1, 3).astype(np.float32),
+            dists=distance.reshape(-1).astype(np.float32),
+            query="OCCLUDED",
+        )
+        free = answer.reshape(on_side.shape) < 0
+        return float((free & on_side).any(axis=1).mean())
+
+
+def _object_boxes(scene: Scene) -> NDArray[np.float64]:
+    """Return the bounding boxes [K, 2, 3] of the objects proper."""
+    boxes = []
+    for row, entry in enumerate(scene.objects):
+        if entry.kind == "object":
+            points = scene.vertex_positions[scene.faces[scene.object_index == row].ravel()]
+            boxes.append([points.min(axis=0), points.max(axis=0)])
+    return np.array(boxes, np.float64).reshape(-1, 2, 3)
+
+
+def _distance_to_boxes(point: NDArray[np.float64], boxes: NDArray[np.float64]) -> float:
+    """Return the distance to the nearest box; 0 inside of one, infinite where there is none."""
+    outside = np.maximum(np.maximum(boxes[:, 0] - point, point - boxes[:, 1]), 0)
+    return float(np.sqrt(np.sum(np.square(outside), axis=1)).min(initial=np.inf))

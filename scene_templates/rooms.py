@@ -1,0 +1,80 @@
+"""Shells: the floor and walls of one room, whose seams are always closed.
+
+The published shells turn every square by any angle in its own plane, so that no fixed diagonal of
+the triangulation can be learnt, and place each by itself: walls then hang over gaps. Here the
+parts share one room. In square rooms a spin is a multiple of 90 degrees, which still swaps the
+diagonals, and edges meet exactly. In the others the spin is free, parts tilt a little, and every
+square is made just large enough to cover its side of the room: parts cross instead of gaping, at
+the price of some hidden triangles.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_templates.layout import Floor
+from scene_templates.patches import SIDES, PatchPlacement
+from scene_templates.settings import SceneSettings
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Room:
+    """Where the shell parts stand, and the space between them."""
+
+    patches: tuple[PatchPlacement, ...]
+    """One per shell part."""
+    low: NDArray[np.float64]
+    """[3] the lower corner of the upright room, world units."""
+    high: NDArray[np.float64]
+    """[3] the upper corner."""
+    lean: float
+    """How far a tilted wall may stand inside of these bounds at most."""
+
+
+def room_rand(rng: np.random.Generator, settings: SceneSettings, names: Sequence[str]) -> Room:
+    """Draw a room with the parts `names`."""
+    scale = rng.uniform(*settings.room_scale, size=3)
+    shift = rng.uniform(-settings.room_shift, settings.room_shift, size=2)
+    translation = np.array([*shift, rng.uniform(*settings.room_raise)])
+    square = rng.random() < settings.square_share
+    tilt_deg = 0.0 if square else settings.shell_tilt_deg
+    patches = []
+    for name in names:
+        spin_deg = 90.0 * rng.integers(4) if square else rng.uniform(-180, 180)
+        angles_deg = rng.uniform(-tilt_deg, tilt_deg, size=3)
+        angles_deg[SIDES[name].axis] = spin_deg
+        patches.append(
+            PatchPlacement(
+                rotation_deg=tuple(angles_deg),
+                reach=1.0 if square else _covering_reach(spin_deg, tilt_deg),
+                scale=tuple(scale),
+                translation=tuple(translation),
+            )
+        )
+    return Room(
+        patches=tuple(patches),
+        low=(translation - scale) / 2,
+        high=(translation + scale) / 2,
+        lean=math.tan(math.radians(tilt_deg)) * float(scale.max()),
+    )
+
+
+def _covering_reach(spin_deg: float, tilt_deg: float) -> float:
+    """Half the side of a spun square that covers its side of the room and the seams there.
+
+    A square of half side c covers the unit square if c = |cos| + |sin| of its spin. Two parts that
+    are both tilted about two axes meet up to 2 tan(tilt) beyond the edge of an upright room, and
+    the tilt shortens a part by its cosine: 3 tan(tilt) covers both.
+    """
+    spin = math.radians(spin_deg)
+    return (abs(math.cos(spin)) + abs(math.sin(spin))) * (1 + 3 * math.tan(math.radians(tilt_deg)))
+
+
+def floor_plane(positions: NDArray[np.float64]) -> Floor:
+    """Return the plane of a floor from its patch, vertices [81, 3]."""
+    origin, along, across = positions[0], positions[-9], positions[8]
+    normal = np.cross(along - origin, across - origin)
+    return Floor(point=positions.mean(axis=0), normal=normal / np.sqrt(np.sum(np.square(normal))))

@@ -1,0 +1,155 @@
+"""Small meshes, and files of every format written by hand: so they can be written wrongly too."""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.prepare import prepare_asset
+from pipeline.assets.settings import AssetSettings
+from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
+from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
+from storage.errors import Rejected
+from storage.records import ObjectRecord
+
+
+def record_of(path: Path, uid: str = "object") -> ObjectRecord:
+    return ObjectRecord(
+        uid=uid, path=str(path), title="", licence="CC0-1.0", attribution="", source_url=""
+    )
+
+
+def reason_of(path: Path, settings: AssetSettings | None = None) -> str:
+    with pytest.raises(Rejected) as caught:
+        prepare_asset(record_of(path), settings or AssetSettings())
+    assert caught.value.message.isprintable()
+    return caught.value.reason
+
+
+def sphere(rings: int = 15, columns: int = 24) -> TriangleMesh:
+    """A closed ellipsoid of 2 rings columns faces, without symmetry of its axes."""
+    positions, faces = superquadric(
+        SuperquadricParams(
+            exponent_profile=1.0,
+            exponent_plan=1.0,
+            half_sizes=(1.0, 0.8, 0.6),
+            taper=0.0,
+            twist_rad=0.0,
+            rings=rings,
+            columns=columns,
+        )
+    )
+    return TriangleMesh(positions=positions, faces=faces)
+
+
+def knot(segments: int = 160, sides: int = 12) -> TriangleMesh:
+    """A trefoil of 2 segments sides faces: no symmetric axes, and it hides parts of itself."""
+    positions, faces = torus_knot(
+        TorusKnotParams(
+            windings=(2, 3),
+            minor_radius=0.45,
+            fill=0.6,
+            ribs=3,
+            rib_depth=0.4,
+            rib_turns=1,
+            flatten=0.8,
+            segments=segments,
+            sides=sides,
+        )
+    )
+    return TriangleMesh(positions=positions, faces=faces)
+
+
+def flip_some(mesh: TriangleMesh, share: float, rng: np.random.Generator) -> TriangleMesh:
+    """Turn the winding of a share of the faces around."""
+    flipped = rng.random(len(mesh.faces)) < share
+    faces = np.where(flipped[:, None], mesh.faces[:, ::-1], mesh.faces)
+    return TriangleMesh(positions=mesh.positions, faces=faces)
+
+
+def volume(mesh: TriangleMesh) -> float:
+    corners = mesh.corners
+    cross = np.cross(corners[:, 1], corners[:, 2])
+    return float(np.einsum("ij,ij->", corners[:, 0], cross)) / 6
+
+
+def write_obj(path: Path, mesh: TriangleMesh) -> Path:
+    """Doubles as text that reads back exactly."""
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.positions.tolist()]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist()]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_off(path: Path, mesh: TriangleMesh) -> Path:
+    lines = ["OFF", f"{len(mesh.positions)} {len(mesh.faces)} 0"]
+    lines += [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.positions.tolist()]
+    lines += [f"3 {a} {b} {c}" for a, b, c in mesh.faces.tolist()]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_stl(path: Path, mesh: TriangleMesh) -> Path:
+    rows = np.zeros(
+        len(mesh.faces), np.dtype([("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
+    )
+    rows["v"] = mesh.corners
+    path.write_bytes(bytes(80) + struct.pack("<I", len(rows)) + rows.tobytes())
+    return path
+
+
+def write_ply(path: Path, mesh: TriangleMesh) -> Path:
+    header = (
+        f"ply\nformat ascii 1.0\nelement vertex {len(mesh.positions)}\n"
+        "property double x\nproperty double y\nproperty double z\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = [f"{x!r} {y!r} {z!r}" for x, y, z in mesh.positions.tolist()]
+    rows += [f"3 {a} {b} {c}" for a, b, c in mesh.faces.tolist()]
+    path.write_text(header + "\n".join(rows) + "\n")
+    return path
+
+
+def gltf_tree(mesh: TriangleMesh) -> tuple[dict[str, Any], bytes]:
+    """A glTF of one node, and its buffer; tests then break the tree in one place."""
+    points = mesh.positions.astype("<f4").tobytes()
+    indices = mesh.faces.astype("<u4").tobytes()
+    tree = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(mesh.positions), "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": len(points)},
+            {"buffer": 0, "byteOffset": len(points), "byteLength": len(indices)},
+        ],
+        "buffers": [{"byteLength": len(points) + len(indices)}],
+    }
+    return tree, points + indices
+
+
+def write_glb(path: Path, tree: dict[str, Any], buffer: bytes) -> Path:
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text
+    body += struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
+    path.write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body)
+    return path
+
+
+WRITERS = {".obj": write_obj, ".off": write_off, ".ply": write_ply, ".stl": write_stl}
+
+
+def as_rows(mesh_positions: NDArray, faces: NDArray) -> set[tuple[tuple[float, ...], ...]]:
+    """Faces as sets of corner positions: equal for equal surfaces, whatever the order."""
+    return {tuple(sorted(map(tuple, corners))) for corners in mesh_positions[faces].tolist()}

@@ -1,0 +1,133 @@
+"""Far from the defaults, a picture is finite and non-negative, or rejected with a reason."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.settings import RenderSettings
+from storage.conventions import HALF_FLOAT_MAX
+from storage.errors import Rejected
+from storage.exr import decode_exr, encode_exr
+from storage.scene import Scene
+from tests.renders.scene_kit import Part, flat, furnace, join, light, material, quad, sphere
+
+SETTINGS = RenderSettings(
+    resolution=16, noise_floor_db=1.0, min_spp=32, max_spp=32, aux_spp=16, min_mean_radiance=0.0
+)
+FLOOR = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+LAMP = [[-0.1, -0.1, 2], [0, 0.1, 2], [0.1, -0.1, 2]]
+
+
+def _floor(surface: NDArray[np.float64] | None = None, scale: float = 1.0) -> Part:
+    row = material(diffuse=0.5) if surface is None else surface
+    return quad(np.array(FLOOR) * scale, row)
+
+
+def _lamp(radiance: float = 100.0, scale: float = 1.0) -> Part:
+    return light(np.array(LAMP) * scale, radiance)
+
+
+def _render(scene: Scene) -> RenderedView:
+    scene.check()
+    renderer = SceneRenderer(scene, SETTINGS)
+    return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed=0)
+
+
+def _sliver(aspect: float) -> Part:
+    return flat([[[-0.5, 0, 0.5], [0.5, 0, 0.5], [0, aspect, 0.5]]], material(diffuse=0.5))
+
+
+SURFACES = {
+    "black": material(),
+    "white diffuse": material(diffuse=1.0),
+    "perfect mirror": material(specular=1.0, roughness=0.0),
+    "rough metal": material(specular=1.0, roughness=1.0),
+    "sum of exactly one": material(diffuse=0.25, specular=0.75, roughness=0.3),
+    "one channel each": material(diffuse=[1, 0, 0], specular=[0, 1, 0], roughness=0.0),
+}
+SHAPES = {
+    "one triangle": [flat([[[-1, -1, 0], [1, -1, 0], [0, 1, 0]]], material(diffuse=0.5)), _lamp()],
+    "sliver 1e-3": [_sliver(1e-3), _floor(), _lamp()],
+    "sliver 1e-7": [_sliver(1e-7), _floor(), _lamp()],
+    "coincident floors": [_floor(), _floor(material(specular=0.9, roughness=0.1)), _lamp()],
+    "interpenetrating": [sphere([0, 0, 0], 0.5, material(diffuse=0.9)), _floor(), _lamp()],
+    "light on the floor": [_floor(), light(np.array(LAMP) * [1, 1, 0], 100.0)],
+    "light inside an object": [
+        sphere([0, 0, 2], 0.5, material(diffuse=0.9)), _floor(), _lamp(),
+        light(np.add(LAMP, [0, 0, 1]), 1.0),
+    ],
+    "faint light": [_floor(), _lamp(1e-3)],
+    "64 lights": [_floor(), *[_lamp(1.0 + i, 1 + 0.01 * i) for i in range(64)]],
+    "light of a millimetre": [_floor(), light(np.array(LAMP) * [1e-3, 1e-3, 1], 1e6)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("surface", SURFACES.values(), ids=SURFACES.keys())
+def test_extreme_materials(surface: NDArray[np.float64]) -> None:
+    ball = sphere([0, 0, 0.5], 0.5, surface)
+    picture = _render(join([ball, _floor(surface), _lamp()])).radiance_rgb
+    assert np.isfinite(picture).all()
+    assert (picture >= 0).all()
+
+
+@pytest.mark.parametrize("parts", SHAPES.values(), ids=SHAPES.keys())
+def test_extreme_shapes_and_lights(parts: list[Part]) -> None:
+    picture = _render(join(parts)).radiance_rgb
+    assert np.isfinite(picture).all()
+    assert (picture >= 0).all()
+    assert picture.max() > 0
+
+
+@pytest.mark.parametrize("fov_deg", [1.0, 10.0, 120.0, 170.0])
+def test_extreme_fields_of_view(fov_deg: float) -> None:
+    picture = _render(join([_floor(), _lamp()], fov_deg=fov_deg)).radiance_rgb
+    assert np.isfinite(picture).all()
+    assert picture.max() > 0
+
+
+@pytest.mark.parametrize("height", [1e-4, 1e-2])
+def test_a_camera_close_to_a_surface(height: float) -> None:
+    scene = join([_floor(), _lamp()], eye=(0, 0, height), target=(0.5, 0.1, 0))
+    assert np.isfinite(_render(scene).radiance_rgb).all()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_scale_changes_nothing(scale: float) -> None:
+    """Radiance knows no length: a scaled scene seen by a scaled camera is the same picture."""
+
+    def picture(s: float) -> NDArray[np.float32]:
+        eye = (0.0, -2.0 * s, 0.5 * s)
+        return _render(join([_floor(scale=s), _lamp(scale=s)], eye=eye)).radiance_rgb
+
+    # equal random numbers, so that only float32 rounding of positions differs; it turns some
+    # samples over at edges, each of which moves a pixel by up to 1/32 of the brightest value
+    assert np.median(abs(picture(scale) - picture(1.0))) < 1e-3 * picture(1.0).max()
+
+
+@pytest.mark.parametrize("radiance", [1e-3, 1.0, 1e4])
+def test_a_white_surface_in_a_furnace_conserves_energy(radiance: float) -> None:
+    ball = sphere([0, 0, 0], 0.5, material(diffuse=1.0), rings=24)
+    scene = join([ball, furnace(radiance)], eye=(0, -2, 0), fov_deg=10)
+    view = _render(scene)
+    # every path ends in the furnace, so there is no noise; the cut at 10 edges loses nothing on a
+    # convex body; 1 % is what shading normals on the facets of the ball take away
+    assert view.radiance_rgb[view.hits].mean() == pytest.approx(radiance, rel=0.01)
+
+
+def test_what_half_floats_cannot_hold_is_rejected() -> None:
+    with pytest.raises(Rejected, match="radiance_overflow"):
+        _render(join([_floor(material(diffuse=1.0)), _lamp(1e9)]))
+
+
+def test_the_brightest_picture_survives_the_file() -> None:
+    view = _render(join([_floor(material(diffuse=1.0)), _lamp(3e6)]))
+    assert 1000 < view.radiance_rgb.max() < HALF_FLOAT_MAX
+    back = decode_exr(encode_exr(view.radiance_rgb))
+    # half floats round to 2^-11 of the value, and below 6e-5 to steps of 6e-8
+    assert np.allclose(back, view.radiance_rgb, rtol=2**-11, atol=6e-8)
+
+
+def test_a_scene_without_light_is_refused_by_its_laws() -> None:
+    with pytest.raises(ValueError, match="no emission"):
+        _render(join([_floor()]))

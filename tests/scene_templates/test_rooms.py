@@ -1,0 +1,139 @@
+"""Shells: 128 triangles each, flat, facing the room, and without gaps at their seams."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from scene_templates.layout import ShellPart
+from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.registry import TEMPLATES
+from scene_templates.rooms import floor_plane, room_rand
+from scene_templates.settings import SceneSettings
+
+ROUNDING = 1e-12
+"""Coordinates about 1 after ten float64 operations are good to 1e-15; a thousand times that."""
+
+SQUARE = SceneSettings(square_share=1.0)
+LOOSE = SceneSettings(square_share=0.0)
+
+
+def _corner_normals(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    corners = positions[PATCH_FACES]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _shells(settings: SceneSettings, name: str, count: int) -> list[tuple[ShellPart, ...]]:
+    template = TEMPLATES[name]
+    return [
+        template.layout_rand(np.random.default_rng(seed), settings, 1).shell
+        for seed in range(count)
+    ]
+
+
+@pytest.mark.parametrize("settings", [SQUARE, LOOSE], ids=["square", "loose"])
+@pytest.mark.parametrize("name", list(TEMPLATES))
+def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
+    settings: SceneSettings, name: str
+) -> None:
+    for shell in _shells(settings, name, 20):
+        assert [part.name for part in shell] == list(TEMPLATES[name].parts)
+        for part in shell:
+            assert part.positions.shape == (81, 3)
+            assert part.faces.shape == (128, 3)
+            normals = _corner_normals(part.positions)
+            plane = floor_plane(part.positions)
+            assert np.abs(plane.height(part.positions)).max() < ROUNDING
+            assert (np.einsum("ti,i->t", normals, plane.normal) > 0).all()
+            # The room's middle is at most 0.125 from the origin, its sides at least 0.375.
+            assert plane.height(np.zeros(3)) > 0.2
+
+
+def test_the_nominal_room_is_the_unit_cube() -> None:
+    still = PatchPlacement(
+        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
+    )
+    for side in SIDES.values():
+        positions = patch(side, still)
+        assert np.array_equal(positions[:, side.axis], np.full(81, 0.5 * side.sign))
+        for axis in {0, 1, 2} - {side.axis}:
+            assert (positions[:, axis].min(), positions[:, axis].max()) == (-0.5, 0.5)
+
+
+def test_a_quarter_spin_keeps_the_outline_and_swaps_the_diagonals() -> None:
+    still = PatchPlacement(
+        rotation_deg=(0, 0, 0), reach=1.0, scale=(1, 1, 1), translation=(0, 0, 0)
+    )
+    plain = patch(SIDES["floor"], still)
+    spun = patch(SIDES["floor"], dataclasses.replace(still, rotation_deg=(0, 0, 90)))
+    order, spun_order = np.lexsort(plain.round(9).T), np.lexsort(spun.round(9).T)
+    assert np.abs(plain[order] - spun[spun_order]).max() < ROUNDING
+
+    def diagonals(positions: NDArray[np.float64]) -> set[tuple[float, ...]]:
+        middle = (positions[PATCH_FACES[:, 0]] + positions[PATCH_FACES[:, 2]]) / 2
+        along = positions[PATCH_FACES[:, 2]] - positions[PATCH_FACES[:, 0]]
+        # Of the edges from corner 0 to corner 2 only the diagonals are oblique.
+        oblique = np.abs(along[:, 0] * along[:, 1]) > ROUNDING
+        signed = np.sign(along[:, 0] * along[:, 1])
+        rows = np.column_stack([middle, signed])[oblique].round(9) + 0.0
+        return {tuple(row) for row in rows.tolist()}
+
+    assert not diagonals(plain) & diagonals(spun)
+
+
+@pytest.mark.parametrize("name", ["wall", "corner", "open_box"])
+def test_in_square_rooms_walls_stand_exactly_on_the_floors_edge(name: str) -> None:
+    for shell in _shells(SQUARE, name, 20):
+        floor = shell[0].positions
+        for wall in shell[1:]:
+            foot = wall.positions[wall.positions[:, 2] < floor[:, 2].max() + ROUNDING]
+            assert len(foot) == 9
+            gaps = np.abs(foot[:, None] - floor[None]).max(axis=-1).min(axis=1)
+            assert gaps.max() < ROUNDING
+
+
+@pytest.mark.parametrize("settings", [SQUARE, LOOSE], ids=["square", "loose"])
+@pytest.mark.parametrize("name", ["wall", "corner", "open_box"])
+def test_nothing_shines_through_the_seams(settings: SceneSettings, name: str) -> None:
+    """From the middle of the room, a look at any point near a seam meets a floor or wall."""
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        room = room_rand(rng, settings, TEMPLATES[name].parts)
+        patches = [
+            patch(SIDES[part], placement)
+            for part, placement in zip(TEMPLATES[name].parts, room.patches, strict=True)
+        ]
+        middle = (room.low + room.high) / 2
+        for part in TEMPLATES[name].parts[1:]:
+            points = _near_seam(rng, room.low, room.high, part)
+            hit = np.any([_meets(middle, points - middle, one) for one in patches], axis=0)
+            assert hit.all(), (seed, part)
+
+
+def _near_seam(
+    rng: np.random.Generator, low: NDArray[np.float64], high: NDArray[np.float64], part: str
+) -> NDArray[np.float64]:
+    """Points on the foot of a wall, up to 1 cm above it, inside the ends of the seam."""
+    points = rng.uniform(low, high, size=(200, 3))
+    side = SIDES[part]
+    points[:, side.axis] = (high if side.sign > 0 else low)[side.axis]
+    points[:, 2] = low[2] + rng.uniform(0, 0.01, size=len(points))
+    along = 1 - side.axis
+    # A seam's open end belongs to no second part; a tilt may take 2 tan(3 deg) of it away.
+    inset = 0.9 * (high - low)[along] / 2
+    points[:, along] = np.clip(points[:, along], -inset, inset)
+    return points
+
+
+def _meets(
+    eye: NDArray[np.float64], toward: NDArray[np.float64], positions: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether rays meet the parallelogram of a patch."""
+    origin, u, v = positions[0], positions[-9] - positions[0], positions[8] - positions[0]
+    solved = np.linalg.solve(
+        np.stack([np.broadcast_to(u, toward.shape), np.broadcast_to(v, toward.shape), -toward], -1),
+        np.broadcast_to(eye - origin, toward.shape)[..., None],
+    )[..., 0]
+    inside = (solved[:, :2] >= -ROUNDING) & (solved[:, :2] <= 1 + ROUNDING)
+    return inside.all(axis=1) & (solved[:, 2] > 0)

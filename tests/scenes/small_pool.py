@@ -1,0 +1,74 @@
+"""A pool of small objects at several levels, made without the asset stage."""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import trimesh
+
+from pipeline.scenes.compose import compose_scene
+from pipeline.scenes.pool import PooledAsset
+from scene_templates.settings import SceneSettings
+from storage.asset import Asset, Level, LevelRecord
+from storage.errors import Rejected
+from storage.records import LockedObject
+from storage.scene import Scene
+
+
+def level(mesh: trimesh.Trimesh) -> Level:
+    """Return a mesh in the unit box as a level."""
+    centred = mesh.vertices - mesh.bounds.mean(axis=0)
+    count = len(mesh.faces)
+    return Level(
+        record=LevelRecord(budget=count, method="source", error_p99=0.0),
+        positions=(centred / mesh.extents.max()).astype(np.float32),
+        faces=mesh.faces.astype(np.uint32),
+    )
+
+
+def pooled(uid: str, meshes: Iterable[trimesh.Trimesh]) -> PooledAsset:
+    """Return an asset whose levels are the meshes, the largest first."""
+    digest = hashlib.sha256(uid.encode()).hexdigest()
+    return PooledAsset(
+        locked=LockedObject(
+            uid=uid,
+            asset_sha256=digest,
+            split="train",
+            licence="CC0-1.0",
+            title=uid,
+            attribution=f"maker of {uid}",
+            source_url=f"https://example.org/{uid}",
+        ),
+        asset=Asset(
+            geometry_sha256=digest,
+            source_sha256=digest,
+            recipe="trimesh creation",
+            levels=tuple(level(mesh) for mesh in meshes),
+        ),
+    )
+
+
+def small_pool() -> list[PooledAsset]:
+    """Return five objects of 12 to 1280 triangles, sorted by uid; one is called like a wall."""
+    create = trimesh.creation
+    return [
+        pooled("made/ball", [create.icosphere(n) for n in (3, 2, 1)]),
+        pooled("made/box", [create.box(extents=(1, 2, 0.5))]),
+        pooled("made/rod", [create.cylinder(0.1, 1, sections=n) for n in (64, 24)]),
+        pooled("made/ring", [create.torus(0.5, 0.2, n, n) for n in (24, 16, 8)]),
+        pooled("made/wall1", [create.cone(0.5, 1, sections=n) for n in (48, 12)]),
+    ]
+
+
+def first_scene(
+    settings: SceneSettings, pool: Sequence[PooledAsset], *, seed: int, scene_index: int
+) -> Scene:
+    """Return the first attempt at a scene that is not rejected, as a run does."""
+    for attempt in range(16):
+        try:
+            return compose_scene(
+                settings, pool, seed=seed, scene_index=scene_index, attempt=attempt
+            )
+        except Rejected:
+            continue
+    raise AssertionError(f"scene {scene_index} of seed {seed} was rejected sixteen times")
