@@ -57,7 +57,7 @@ BAD_INPUT = [
     (("generate", "smoke", "--objects", "nowhere"), "nowhere"),
     (("generate", "smoke", "--objects", "empty"), "empty"),
     (("generate", "smoke", "--objects", "broken"), "none was accepted"),
-    (("generate", "smoke", "--objects", "twice"), "twice"),
+    (("generate", "smoke", "--objects", "twice"), "objects.jsonl:2: uid 'a' is already used"),
     (("generate", "smoke", "--out", "/proc/nowhere"), "cannot write"),
     (("generate", "smoke", "--resolution", "100"), "resolution"),
     (("generate", "smoke", "--scenes", "0"), "scenes is 0"),

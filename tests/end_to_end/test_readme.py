@@ -1,0 +1,80 @@
+"""The commands of the README do what it says."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+README = (ROOT / "README.md").read_text()
+COMMANDS = [
+    line.split("#")[0].strip()
+    for block in re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
+    for line in block.splitlines()
+    if line.strip()
+]
+NOT_RUN_HERE = {"make test"}
+"""This very test is part of it."""
+
+
+def test_the_readme_shows_commands() -> None:
+    assert {"make dataset", "make test", "make train"} <= set(COMMANDS)
+    assert any(command.startswith("trilight generate") for command in COMMANDS)
+
+
+@pytest.mark.parametrize("target", re.findall(r"\[[^\]]*\]\(([^)#:]+)\)", README))
+def test_links_lead_somewhere(target: str) -> None:
+    assert (ROOT / target).exists()
+
+
+def test_every_folder_has_its_line() -> None:
+    folders = [p for p in (ROOT / "pipeline").iterdir() if p.is_dir() and p.name[0] not in "_."]
+    tops = ("storage", "scene_templates", "model", "train", "infra", "tests")
+    for name in [*tops, *(f"pipeline/{folder.name}" for folder in folders)]:
+        assert f"`{name}/`" in README, name
+
+
+def _copy_of_the_project(folder: Path) -> None:
+    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (LOG.md)."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    for name in filter(None, listed.split("\0")):
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, target)
+    (folder / ".venv").symlink_to(ROOT / ".venv")
+
+
+def _run(command: str, folder: Path) -> None:
+    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKELEVEL")}
+    environment["PATH"] = f"{ROOT / '.venv' / 'bin'}:{environment['PATH']}"
+    result = subprocess.run(
+        ["sh", "-c", command],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=1500,
+        check=False,
+    )
+    assert result.returncode == 0, f"{command}\n{result.stdout[-2000:]}\n{result.stderr[-2000:]}"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2400)
+def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
+    """All of them, in order; only the number of the user's own scenes is smaller."""
+    _copy_of_the_project(tmp_path)
+    for command in COMMANDS:
+        if command not in NOT_RUN_HERE:
+            command = command.replace("FOLDER", shlex.quote(str(shared / "objects")))
+            _run(command.replace("--scenes 64", "--scenes 12"), tmp_path)
+    for made in ("data/smoke/contact_sheet.png", "runs/smoke/validation_sheet.png"):
+        assert (tmp_path / made).stat().st_size > 10_000
+    assert (tmp_path / "runs" / "mine" / "validation_sheet.png").exists()

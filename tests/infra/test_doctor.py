@@ -1,0 +1,46 @@
+"""`trilight doctor` finds what is there, and says how to mend what is not."""
+
+import pytest
+
+from infra import doctor
+
+
+@pytest.fixture(scope="module")
+def findings() -> list[doctor.Finding]:
+    return doctor.examine()
+
+
+def test_a_machine_that_passes_tests_lacks_nothing(findings: list[doctor.Finding]) -> None:
+    assert {finding.name for finding in findings} >= {"renderer", "mesh filters", "orchestrator"}
+    assert [finding for finding in findings if finding.state == "missing"] == []
+
+
+def test_whatever_is_not_well_names_its_consequence_and_cure(
+    findings: list[doctor.Finding],
+) -> None:
+    for finding in findings:
+        assert bool(finding.consequence) == bool(finding.mend) == (finding.state != "ok")
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("raise SystemExit('filters are gone')", "filters are gone"),
+        ("import os; os.abort()", "ended with status -6"),
+        ("import nothing_of_that_name", "No module named 'nothing_of_that_name'"),
+    ],
+)
+def test_a_probe_that_fails_is_missing(code: str, said: str) -> None:
+    finding = doctor._probe("x", code, found="x 1", consequence="no x", mend="get x")
+    assert finding.state == "missing"
+    assert said in finding.found
+
+
+def test_no_llvm_is_slower_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline.renders.variant import Variant
+
+    fallback = Variant(name="scalar_rgb", libllvm="", note="rendering is slower")
+    monkeypatch.setattr(doctor, "choose_variant", lambda: fallback)
+    finding = doctor._renderer()
+    assert (finding.state, finding.consequence) == ("slower", "rendering is slower")
+    assert "libllvm19" in finding.mend
