@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -196,6 +197,6 @@ def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
         ({"name": "smoke", "noise_floor_db": -3.0}, "noise_floor_db"),
     ],
 )
-def test_wrong_settings_are_named(arguments: dict, message: str) -> None:  # type: ignore[type-arg]
+def test_wrong_settings_are_named(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
         named_build(**arguments)

@@ -1,0 +1,21 @@
+"""The one attention function of the network; `attention_reference` is its slow twin.
+
+Everything that may later be faster (kernels, precisions, packed sequences) goes behind this
+signature, so that nothing above it knows.
+"""
+
+from torch import Tensor
+from torch.nn.functional import scaled_dot_product_attention
+
+
+def attend(q_BHQD: Tensor, k_BHND: Tensor, v_BHND: Tensor, is_key_BN: Tensor | None) -> Tensor:
+    """Return softmax(q k^T / sqrt(D)) v, [B, H, Q, D], over the keys that exist.
+
+    Args:
+        q_BHQD, k_BHND, v_BHND: one floating dtype.
+        is_key_BN: bool, False for padding; None where every key exists. It reaches the kernel as
+            [B, 1, 1, N]: spelled out for every query and head it would double the time. Each row
+            needs at least one key.
+    """
+    mask = None if is_key_BN is None else is_key_BN[:, None, None, :]
+    return scaled_dot_product_attention(q_BHQD, k_BHND, v_BHND, attn_mask=mask)

@@ -1,0 +1,124 @@
+"""Sizes of the network: one frozen description, from which every part builds itself.
+
+The architecture is written once; a size is only numbers. `SIZES` names those that are used. What a
+size cannot change: two stages, QK-norm over the full width, SwiGLU, RMSNorm before each block.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from storage.errors import TrilightError
+
+Head = Literal["dpt", "linear"]
+
+VERTEX_COORDINATES = 9
+"""Three vertices of three coordinates: what a triangle's rotary position is made of."""
+
+NUM_TAPS = 4
+"""Decoder layers that a DPT head reads (Ranftl et al. 2021)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """All numbers of one network."""
+
+    width: int
+    """Width of every token."""
+    num_heads: int
+    """Attention heads; each is width / num_heads wide."""
+    encoder_layers: int
+    """Layers of the view-independent stage."""
+    decoder_layers: int
+    """Layers of the view stage."""
+    hidden_width: int
+    """Width inside the SwiGLU."""
+    num_registers: int
+    """Learned tokens that belong to no triangle."""
+    rope_num_freqs: int
+    """Rotary frequencies per coordinate; 2 x 9 x rope_num_freqs may not exceed the head width."""
+    rope_max_freq: float
+    """Highest rotary frequency in radians per metre; the lowest is 1, the rest log-spaced."""
+    normal_octaves: int = 6
+    """Octaves of the sines that encode vertex normals."""
+    patch_px: int = 8
+    """Width of a ray bundle in pixels."""
+    head: Head
+    """`dpt` mixes neighbouring bundles by convolution, `linear` reads each bundle alone."""
+    dpt_features: int = 0
+    """Width of the DPT's fusion path; 0 with a linear head."""
+    dpt_channels: tuple[int, ...] = ()
+    """Widths of the DPT's four grids, finest first; empty with a linear head."""
+    dpt_taps: tuple[int, ...] = ()
+    """Decoder layers that feed those grids, in the same order; empty with a linear head."""
+
+    def __post_init__(self) -> None:
+        if self.width % self.num_heads or self.head_width % 2:
+            _wrong(f"width {self.width} in {self.num_heads} heads", "even heads of equal width")
+        if 2 * VERTEX_COORDINATES * self.rope_num_freqs > self.head_width:
+            most = self.head_width // (2 * VERTEX_COORDINATES)
+            _wrong(f"rope_num_freqs {self.rope_num_freqs}", f"at most {most} for this head width")
+        if self.rope_num_freqs < 1 or self.rope_max_freq < 1:
+            _wrong("a rotary range without a frequency", "rope_num_freqs and rope_max_freq from 1")
+        if self.head not in ("dpt", "linear"):
+            _wrong(f"head {self.head!r}", "dpt or linear")
+        if self.head == "dpt":
+            self._check_dpt()
+        elif self.dpt_features or self.dpt_channels or self.dpt_taps:
+            _wrong("dpt fields beside a linear head", "0 and empty tuples")
+
+    def _check_dpt(self) -> None:
+        if len(self.dpt_channels) != NUM_TAPS or len(self.dpt_taps) != NUM_TAPS:
+            _wrong(f"dpt_channels {self.dpt_channels}, taps {self.dpt_taps}", "four of each")
+        if not all(0 <= tap < self.decoder_layers for tap in self.dpt_taps):
+            _wrong(f"dpt_taps {self.dpt_taps}", f"layers below {self.decoder_layers}")
+        if self.dpt_features < 2 or self.dpt_features % 2:
+            _wrong(f"dpt_features {self.dpt_features}", "an even number from 2")
+        if self.patch_px != 8:
+            _wrong(f"patch_px {self.patch_px} with a dpt head", "8, which its grids multiply up to")
+
+    @property
+    def head_width(self) -> int:
+        """Width of one attention head."""
+        return self.width // self.num_heads
+
+
+def smoke() -> ModelConfig:
+    """Return the size that two CPU cores train in minutes."""
+    return ModelConfig(
+        width=128,
+        num_heads=2,
+        encoder_layers=4,
+        decoder_layers=4,
+        hidden_width=384,
+        num_registers=4,
+        rope_num_freqs=3,
+        rope_max_freq=5.0,
+        head="linear",
+    )
+
+
+def base() -> ModelConfig:
+    """Return the paper's configuration (Zeng et al. 2025, 205M with its texture encoder)."""
+    return ModelConfig(
+        width=768,
+        num_heads=6,
+        encoder_layers=12,
+        decoder_layers=6,
+        hidden_width=3072,
+        num_registers=16,
+        rope_num_freqs=6,
+        rope_max_freq=5.0,
+        head="dpt",
+        dpt_features=128,
+        dpt_channels=(96, 192, 384, 768),
+        dpt_taps=(2, 3, 4, 5),
+    )
+
+
+SIZES: dict[str, Callable[[], ModelConfig]] = {"smoke": smoke, "base": base}
+"""Every named size."""
+
+
+def _wrong(got: str, expected: str) -> None:
+    raise TrilightError(f"model config: {got}; expected {expected}.")

@@ -1,0 +1,133 @@
+"""Bundle tokens -> pixels: a linear map of each bundle, or a dense prediction transformer (DPT).
+
+The linear head is smaller and as good for minutes of training; the DPT (Ranftl et al. 2021) mixes
+neighbouring bundles, so that their borders do not show. Both start at a black picture.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, silu
+
+from model.config import NUM_TAPS, ModelConfig
+from model.layers import LAYER_NORM_EPS
+from model.rays import unbundle
+
+LAST_CHANNELS = 32
+"""Channels before the DPT's last 1x1, as published."""
+
+
+class LinearHead(nn.Module):
+    """Last layer's tokens -> 3 P P values each."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.patch_px = config.patch_px
+        self.taps = (config.decoder_layers - 1,)
+        self.norm = nn.RMSNorm(config.width, eps=LAYER_NORM_EPS)
+        self.last = nn.Linear(config.width, 3 * config.patch_px**2)
+
+    def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
+        """Return pictures [M, 3, R, R]."""
+        return unbundle(self.last(self.norm(taps_MQW[0])), self.patch_px)
+
+
+class ResidualConv(nn.Module):
+    """x + two 3x3 convolutions, each after a SiLU."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(features, features, 3, padding=1)
+        self.second = nn.Conv2d(features, features, 3, padding=1)
+
+    def forward(self, x_MCHW: Tensor) -> Tensor:
+        """[M, C, H, W] -> [M, C, H, W]."""
+        return x_MCHW + self.second(silu(self.first(silu(x_MCHW))))
+
+
+class Fusion(nn.Module):
+    """Adds one grid to the coarser sum so far and brings it to the size of the next finer one."""
+
+    def __init__(self, features: int, *, deepest: bool) -> None:
+        super().__init__()
+        self.skip = None if deepest else ResidualConv(features)
+        self.refine = ResidualConv(features)
+        self.project = nn.Conv2d(features, features, 1)
+
+    def forward(
+        self, coarse_MCHW: Tensor | None, grid_MCHW: Tensor, size: tuple[int, int]
+    ) -> Tensor:
+        """Return [M, C, *size].
+
+        The 1x1 runs before the upsampling, where it costs a quarter; bilinear weights add up to
+        one, so the result is the same but for rounding.
+        """
+        if self.skip is not None and coarse_MCHW is not None:
+            grid_MCHW = coarse_MCHW + self.skip(grid_MCHW)
+        fused = self.project(self.refine(grid_MCHW))
+        return interpolate(fused, size=size, mode="bilinear", align_corners=True)
+
+
+class DptHead(nn.Module):
+    """Four decoder layers -> four grids (4x, 2x, 1x, 1/2 of the bundles) -> one picture."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.taps = config.dpt_taps
+        features, channels = config.dpt_features, config.dpt_channels
+        self.project = nn.ModuleList(nn.Conv2d(config.width, wide, 1) for wide in channels)
+        self.resize = nn.ModuleList(
+            [
+                nn.ConvTranspose2d(channels[0], channels[0], 4, stride=4),
+                nn.ConvTranspose2d(channels[1], channels[1], 2, stride=2),
+                nn.Identity(),
+                nn.Conv2d(channels[3], channels[3], 3, stride=2, padding=1),
+            ]
+        )
+        self.reassemble = nn.ModuleList(
+            nn.Conv2d(wide, features, 3, padding=1, bias=False) for wide in channels
+        )
+        self.fuse = nn.ModuleList(
+            Fusion(features, deepest=level == NUM_TAPS - 1) for level in range(NUM_TAPS)
+        )
+        self.halve = nn.Conv2d(features, features // 2, 3, padding=1)
+        self.widen = nn.Conv2d(features // 2, LAST_CHANNELS, 3, padding=1)
+        self.last = nn.Conv2d(LAST_CHANNELS, 3, 1)
+
+    def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
+        """Return pictures [M, 3, R, R]."""
+        grids = [self._grid(level, tokens) for level, tokens in enumerate(taps_MQW)]
+        fused: Tensor | None = None
+        for level in reversed(range(NUM_TAPS)):
+            height, width = grids[level - 1].shape[-2:]
+            if level == 0:
+                height, width = 2 * grids[0].shape[-2], 2 * grids[0].shape[-1]
+            fused = self.fuse[level](fused, grids[level], (height, width))
+        return self.last(silu(self.widen(self.halve(fused))))
+
+    def _grid(self, level: int, tokens_MQW: Tensor) -> Tensor:
+        per_side = round(tokens_MQW.shape[1] ** 0.5)
+        grid_MWQQ = tokens_MQW.transpose(1, 2).unflatten(2, (per_side, per_side))
+        return self.reassemble[level](self.resize[level](self.project[level](grid_MWQQ)))
+
+
+def build_head(config: ModelConfig) -> LinearHead | DptHead:
+    """Return the head that the configuration names."""
+    return DptHead(config) if config.head == "dpt" else LinearHead(config)
+
+
+def blacken(head: LinearHead | DptHead) -> None:
+    """Zero the last layer, so that training starts at a black picture.
+
+    Safe only because the loss is taken before the ELU: after it, a start at 0 has a thousandth of
+    the gradient on one side, and most runs stay black.
+    """
+    nn.init.zeros_(head.last.weight)
+    assert head.last.bias is not None
+    nn.init.zeros_(head.last.bias)
+
+
+def stack_taps(layers: Sequence[Tensor], taps: Sequence[int]) -> list[Tensor]:
+    """Return the outputs [M, Q, W] of the layers that a head reads, in its order."""
+    return [torch.flatten(layers[tap], 0, 1) for tap in taps]

@@ -1,0 +1,149 @@
+"""The blocks of both stages: self-attention, cross-attention and SwiGLU, each behind an RMSNorm.
+
+No biases. Queries and keys are normalised over the full width, before the split into heads and
+before the rotation, which keeps their products bounded while training.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from model.attention import attend
+from model.positions import rotate
+
+LAYER_NORM_EPS = 1e-6
+"""Of every norm inside a layer, as published."""
+
+TOKEN_NORM_EPS = 1.1920929e-07
+"""Of the norms that make tokens: float32's machine epsilon, as published."""
+
+Rotation = tuple[Tensor, Tensor]
+"""cos and sin [..., N, D / 2] of `model.positions`."""
+
+
+def split_heads(x_BNW: Tensor, num_heads: int) -> Tensor:
+    """[B, N, W] -> [B, H, N, D]."""
+    return x_BNW.unflatten(-1, (num_heads, -1)).transpose(-2, -3)
+
+
+def merge_heads(x_BHND: Tensor) -> Tensor:
+    """[B, H, N, D] -> [B, N, W]."""
+    return x_BHND.transpose(-2, -3).flatten(-2)
+
+
+class SwiGLU(nn.Module):
+    """down(silu(gate x) * up x) (Shazeer 2020, equation 6)."""
+
+    def __init__(self, width: int, hidden_width: int) -> None:
+        super().__init__()
+        self.gate = nn.Linear(width, hidden_width, bias=False)
+        self.up = nn.Linear(width, hidden_width, bias=False)
+        self.down = nn.Linear(hidden_width, width, bias=False)
+
+    def forward(self, x_BNW: Tensor) -> Tensor:
+        """[B, N, W] -> [B, N, W]."""
+        return self.down(nn.functional.silu(self.gate(x_BNW)) * self.up(x_BNW))
+
+
+class SelfAttention(nn.Module):
+    """Attention of a sequence to itself, with or without rotary positions."""
+
+    def __init__(self, width: int, num_heads: int) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.qkv = nn.Linear(width, 3 * width, bias=False)
+        self.q_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.k_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.out = nn.Linear(width, width, bias=False)
+
+    def forward(
+        self, x_BNW: Tensor, rotation: Rotation | None = None, is_key_BN: Tensor | None = None
+    ) -> Tensor:
+        """[B, N, W] -> [B, N, W]; `rotation` is None where all positions are the origin."""
+        q_BNW, k_BNW, v_BNW = self.qkv(x_BNW).chunk(3, dim=-1)
+        q_BHND = split_heads(self.q_norm(q_BNW), self.num_heads)
+        k_BHND = split_heads(self.k_norm(k_BNW), self.num_heads)
+        if rotation is not None:
+            q_BHND, k_BHND = rotate(q_BHND, *rotation), rotate(k_BHND, *rotation)
+        attended = attend(q_BHND, k_BHND, split_heads(v_BNW, self.num_heads), is_key_BN)
+        return self.out(merge_heads(attended))
+
+
+class CrossAttention(nn.Module):
+    """Attention of ray bundles to the tokens of their scene.
+
+    Keys and values are projected once per scene and rotated once per view: the rotation is what
+    carries the camera. Queries stand at the camera's origin, where the rotation is the identity.
+    """
+
+    def __init__(self, width: int, num_heads: int) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.context_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.q = nn.Linear(width, width, bias=False)
+        self.k = nn.Linear(width, width, bias=False)
+        self.v = nn.Linear(width, width, bias=False)
+        self.q_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.k_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.out = nn.Linear(width, width, bias=False)
+
+    def forward(
+        self,
+        x_BVQW: Tensor,
+        context_BNW: Tensor,
+        rotation_BVNA: Rotation,
+        is_key_BN: Tensor | None,
+    ) -> Tensor:
+        """[B, V, Q, W] -> [B, V, Q, W], from a context [B, N, W]."""
+        num_views = x_BVQW.shape[1]
+        normed_BNW = self.context_norm(context_BNW)
+        k_BHND = split_heads(self.k_norm(self.k(normed_BNW)), self.num_heads)
+        v_BHND = split_heads(self.v(normed_BNW), self.num_heads)
+        k_BVHND = rotate(k_BHND[:, None], *rotation_BVNA)
+        v_BVHND = v_BHND[:, None].expand_as(k_BVHND)
+        q_BVHQD = split_heads(self.q_norm(self.q(x_BVQW)), self.num_heads)
+        mask = None if is_key_BN is None else is_key_BN.repeat_interleave(num_views, dim=0)
+        attended = attend(q_BVHQD.flatten(0, 1), k_BVHND.flatten(0, 1), v_BVHND.flatten(0, 1), mask)
+        return self.out(merge_heads(attended)).unflatten(0, x_BVQW.shape[:2])
+
+
+class EncoderLayer(nn.Module):
+    """Self-attention of all tokens of a scene, then SwiGLU, each added to the residual stream."""
+
+    def __init__(self, width: int, num_heads: int, hidden_width: int) -> None:
+        super().__init__()
+        self.attention_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.attention = SelfAttention(width, num_heads)
+        self.ffn_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.ffn = SwiGLU(width, hidden_width)
+
+    def forward(self, x_BNW: Tensor, rotation: Rotation, is_key_BN: Tensor | None) -> Tensor:
+        """[B, N, W] -> [B, N, W]."""
+        x_BNW = x_BNW + self.attention(self.attention_norm(x_BNW), rotation, is_key_BN)
+        return x_BNW + self.ffn(self.ffn_norm(x_BNW))
+
+
+class DecoderLayer(nn.Module):
+    """Bundles read the scene, then each other within their view, then SwiGLU."""
+
+    def __init__(self, width: int, num_heads: int, hidden_width: int) -> None:
+        super().__init__()
+        self.cross_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.cross = CrossAttention(width, num_heads)
+        self.self_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.self_attention = SelfAttention(width, num_heads)
+        self.ffn_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.ffn = SwiGLU(width, hidden_width)
+
+    def forward(
+        self,
+        x_BVQW: Tensor,
+        context_BNW: Tensor,
+        rotation_BVNA: Rotation,
+        is_key_BN: Tensor | None,
+    ) -> Tensor:
+        """[B, V, Q, W] -> [B, V, Q, W]."""
+        views = x_BVQW.shape[:2]
+        x_BVQW = x_BVQW + self.cross(self.cross_norm(x_BVQW), context_BNW, rotation_BVNA, is_key_BN)
+        x_MQW = torch.flatten(x_BVQW, 0, 1)
+        x_MQW = x_MQW + self.self_attention(self.self_norm(x_MQW))
+        return (x_MQW + self.ffn(self.ffn_norm(x_MQW))).unflatten(0, views)

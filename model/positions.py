@@ -1,0 +1,90 @@
+"""Where a triangle is: rotary angles of its vertices, and the sines that encode its normals.
+
+Queries and keys are rotated by angles proportional to the nine vertex coordinates, so that their
+product depends on differences of positions only: the network cannot tell where in the world a
+scene stands (Zeng et al. 2025, section 3.1). It can tell which way the scene is turned.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+
+class TriangleRotary(nn.Module):
+    """Angles of triangles: coordinate x frequency, coordinate-major, no factor of 2 pi.
+
+    The frequencies stay outside the state dict, since the configuration determines them, and
+    positions must reach this module in float32 or better: rounding them costs 60 dB and more.
+    """
+
+    freqs_F: Tensor
+
+    def __init__(self, *, num_freqs: int, max_freq: float, head_width: int) -> None:
+        super().__init__()
+        steps = torch.linspace(0, 1, num_freqs) if num_freqs > 1 else torch.zeros(1)
+        self.register_buffer("freqs_F", max_freq**steps, persistent=False)
+        self.half_width = head_width // 2
+
+    def forward(self, triangles_N33: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (cos, sin) [..., N, D / 2] of vertex positions [..., N, 3, 3].
+
+        Angles beyond the 9 x num_freqs that positions fill are 0: those pairs do not turn.
+        """
+        coordinates_N9 = triangles_N33.flatten(-2)
+        angles_NA = (coordinates_N9[..., None] * self.freqs_F).flatten(-2)
+        angles_NA = nn.functional.pad(angles_NA, (0, self.half_width - angles_NA.shape[-1]))
+        return angles_NA.cos(), angles_NA.sin()
+
+
+def rotate(x_HND: Tensor, cos_NA: Tensor, sin_NA: Tensor) -> Tensor:
+    """Turn each pair (channel i, channel i + D / 2) of x [..., H, N, D] by its angle.
+
+    cos and sin are [..., N, D / 2]; all heads turn alike.
+    """
+    cos_1NA, sin_1NA = cos_NA.unsqueeze(-3), sin_NA.unsqueeze(-3)
+    a, b = x_HND.chunk(2, dim=-1)
+    return torch.cat([a * cos_1NA - b * sin_1NA, b * cos_1NA + a * sin_1NA], dim=-1)
+
+
+def encode_normals(normals_N33: Tensor, octaves: int) -> Tensor:
+    """Return [..., N, 9 + 18 octaves]: the components, their sines, their cosines.
+
+    Sines are of component x 2^k, component-major (NeRF, Mildenhall et al. 2020, equation 4,
+    without its factor pi).
+    """
+    components_N9 = normals_N33.flatten(-2)
+    scale_F = 2.0 ** torch.arange(octaves, dtype=components_N9.dtype, device=components_N9.device)
+    phase_NF = (components_N9[..., None] * scale_F).flatten(-2)
+    shifted_NF = phase_NF + math.pi / 2
+    return torch.cat([components_N9, phase_NF.sin(), shifted_NF.sin()], dim=-1)
+
+
+def encoded_normal_width(octaves: int) -> int:
+    """Return the last dimension of `encode_normals`."""
+    return 9 + 18 * octaves
+
+
+def to_camera(points_BT33: Tensor, c2w_BV44: Tensor) -> Tensor:
+    """Return the points [B, V, T, 3, 3] in the space of each camera.
+
+    The origin is subtracted before the rotation, so that a scene far from the world's origin loses
+    no more digits than its coordinates already have. c2w must hold a rotation (Scene.check).
+    """
+    relative_BVT33 = points_BT33[:, None] - c2w_BV44[:, :, None, None, :3, 3]
+    return relative_BVT33 @ c2w_BV44[:, :, None, :3, :3]
+
+
+def register_position(triangles_BT33: Tensor, is_triangle_BT: Tensor | None) -> Tensor:
+    """Return [B, 1, 3, 3]: the mean vertex of the scene, three times over.
+
+    The published code divides by T + 1e-5; we do not, because that would make the position, and so
+    the picture, depend on where the world's origin is (by 1e-5 / T, below float32's rounding).
+    """
+    centre_BT3 = triangles_BT33.mean(dim=-2)
+    if is_triangle_BT is None:
+        mean_B3 = centre_BT3.mean(dim=1)
+    else:
+        weight_BT1 = is_triangle_BT[..., None].to(centre_BT3.dtype)
+        mean_B3 = (centre_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
+    return mean_B3[:, None, None, :].expand(-1, 1, 3, 3)

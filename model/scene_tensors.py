@@ -1,0 +1,102 @@
+"""`Scene` -> tensors: the one way in, for training and inference alike.
+
+Shape suffixes here and in all of `model`:
+    B scenes of a batch      V views of a scene      T triangles (padded to the longest of a batch)
+    N tokens of a scene = registers + T              Q ray bundles of a picture
+    W token width   H heads   D width of a head      R pixels across a picture, P across a bundle
+    A rotary angles of a position                    3 x, y, z or r, g, b      10 a material row
+
+A batch holds scenes of about one length and is padded to the longest of them, never to a constant;
+the padding is zero, because a mask hides finite garbage but not NaN (0 * NaN is NaN).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from storage.conventions import EMISSION, MATERIAL_WIDTH, log10_radiance
+from storage.scene import Scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneTensors:
+    """One scene as the network reads it; float32 unless converted."""
+
+    triangles_T33: Tensor
+    """Vertices of each triangle, world space, metres."""
+    normals_T33: Tensor
+    """Unit shading normals at those vertices, world space."""
+    material_T10: Tensor
+    """Columns of storage.conventions, with emission as log10(1 + emission)."""
+    c2w_V44: Tensor
+    """Camera to world."""
+    fov_deg_V: Tensor
+    """Full field of view in degrees."""
+
+    @property
+    def num_triangles(self) -> int:
+        return len(self.triangles_T33)
+
+    @property
+    def num_views(self) -> int:
+        return len(self.c2w_V44)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneBatch:
+    """Scenes of equal view count, padded with zeros to the longest."""
+
+    triangles_BT33: Tensor
+    """As in SceneTensors."""
+    normals_BT33: Tensor
+    """As in SceneTensors."""
+    material_BT10: Tensor
+    """As in SceneTensors."""
+    c2w_BV44: Tensor
+    """As in SceneTensors."""
+    fov_deg_BV: Tensor
+    """As in SceneTensors."""
+    is_triangle_BT: Tensor | None
+    """bool, False in the padding; None where nothing is padded, which spares the mask."""
+
+
+def scene_tensors(scene: Scene) -> SceneTensors:
+    """Return the tensors of a scene that passes `Scene.check`; its arrays stay unchanged."""
+    faces = scene.faces.astype(np.int64)
+    material = scene.materials[scene.material_index]
+    encoded = np.concatenate(
+        [material[:, : EMISSION.start], log10_radiance(material[:, EMISSION])], axis=1
+    )
+    assert encoded.shape[1] == MATERIAL_WIDTH
+    return SceneTensors(
+        triangles_T33=torch.from_numpy(scene.vertex_positions[faces]),
+        normals_T33=torch.from_numpy(scene.vertex_normals[faces]),
+        material_T10=torch.from_numpy(encoded.astype(np.float32)),
+        c2w_V44=torch.from_numpy(scene.c2w.copy()),
+        fov_deg_V=torch.from_numpy(scene.fov_deg.copy()),
+    )
+
+
+def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
+    """Stack scenes of equal view count; the picture of a scene does not depend on its company."""
+    lengths = torch.tensor([scene.num_triangles for scene in scenes])
+    longest = int(lengths.max())
+    padded = bool((lengths < longest).any())
+    return SceneBatch(
+        triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
+        normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
+        material_BT10=_stack_padded([scene.material_T10 for scene in scenes], longest),
+        c2w_BV44=torch.stack([scene.c2w_V44 for scene in scenes]),
+        fov_deg_BV=torch.stack([scene.fov_deg_V for scene in scenes]),
+        is_triangle_BT=torch.arange(longest) < lengths[:, None] if padded else None,
+    )
+
+
+def _stack_padded(rows: Sequence[Tensor], length: int) -> Tensor:
+    stacked = rows[0].new_zeros((len(rows), length, *rows[0].shape[1:]))
+    for index, row in enumerate(rows):
+        stacked[index, : len(row)] = row
+    return stacked

@@ -1,0 +1,80 @@
+"""The view-independent stage: light transport between triangles, once per scene.
+
+Every triangle is one token: a learned vector plus what its material is plus how its normals point.
+Where it is enters through rotary positions alone. Registers stand at the mean of all vertices.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from model.config import ModelConfig
+from model.layers import TOKEN_NORM_EPS, EncoderLayer
+from model.positions import (
+    TriangleRotary,
+    encode_normals,
+    encoded_normal_width,
+    register_position,
+)
+from model.scene_tensors import SceneBatch
+from storage.conventions import MATERIAL_WIDTH
+
+
+class TriangleTokens(nn.Module):
+    """Material and normals -> token.
+
+    The published network reads a 13 x 32 x 32 texture whose cells are all equal; that is a linear
+    map of these ten numbers (its tangent-space normal is constant), at a thousandth of the input.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.octaves = config.normal_octaves
+        self.token_W = nn.Parameter(torch.zeros(config.width))
+        self.material = nn.Linear(MATERIAL_WIDTH, config.width)
+        self.material_norm = nn.RMSNorm(config.width, eps=TOKEN_NORM_EPS)
+        self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
+        self.normal_norm = nn.RMSNorm(config.width, eps=TOKEN_NORM_EPS)
+
+    def forward(self, material_BT10: Tensor, normals_BT33: Tensor) -> Tensor:
+        """Return tokens [B, T, W]."""
+        material_BTW = self.material_norm(self.material(material_BT10))
+        normal_BTW = self.normal_norm(self.normal(encode_normals(normals_BT33, self.octaves)))
+        return self.token_W + material_BTW + normal_BTW
+
+
+class TriangleEncoder(nn.Module):
+    """Scene batch -> context tokens, registers first."""
+
+    def __init__(self, config: ModelConfig, rotary: TriangleRotary) -> None:
+        super().__init__()
+        self.rotary = rotary
+        self.tokens = TriangleTokens(config)
+        self.registers_NW = nn.Parameter(torch.zeros(config.num_registers, config.width))
+        self.layers = nn.ModuleList(
+            EncoderLayer(config.width, config.num_heads, config.hidden_width)
+            for _ in range(config.encoder_layers)
+        )
+
+    def forward(self, batch: SceneBatch) -> Tensor:
+        """Return the context [B, N, W] with N = registers + triangles."""
+        tokens_BTW = self.tokens(batch.material_BT10, batch.normals_BT33)
+        registers_BNW = self.registers_NW.expand(len(tokens_BTW), -1, -1)
+        x_BNW = torch.cat([registers_BNW, tokens_BTW], dim=1)
+        rotation = self.rotary(token_positions(batch, len(self.registers_NW)))
+        is_key_BN = token_mask(batch, len(self.registers_NW))
+        for layer in self.layers:
+            x_BNW = layer(x_BNW, rotation, is_key_BN)
+        return x_BNW
+
+
+def token_positions(batch: SceneBatch, num_registers: int) -> Tensor:
+    """Return the world positions [B, N, 3, 3] of registers and triangles."""
+    register_B133 = register_position(batch.triangles_BT33, batch.is_triangle_BT)
+    return torch.cat([register_B133.expand(-1, num_registers, -1, -1), batch.triangles_BT33], dim=1)
+
+
+def token_mask(batch: SceneBatch, num_registers: int) -> Tensor | None:
+    """Return which tokens [B, N] exist, or None where all do."""
+    if batch.is_triangle_BT is None:
+        return None
+    return nn.functional.pad(batch.is_triangle_BT, (num_registers, 0), value=True)

@@ -1,0 +1,52 @@
+"""The two lobes of a material as one mixture: which share of the samples each gets.
+
+An additive BRDF, diffuse d plus specular s, equals the blend (1 - w) * d/(1 - w) + w * s/w for any
+w between 0 and 1. With w = max s / (max s + max d) both scaled albedos stay at most max s + max d,
+hence at most 1, and the lobes are sampled in proportion to what they reflect.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.conventions import DIFFUSE, ROUGHNESS, SPECULAR, alpha_ggx
+
+MIN_ALPHA = 1e-4
+"""Floor of the GGX width: a roughness of 0.01, the smoothest that scenes draw.
+
+Below it float32 half vectors are too coarse to place the peak. A smaller roughness renders as 0.01.
+"""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lobes:
+    """Materials of T triangles, ready for a renderer."""
+
+    diffuse: NDArray[np.float64]
+    """[T, 3] diffuse albedo."""
+    specular: NDArray[np.float64]
+    """[T, 3] specular albedo."""
+    alpha: NDArray[np.float64]
+    """[T] GGX width, at least MIN_ALPHA."""
+    weight: NDArray[np.float64]
+    """[T] share of the specular lobe, in [0, 1]; 0 for black."""
+
+
+def lobes_of(materials: NDArray[np.float32]) -> Lobes:
+    """Return the lobes of material rows [T, 10]."""
+    rows = materials.astype(np.float64)
+    diffuse, specular = rows[:, DIFFUSE], rows[:, SPECULAR]
+    d, s = diffuse.max(axis=1), specular.max(axis=1)
+    weight = np.divide(s, s + d, out=np.zeros_like(s), where=s + d > 0)
+    alpha = np.maximum(alpha_ggx(rows[:, ROUGHNESS]), MIN_ALPHA)
+    return Lobes(diffuse=diffuse, specular=specular, alpha=alpha, weight=weight)
+
+
+def scaled_albedos(lobes: Lobes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return d/(1 - w) and s/w, [T, 3] each, 0 where the lobe has no share."""
+    weight = lobes.weight[:, None]
+    zeros = np.zeros_like(lobes.diffuse)
+    diffuse = np.divide(lobes.diffuse, 1 - weight, out=zeros.copy(), where=weight < 1)
+    specular = np.divide(lobes.specular, weight, out=zeros, where=weight > 0)
+    return diffuse, specular

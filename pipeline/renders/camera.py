@@ -1,0 +1,18 @@
+"""`Camera`: one pinhole and its pixel grid, the only thing about a view that a tracer is told."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Camera:
+    """A square picture's camera, as storage.conventions means it."""
+
+    c2w: NDArray[np.float64]
+    """[4, 4] camera to world; looks along -Z with +Y up."""
+    fov_deg: float
+    """Full field of view, equal in width and height."""
+    resolution: int
+    """Width and height in pixels."""

@@ -1,0 +1,46 @@
+"""What the render stage runs on, for people and for logs; asked in a process of its own."""
+
+import json
+import os
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+from pipeline.renders.variant import Variant
+
+_ROOT = Path(__file__).parents[2]
+_ASK_S = 120
+
+_QUESTION = """
+import json, sys
+from pipeline.renders.denoiser import load_oidn
+from pipeline.renders.variant import Variant, activate
+variant = Variant(**json.loads(sys.argv[1]))
+activate(variant)
+import drjit
+device = (oidn := load_oidn()).Device(oidn.OIDN_DEVICE_TYPE_CPU)
+device.commit()
+version = device.get_int("version")
+print(json.dumps({
+    "threads": str(drjit.thread_count()),
+    "denoiser": f"{version // 10000}.{version // 100 % 100}.{version % 100}",
+    "denoiser_device": "CPU" if device.get_error() is None else "none",
+}))
+"""
+
+
+def render_facts(variant: Variant) -> dict[str, str]:
+    """Return versions, device and threads by name; what cannot be asked is left out."""
+    facts = {name: metadata.version(name) for name in ("mitsuba", "drjit", "pyoidn")}
+    facts |= {"variant": variant.name, "llvm": Path(variant.libllvm).name}
+    result = subprocess.run(
+        [sys.executable, "-c", _QUESTION, json.dumps(vars(variant))],
+        cwd=_ROOT,
+        env=dict(os.environ),
+        capture_output=True,
+        text=True,
+        timeout=_ASK_S,
+        check=False,
+    )
+    return facts | json.loads(result.stdout) if result.returncode == 0 else facts

@@ -1,0 +1,55 @@
+"""Where LLVM's shared library may be on this machine: a list of candidates, newest first."""
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+
+_FOLDERS = (
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib64/llvm*/lib64",
+    "/usr/lib/llvm-*/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    "/usr/local/opt/llvm*/lib",
+)
+_NAME = re.compile(r"libLLVM(?:-(\d+))?(?:\.so|\.dylib)?(?:\.(\d+))?[\d.]*(?:\.so|\.dylib)?[\d.]*$")
+_LDCONFIG_S = 20
+
+
+def llvm_libraries() -> list[Path]:
+    """Return what may be LLVM: DRJIT_LIBLLVM_PATH first, then by falling version.
+
+    Symbolic links are resolved, so that one library is named once.
+    """
+    asked = os.environ.get("DRJIT_LIBLLVM_PATH")
+    found = {path.resolve() for path in (*_known_to_loader(), *_in_usual_folders())}
+    ordered = sorted(found, key=lambda path: (-_major_version(path), str(path)))
+    first = [Path(asked).resolve()] if asked else []
+    return [path for path in dict.fromkeys([*first, *ordered]) if path.is_file()]
+
+
+def _major_version(path: Path) -> int:
+    match = _NAME.match(path.name)
+    numbers = [int(group) for group in match.groups() if group] if match else []
+    return numbers[0] if numbers else 0
+
+
+def _known_to_loader() -> Iterable[Path]:
+    ldconfig = shutil.which("ldconfig") or shutil.which("ldconfig", path="/sbin:/usr/sbin")
+    if ldconfig is None:
+        return []
+    listing = subprocess.run(
+        [ldconfig, "-p"], capture_output=True, text=True, timeout=_LDCONFIG_S, check=False
+    ).stdout
+    return [Path(path) for path in re.findall(r"=> (\S*/libLLVM[-.]\S*)", listing)]
+
+
+def _in_usual_folders() -> Iterable[Path]:
+    for pattern in _FOLDERS:
+        for folder in Path("/").glob(pattern.lstrip("/")):
+            for name in ("libLLVM*.so*", "libLLVM*.dylib"):
+                yield from (path for path in folder.glob(name) if _NAME.match(path.name))

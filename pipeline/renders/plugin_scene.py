@@ -1,0 +1,124 @@
+"""A `Scene` as stock Mitsuba plugins, for either variant.
+
+One mesh holds all surfaces, with the material as attributes of its faces. Emitters are one shape
+per material row and side: Mitsuba's `area` emitter has one side, so each triangle has a turned
+twin, and both are moved apart, or rays would meet either of two coincident faces at random and
+half of the emission would be lost.
+"""
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.renders.blend import lobes_of, scaled_albedos
+from pipeline.renders.tracer import split_triangles
+from storage.conventions import EMISSION
+from storage.errors import Rejected
+from storage.scene import Scene
+
+_TWIN_OFFSET = 1e-4
+"""World units between a twin and the emitter itself: ten times what shadow rays stop short."""
+
+
+def plugin_scene(scene: Scene) -> Any:
+    """Return the mi.Scene of everything."""
+    surfaces, emitters = split_triangles(scene)
+    shapes = {"surfaces": _surfaces(scene, surfaces)} if len(surfaces) else {}
+    for row in np.unique(scene.material_index[emitters]):
+        triangles = emitters[scene.material_index[emitters] == row]
+        for side in (1, -1):
+            shapes[f"emitter_{row}_{side}"] = _emitter(scene, triangles, side)
+    return mi.load_dict({"type": "scene", **shapes})
+
+
+def plugin_feature_scene(scene: Scene) -> Any:
+    """Return the mi.Scene of the surfaces alone, with diffuse + specular as its albedo."""
+    surfaces, _ = split_triangles(scene)
+    lobes = lobes_of(scene.materials[scene.material_index[surfaces]])
+    mesh = _mesh(scene, surfaces, _two_sided({"type": "diffuse", "reflectance": _face("albedo")}))
+    _add_attribute(mesh, "albedo", lobes.diffuse + lobes.specular)
+    return mi.load_dict({"type": "scene", "surfaces": mesh})
+
+
+def _surfaces(scene: Scene, triangles: NDArray[np.intp]) -> Any:
+    lobes = lobes_of(scene.materials[scene.material_index[triangles]])
+    diffuse, specular = scaled_albedos(lobes)
+    material = {
+        "type": "blendbsdf",
+        "weight": _face("weight"),
+        "first": {"type": "diffuse", "reflectance": _face("diffuse")},
+        "second": {
+            "type": "roughconductor",
+            "material": "none",
+            "distribution": "ggx",
+            "alpha": _face("alpha"),
+            "specular_reflectance": _face("specular"),
+        },
+    }
+    mesh = _mesh(scene, triangles, _two_sided(material))
+    _add_attribute(mesh, "weight", lobes.weight[:, None])
+    _add_attribute(mesh, "alpha", lobes.alpha[:, None])
+    _add_attribute(mesh, "diffuse", diffuse)
+    _add_attribute(mesh, "specular", specular)
+    return mesh
+
+
+def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int) -> Any:
+    """Return the shape of emitting triangles of one material row, lit on one side."""
+    corners = scene.vertex_positions[scene.faces[triangles]].astype(np.float64)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled_area = np.linalg.norm(cross, axis=1, keepdims=True)
+    normal = np.divide(cross, doubled_area, out=np.zeros_like(cross), where=doubled_area > 0)
+    radiance = scene.materials[scene.material_index[triangles[0]], EMISSION].astype(np.float64)
+    power = 0.5 * float(doubled_area.sum()) * float(radiance.mean())
+    if not power > 0:
+        raise Rejected("unlit_scene", f"{len(triangles)} emitting triangles have no area")
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _colour([0.0] * 3)})
+    properties["emitter"] = mi.load_dict(
+        {"type": "area", "radiance": _colour(radiance.tolist()), "sampling_weight": power}
+    )
+    mesh = mi.Mesh(f"emitter{side}", 3 * len(triangles), len(triangles), props=properties)
+    twin = corners[:, ::side] + side * _TWIN_OFFSET * normal[:, None]
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = twin.astype(np.float32).ravel()
+    parameters["faces"] = np.arange(3 * len(triangles), dtype=np.uint32)
+    parameters.update()
+    return mesh
+
+
+def _mesh(scene: Scene, triangles: NDArray[np.intp], material: Any) -> Any:
+    properties = mi.Properties()
+    properties["bsdf"] = material
+    mesh = mi.Mesh(
+        "surfaces",
+        len(scene.vertex_positions),
+        len(triangles),
+        props=properties,
+        has_vertex_normals=True,
+    )
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = scene.vertex_positions.ravel()
+    parameters["vertex_normals"] = scene.vertex_normals.ravel()
+    parameters["faces"] = scene.faces[triangles].ravel()
+    parameters.update()
+    return mesh
+
+
+def _two_sided(material: dict[str, Any]) -> Any:
+    return mi.load_dict({"type": "twosided", "material": material})
+
+
+def _colour(values: list[float]) -> dict[str, Any]:
+    return {"type": "rgb", "value": values}
+
+
+def _face(name: str) -> dict[str, str]:
+    return {"type": "mesh_attribute", "name": f"face_{name}"}
+
+
+def _add_attribute(mesh: Any, name: str, values: NDArray[np.float64]) -> None:
+    flat = np.ascontiguousarray(values, np.float32).ravel()
+    mesh.add_attribute(f"face_{name}", values.shape[1], flat)

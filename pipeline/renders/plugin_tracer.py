@@ -1,0 +1,79 @@
+"""`PluginTracer`: Mitsuba's own `path` integrator over stock plugins.
+
+It runs where no LLVM is found (`scalar_rgb`), six times slower per sample on two cores and with
+more noise, and it is what `VectorTracer` is compared with. A Python emitter in `scalar_rgb` was
+tried and takes another 5.5 times as long, hence the twins of `plugin_scene`.
+"""
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.renders.camera import Camera
+from pipeline.renders.plugin_scene import plugin_feature_scene, plugin_scene
+from pipeline.renders.tracer import Features
+from storage.scene import Scene
+
+_BLOCK_SIZE = 8
+"""Pixels; fixed, because the random numbers of `scalar_rgb` belong to blocks."""
+
+_NEAR_CLIP, _FAR_CLIP = 1e-4, 1e4
+"""World units; wide enough to cut nothing of a scene around the unit cube."""
+
+
+class PluginTracer:
+    """A scene on any backend; see `Tracer` for the meaning of its methods."""
+
+    def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
+        self._scene = plugin_scene(scene)
+        self._feature_scene = plugin_feature_scene(scene)
+        self._path = _integrator(
+            type="path", max_depth=max_depth, rr_depth=rr_depth, hide_emitters=True
+        )
+        self._features = _integrator(type="aov", aovs="albedo:albedo,normal:sh_normal")
+        self._depth = _integrator(type="aov", aovs="depth:depth")
+
+    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        return _render(self._scene, self._path, camera, seed=seed, spp=spp)
+
+    def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
+        channels = _render(self._feature_scene, self._features, camera, seed=seed, spp=spp)
+        return Features(albedo=channels[..., 0:3].copy(), normal=channels[..., 3:6].copy())
+
+    def hits(self, camera: Camera) -> NDArray[np.bool_]:
+        depth = _render(self._feature_scene, self._depth, camera, seed=0, spp=1, jitter=False)
+        return depth[..., 0] > 0
+
+
+def _integrator(**parameters: Any) -> Any:
+    return mi.load_dict({"block_size": _BLOCK_SIZE, **parameters})
+
+
+def _render(
+    scene: Any, integrator: Any, camera: Camera, *, seed: int, spp: int, jitter: bool = True
+) -> NDArray[np.float32]:
+    """Return the picture [R, R, channels]; without jitter, samples lie on a regular grid."""
+    # Mitsuba's cameras look along +Z with +X to the left.
+    to_world = camera.c2w @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": camera.fov_deg,
+            "to_world": mi.ScalarTransform4f(to_world.tolist()),
+            "near_clip": _NEAR_CLIP,
+            "far_clip": _FAR_CLIP,
+            "film": {
+                "type": "hdrfilm",
+                "width": camera.resolution,
+                "height": camera.resolution,
+                "rfilter": {"type": "box"},
+                "pixel_format": "rgb",
+                "component_format": "float32",
+            },
+            "sampler": {"type": "multijitter", "sample_count": spp, "jitter": jitter},
+        }
+    )
+    picture = mi.render(scene, sensor=sensor, integrator=integrator, seed=mi.UInt32(seed), spp=spp)
+    return np.array(picture)

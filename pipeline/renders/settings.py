@@ -1,0 +1,86 @@
+"""`RenderSettings`: how good a picture must be, and how much it may cost."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from storage.errors import TrilightError
+from storage.metrics import MAX_DB
+
+PASS_SPP = (64, 16, 4)
+"""Samples per pixel of one pass, from best to cheapest: squares, as the sampler needs.
+
+A pass of 64 is stratified finer than four of 16: 0.1 to 0.3 dB less error on sampled scenes, and 1
+to 2 dB in the median pixel of the easy ones (LOG.md). The small ones are for quick previews.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderSettings:
+    """The target, the budget and the estimator of every picture of a build."""
+
+    resolution: int
+    """Width and height in pixels, a multiple of 8."""
+    noise_floor_db: float
+    """Sampling stops when the measured floor (psnr_log_db) reaches this."""
+    min_spp: int
+    """Samples per pixel, both halves together, before a measured floor may be believed: the
+    estimate is honest from 128 on (64 a half)."""
+    max_spp: int
+    """The cap: sampling stops here whatever the floor is."""
+    max_depth: int = 10
+    """Longest path in edges: 1 sees emitters alone, 2 adds direct light."""
+    rr_depth: int = 5
+    """Paths longer than this many edges go on by Russian roulette."""
+    aux_spp: int = 64
+    """Samples per pixel of the albedo and normal pictures that guide the denoiser."""
+    denoiser: Literal["high", "fast", "off"] = "high"
+    """Quality of Open Image Denoise; `fast` costs 1 to 2 dB and saves 0.3 core-seconds."""
+    min_mean_radiance: float = 0.01
+    """A view whose first samples are darker than this on average is rejected as black_view."""
+
+    def __post_init__(self) -> None:
+        _require(
+            self.resolution > 0 and self.resolution % 8 == 0,
+            f"resolution is {self.resolution}; expected a positive multiple of 8",
+        )
+        _require(
+            0 < self.noise_floor_db < MAX_DB,
+            f"noise_floor_db is {self.noise_floor_db}; expected dB between 0 and {MAX_DB:.0f}",
+        )
+        _require(
+            0 < self.min_spp <= self.max_spp,
+            f"min_spp is {self.min_spp} and max_spp {self.max_spp}; expected 0 < min <= max",
+        )
+        unit = 2 * PASS_SPP[-1]
+        _require(
+            self.min_spp % unit == 0 and self.max_spp % unit == 0,
+            f"min_spp is {self.min_spp} and max_spp {self.max_spp}; expected multiples of {unit}, "
+            f"and of {2 * PASS_SPP[0]} for the best sampling",
+        )
+        _require(self.aux_spp in PASS_SPP, f"aux_spp is {self.aux_spp}; expected one of {PASS_SPP}")
+        _require(
+            self.max_depth >= 1 and self.rr_depth >= 1,
+            f"max_depth is {self.max_depth} and rr_depth {self.rr_depth}; expected 1 or more",
+        )
+        _require(
+            self.denoiser in ("high", "fast", "off"),
+            f"denoiser is {self.denoiser!r}; expected high, fast or off",
+        )
+        _require(
+            self.min_mean_radiance >= 0,
+            f"min_mean_radiance is {self.min_mean_radiance}; expected 0 or more",
+        )
+
+    @property
+    def pass_spp(self) -> int:
+        """Samples per pixel of one pass: the largest of PASS_SPP that divides both halves."""
+        return next(
+            size
+            for size in PASS_SPP
+            if self.min_spp % (2 * size) == 0 and self.max_spp % (2 * size) == 0
+        )
+
+
+def _require(law: bool, complaint: str) -> None:
+    if not law:
+        raise TrilightError(f"render settings: {complaint}.")

@@ -1,0 +1,68 @@
+"""`Tracer`: what the renderer asks of Mitsuba, whichever variant runs.
+
+Two of them exist. `VectorTracer` is a path tracer of our own for the LLVM variant. `PluginTracer`
+is Mitsuba's stock path integrator: it is what `scalar_rgb` can run, and the independent twin that
+the other is tested against. Both estimate the same integral.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.renders.camera import Camera
+from storage.scene import Scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Features:
+    """What guides the denoiser, averaged over the area of each pixel."""
+
+    albedo: NDArray[np.float32]
+    """[R, R, 3] diffuse + specular albedo of the first surface, 0 where there is none."""
+    normal: NDArray[np.float32]
+    """[R, R, 3] its shading normal in world space, 0 where there is none."""
+
+
+class Tracer(Protocol):
+    """One loaded scene. Emitters are hidden from camera rays in everything that it returns."""
+
+    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        """Return the mean of one pass of samples, linear radiance [R, R, 3].
+
+        Equal arguments give equal bits, whatever the number of threads.
+
+        Args:
+            camera: the view.
+            seed: 31 bits; passes with different seeds are independent.
+            spp: samples per pixel, a square of a power of two.
+        """
+        ...
+
+    def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
+        """Return the albedo and normal pictures."""
+        ...
+
+    def hits(self, camera: Camera) -> NDArray[np.bool_]:
+        """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
+        ...
+
+
+def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> Tracer:
+    """Return the fastest tracer of the variant that `activate` has set, with the scene loaded."""
+    import mitsuba  # not before `activate`, which says where compiled kernels are kept
+
+    if mitsuba.variant() == "llvm_ad_rgb":
+        from pipeline.renders.vector_tracer import VectorTracer
+
+        return VectorTracer(scene, max_depth=max_depth, rr_depth=rr_depth)
+    from pipeline.renders.plugin_tracer import PluginTracer
+
+    return PluginTracer(scene, max_depth=max_depth, rr_depth=rr_depth)
+
+
+def split_triangles(scene: Scene) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the triangle rows of surfaces and those of emitters."""
+    emits = scene.triangle_emits
+    return np.flatnonzero(~emits), np.flatnonzero(emits)

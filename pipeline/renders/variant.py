@@ -1,0 +1,126 @@
+"""Which of Mitsuba's variants this machine can run, found out by really rendering with it.
+
+LLVM is loaded at run time, and a library that loads may still abort the whole process while it
+compiles (LLVM 15 does, "Cannot select: fminimum"). So each candidate renders a tiny picture in a
+process of its own, without any kernel that another library compiled. The answer is remembered.
+
+Nothing here imports mitsuba, except `activate`.
+"""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+from pipeline.renders.llvm_libraries import llvm_libraries
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+
+_ROOT = Path(__file__).parents[2]
+_PROBE_S = 180
+_REMEMBERED_TRIES = 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """What Mitsuba runs on."""
+
+    name: Literal["llvm_ad_rgb", "scalar_rgb"]
+    """Mitsuba's name for it."""
+    libllvm: str
+    """The LLVM library that it compiles with; empty for scalar_rgb."""
+    note: str
+    """One sentence for the user where this is the slow fallback, else empty."""
+
+
+def choose_variant() -> Variant:
+    """Return the fastest variant that works here; later calls read the remembered probes."""
+    tried = []
+    for library in llvm_libraries():
+        if _works(library):
+            return Variant(name="llvm_ad_rgb", libllvm=str(library), note="")
+        tried.append(library.name)
+    found = f"of {', '.join(tried)} none works with Mitsuba" if tried else "no LLVM library found"
+    return Variant(
+        name="scalar_rgb",
+        libllvm="",
+        note=f"{found}, so rendering takes ten times as long; `apt-get install libllvm19` mends it",
+    )
+
+
+def activate(variant: Variant) -> None:
+    """Make Mitsuba ready in this process; call before anything imports mitsuba.
+
+    Compiled kernels are kept below the cache folder, apart for each LLVM library: Dr.Jit itself
+    would run kernels of one library under another.
+    """
+    if variant.libllvm:
+        os.environ["DRJIT_LIBLLVM_PATH"] = variant.libllvm
+        kernels = cache_folder("kernels") / _identity(Path(variant.libllvm))[:16]
+        with contextlib.suppress(OSError):  # a cache that cannot be written costs time, no more
+            kernels.mkdir(parents=True, exist_ok=True)
+            os.environ["DRJIT_CACHE_DIR"] = str(kernels)
+    import mitsuba
+
+    mitsuba.set_variant(variant.name)
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+
+
+def _works(library: Path) -> bool:
+    """Return whether Mitsuba renders with a library, from memory or by a probe."""
+    memory = cache_folder("llvm_probes.json")
+    identity = _identity(library)
+    answers = _remembered(memory)
+    if identity not in answers:
+        answers[identity] = _probe(library)
+        recent = dict(list(answers.items())[-_REMEMBERED_TRIES:])
+        with contextlib.suppress(TrilightError):  # remembered next time, or probed again
+            write_atomically(memory, json.dumps(recent).encode())
+    return answers[identity]
+
+
+def _remembered(memory: Path) -> dict[str, bool]:
+    try:
+        answers = json.loads(memory.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(answers, dict):
+        return {}
+    return {name: answer for name, answer in answers.items() if isinstance(answer, bool)}
+
+
+def _identity(library: Path) -> str:
+    """Return a name that changes whenever the library or Mitsuba does."""
+    status = library.stat()
+    versions = [metadata.version(name) for name in ("mitsuba", "drjit")]
+    return sha256_hex(canonical_json([str(library), status.st_mtime_ns, status.st_size, *versions]))
+
+
+def _probe(library: Path) -> bool:
+    """Render a tiny picture in a child; an abort, a hang or a wrong picture is a no."""
+    with tempfile.TemporaryDirectory() as kernels:
+        environment = {
+            **os.environ,
+            "DRJIT_LIBLLVM_PATH": str(library),
+            "DRJIT_CACHE_DIR": kernels,
+        }
+        try:
+            result = subprocess.run(
+                [sys.executable, "-m", "pipeline.renders.variant_probe"],
+                cwd=_ROOT,
+                env=environment,
+                capture_output=True,
+                timeout=_PROBE_S,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return False
+    return result.returncode == 0

@@ -1,0 +1,80 @@
+"""Tiny networks with awake heads, and random scenes for them."""
+
+import dataclasses
+
+import torch
+from torch import Tensor, nn
+
+from model.config import ModelConfig
+from model.renderformer import RenderFormer
+from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes
+
+RESOLUTION = 16
+
+
+def tiny_config(head: str = "linear", **changes: object) -> ModelConfig:
+    config = ModelConfig(
+        width=48,
+        num_heads=2,
+        encoder_layers=2,
+        decoder_layers=2,
+        hidden_width=32,
+        num_registers=2,
+        rope_num_freqs=1,
+        rope_max_freq=5.0,
+        head="linear",
+    )
+    if head == "dpt":
+        dpt = {"dpt_features": 4, "dpt_channels": (4, 6, 4, 8), "dpt_taps": (0, 1, 0, 1)}
+        config = dataclasses.replace(config, head="dpt", **dpt)  # type: ignore[arg-type]
+    return dataclasses.replace(config, **changes)  # type: ignore[arg-type]
+
+
+def awake(config: ModelConfig, dtype: torch.dtype = torch.float64, seed: int = 0) -> RenderFormer:
+    """Return a network none of whose parts is zero or one: it stands for a trained one."""
+    generator = torch.Generator().manual_seed(seed)
+    model = RenderFormer(config)
+    model.initialise(generator)
+    for module in model.modules():
+        if isinstance(module, nn.RMSNorm):
+            assert module.weight is not None
+            nn.init.uniform_(module.weight, 0.7, 1.3, generator=generator)
+        elif isinstance(module, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
+            if module.bias is not None:
+                nn.init.normal_(module.bias, std=0.1, generator=generator)
+    nn.init.normal_(model.decoder.head.last.weight, std=0.2, generator=generator)
+    return model.to(dtype).eval()
+
+
+def random_pose(generator: torch.Generator) -> Tensor:
+    rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotation * torch.det(rotation).sign()
+    pose[:3, 3] = 2 * torch.randn(3, generator=generator, dtype=torch.float64)
+    return pose
+
+
+def random_scene(
+    num_triangles: int, num_views: int = 2, seed: int = 0, dtype: torch.dtype = torch.float64
+) -> SceneTensors:
+    generator = torch.Generator().manual_seed(seed)
+    normals = torch.randn(num_triangles, 3, 3, generator=generator, dtype=torch.float64)
+    poses = torch.stack([random_pose(generator) for _ in range(num_views)])
+    fov_deg = torch.rand(num_views, generator=generator, dtype=torch.float64)
+    return SceneTensors(
+        triangles_T33=torch.randn(num_triangles, 3, 3, generator=generator).to(dtype),
+        normals_T33=(normals / normals.norm(dim=-1, keepdim=True)).to(dtype),
+        material_T10=torch.rand(num_triangles, 10, generator=generator).to(dtype),
+        c2w_V44=poses.to(dtype),
+        fov_deg_V=(30 + 30 * fov_deg).to(dtype),
+    )
+
+
+def render(model: RenderFormer, *scenes: SceneTensors, resolution: int = RESOLUTION) -> Tensor:
+    with torch.no_grad():
+        pictures: Tensor = model(batch_scenes(scenes), resolution)
+    return pictures
+
+
+def with_fields(batch: SceneBatch, **fields: Tensor) -> SceneBatch:
+    return dataclasses.replace(batch, **fields)

@@ -1,0 +1,205 @@
+"""Laws of the whole network, in float64 on tiny sizes, for both heads.
+
+Tolerance 1e-11: pictures of size 1 after some twenty layers of float64 sums; a broken law changes
+them by 1e-3 and more, as the two guards at the end show.
+"""
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+from torch.func import functional_call
+
+from model.renderformer import RenderFormer, radiance
+from model.scene_tensors import SceneTensors, batch_scenes
+from storage.errors import TrilightError
+from tests.model.kit import (
+    RESOLUTION,
+    awake,
+    random_pose,
+    random_scene,
+    render,
+    tiny_config,
+    with_fields,
+)
+
+TIGHT = 1e-11
+
+HEADS = ["linear", "dpt"]
+
+
+def model_for(head: str) -> RenderFormer:
+    return awake(tiny_config(head))
+
+
+def close(got: Tensor, expected: Tensor) -> None:
+    torch.testing.assert_close(got, expected, rtol=0, atol=TIGHT)
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_company_and_padding_do_not_change_a_picture(head: str) -> None:
+    model = model_for(head)
+    short, long = random_scene(5, seed=1), random_scene(19, seed=2)
+    together = render(model, short, long)
+    assert together.shape == (2, 2, RESOLUTION, RESOLUTION, 3)
+    close(together[0], render(model, short)[0])
+    close(together[1], render(model, long)[0])
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_finite_garbage_in_the_padding_changes_nothing(head: str) -> None:
+    model = model_for(head)
+    batch = batch_scenes([random_scene(3, seed=1), random_scene(6, seed=2)])
+    triangles, normals = batch.triangles_BT33.clone(), batch.normals_BT33.clone()
+    triangles[0, 3:], normals[0, 3:] = 1e3, 7.0
+    dirty = with_fields(batch, triangles_BT33=triangles, normals_BT33=normals)
+    with torch.no_grad():
+        close(model(dirty, RESOLUTION), model(batch, RESOLUTION))
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_the_order_of_triangles_does_not_matter(head: str) -> None:
+    scene = random_scene(11)
+    order = torch.randperm(11, generator=torch.Generator().manual_seed(5))
+    shuffled = dataclasses.replace(
+        scene,
+        triangles_T33=scene.triangles_T33[order],
+        normals_T33=scene.normals_T33[order],
+        material_T10=scene.material_T10[order],
+    )
+    model = model_for(head)
+    close(render(model, shuffled), render(model, scene))
+
+
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize("distance", [1.0, 100.0])
+def test_translating_the_world_changes_neither_context_nor_picture(
+    head: str, distance: float
+) -> None:
+    model = model_for(head)
+    scene = random_scene(9)
+    moved = translated(scene, torch.tensor([distance, -2 * distance, 0.5], dtype=torch.float64))
+    with torch.no_grad():
+        context = model.encoder(batch_scenes([scene]))
+        context_moved = model.encoder(batch_scenes([moved]))
+    # Angles grow with the distance, and so does what float64 loses of them.
+    torch.testing.assert_close(context_moved, context, rtol=0, atol=TIGHT * distance)
+    torch.testing.assert_close(
+        render(model, moved), render(model, scene), rtol=0, atol=TIGHT * distance
+    )
+
+
+def translated(scene: SceneTensors, offset: Tensor) -> SceneTensors:
+    poses = scene.c2w_V44.clone()
+    poses[:, :3, 3] += offset
+    return dataclasses.replace(scene, triangles_T33=scene.triangles_T33 + offset, c2w_V44=poses)
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_views_one_by_one_or_together(head: str) -> None:
+    model = model_for(head)
+    scene = random_scene(8, num_views=3)
+    together = render(model, scene)[0]
+    for view in range(3):
+        alone = dataclasses.replace(
+            scene, c2w_V44=scene.c2w_V44[[view]], fov_deg_V=scene.fov_deg_V[[view]]
+        )
+        close(render(model, alone)[0, 0], together[view])
+
+
+def test_float32_stays_near_float64() -> None:
+    scene = random_scene(9)
+    precise = render(awake(tiny_config(), torch.float64), scene)
+    single = SceneTensors(**{name: value.float() for name, value in vars(scene).items()})
+    rounded = render(awake(tiny_config(), torch.float32), single).double()
+    # float32 through twenty layers; positions of size 3 at frequency 5 cost another digit
+    torch.testing.assert_close(rounded, precise, rtol=0, atol=2e-5)
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    model = awake(tiny_config(width=36, hidden_width=8, encoder_layers=1, decoder_layers=1))
+    batch = batch_scenes([random_scene(2, num_views=1, seed=1), random_scene(3, 1, seed=2)])
+    names = ["encoder.registers_NW", "encoder.tokens.material.weight", "decoder.head.norm.weight"]
+    weights = dict(model.named_parameters())
+
+    def picture(triangles: Tensor, normals: Tensor, c2w: Tensor, *changed: Tensor) -> Tensor:
+        scene = with_fields(batch, triangles_BT33=triangles, normals_BT33=normals, c2w_BV44=c2w)
+        replaced = dict(zip(names, changed, strict=True))
+        return functional_call(model, replaced, (scene, 8))[..., ::5, ::5, :]
+
+    inputs = [batch.triangles_BT33, batch.normals_BT33, batch.c2w_BV44]
+    inputs += [weights[name].detach().clone() for name in names]
+    assert torch.autograd.gradcheck(picture, [value.requires_grad_() for value in inputs])
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_every_parameter_reaches_the_picture(head: str) -> None:
+    model = model_for(head)
+    scene = random_scene(6)
+    before = render(model, scene)
+    for name, weight in model.named_parameters():
+        kept = weight.detach().clone()
+        noise = torch.randn(weight.shape, generator=torch.Generator().manual_seed(1))
+        with torch.no_grad():
+            weight.add_(0.1 * noise)
+        # 1e-9 is far above float64's rounding and far below the effect of a tenth
+        assert (render(model, scene) - before).abs().max() > 1e-9, name
+        with torch.no_grad():
+            weight.copy_(kept)
+
+
+def test_a_fresh_network_is_black_and_learns_from_every_picture() -> None:
+    model = RenderFormer(tiny_config()).double()
+    model.initialise(torch.Generator().manual_seed(0))
+    output = model(batch_scenes([random_scene(4)]), RESOLUTION)
+    assert torch.all(output == 0)
+    (output - 0.1).abs().mean().backward()
+    bias = model.decoder.head.last.bias
+    assert bias is not None and bias.grad is not None
+    # 192 values share a mean of slope 1 / 3 each channel: not a thousandth of it, as behind the ELU
+    assert bias.grad.abs().sum() > 0.9
+
+
+def test_initial_weights_depend_on_the_generator_alone() -> None:
+    first, second = (awake(tiny_config("dpt"), seed=4) for _ in range(2))
+    for (name, a), b in zip(first.named_parameters(), second.parameters(), strict=True):
+        assert torch.equal(a, b), name
+
+
+def test_radiance_undoes_the_logarithm_and_bounds_the_dark() -> None:
+    log10 = torch.tensor([0.0, 0.5, 3.0], dtype=torch.float64)
+    expected = torch.tensor([0.0, 10**0.5 - 1, 999.0], dtype=torch.float64)
+    torch.testing.assert_close(radiance(log10), expected)
+    darkest = radiance(torch.tensor([-50.0], dtype=torch.float64)).item()
+    assert -2.31e-3 < darkest < -2.29e-3  # 10^-0.001 - 1
+
+
+@pytest.mark.parametrize("resolution", [0, 4, 12, -8])
+def test_a_resolution_that_bundles_do_not_fill_is_refused(resolution: int) -> None:
+    with pytest.raises(TrilightError, match=f"resolution {resolution}: expected a multiple of 8"):
+        render(model_for("linear"), random_scene(2), resolution=resolution)
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_rotation_and_vertex_order_do_change_the_picture(head: str) -> None:
+    """Guards: a network without positions would pass every law above."""
+    model = model_for(head)
+    scene = random_scene(6)
+    rotation = random_pose(torch.Generator().manual_seed(9))[:3, :3]
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotation
+    turned = dataclasses.replace(
+        scene,
+        triangles_T33=scene.triangles_T33 @ rotation.T,
+        normals_T33=scene.normals_T33 @ rotation.T,
+        c2w_V44=pose @ scene.c2w_V44,
+    )
+    relabelled = dataclasses.replace(
+        scene,
+        triangles_T33=scene.triangles_T33.roll(1, dims=1),
+        normals_T33=scene.normals_T33.roll(1, dims=1),
+    )
+    before = render(model, scene)
+    assert (render(model, turned) - before).abs().max() > 1e-4
+    assert (render(model, relabelled) - before).abs().max() > 1e-4

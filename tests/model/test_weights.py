@@ -1,0 +1,70 @@
+"""Weights go round through bytes, and nothing else is accepted."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from safetensors.torch import load, save
+from torch import Tensor
+
+from model.weights import CONFIG_KEY, decode_weights, encode_config, encode_weights
+from storage.errors import TrilightError
+from tests.model.kit import awake, tiny_config
+
+
+@pytest.mark.parametrize("head", ["linear", "dpt"])
+def test_round_trip_is_exact_and_reproducible(head: str) -> None:
+    model = awake(tiny_config(head), torch.float32)
+    data = encode_weights(model)
+    again = decode_weights(data)
+    assert again.config == model.config
+    assert not again.training
+    for (name, a), b in zip(model.named_parameters(), again.parameters(), strict=True):
+        assert torch.equal(a, b), name
+    assert encode_weights(again) == data
+
+
+def without_first(tensors: dict[str, Tensor]) -> None:
+    del tensors["decoder.token_W"]
+
+
+def with_other_shape(tensors: dict[str, Tensor]) -> None:
+    tensors["decoder.token_W"] = torch.zeros(3)
+
+
+def with_stranger(tensors: dict[str, Tensor]) -> None:
+    tensors["stranger"] = torch.zeros(3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without_first, r"decoder.token_W is missing, expected \(48,\)"),
+        (with_other_shape, r"decoder.token_W is \(3,\), expected \(48,\)"),
+        (with_stranger, r"stranger is \(3,\), expected no such tensor"),
+    ],
+)
+def test_wrong_tensors_are_listed(
+    change: Callable[[dict[str, Tensor]], None], message: str
+) -> None:
+    config = tiny_config()
+    tensors = load(encode_weights(awake(config, torch.float32)))
+    change(tensors)
+    with pytest.raises(TrilightError, match=message):
+        decode_weights(save(tensors, metadata={CONFIG_KEY: encode_config(config)}))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"PK\x03\x04 a zip with a pickle in it",
+        save({"a": torch.zeros(1)}),
+        save({"a": torch.zeros(1)}, metadata={CONFIG_KEY: "{}"}),
+        save({"a": torch.zeros(1)}, metadata={CONFIG_KEY: "[1]"}),
+    ],
+    ids=["empty", "zip", "no config", "empty config", "no object"],
+)
+def test_other_files_are_refused(data: bytes) -> None:
+    with pytest.raises(TrilightError):
+        decode_weights(data)

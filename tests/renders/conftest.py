@@ -1,0 +1,22 @@
+"""Mitsuba is activated once for all render tests, as a render child does it."""
+
+import pytest
+
+from pipeline.renders.renderer import set_threads
+from pipeline.renders.variant import Variant, activate, choose_variant
+
+
+@pytest.fixture(scope="session", autouse=True)
+def variant() -> Variant:
+    """What this machine renders with."""
+    chosen = choose_variant()
+    activate(chosen)
+    set_threads(2)
+    return chosen
+
+
+@pytest.fixture
+def llvm(variant: Variant) -> None:
+    """Skips where no LLVM library works."""
+    if variant.name != "llvm_ad_rgb":
+        pytest.skip(variant.note)

@@ -1,0 +1,201 @@
+"""Small scenes for the render tests: parts in numpy, joined to a `Scene`.
+
+`sampled_like_scene` imitates what the templates make (shell, one to three objects, one to eight
+triangle lights), so that tests and measurements of the renderer need no other stage.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from storage.conventions import look_at_c2w
+from storage.scene import ObjectKind, Scene, SceneObject
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """One object of a test scene: triangles [T, 3, 3], normals [T, 3, 3], one material row [10]."""
+
+    triangles: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    material: NDArray[np.float64]
+    kind: ObjectKind
+
+
+def material(
+    *,
+    diffuse: ArrayLike = 0.0,
+    specular: ArrayLike = 0.0,
+    roughness: float = 1.0,
+    emission: ArrayLike = 0.0,
+) -> NDArray[np.float64]:
+    """Return one material row; scalars mean grey."""
+    row = np.zeros(10)
+    row[0:3], row[3:6], row[6], row[7:10] = diffuse, specular, roughness, emission
+    return row
+
+
+def flat(triangles: ArrayLike, material_row: NDArray, kind: ObjectKind = "object") -> Part:
+    """Return a part whose shading normals are those of its faces."""
+    corners = np.asarray(triangles, np.float64).reshape(-1, 3, 3)
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face_normals /= np.linalg.norm(face_normals, axis=1, keepdims=True)
+    normals = np.repeat(face_normals[:, None], 3, axis=1)
+    return Part(triangles=corners, normals=normals, material=material_row, kind=kind)
+
+
+def quad(corners: ArrayLike, material_row: NDArray, kind: ObjectKind = "shell") -> Part:
+    """Return a flat quadrilateral from its four corners [4, 3] in order."""
+    ring: NDArray[np.float64] = np.asarray(corners, np.float64)
+    return flat(ring[np.array([[0, 1, 2], [0, 2, 3]])], material_row, kind)
+
+
+def light(triangle: ArrayLike, radiance: ArrayLike) -> Part:
+    """Return one emitting triangle [3, 3], whose white albedo must not matter."""
+    return flat(np.asarray(triangle), material(diffuse=1.0, emission=radiance), "emitter")
+
+
+def sphere(centre: ArrayLike, radius: float, material_row: NDArray, rings: int = 12) -> Part:
+    """Return a smooth sphere of 4 * rings * (rings - 1) triangles."""
+    theta = np.linspace(0, np.pi, rings + 1)
+    phi = np.linspace(0, 2 * np.pi, 2 * rings + 1)
+    t, p = np.meshgrid(theta, phi, indexing="ij")
+    grid = np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], axis=-1)
+    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    # At the poles one of the two triangles of a cell has no area.
+    lower = np.stack([a, b, c], axis=-2)[:-1].reshape(-1, 3, 3)
+    upper = np.stack([a, c, d], axis=-2)[1:].reshape(-1, 3, 3)
+    unit = np.concatenate([lower, upper])
+    corners = unit * radius + np.asarray(centre, np.float64)
+    return Part(triangles=corners, normals=unit, material=material_row, kind="object")
+
+
+def box(
+    centre: ArrayLike,
+    size: float,
+    material_row: NDArray,
+    turn: float = 0.0,
+    kind: ObjectKind = "object",
+) -> Part:
+    """Return a flat cube of 12 triangles, turned about z by `turn` radians."""
+    corners = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            normal, u, v = (np.eye(3)[(axis + step) % 3] for step in range(3))
+            normal, u = normal * sign, u * sign
+            ring = np.array([normal - u - v, normal + u - v, normal + u + v, normal - u + v])
+            corners.append(quad(ring * size / 2, material_row).triangles)
+    cos, sin = np.cos(turn), np.sin(turn)
+    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    placed = np.concatenate(corners) @ rotation.T + np.asarray(centre, np.float64)
+    return flat(placed, material_row, kind)
+
+
+def furnace(radiance: float = 1.0) -> Part:
+    """Return a box around everything that emits the same radiance from everywhere."""
+    return box([0, 0, 0], 40.0, material(diffuse=1.0, emission=radiance), kind="emitter")
+
+
+def join(
+    parts: Sequence[Part],
+    *,
+    eye: ArrayLike = (0.0, -2.0, 0.5),
+    target: ArrayLike = (0.0, 0.0, 0.0),
+    fov_deg: float = 40.0,
+) -> Scene:
+    """Return the scene of `parts` with one camera; every part has its own material row."""
+    counts = [len(part.triangles) for part in parts]
+    rows = np.repeat(np.arange(len(parts)), counts).astype(np.uint16)
+    positions = np.concatenate([part.triangles for part in parts]).reshape(-1, 3)
+    scene = Scene(
+        vertex_positions=positions.astype(np.float32),
+        vertex_normals=np.concatenate([part.normals for part in parts])
+        .reshape(-1, 3)
+        .astype(np.float32),
+        faces=np.arange(3 * sum(counts), dtype=np.uint32).reshape(-1, 3),
+        material_index=rows,
+        materials=np.array([part.material for part in parts], np.float32),
+        object_index=rows,
+        c2w=look_at_c2w(eye=eye, target=target, up=(0, 0, 1))[None].astype(np.float32),
+        fov_deg=np.array([fov_deg], np.float32),
+        objects=tuple(
+            SceneObject(name=f"{part.kind}{row}", kind=part.kind) for row, part in enumerate(parts)
+        ),
+        provenance={},
+    )
+    scene.check()
+    return scene
+
+
+def sampled_like_scene(rng: np.random.Generator, *, num_views: int = 4) -> Scene:
+    """Return a scene of the published distribution's flavour: shell, objects, lights, cameras."""
+    kind = int(rng.integers(4))
+    parts = [quad(corners, _random_material(rng), "shell") for corners in _shell(kind)]
+    for _ in range(int(rng.integers(1, 4))):
+        centre = rng.uniform(-0.3, 0.3, 3)
+        size = rng.uniform(0.2, 0.45)
+        row = _random_material(rng)
+        if rng.uniform() < 0.6:
+            parts.append(sphere(centre, size / 2, row, rings=14))
+        else:
+            parts.append(box(centre, size * 0.8, row, turn=rng.uniform(0, np.pi)))
+    num_lights = int(rng.integers(1, 9))
+    parts += [
+        light(_random_light(rng, kind), rng.uniform(2500, 5000) / num_lights)
+        for _ in range(num_lights)
+    ]
+    scene = join(parts)
+    poses = np.stack([_random_pose(rng, kind) for _ in range(num_views)])
+    return scene.with_cameras(
+        poses.astype(np.float32), rng.uniform(30, 60, num_views).astype(np.float32)
+    )
+
+
+def _shell(kind: int) -> list[NDArray]:
+    s = 0.5
+    floor = np.array([[-s, -s, -s], [s, -s, -s], [s, s, -s], [-s, s, -s]])
+    back = np.array([[-s, s, -s], [s, s, -s], [s, s, s], [-s, s, s]])
+    left = np.array([[-s, -s, -s], [-s, s, -s], [-s, s, s], [-s, -s, s]])
+    right = np.array([[s, s, -s], [s, -s, -s], [s, -s, s], [s, s, s]])
+    grow = 1.6 if kind == 0 else 1.1
+    return [wall * grow for wall in [floor, back, left, right][: kind + 1]]
+
+
+def _random_material(rng: np.random.Generator) -> NDArray[np.float64]:
+    total, ratio = rng.uniform(0.9, 1.0), rng.uniform()
+    roughness = np.clip(np.exp(rng.uniform(np.log(0.06), np.log(1.055))) - 0.05, 0.01, 1.0)
+    return material(
+        diffuse=total * (1 - ratio) * rng.uniform(size=3),
+        specular=total * ratio,
+        roughness=float(roughness),
+    )
+
+
+def _open_direction(rng: np.random.Generator, kind: int) -> NDArray[np.float64]:
+    """A direction from which the inside of the shell is seen (open towards -y, and above)."""
+    half_width = [np.pi, 0.5 * np.pi, 0.25 * np.pi, 0.15 * np.pi][kind]
+    centre = [-0.5 * np.pi, -0.5 * np.pi, -0.25 * np.pi, -0.5 * np.pi][kind]
+    azimuth = centre + rng.uniform(-half_width, half_width)
+    elevation = np.radians(rng.uniform(10, 65))
+    return np.array(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+
+
+def _random_pose(rng: np.random.Generator, kind: int) -> NDArray[np.float64]:
+    target = rng.uniform(-0.2, 0.2, 3)
+    eye = target + _open_direction(rng, kind) * rng.uniform(1.5, 2.0)
+    return look_at_c2w(eye=eye, target=target, up=(0, 0, 1))
+
+
+def _random_light(rng: np.random.Generator, kind: int) -> NDArray[np.float64]:
+    base = np.array([[-1, 1, 1], [1, -1, 1], [1, 1, -1]]) * 0.025
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    corners = (base * rng.uniform(2.0, 2.5, 3)) @ q.T
+    return corners + _open_direction(rng, kind) * rng.uniform(2.1, 2.7)

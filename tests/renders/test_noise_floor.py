@@ -1,0 +1,51 @@
+"""The stop rule and the measure behind it."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.renders.noise_floor import measure_floor, next_spp
+from storage.metrics import MAX_DB, psnr_log_db
+
+
+@given(st.integers(1, 62), st.floats(1e-6, 60), st.floats(1e-6, 60), st.sampled_from([8, 32, 128]))
+def test_samples_grow_in_whole_steps_up_to_the_cap(
+    steps: int, gap_db: float, wider_gap_db: float, step: int
+) -> None:
+    spp, cap = steps * step, 64 * step
+    chosen = next_spp(spp, gap_db=gap_db, step=step, max_spp=cap)
+    assert chosen % step == 0
+    assert spp < chosen <= cap
+    assert chosen <= max(4 * spp, spp + step)
+    if wider_gap_db >= gap_db:
+        assert chosen <= next_spp(spp, gap_db=wider_gap_db, step=step, max_spp=cap)
+
+
+def test_a_gap_of_one_slope_doubles_the_samples() -> None:
+    assert next_spp(128, gap_db=1.2, step=128, max_spp=4096) == 256
+    assert next_spp(128, gap_db=2.4, step=128, max_spp=4096) == 512
+    assert next_spp(128, gap_db=99.0, step=128, max_spp=4096) == 512
+    assert next_spp(512, gap_db=99.0, step=128, max_spp=640) == 640
+
+
+def test_the_floor_is_one_decibel_below_the_halves_agreement() -> None:
+    rng = np.random.default_rng(0)
+    a = rng.uniform(size=(8, 8, 3)).astype(np.float32)
+    b = a + rng.normal(scale=0.01, size=a.shape).astype(np.float32).clip(-a, None)
+    everywhere = np.ones((8, 8), bool)
+    floor = measure_floor(a, b, everywhere)
+    assert floor == measure_floor(b, a, everywhere)
+    assert floor.log_db == psnr_log_db(a, b) - 1
+    assert floor.object_log_db == floor.log_db
+    assert measure_floor(a, a, everywhere).log_db == MAX_DB - 1
+
+
+def test_an_empty_background_earns_nothing() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.uniform(size=(2, 8, 8, 3)).astype(np.float32)
+    hits = np.zeros((8, 8), bool)
+    hits[:4] = True
+    a[4:] = b[4:] = 0
+    floor = measure_floor(a, b, hits)
+    # Half of the pixels agree exactly: the mean over all is 10 log10 2 dB better.
+    np.testing.assert_allclose(floor.log_db - floor.object_log_db, 10 * np.log10(2))

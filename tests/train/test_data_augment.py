@@ -1,0 +1,92 @@
+"""Law of every symmetry: rendering the transformed scene gives the transformed picture.
+
+The renderer is the toy one, which knows nothing of symmetries. Pixels on an edge may fall on
+either side of it by rounding: at most 1 % of them may differ.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from storage.scene import Scene
+from storage.seeds import rng_for
+from tests.train.toy import toy_picture, toy_sample
+from train.data.augment import augmented, mirrored, with_channels, with_vertices_turned, with_views
+from train.data.scenes import TrainingScene, training_scene
+
+RESOLUTION = 32
+
+Symmetry = Callable[[TrainingScene], TrainingScene]
+
+SYMMETRIES: dict[str, Symmetry] = {
+    "mirror": mirrored,
+    "channels": lambda scene: with_channels(scene, np.array([2, 0, 1])),
+    "vertices": lambda scene: with_vertices_turned(
+        scene, np.arange(scene.tensors.num_triangles) % 3
+    ),
+    "views": lambda scene: with_views(scene, np.array([1])),
+    "all at random": lambda scene: augmented(scene, rng_for(0, "augment")),
+}
+
+
+def scene_behind(training: TrainingScene, original: Scene) -> Scene:
+    """Return a Scene with the geometry, materials and cameras of training tensors."""
+    tensors = training.tensors
+    materials = tensors.material_T10.numpy().copy()
+    materials[:, 7:] = 10 ** materials[:, 7:] - 1
+    return dataclasses.replace(
+        original,
+        vertex_positions=tensors.triangles_T33.reshape(-1, 3).numpy(),
+        vertex_normals=tensors.normals_T33.reshape(-1, 3).numpy(),
+        faces=np.arange(3 * tensors.num_triangles, dtype=np.uint32).reshape(-1, 3),
+        material_index=np.arange(tensors.num_triangles, dtype=np.uint16),
+        materials=materials,
+        c2w=tensors.c2w_V44.numpy(),
+        fov_deg=tensors.fov_deg_V.numpy(),
+    )
+
+
+@pytest.mark.parametrize("name", sorted(SYMMETRIES))
+@pytest.mark.parametrize("index", [0, 3, 8])
+def test_the_picture_of_the_transformed_scene_is_the_transformed_picture(
+    name: str, index: int
+) -> None:
+    sample = toy_sample(index, resolution=RESOLUTION)
+    transformed = SYMMETRIES[name](training_scene(sample, RESOLUTION))
+    scene = scene_behind(transformed, sample.scene)
+    scene.check()  # among others: poses stay rotations, normals stay unit
+    for view in range(scene.num_views):
+        expected = np.log10(1 + toy_picture(scene, view, RESOLUTION))
+        got = transformed.target_VRR3[view].numpy()
+        # float32 positions: shading moves by a millionth, except on edges
+        differs = np.abs(got - expected).max(axis=-1) > 1e-4
+        assert differs.mean() < 0.01
+        assert expected.std() > 0.01, "an empty picture would prove nothing"
+
+
+@pytest.mark.parametrize("name", sorted(SYMMETRIES))
+def test_winding_still_agrees_with_the_normals(name: str) -> None:
+    training = SYMMETRIES[name](training_scene(toy_sample(1), 8))
+    a, b, c = training.tensors.triangles_T33.unbind(1)
+    facing = torch.cross(b - a, c - a, dim=-1) * training.tensors.normals_T33[:, 0]
+    assert torch.all(facing.sum(-1) > 0)
+
+
+def test_mirroring_twice_is_nothing() -> None:
+    scene = training_scene(toy_sample(2), 16)
+    again = mirrored(mirrored(scene))
+    assert torch.equal(again.target_VRR3, scene.target_VRR3)
+    for name, value in vars(scene.tensors).items():
+        assert torch.equal(getattr(again.tensors, name), value), name
+
+
+def test_the_original_is_left_alone() -> None:
+    scene = training_scene(toy_sample(2), 16)
+    copies = {name: value.clone() for name, value in vars(scene.tensors).items()}
+    target = scene.target_VRR3.clone()
+    augmented(scene, rng_for(1, "augment"))
+    assert torch.equal(scene.target_VRR3, target)
+    assert all(torch.equal(getattr(scene.tensors, name), copies[name]) for name in copies)

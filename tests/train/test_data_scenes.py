@@ -1,0 +1,69 @@
+"""Laws of targets: block means are measurements, and bad values never reach the weights."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from storage.errors import TrilightError
+from storage.seeds import rng_for
+from tests.train.toy import toy_sample
+from train.data.buckets import LONGEST_TO_SHORTEST, bucket_scenes
+from train.data.resolution import block_mean
+from train.data.scenes import training_scene
+
+
+def test_a_smaller_picture_is_the_mean_of_its_blocks() -> None:
+    pictures = rng_for(0, "pictures").uniform(0, 9, (2, 12, 12, 3)).astype(np.float32)
+    small = block_mean(pictures, 4)
+    assert small.shape == (2, 4, 4, 3) and small.dtype == np.float32
+    for row in range(4):
+        for column in range(4):
+            block = pictures[:, 3 * row : 3 * row + 3, 3 * column : 3 * column + 3]
+            # float32 mean of nine numbers below 9
+            expected = block.mean(axis=(1, 2), dtype=np.float64)
+            np.testing.assert_allclose(small[:, row, column], expected, rtol=1e-6)
+
+
+def test_halving_twice_is_quartering_and_light_is_kept() -> None:
+    pictures = rng_for(1, "pictures").uniform(0, 9, (1, 16, 16, 3)).astype(np.float32)
+    twice = block_mean(block_mean(pictures, 8), 4)
+    np.testing.assert_allclose(twice, block_mean(pictures, 4), rtol=1e-6)  # float32 means
+    np.testing.assert_allclose(twice.mean(), pictures.mean(), rtol=1e-6)
+    assert block_mean(pictures, 16) is pictures
+
+
+@pytest.mark.parametrize("resolution", [0, 5, 32])
+def test_a_resolution_that_does_not_divide_is_refused(resolution: int) -> None:
+    with pytest.raises(TrilightError, match=f"resolution {resolution}: expected a divisor of 16"):
+        block_mean(np.zeros((1, 16, 16, 3), np.float32), resolution)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -1e-3])
+def test_a_bad_target_is_refused_by_name(bad: float) -> None:
+    sample = toy_sample(4, resolution=16)
+    radiance = sample.radiance_rgb.copy()
+    radiance[1, 2, 3, 0] = bad
+    with pytest.raises(TrilightError, match=r"sample 000000004: view 1 .* at pixel \(2, 3\)"):
+        training_scene(dataclasses.replace(sample, radiance_rgb=radiance), 8)
+
+
+def test_targets_are_log10_of_one_plus_radiance() -> None:
+    sample = toy_sample(4, resolution=16)
+    target = training_scene(sample, 16).target_VRR3.numpy()
+    np.testing.assert_allclose(10.0**target - 1, sample.radiance_rgb, atol=1e-6)  # float32 log
+
+
+def test_buckets_hold_each_scene_once_and_pad_little() -> None:
+    scenes = [training_scene(toy_sample(index), 8) for index in range(12)]
+    batches = bucket_scenes(scenes)
+    lengths: list[int] = []
+    for batch in batches:
+        longest = batch.scenes.triangles_BT33.shape[1]
+        mask = batch.scenes.is_triangle_BT
+        own = mask.sum(1).tolist() if mask is not None else [longest] * len(batch.target_BVRR3)
+        assert longest == max(own) <= LONGEST_TO_SHORTEST * min(own)
+        assert len(batch.target_BVRR3) == len(own)
+        lengths += own
+    assert sorted(lengths) == sorted(scene.tensors.num_triangles for scene in scenes)
+    assert len(batches) > 1

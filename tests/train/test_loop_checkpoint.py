@@ -1,0 +1,112 @@
+"""Checkpoints hold all that changes, and are refused where they do not belong."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from storage.errors import TrilightError
+from tests.train.kit import TINY_MODEL, tiny_run
+from tests.train.toy import toy_sample
+from train.data.buckets import make_batch
+from train.data.scenes import training_scene
+from train.loop.checkpoint import load_checkpoint, save_checkpoint
+from train.loop.metrics_log import MetricsLog, read_rows
+from train.loop.state import TrainState, follow, new_state
+from train.loop.step import train_step
+
+DIGEST = "d" * 64
+
+
+def trained(steps: int = 3) -> TrainState:
+    state = new_state(tiny_run())
+    batch = make_batch([training_scene(toy_sample(0), 16)])
+    for _ in range(steps):
+        one_step(state, batch)
+    return state
+
+
+def one_step(state: TrainState, batch: object) -> None:
+    train_step(
+        state.model,
+        state.optimizer,
+        [batch],  # type: ignore[list-item]
+        resolution=16,
+        learning_rate=1e-3,
+        grad_clip=1.0,
+    )
+    state.step += 1
+    follow(state, decay=0.9)
+
+
+@pytest.mark.parametrize("steps", [0, 3])
+def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
+    state = trained(steps)
+    path = tmp_path / "checkpoint"
+    save_checkpoint(path, state, tiny_run(), DIGEST)
+    loaded = load_checkpoint(path, tiny_run(), DIGEST)
+    assert (loaded.step, loaded.skipped_steps) == (state.step, state.skipped_steps)
+    batch = make_batch([training_scene(toy_sample(1), 16)])
+    for each in (state, loaded):
+        one_step(each, batch)
+    for name in ("model", "average"):
+        ours, theirs = getattr(state, name).state_dict(), getattr(loaded, name).state_dict()
+        assert all(torch.equal(ours[key], theirs[key]) for key in ours)
+
+
+def test_equal_states_give_equal_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        save_checkpoint(tmp_path / name, trained(), tiny_run(), DIGEST)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_skipped_steps_do_not_count_as_updates(tmp_path: Path) -> None:
+    state = trained(2)
+    state.step, state.skipped_steps = 5, 3
+    save_checkpoint(tmp_path / "c", state, tiny_run(), DIGEST)
+    loaded = load_checkpoint(tmp_path / "c", tiny_run(), DIGEST)
+    assert {float(memory["step"]) for memory in loaded.optimizer.state.values()} == {2.0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "digest", "message"),
+    [
+        ({"seed": 1}, DIGEST, "settings.seed is 1, but the checkpoint was made with 0"),
+        ({"num_steps": 20}, DIGEST, "settings.num_steps is 20"),
+        (
+            {"model": dataclasses.replace(TINY_MODEL, hidden_width=64)},
+            DIGEST,
+            "settings.model.hidden_width is 64, but the checkpoint was made with 48",
+        ),
+        ({}, "e" * 64, "data.digest is eee"),
+    ],
+)
+def test_another_run_or_other_data_is_refused_by_field(
+    tmp_path: Path, changes: dict[str, object], digest: str, message: str
+) -> None:
+    save_checkpoint(tmp_path / "c", new_state(tiny_run()), tiny_run(), DIGEST)
+    with pytest.raises(TrilightError, match=message):
+        load_checkpoint(tmp_path / "c", tiny_run(**changes), digest)
+
+
+def test_a_missing_or_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
+        load_checkpoint(tmp_path / "c", tiny_run(), DIGEST)
+    save_checkpoint(tmp_path / "c", new_state(tiny_run()), tiny_run(), DIGEST)
+    data = (tmp_path / "c").read_bytes()
+    for damaged in (b"", data[:100], data[:-1], b"PK\x03\x04" + data):
+        (tmp_path / "c").write_bytes(damaged)
+        with pytest.raises(TrilightError):
+            load_checkpoint(tmp_path / "c", tiny_run(), DIGEST)
+
+
+def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    log = MetricsLog(path, first_step=0)
+    for step in (2, 4, 6):
+        log.append({"step": step, "loss": 1.0 / step})
+    with path.open("a") as stream:
+        stream.write('{"step": 8, "lo')
+    MetricsLog(path, first_step=4)
+    assert [row["step"] for row in read_rows(path)] == [2, 4]

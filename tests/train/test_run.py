@@ -1,0 +1,214 @@
+"""Laws of a run: interrupted is uninterrupted, learning is learning, a mistake is one line."""
+
+import json
+import os
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from model.weights import decode_weights
+from storage.dataset import Dataset
+from storage.errors import TrilightError
+from tests.train.kit import tiny_run
+from tests.train.toy import write_toy_dataset
+from train.loop.metrics_log import read_rows
+from train.progress import Silent
+from train.run import TrainResult, train_run
+from train.settings import TrainSettings
+
+TIMINGS = {"views_per_s", "data_wait_share"}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=7, validation=2, per_shard=3)
+
+
+@pytest.fixture(scope="module")
+def whole(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
+    return run(tiny_run(), dataset, tmp_path_factory.mktemp("whole"))
+
+
+def run(
+    settings: TrainSettings,
+    dataset: Dataset,
+    out: Path,
+    *,
+    resume: bool = False,
+    progress: Silent | None = None,
+) -> TrainResult:
+    return train_run(
+        settings, data=str(dataset.folder.root), out=out, resume=resume, progress=progress
+    )
+
+
+class SignalAt(Silent):
+    """A person who presses Ctrl-C, or a scheduler that sends SIGTERM."""
+
+    def __init__(self, step: int, number: int) -> None:
+        self.step = step
+        self.number = number
+
+    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
+        if step == self.step:
+            os.kill(os.getpid(), self.number)
+
+
+class Killed(BaseException):
+    """Stands for a power cut: nothing is saved on the way out."""
+
+
+class KillAt(Silent):
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
+        if step == self.step:
+            raise Killed
+
+
+def same_as_uninterrupted(out: Path, whole: TrainResult) -> None:
+    for name in ("model.safetensors", "checkpoint.safetensors", "validation_sheet.png"):
+        assert (out / name).read_bytes() == (whole.folder.root / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("step", [1, 7, 11])
+def test_stopped_and_resumed_is_uninterrupted_to_the_bit(
+    dataset: Dataset, whole: TrainResult, tmp_path: Path, step: int, number: int
+) -> None:
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with pytest.raises(TrilightError, match=f"stopped at step {step} .* --resume"):
+        run(tiny_run(), dataset, tmp_path, progress=SignalAt(step, number))
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
+    run(tiny_run(), dataset, tmp_path, resume=True)
+    same_as_uninterrupted(tmp_path, whole)
+
+
+def test_killed_and_resumed_repeats_at_most_one_checkpoint(
+    dataset: Dataset, whole: TrainResult, tmp_path: Path
+) -> None:
+    with pytest.raises(Killed):
+        run(tiny_run(), dataset, tmp_path, progress=KillAt(7))
+    run(tiny_run(), dataset, tmp_path, resume=True)
+    same_as_uninterrupted(tmp_path, whole)
+    ours, theirs = (
+        [{k: v for k, v in row.items() if k not in TIMINGS} for row in read_rows(path)]
+        for path in (tmp_path / "metrics.jsonl", whole.folder.metrics)
+    )
+    assert ours == theirs
+
+
+def test_a_finished_run_is_judged_again(
+    dataset: Dataset, whole: TrainResult, tmp_path: Path
+) -> None:
+    run(tiny_run(), dataset, tmp_path)
+    (tmp_path / "validation_sheet.png").unlink()
+    again = run(tiny_run(), dataset, tmp_path, resume=True)
+    assert again.scores == whole.scores
+    same_as_uninterrupted(tmp_path, whole)
+
+
+def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResult) -> None:
+    folder = whole.folder
+    summary = json.loads(folder.summary.read_text())
+    assert summary["scores"] == whole.scores
+    assert summary["median_scores"] == whole.median_scores
+    assert summary["beats_median"] == whole.beats_median
+    settings = json.loads(folder.settings.read_text())
+    assert settings["settings"]["num_steps"] == whole.num_steps == 12
+    rows = read_rows(folder.metrics)
+    assert [row["step"] for row in rows if "loss" in row] == [2, 4, 6, 8, 10, 12]
+    assert [row["step"] for row in rows if "validation" in row] == [4, 8, 12]
+    assert rows[-1]["validation"] == whole.scores
+    with Image.open(folder.sheet) as sheet:
+        assert min(sheet.size) > 200
+    model = decode_weights(folder.weights.read_bytes())
+    assert sum(weight.numel() for weight in model.parameters()) == whole.num_parameters
+
+
+def test_progress_hears_of_every_step(dataset: Dataset, tmp_path: Path) -> None:
+    class Listener(Silent):
+        heard: list[str] = []  # noqa: RUF012
+
+        def begin(
+            self,
+            *,
+            step: int,
+            num_steps: int,
+            num_parameters: int,
+            median_scores: Mapping[str, float],
+        ) -> None:
+            self.heard.append(f"begin {step}/{num_steps}")
+
+        def advance(
+            self, *, step: int, loss: float, learning_rate: float, views_per_s: float
+        ) -> None:
+            self.heard.append(f"step {step}")
+
+        def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
+            self.heard.append(f"validated {step}")
+
+    listener = Listener()
+    run(tiny_run(num_steps=4), dataset, tmp_path, progress=listener)
+    steps = [f"step {step}" for step in (1, 2, 3, 4)]
+    assert listener.heard == ["begin 0/4", *steps, "validated 4"]
+
+
+def test_mistakes_are_named(dataset: Dataset, whole: TrainResult, tmp_path: Path) -> None:
+    with pytest.raises(TrilightError, match=r"no manifest\.json here"):
+        train_run(tiny_run(), data=str(tmp_path / "nowhere"), out=tmp_path / "a")
+    with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):
+        run(tiny_run(resolution=24), dataset, tmp_path / "b")
+    with pytest.raises(TrilightError, match="views_per_scene is 3, .* have 2 views"):
+        run(tiny_run(views_per_scene=3), dataset, tmp_path / "c")
+    with pytest.raises(TrilightError, match="holds a run already; add --resume"):
+        run(tiny_run(), dataset, whole.folder.root)
+    with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
+        run(tiny_run(), dataset, tmp_path / "d", resume=True)
+    with pytest.raises(TrilightError, match="settings.seed is 9"):
+        run(tiny_run(seed=9), dataset, whole.folder.root, resume=True)
+
+
+@pytest.mark.parametrize("split", ["train", "validation"])
+def test_an_empty_split_is_named(tmp_path: Path, split: str) -> None:
+    sizes = {"train": 1, "validation": 1} | {split: 0}
+    dataset = write_toy_dataset(tmp_path / "data", resolution=8, **sizes)
+    with pytest.raises(TrilightError, match=f"the {split} split holds no scene"):
+        run(tiny_run(resolution=8), dataset, tmp_path / "out")
+
+
+def test_a_run_that_keeps_failing_stops_with_its_weights(dataset: Dataset, tmp_path: Path) -> None:
+    class Poison(Silent):
+        def advance(
+            self, *, step: int, loss: float, learning_rate: float, views_per_s: float
+        ) -> None:
+            torch.nn.Module.__call__ = nan_forward  # type: ignore[method-assign]
+
+    original = torch.nn.Module.__call__
+
+    def nan_forward(module: torch.nn.Module, *args: object, **kwargs: object) -> object:
+        result = original(module, *args, **kwargs)
+        return result * torch.nan if isinstance(module, torch.nn.RMSNorm) else result
+
+    try:
+        with pytest.raises(TrilightError, match="10 steps in a row up to step 11"):
+            run(tiny_run(num_steps=40), dataset, tmp_path, progress=Poison())
+    finally:
+        torch.nn.Module.__call__ = original  # type: ignore[method-assign]
+
+
+@pytest.mark.slow
+def test_it_learns_scenes_that_it_has_never_seen(tmp_path: Path) -> None:
+    dataset = write_toy_dataset(tmp_path / "data", train=96, validation=12, per_shard=32)
+    settings = tiny_run(
+        num_steps=400, scenes_per_step=8, log_every=10, validate_every=100, checkpoint_every=400
+    )
+    result = run(settings, dataset, tmp_path / "out")
+    assert result.loss_at_end < 0.7 * result.loss_at_start
+    # measured: 0.91 of the median picture, 0.61 of the first loss
+    assert result.scores["log_l1"] < 0.95 * result.median_scores["log_l1"]

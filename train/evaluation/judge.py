@@ -1,0 +1,96 @@
+"""The validation split, its simplest rival, and how a network stands between the two."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from model.renderformer import RenderFormer, radiance
+from storage.conventions import radiance_from_log10
+from storage.sample import Sample
+from train.data.buckets import make_batch
+from train.data.scenes import TrainingScene, training_scene
+from train.evaluation.hits import hit_masks
+from train.evaluation.scores import ViewScore, score_view, share_better, summarise
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JudgedScene:
+    """One scene of the validation split, with what its pictures are judged by."""
+
+    scene: TrainingScene
+    """Tensors and targets."""
+    target_VRR3: NDArray[np.float64]
+    """Linear radiance."""
+    hits_VRR: NDArray[np.bool_]
+    """evaluation.hits."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Judgement:
+    """How a network did on the validation split."""
+
+    pictures: tuple[NDArray[np.float64], ...]
+    """[V, R, R, 3] linear radiance of each scene."""
+    views: tuple[ViewScore, ...]
+    """Scene by scene, view by view."""
+    scores: dict[str, float]
+    """evaluation.scores.summarise, and `better_than_median`: the share of views won."""
+
+
+class Judge:
+    """Holds the validation scenes and the median picture's scores on them."""
+
+    def __init__(self, samples: Sequence[Sample], resolution: int, median_RR3: NDArray) -> None:
+        self.scenes = [judged_scene(sample, resolution) for sample in samples]
+        stills = [np.broadcast_to(median_RR3, scene.target_VRR3.shape) for scene in self.scenes]
+        self.median_views = score_pictures(stills, self.scenes)
+        self.median_scores = summarise(self.median_views)
+
+    def judge(self, model: RenderFormer) -> Judgement:
+        """Judge a network on all scenes."""
+        pictures = tuple(predict(model, judged.scene) for judged in self.scenes)
+        views = score_pictures(pictures, self.scenes)
+        scores = summarise(views)
+        scores["better_than_median"] = share_better(views, self.median_views)
+        return Judgement(pictures=pictures, views=tuple(views), scores=scores)
+
+
+def judged_scene(sample: Sample, resolution: int) -> JudgedScene:
+    """Return a sample with what its pictures are judged by, at the resolution of the run."""
+    scene = training_scene(sample, resolution)
+    return JudgedScene(
+        scene=scene,
+        target_VRR3=radiance_from_log10(scene.target_VRR3.double().numpy()),
+        hits_VRR=hit_masks(sample.scene, resolution),
+    )
+
+
+@torch.no_grad()
+def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
+    """Return the finished pictures of one scene, linear radiance [V, R, R, 3] of at least 0."""
+    log10_VRR3 = model(make_batch([scene]).scenes, scene.target_VRR3.shape[1])[0]
+    return np.maximum(radiance(log10_VRR3.double()).numpy(), 0)
+
+
+def score_pictures(pictures: Sequence[NDArray], judged: Sequence[JudgedScene]) -> list[ViewScore]:
+    """Judge [V, R, R, 3] of each scene, view by view."""
+    return [
+        score_view(picture, target, hits)
+        for pictures_VRR3, entry in zip(pictures, judged, strict=True)
+        for picture, target, hits in zip(
+            pictures_VRR3, entry.target_VRR3, entry.hits_VRR, strict=True
+        )
+    ]
+
+
+def median_picture(scenes: Sequence[TrainingScene]) -> NDArray[np.float64]:
+    """Return the radiance [R, R, 3] that is, pixel by pixel, the median over all views.
+
+    Of all fixed pictures it has the least L1 error, in any monotonic space: who does not beat it on
+    unseen scenes has learned nothing about scenes.
+    """
+    log10_MRR3 = np.concatenate([scene.target_VRR3.numpy() for scene in scenes])
+    return radiance_from_log10(np.median(log10_MRR3, axis=0))

@@ -1,0 +1,54 @@
+"""How good pictures are: each view judged alone, then summed up without hiding the bad ones."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.conventions import log10_radiance
+from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewScore:
+    """One picture against its target."""
+
+    log_l1: float
+    """Mean |log10(1 + a) - log10(1 + b)|: the training loss, of the finished picture."""
+    psnr_log_db: float
+    """storage.metrics."""
+    psnr_linear_db: float
+    """storage.metrics."""
+    object_psnr_log_db: float
+    """storage.metrics."""
+
+
+METRICS = ("log_l1", "psnr_log_db", "psnr_linear_db", "object_psnr_log_db")
+
+
+def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_]) -> ViewScore:
+    """Judge one picture [R, R, 3] of linear radiance; `hits` is [R, R] (evaluation.hits)."""
+    difference = log10_radiance(radiance_rgb) - log10_radiance(target_rgb)
+    return ViewScore(
+        log_l1=float(np.abs(difference).mean(dtype=np.float64)),
+        psnr_log_db=psnr_log_db(radiance_rgb, target_rgb),
+        psnr_linear_db=psnr_linear_db(radiance_rgb, target_rgb),
+        object_psnr_log_db=object_psnr_log_db(radiance_rgb, target_rgb, hits),
+    )
+
+
+def summarise(views: Sequence[ViewScore]) -> dict[str, float]:
+    """Return mean log_l1, and median and the worse 5th percentile of each dB value."""
+    summary = {"log_l1": float(np.mean([view.log_l1 for view in views]))}
+    for metric in METRICS[1:]:
+        values = [getattr(view, metric) for view in views]
+        summary[f"{metric}_median"] = float(np.median(values))
+        summary[f"{metric}_p5"] = float(np.percentile(values, 5))
+    return summary
+
+
+def share_better(views: Sequence[ViewScore], others: Sequence[ViewScore]) -> float:
+    """Return the share of views whose log_l1 is below that of the same view in `others`."""
+    pairs = zip(views, others, strict=True)
+    return float(np.mean([view.log_l1 < other.log_l1 for view, other in pairs]))

@@ -1,0 +1,108 @@
+"""Checkpoints: one safetensors file with all that changes while a run goes on.
+
+It appears by rename, so a kill while saving leaves the previous one whole. It also names the
+settings and the data, because going on with others would be neither the old run nor a new one.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import save
+from torch import Tensor
+
+from model.weights import load_tensors
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+from storage.safe_read import read_safetensors
+from train.loop.state import TrainState, new_state
+from train.settings import TrainSettings, settings_record
+
+HEADER_KEY = "trilight_checkpoint"
+"""Metadata entry with counters, settings and the digest of the data."""
+
+MOMENTS = ("exp_avg", "exp_avg_sq")
+"""AdamW's memories per weight; its step count is the same for all."""
+
+
+def save_checkpoint(
+    path: Path, state: TrainState, settings: TrainSettings, data_digest: str
+) -> None:
+    """Write the checkpoint; raises TrilightError where the folder is full or cannot be written."""
+    tensors: dict[str, Tensor] = {}
+    for name, weight in state.model.named_parameters():
+        tensors[f"model/{name}"] = weight.detach()
+        for moment in MOMENTS if state.optimizer.state else ():
+            tensors[f"{moment}/{name}"] = state.optimizer.state[weight][moment]
+    for name, weight in state.average.named_parameters():
+        tensors[f"average/{name}"] = weight
+    header = {
+        "step": state.step,
+        "skipped_steps": state.skipped_steps,
+        "settings": settings_record(settings),
+        "data_digest": data_digest,
+    }
+    contiguous = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    write_atomically(path, save(contiguous, metadata={HEADER_KEY: json.dumps(header)}))
+
+
+def load_checkpoint(path: Path, settings: TrainSettings, data_digest: str) -> TrainState:
+    """Return the state of a run, ready for its next step.
+
+    Raises:
+        TrilightError: there is no checkpoint, it is damaged, or it belongs to other settings or
+            other data; the first field that differs is named.
+    """
+    if not path.exists():
+        raise TrilightError(
+            f"{path.parent}: no checkpoint here to resume from; start the run without --resume."
+        )
+    arrays, metadata = read_safetensors(path.read_bytes())
+    if HEADER_KEY not in metadata:
+        raise TrilightError(f"{path}: not a checkpoint of a run; expected one that train wrote.")
+    header = json.loads(metadata[HEADER_KEY])
+    _require_same("settings", header["settings"], settings_record(settings))
+    _require_same("data", {"digest": header["data_digest"]}, {"digest": data_digest})
+    state = new_state(settings)
+    state.step, state.skipped_steps = header["step"], header["skipped_steps"]
+    load_tensors(state.model, _part(arrays, "model"))
+    load_tensors(state.average, _part(arrays, "average"))
+    _load_moments(state, arrays)
+    return state
+
+
+def _load_moments(state: TrainState, arrays: Mapping[str, NDArray]) -> None:
+    updates = state.step - state.skipped_steps
+    if updates == 0:
+        return
+    parts = {moment: _part(arrays, moment) for moment in MOMENTS}
+    for name, weight in state.model.named_parameters():
+        state.optimizer.state[weight] = {
+            "step": torch.tensor(float(updates)),
+            **{moment: parts[moment][name] for moment in MOMENTS},
+        }
+
+
+def _part(arrays: Mapping[str, NDArray], prefix: str) -> dict[str, Tensor]:
+    start = f"{prefix}/"
+    return {
+        name.removeprefix(start): torch.from_numpy(array)
+        for name, array in arrays.items()
+        if name.startswith(start)
+    }
+
+
+def _require_same(place: str, saved: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Raise for the first field that differs between a checkpoint and what is asked for now."""
+    for name in sorted(saved.keys() | wanted.keys()):
+        before, now = saved.get(name), wanted.get(name)
+        if isinstance(before, dict) and isinstance(now, dict):
+            _require_same(f"{place}.{name}", before, now)
+        elif before != now:
+            raise TrilightError(
+                f"resume: {place}.{name} is {now}, but the checkpoint was made with {before}. "
+                "Resume with the same, or start another run in another folder."
+            )

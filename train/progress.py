@@ -1,0 +1,34 @@
+"""What a run tells whoever started it, while it runs. `train` itself prints nothing."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """Receives the course of a run, in this order: begin, then advance and validated, in turns."""
+
+    def begin(
+        self, *, step: int, num_steps: int, num_parameters: int, median_scores: Mapping[str, float]
+    ) -> None:
+        """The run starts at `step`, above 0 when it resumes; the median picture is its rival."""
+
+    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
+        """`step` steps are done; `loss` is the mean over the views of the last one."""
+
+    def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
+        """The validation split was judged after `step` steps (evaluation.scores)."""
+
+
+class Silent:
+    """A Progress that says nothing."""
+
+    def begin(
+        self, *, step: int, num_steps: int, num_parameters: int, median_scores: Mapping[str, float]
+    ) -> None:
+        """Ignore it."""
+
+    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
+        """Ignore it."""
+
+    def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
+        """Ignore it."""

@@ -1,0 +1,230 @@
+"""One training run, from a dataset to weights, figures and a sheet: joins the parts, no more."""
+
+import dataclasses
+import json
+import platform
+import time
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from model.renderformer import count_parameters
+from model.weights import encode_weights
+from storage.atomic import write_atomically
+from storage.dataset import Dataset, open_dataset
+from storage.errors import TrilightError
+from train.data.scenes import training_scene
+from train.data.splits import first_samples, shards_of
+from train.data.stream import StreamSettings, prefetched, stream_scenes
+from train.evaluation.judge import Judge, Judgement, median_picture
+from train.evaluation.sheet import SheetView, write_sheet
+from train.folder import RunFolder
+from train.loop.checkpoint import load_checkpoint
+from train.loop.metrics_log import read_rows
+from train.loop.state import TrainState, new_state
+from train.loop.trainer import Trainer
+from train.progress import Progress, Silent
+from train.settings import TrainSettings, settings_record
+
+MEDIAN_SCENES = 256
+"""Training scenes of which the median picture is taken; more would not move it."""
+
+LOSS_SHARE = 20
+"""The loss at start and end is the mean over the first and last 1 / LOSS_SHARE of the log."""
+
+SHEET_SCENES = 8
+"""Scenes on the sheet, one view each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainResult:
+    """What a finished run has to show."""
+
+    folder: RunFolder
+    """Where everything is."""
+    num_parameters: int
+    """Of the network."""
+    num_steps: int
+    """Steps done, including skipped ones."""
+    skipped_steps: int
+    """Steps that were not finite and changed nothing."""
+    loss_at_start: float
+    """Mean training loss over the first twentieth of the run."""
+    loss_at_end: float
+    """The same over the last twentieth."""
+    scores: dict[str, float]
+    """The network on the validation split (evaluation.judge)."""
+    median_scores: dict[str, float]
+    """The median picture of the training views on the same split."""
+    seconds: float
+    """Wall time of this call, from opening the data to writing the sheet."""
+
+    @property
+    def beats_median(self) -> bool:
+        """Whether the network's log_l1 is below that of the median picture."""
+        return self.scores["log_l1"] < self.median_scores["log_l1"]
+
+
+def train_run(
+    settings: TrainSettings,
+    *,
+    data: str,
+    out: Path,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> TrainResult:
+    """Train a network and judge it.
+
+    Args:
+        settings: the run; `train.settings.named_run` returns those that have a name.
+        data: folder of a dataset with a train and a validation split.
+        out: folder of the run (train.folder), new unless `resume`.
+        resume: go on from the folder's checkpoint; the weights come out the same to the bit on the
+            CPU, for the same number of threads. A finished run is judged again.
+        progress: is told how it goes.
+
+    Raises:
+        TrilightError: no dataset, an empty split, a damaged shard, a bad target, a resolution or
+            number of views that the data does not have, a folder that already holds a run, a
+            checkpoint that is missing or of another run, or a signal that asked to stop.
+    """
+    began = time.monotonic()
+    progress = progress or Silent()
+    dataset, folder = open_dataset(data), RunFolder(out)
+    _check_data(dataset, settings)
+    state = _begin(settings, folder, dataset, resume)
+    judge = _make_judge(dataset, settings)
+    progress.begin(
+        step=state.step,
+        num_steps=settings.num_steps,
+        num_parameters=count_parameters(state.model),
+        median_scores=judge.median_scores,
+    )
+    trainer = Trainer(
+        state=state,
+        settings=settings,
+        folder=folder,
+        data_digest=dataset.digest,
+        judge=judge,
+        progress=progress,
+    )
+    stream = StreamSettings(
+        seed=settings.seed,
+        window=settings.shuffle_window,
+        resolution=settings.resolution,
+        views_per_scene=settings.views_per_scene,
+    )
+    shards = shards_of(dataset, "train")
+    first = state.step * settings.scenes_per_step
+    with closing(prefetched(stream_scenes(dataset, shards, stream, first))) as scenes:
+        trainer.run(scenes)
+    return _finish(state, settings, folder, judge, began)
+
+
+def _check_data(dataset: Dataset, settings: TrainSettings) -> None:
+    """Find out before any work what the data cannot give."""
+    for split in ("train", "validation"):
+        shards_of(dataset, split)
+    if settings.views_per_scene > dataset.manifest.num_views:
+        raise TrilightError(
+            f"views_per_scene is {settings.views_per_scene}, but scenes of {dataset.folder.root} "
+            f"have {dataset.manifest.num_views} views; expected at most that many."
+        )
+
+
+def _begin(
+    settings: TrainSettings, folder: RunFolder, dataset: Dataset, resume: bool
+) -> TrainState:
+    if resume:
+        return load_checkpoint(folder.checkpoint, settings, dataset.digest)
+    if folder.checkpoint.exists():
+        raise TrilightError(
+            f"{folder.root}: holds a run already; add --resume to go on with it, or choose "
+            "another --out."
+        )
+    record = {
+        "settings": settings_record(settings),
+        "data_digest": dataset.digest,
+        "versions": {"torch": torch.__version__, "python": platform.python_version()},
+        "threads": torch.get_num_threads(),
+    }
+    write_atomically(folder.settings, _pretty_json(record))
+    return new_state(settings)
+
+
+def _make_judge(dataset: Dataset, settings: TrainSettings) -> Judge:
+    training = [
+        training_scene(sample, settings.resolution)
+        for sample in first_samples(dataset, "train", MEDIAN_SCENES)
+    ]
+    samples = list(first_samples(dataset, "validation", settings.validation_scenes))
+    return Judge(samples, settings.resolution, median_picture(training))
+
+
+def _finish(
+    state: TrainState,
+    settings: TrainSettings,
+    folder: RunFolder,
+    judge: Judge,
+    began: float,
+) -> TrainResult:
+    write_atomically(folder.weights, encode_weights(state.average))
+    judgement = judge.judge(state.average)
+    loss_at_start, loss_at_end = _losses(folder, settings)
+    _write_sheet(folder, settings, judge, judgement)
+    result = TrainResult(
+        folder=folder,
+        num_parameters=count_parameters(state.average),
+        num_steps=state.step,
+        skipped_steps=state.skipped_steps,
+        loss_at_start=loss_at_start,
+        loss_at_end=loss_at_end,
+        scores=judgement.scores,
+        median_scores=judge.median_scores,
+        seconds=time.monotonic() - began,
+    )
+    record = dataclasses.asdict(result) | {"beats_median": result.beats_median}
+    del record["folder"]
+    write_atomically(folder.summary, _pretty_json(record))
+    return result
+
+
+def _losses(folder: RunFolder, settings: TrainSettings) -> tuple[float, float]:
+    """Return the mean training loss of the first and of the last rows of the log."""
+    rows = [row["loss"] for row in read_rows(folder.metrics) if row.get("loss") is not None]
+    count = max(len(rows) // LOSS_SHARE, 1)
+    return sum(rows[:count]) / count, sum(rows[-count:]) / count
+
+
+def _write_sheet(
+    folder: RunFolder, settings: TrainSettings, judge: Judge, judgement: Judgement
+) -> None:
+    views, at = [], 0
+    for judged, pictures in zip(judge.scenes, judgement.pictures, strict=True):
+        score, median = judgement.views[at], judge.median_views[at]
+        at += len(pictures)
+        views.append(
+            SheetView(
+                name=f"scene {judged.scene.key}, view 0",
+                scores=(
+                    f"log L1 {score.log_l1:.4f} (median picture {median.log_l1:.4f}), "
+                    f"{score.psnr_log_db:.1f} dB log, {score.psnr_linear_db:.1f} dB linear"
+                ),
+                target_rgb=judged.target_VRR3[0],
+                predicted_rgb=pictures[0],
+            )
+        )
+    title = (
+        f"run {settings.run}, {settings.num_steps} steps, {settings.resolution} pixels: "
+        f"validation scenes, never trained on",
+        f"log L1 {judgement.scores['log_l1']:.4f}, median picture of the training views "
+        f"{judge.median_scores['log_l1']:.4f}, "
+        f"{judgement.scores['better_than_median']:.0%} of views better than it",
+    )
+    write_sheet(folder.sheet, views[:SHEET_SCENES], title)
+
+
+def _pretty_json(record: object) -> bytes:
+    return json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"
