@@ -68,24 +68,33 @@ def _disk() -> Finding:
 
 
 def _renderer() -> Finding:
+    found = f"mitsuba {metadata.version('mitsuba')}"
+    finding = _probe(
+        "renderer",
+        "import mitsuba; mitsuba.set_variant('scalar_rgb')",
+        found=found,
+        consequence="nothing can be rendered",
+        mend=f"{_APT} libatomic1",
+    )
+    if finding.state == "missing":
+        return finding
     variant = choose_variant()
-    found = f"mitsuba {metadata.version('mitsuba')}, {variant.name}"
     if variant.libllvm:
-        return Finding(name="renderer", state="ok", found=f"{found}, {variant.libllvm}")
+        found = f"{found}, {variant.name}, {variant.libllvm}"
+        return Finding(name="renderer", state="ok", found=found)
     return Finding(
         name="renderer",
         state="slower",
-        found=found,
+        found=f"{found}, {variant.name}",
         consequence=variant.note,
         mend=f"{_APT} libllvm19",
     )
 
 
 def _denoiser() -> Finding:
-    code = "import pyoidn; d = pyoidn.Device(); d.commit()"
     return _probe(
         "denoiser",
-        code,
+        "from pipeline.renders.denoiser import load_oidn; load_oidn().Device().commit()",
         found=f"pyoidn {metadata.version('pyoidn')} (CPU)",
         consequence="pictures cannot be denoised",
         mend="make setup",

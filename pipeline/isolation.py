@@ -86,6 +86,7 @@ class IsolatedChild:
             Rejected, TrilightError: as the function raised them.
             ChildFailed: the child died, took too long, ran out of memory, or the function raised
                 anything else. The next call starts a fresh child.
+            TrilightError: also where a new child cannot be set up.
             ChildClosed: `close` was called, perhaps by another thread.
         """
         if self._closed:
@@ -123,8 +124,13 @@ class IsolatedChild:
         self._process.start()
         theirs.close()
         self._calls_left = self._limits.calls_per_child
-        function, args = self._setup
-        self._exchange((function, args), _START_UP_S)
+        try:
+            self._exchange(self._setup, _START_UP_S)
+        except ChildFailed as failure:
+            # no item is to blame, and another child would fail as this one did
+            raise TrilightError(
+                f"a child process cannot be set up ({failure}); see `trilight doctor`."
+            ) from failure
 
     def _exchange(self, request: tuple[Callable[..., Any], tuple[Any, ...]], wall_s: float) -> Any:
         assert self._connection is not None
@@ -213,7 +219,13 @@ def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, .
     except MemoryError:
         return ("out_of_memory", "an allocation went over the limit of the child")
     except Exception:
-        return ("exception", traceback.format_exc(limit=-4).strip())
+        return ("exception", _last_error())
+
+
+def _last_error() -> str:
+    """Return the last lines of the current traceback, the innermost call and the error."""
+    lines = traceback.format_exc(limit=-1).strip().splitlines()
+    return " | ".join(line.strip() for line in lines[1:])
 
 
 def call_with_retries(

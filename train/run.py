@@ -170,13 +170,13 @@ def _finish(
     judge: Judge,
     began: float,
 ) -> TrainResult:
-    write_atomically(folder.weights, encode_weights(state.average))
-    judgement = judge.judge(state.average)
+    write_atomically(folder.weights, encode_weights(state.model))
+    judgement = judge.judge(state.model)
     loss_at_start, loss_at_end = _losses(folder, settings)
     _write_sheet(folder, settings, judge, judgement)
     result = TrainResult(
         folder=folder,
-        num_parameters=count_parameters(state.average),
+        num_parameters=count_parameters(state.model),
         num_steps=state.step,
         skipped_steps=state.skipped_steps,
         loss_at_start=loss_at_start,

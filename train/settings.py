@@ -45,10 +45,6 @@ class TrainSettings:
     """AdamW's memories."""
     grad_clip: float = 1.0
     """Longest gradient that is followed; a longer one is shortened to this."""
-    ema_decay: float = 0.0
-    """averaging"""
-    augment: str = ""
-    """experiment"""
     shuffle_window: int = 64
     """Samples in memory to shuffle among."""
     log_every: int = 10
@@ -86,8 +82,6 @@ class TrainSettings:
                 _wrong(name, getattr(self, name), "above 0")
         if not self.weight_decay >= 0:
             _wrong("weight_decay", self.weight_decay, "at least 0")
-        if not 0 <= self.ema_decay < 1:
-            _wrong("ema_decay", self.ema_decay, "from 0 to below 1")
 
 
 def smoke() -> TrainSettings:

@@ -12,6 +12,7 @@ from rich.progress import Progress as Bars
 
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
+from pipeline.renders.variant import choose_variant
 from storage.failures import count_by_reason, read_failures
 from storage.layout import DatasetFolder
 from storage.progress import read_progress
@@ -48,6 +49,8 @@ def generate(
     quiet_prefect()
     folder = DatasetFolder(out)
     started = time.monotonic()
+    if note := choose_variant().note:
+        console.print(f"Note: {note}; see trilight doctor.", style="yellow")
     with prefect_server():
         from pipeline.flows.generate_scenes import generate_scenes  # after Prefect is quiet
 

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs the three system libraries that wheels cannot bring, where apt may be used; says what is
+# Installs the system libraries that wheels cannot bring, where apt may be used; says what is
 # missing and goes on where it may not. `trilight doctor` tells what each of them is for.
 set -u
 
@@ -9,6 +9,7 @@ have() { ldconfig -p 2>/dev/null | grep -q "$1"; }
 missing=""
 have 'libOpenGL\.so\.0' || missing="$missing libopengl0"
 have 'libGL\.so\.1' || missing="$missing libgl1"
+have 'libatomic\.so\.1' || missing="$missing libatomic1"
 # Mitsuba compiles with LLVM; releases before 16 abort in it, so they do not count.
 ldconfig -p 2>/dev/null | grep -qE 'libLLVM(-|\.so\.)(1[6-9]|2[0-9])' || missing="$missing libllvm19"
 [ -n "$missing" ] || exit 0
@@ -21,5 +22,6 @@ if command -v apt-get >/dev/null 2>&1 && $run true 2>/dev/null; then
     $run apt-get update -qq && $run env DEBIAN_FRONTEND=noninteractive \
         apt-get install -y -qq --no-install-recommends $missing >/dev/null && exit 0
 fi
-echo "Not installed:$missing. Rendering is slower without LLVM, and meshes need OpenGL's library."
+echo "Not installed:$missing. Meshes need OpenGL's library, rendering needs libatomic, and is slow"
+echo "without LLVM; trilight doctor tells more."
 echo "Ask an administrator for: apt-get install$missing"

@@ -29,8 +29,9 @@ class RenderSettings:
     """The cap: sampling stops here whatever the floor is."""
     max_depth: int = 10
     """Longest path in edges: 1 sees emitters alone, 2 adds direct light."""
-    rr_depth: int = 5
-    """Paths longer than this many edges go on by Russian roulette."""
+    rr_depth: int = 2
+    """From this many edges on, paths go on by Russian roulette. 2 instead of 5 takes 20 % less
+    time for the same error on sampled scenes (LOG.md)."""
     aux_spp: int = 64
     """Samples per pixel of the albedo and normal pictures that guide the denoiser."""
     denoiser: Literal["high", "fast", "off"] = "high"

@@ -52,7 +52,7 @@ def choose_variant() -> Variant:
     return Variant(
         name="scalar_rgb",
         libllvm="",
-        note=f"{found}, so rendering takes ten times as long; `apt-get install libllvm19` mends it",
+        note=f"{found}, so rendering takes ten times as long",
     )
 
 
@@ -75,26 +75,30 @@ def activate(variant: Variant) -> None:
 
 
 def _works(library: Path) -> bool:
-    """Return whether Mitsuba renders with a library, from memory or by a probe."""
+    """Return whether Mitsuba renders with a library, from memory or by a probe.
+
+    Only success is remembered: what failed may have failed for want of something else, which
+    somebody has installed since.
+    """
     memory = cache_folder("llvm_probes.json")
     identity = _identity(library)
-    answers = _remembered(memory)
-    if identity not in answers:
-        answers[identity] = _probe(library)
-        recent = dict(list(answers.items())[-_REMEMBERED_TRIES:])
-        with contextlib.suppress(TrilightError):  # remembered next time, or probed again
-            write_atomically(memory, json.dumps(recent).encode())
-    return answers[identity]
+    known = _remembered(memory)
+    if identity in known:
+        return True
+    if not _probe(library):
+        return False
+    with contextlib.suppress(TrilightError):  # remembered next time, or probed again
+        recent = [*known, identity][-_REMEMBERED_TRIES:]
+        write_atomically(memory, json.dumps(recent).encode())
+    return True
 
 
-def _remembered(memory: Path) -> dict[str, bool]:
+def _remembered(memory: Path) -> list[str]:
     try:
-        answers = json.loads(memory.read_bytes())
+        known = json.loads(memory.read_bytes())
     except (OSError, ValueError):
-        return {}
-    if not isinstance(answers, dict):
-        return {}
-    return {name: answer for name, answer in answers.items() if isinstance(answer, bool)}
+        return []
+    return known if isinstance(known, list) else []
 
 
 def _identity(library: Path) -> str:

@@ -88,6 +88,13 @@ def test_a_failure_costs_one_call(child: IsolatedChild, function, reason: str) -
     assert child.call(double, 4) == 8
 
 
+def test_a_child_that_cannot_be_set_up_stops_the_run(tmp_path: Path) -> None:
+    child = IsolatedChild(limits=LIMITS, setup=_prepare, setup_args=(str(tmp_path / "nowhere"),))
+    with pytest.raises(TrilightError, match=r"cannot be set up.*FileNotFoundError.*doctor"):
+        child.call(double, 1)
+    child.close()
+
+
 def test_a_child_is_replaced_after_its_calls(child: IsolatedChild, tmp_path: Path) -> None:
     for _ in range(LIMITS.calls_per_child + 1):
         child.call(double, 1)

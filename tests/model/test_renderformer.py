@@ -8,7 +8,7 @@ import dataclasses
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.func import functional_call
 
 from model.renderformer import RenderFormer, radiance
@@ -165,6 +165,23 @@ def test_initial_weights_depend_on_the_generator_alone() -> None:
     first, second = (awake(tiny_config("dpt"), seed=4) for _ in range(2))
     for (name, a), b in zip(first.named_parameters(), second.parameters(), strict=True):
         assert torch.equal(a, b), name
+
+
+def test_norms_have_the_published_epsilons() -> None:
+    """By attribute: the picture cannot tell 1e-6 from 1e-5 (1e-7 of it)."""
+    token_norms = {
+        "encoder.tokens.material_norm",
+        "encoder.tokens.normal_norm",
+        "decoder.rays_norm",
+    }
+    norms = {
+        name: module.eps
+        for name, module in model_for("linear").named_modules()
+        if isinstance(module, nn.RMSNorm)
+    }
+    assert token_norms < set(norms)
+    for name, eps in norms.items():
+        assert eps == (1.1920929e-07 if name in token_norms else 1e-6), name
 
 
 def test_radiance_undoes_the_logarithm_and_bounds_the_dark() -> None:

@@ -13,7 +13,7 @@ from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, bucket_scenes, make_batch
 from train.data.scenes import training_scene
 from train.loop.optim import learning_rate
-from train.loop.state import TrainState, follow, new_state
+from train.loop.state import TrainState, new_state
 from train.loop.step import StepReport, train_step, view_losses
 
 RESOLUTION = 16
@@ -29,7 +29,7 @@ def step(state: TrainState, batches: list[TrainingBatch], grad_clip: float = 1.0
         state.optimizer,
         batches,
         resolution=RESOLUTION,
-        learning_rate=1e-3,
+        learning_rate=3e-3,
         grad_clip=grad_clip,
     )
 
@@ -70,7 +70,12 @@ def ruin_weight(state: TrainState, batch: TrainingBatch) -> None:
         state.model.decoder.token_W[0] = math.nan
 
 
-@pytest.mark.parametrize("ruin", [ruin_target, ruin_weight])
+def ruin_gradient(state: TrainState, batch: TrainingBatch) -> None:
+    """The loss stays finite; a backward pass that overflows looks like this."""
+    state.model.decoder.token_W.register_hook(lambda gradient: gradient * math.inf)
+
+
+@pytest.mark.parametrize("ruin", [ruin_target, ruin_weight, ruin_gradient])
 def test_a_step_that_is_not_finite_changes_nothing(
     ruin: Callable[[TrainState, TrainingBatch], None],
 ) -> None:
@@ -114,27 +119,17 @@ def test_the_rate_rises_to_its_peak_and_falls_to_its_end_once() -> None:
     assert learning_rate(500, settings) == rates[99], "no restart after the end"
 
 
-def test_a_fresh_network_is_not_dead() -> None:
-    """A zero start with the loss behind the ELU stays black; ours must leave black at once."""
-    settings = tiny_run()
-    state = new_state(settings)
-    batches = bucket_scenes(scenes(4))
-    black = float(torch.cat([b.target_BVRR3.flatten() for b in batches]).abs().mean())
-    reports = [step(state, batches) for _ in range(60)]
-    assert reports[-1].loss < 0.8 * black  # measured: 0.5
-    assert min(report.grad_norm for report in reports) > 0.01
+def test_a_fresh_network_learns_eight_pictures() -> None:
+    """A zero start with the loss behind the ELU stays black; ours must leave black at once.
 
-
-def test_the_average_follows_and_forgets_the_start() -> None:
+    Four scenes of two views each, over and over: the pictures must become better than the best
+    fixed one, which is their median.
+    """
     state = new_state(tiny_run())
-    with torch.no_grad():
-        state.model.decoder.token_W.fill_(1.0)
-        state.average.decoder.token_W.fill_(-1.0)
-    for _ in range(50):
-        state.step += 1
-        follow(state, decay=0.9)
-    # 50 steps of at most 0.9: what remains of the start is below 2 * 0.9^50
-    torch.testing.assert_close(
-        state.average.decoder.token_W, state.model.decoder.token_W, rtol=0, atol=0.011
-    )
-    assert not any(weight.requires_grad for weight in state.average.parameters())
+    drawn = scenes(4)
+    targets = torch.cat([scene.target_VRR3 for scene in drawn])
+    median_error = (targets - targets.median(dim=0).values).abs().mean().item()
+    reports = [step(state, bucket_scenes(drawn), grad_clip=1.0) for _ in range(150)]
+    assert reports[0].loss == pytest.approx(targets.mean().item(), rel=1e-4)  # a black start
+    assert reports[-1].loss < 0.7 * median_error  # measured: 0.53
+    assert min(report.grad_norm for report in reports) > 0.01

@@ -34,7 +34,6 @@ def test_an_unknown_run_is_refused_with_the_known_ones() -> None:
         ({"learning_rate": 0.0}, "learning_rate is 0.0; expected above 0"),
         ({"learning_rate": float("nan")}, "learning_rate is nan"),
         ({"grad_clip": -1.0}, "grad_clip is -1.0"),
-        ({"ema_decay": 1.0}, "ema_decay is 1.0; expected from 0 to below 1"),
         ({"weight_decay": -0.1}, "weight_decay is -0.1"),
         ({"validate_every": 5}, "validate_every is 5; expected a multiple of log_every, 2"),
         ({"checkpoint_every": 3}, "checkpoint_every is 3"),

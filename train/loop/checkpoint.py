@@ -37,8 +37,6 @@ def save_checkpoint(
         tensors[f"model/{name}"] = weight.detach()
         for moment in MOMENTS if state.optimizer.state else ():
             tensors[f"{moment}/{name}"] = state.optimizer.state[weight][moment]
-    for name, weight in state.average.named_parameters():
-        tensors[f"average/{name}"] = weight
     header = {
         "step": state.step,
         "skipped_steps": state.skipped_steps,
@@ -69,7 +67,6 @@ def load_checkpoint(path: Path, settings: TrainSettings, data_digest: str) -> Tr
     state = new_state(settings)
     state.step, state.skipped_steps = header["step"], header["skipped_steps"]
     load_tensors(state.model, _part(arrays, "model"))
-    load_tensors(state.average, _part(arrays, "average"))
     _load_moments(state, arrays)
     return state
 

@@ -15,7 +15,7 @@ from train.loop.checkpoint import save_checkpoint
 from train.loop.interrupts import deferred_interrupts
 from train.loop.metrics_log import MetricsLog
 from train.loop.optim import learning_rate
-from train.loop.state import TrainState, follow
+from train.loop.state import TrainState
 from train.loop.step import StepReport, train_step
 from train.progress import Progress
 from train.settings import TrainSettings
@@ -97,7 +97,6 @@ class Trainer:
         self.state.step += 1
         if report.applied:
             self.skipped_in_a_row = 0
-            follow(self.state, decay=self.settings.ema_decay)
         else:
             self._skip()
         return report
@@ -151,7 +150,7 @@ class Trainer:
         self.window = Window()
 
     def _validate(self) -> None:
-        scores = self.judge.judge(self.state.average).scores
+        scores = self.judge.judge(self.state.model).scores
         self.log.append({"step": self.state.step, "validation": scores})
         self.progress.validated(step=self.state.step, scores=scores)
         self.window.began = time.monotonic()
