@@ -13,6 +13,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
+from pipeline.renders.facts import render_facts
 from pipeline.renders.variant import choose_variant
 from storage.cache import cache_folder
 
@@ -92,10 +93,14 @@ def _renderer() -> Finding:
 
 
 def _denoiser() -> Finding:
-    return _probe(
-        "denoiser",
-        "from pipeline.renders.denoiser import load_oidn; load_oidn().Device().commit()",
-        found=f"pyoidn {metadata.version('pyoidn')} (CPU)",
+    facts = render_facts(choose_variant())
+    if "denoiser" in facts:
+        found = f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads"
+        return Finding(name="denoiser", state="ok", found=found)
+    return Finding(
+        name="denoiser",
+        state="missing",
+        found=f"pyoidn {facts['pyoidn']} does not answer",
         consequence="pictures cannot be denoised",
         mend="make setup",
     )

@@ -88,7 +88,7 @@ def smoke() -> ModelConfig:
     return ModelConfig(
         width=128,
         num_heads=2,
-        encoder_layers=4,
+        encoder_layers=2,
         decoder_layers=4,
         hidden_width=384,
         num_registers=4,

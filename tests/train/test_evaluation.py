@@ -101,9 +101,11 @@ def test_no_fixed_picture_has_less_l1_error_than_the_median() -> None:
 
     median = median_picture(scenes)
     rng = rng_for(0, "rivals")
-    rivals = [np.zeros_like(median), 10 ** targets.mean(axis=0) - 1, *(10 ** targets[:4] - 1)]
+    middle = 10 ** np.sort(targets, axis=0)[len(targets) // 2] - 1
+    rivals = [np.zeros_like(median), middle, 10 ** targets.mean(axis=0) - 1, *(10**targets - 1)]
     rivals += [np.maximum(median + rng.normal(0, 0.01, median.shape), 0) for _ in range(20)]
-    assert all(error(median) <= error(rival) for rival in rivals)
+    # of an even number of views the upper middle is as good: only rounding parts the two
+    assert all(error(median) <= error(rival) + 1e-9 for rival in rivals)
 
 
 def test_the_error_picture_is_black_without_error_and_white_at_its_limit() -> None:

@@ -182,24 +182,39 @@ def test_an_empty_split_is_named(tmp_path: Path, split: str) -> None:
         run(tiny_run(resolution=8), dataset, tmp_path / "out")
 
 
-def test_a_run_that_keeps_failing_stops_with_its_weights(dataset: Dataset, tmp_path: Path) -> None:
-    class Poison(Silent):
-        def advance(
-            self, *, step: int, loss: float, learning_rate: float, views_per_s: float
-        ) -> None:
-            torch.nn.Module.__call__ = nan_forward  # type: ignore[method-assign]
+class Poison(Silent):
+    """Makes every norm return NaN in all steps after the first but those in `spared`."""
 
-    original = torch.nn.Module.__call__
+    def __init__(self, spared: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
+        self.spared = spared
+        self.poisoned = False
+        original = torch.nn.RMSNorm.forward
 
-    def nan_forward(module: torch.nn.Module, *args: object, **kwargs: object) -> object:
-        result = original(module, *args, **kwargs)
-        return result * torch.nan if isinstance(module, torch.nn.RMSNorm) else result
+        def forward(module: torch.nn.RMSNorm, x: torch.Tensor) -> torch.Tensor:
+            return original(module, x) * (torch.nan if self.poisoned else 1)
 
-    try:
-        with pytest.raises(TrilightError, match="10 steps in a row up to step 11"):
-            run(tiny_run(num_steps=40), dataset, tmp_path, progress=Poison())
-    finally:
-        torch.nn.Module.__call__ = original  # type: ignore[method-assign]
+        monkeypatch.setattr(torch.nn.RMSNorm, "forward", forward)
+
+    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
+        self.poisoned = step + 1 not in self.spared
+
+
+def test_a_run_that_keeps_failing_stops(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(TrilightError, match="10 steps in a row up to step 11"):
+        run(tiny_run(num_steps=40), dataset, tmp_path, progress=Poison(set(), monkeypatch))
+
+
+def test_a_run_that_recovers_goes_on_and_counts(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poison = Poison({10, 19, 20, 21}, monkeypatch)
+    settings = tiny_run(num_steps=20, validate_every=20)
+    result = run(settings, dataset, tmp_path, progress=poison)
+    assert result.skipped_steps == 16
+    losses = {row["step"]: row["loss"] for row in read_rows(result.folder.metrics) if "loss" in row}
+    assert losses[4] is None and losses[10] > 0, "a row without a finite step has no loss"
 
 
 @pytest.mark.slow
