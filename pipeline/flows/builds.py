@@ -13,14 +13,14 @@ from storage.splits import SplitSettings
 
 
 def smoke() -> BuildSettings:
-    """Minutes on a laptop: small shards, 256 pixels, pictures to 40 dB or 512 samples."""
+    """Minutes on a laptop: small shards, 256 pixels, pictures to 40 dB or 256 samples."""
     return BuildSettings(
         build="smoke",
         seed=0,
         allowed_licences=DEFAULT_ALLOWED,
         assets=AssetSettings(budgets=(1400, 1000, 700, 500, 340, 240)),
         scenes=SceneSettings(max_triangles=1536, num_views=4),
-        renders=RenderSettings(resolution=256, noise_floor_db=40.0, min_spp=128, max_spp=512),
+        renders=RenderSettings(resolution=256, noise_floor_db=40.0, min_spp=128, max_spp=256),
         splits=SplitSettings(scenes_per_shard=4),
     )
 

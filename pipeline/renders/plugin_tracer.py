@@ -1,8 +1,8 @@
 """`PluginTracer`: Mitsuba's own `path` integrator over stock plugins.
 
-It runs where no LLVM is found (`scalar_rgb`), six times slower per sample on two cores and with
-more noise, and it is what `VectorTracer` is compared with. A Python emitter in `scalar_rgb` was
-tried and takes another 5.5 times as long, hence the twins of `plugin_scene`.
+It runs where no LLVM is found (`scalar_rgb`), four to five times slower per sample and with up to
+twice the variance, and it is what `VectorTracer` is compared with. A Python emitter in `scalar_rgb`
+was tried and takes another 5.5 times as long, hence the twins of `plugin_scene`.
 """
 
 from typing import Any

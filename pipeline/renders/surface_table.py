@@ -20,6 +20,8 @@ from storage.scene import Scene
 _GROUPS = 8
 """Groups of four floats per row."""
 
+_TINY = 1e-20
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SurfacePoint:
@@ -80,7 +82,9 @@ class SurfaceTable:
             alpha=groups[6].x,
             weight=groups[6].y,
         )
-        return dr.normalize(normal), lobes
+        # Opposite normals may cancel: a zero normal reflects nothing, where 0 / 0 would spread.
+        length_sq = dr.maximum(dr.squared_norm(normal), _TINY)
+        return normal * dr.rsqrt(length_sq), lobes
 
     def _group(self, triangle: Any, group: int, active: Any) -> Any:
         return dr.gather(mi.Vector4f, self._rows, triangle * _GROUPS + group, active)
