@@ -1,0 +1,29 @@
+"""Smaller pictures for nothing: block means of linear radiance.
+
+Targets are box-filtered over each pixel, so the mean of a block of pixels is what a camera with
+fewer pixels would have measured, with less noise and without another render.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import TrilightError
+
+
+def block_mean(radiance_rgb: NDArray[np.float32], resolution: int) -> NDArray[np.float32]:
+    """Return pictures [V, R, R, 3] as [V, resolution, resolution, 3], exact but for rounding.
+
+    Raises:
+        TrilightError: `resolution` does not divide the pictures' own.
+    """
+    views, stored = radiance_rgb.shape[:2]
+    if resolution < 1 or stored % resolution:
+        raise TrilightError(
+            f"resolution {resolution}: expected a divisor of {stored}, the resolution of the "
+            "dataset. Choose one, or generate the dataset at another resolution."
+        )
+    factor = stored // resolution
+    if factor == 1:
+        return radiance_rgb
+    blocks = radiance_rgb.reshape(views, resolution, factor, resolution, factor, 3)
+    return blocks.mean(axis=(2, 4), dtype=np.float32)
