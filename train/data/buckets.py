@@ -15,7 +15,7 @@ from model.scene_tensors import SceneBatch, batch_scenes
 from train.data.scenes import TrainingScene
 
 LONGEST_TO_SHORTEST = 1.5
-"""Within one batch. 1 would pad nothing and make many small products; 3 buckets a step are typical."""
+"""Within one batch. 1 would pad nothing, but make many small products; 3 buckets are typical."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
