@@ -90,13 +90,13 @@ def smoke() -> TrainSettings:
         run="smoke",
         model=smoke_model(),
         resolution=64,
-        num_steps=600,
+        num_steps=360,
         scenes_per_step=4,
         views_per_scene=4,
         learning_rate=1.5e-3,
         warmup_steps=50,
-        validate_every=100,
-        checkpoint_every=100,
+        validate_every=60,
+        checkpoint_every=60,
     )
 
 

@@ -30,7 +30,7 @@ def test_objects_to_shards_to_a_model(trilight: Trilight, tmp_path: Path) -> Non
         assert len(sheet.getcolors(1 << 24) or []) > 1000  # pictures, not an empty sheet
     assert trilight("inspect", "set").returncode == 0
 
-    trained = trilight("train", "smoke", "--data", "set", "--out", "run", "--steps", "4")
+    trained = trilight("train", "smoke", "--data", "set", "--out", "run", "--steps", "60")
     assert trained.returncode == 1
     assert "resolution" in trained.stderr  # the smoke run needs 64 pixels, and says so
 
