@@ -31,13 +31,13 @@ from storage.sample import Sample, ViewRecord
 
 NAME = "render"
 TARGETS_DB = (40.0, 46.0, 52.0)
-_MAX_SPP = 1024
+_MAX_SPP = 512
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
 
 
 def run(*, quick: bool, round_done: Callable[[], None]) -> Comparison:
-    """Measure; `quick` takes eight scenes once, otherwise 32 scenes three times."""
-    num_scenes, repeats = (8, 1) if quick else (32, 3)
+    """Measure; `quick` takes four scenes once, otherwise 32 scenes three times."""
+    num_scenes, repeats = (4, 1) if quick else (32, 3)
     with tempfile.TemporaryDirectory() as folder:
         sides, children = {}, []
         for target_db in TARGETS_DB:
