@@ -1,39 +1,58 @@
-"""`objects.jsonl`: one JSON object per line that names a file of the folder and the rights to it.
+"""Catalogues: `objects.jsonl` or `objects.csv`, a row per object with its file and its rights.
 
 A mistake in it stops the run, since it is the user's text; a file that it names and that is missing
 does not, since one lost download must not cost the others.
 """
 
-import json
-from collections.abc import Iterator
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pipeline.objects.catalogue_rows import csv_rows, jsonl_rows
 from pipeline.objects.licences import UNKNOWN
 from pipeline.objects.names import printable
 from storage.errors import TrilightError
 from storage.records import ObjectRecord
 
-CATALOGUE_NAME = "objects.jsonl"
+CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")
 
 
-def read_catalogue(folder: Path) -> list[ObjectRecord]:
-    """Return the records of `folder`'s catalogue, in its order.
+def only_catalogue(exists: Callable[[str], bool]) -> str | None:
+    """Return the name of a folder's catalogue, or None where it has none.
 
-    `uid` and `path` are required; `title` falls back to the uid, `licence` to LicenseRef-unknown
-    (which the default allow-list refuses), `attribution` and `source_url` to nothing. Other fields
-    are ignored.
+    Args:
+        exists: says whether the folder has a file of a name.
 
     Raises:
-        TrilightError: a line is no JSON object, a field is missing or no text, a uid is empty, not
+        TrilightError: it has both.
+    """
+    found = [name for name in CATALOGUE_NAMES if exists(name)]
+    if len(found) > 1:
+        raise TrilightError(
+            f"objects: the folder has {' and '.join(found)}; expected one catalogue. Remove one."
+        )
+    return found[0] if found else None
+
+
+def read_catalogue(path: Path) -> list[ObjectRecord]:
+    """Return the records of a catalogue, in its order.
+
+    `uid` and `path` (below the folder of the catalogue) are required; `title` falls back to the
+    uid, `licence` to LicenseRef-unknown (which the default allow-list refuses), `licence_source` to
+    the name of the catalogue, `attribution` and `source_url` to nothing. Other fields are ignored.
+
+    Raises:
+        TrilightError: a row is malformed, a field is missing or no text, a uid is empty, not
             printable or used twice, or a path leads out of the folder; names file and line.
     """
-    root = folder.resolve()
+    root = Path(os.path.realpath(path.parent))
     records: list[ObjectRecord] = []
     line_of: dict[str, int] = {}
-    for number, row in _rows(folder / CATALOGUE_NAME):
-        place = f"{CATALOGUE_NAME}:{number}"
-        record = _record(root, row, place)
+    rows = csv_rows(path) if path.suffix == ".csv" else jsonl_rows(path)
+    for number, row in rows:
+        place = f"{path.name}:{number}"
+        record = _record(root, row, place, path.name)
         if record.uid in line_of:
             raise TrilightError(
                 f"{place}: uid {record.uid!r} is already used in line {line_of[record.uid]}; "
@@ -44,34 +63,7 @@ def read_catalogue(folder: Path) -> list[ObjectRecord]:
     return records
 
 
-def _rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield line numbers from 1 and rows; blank lines are skipped."""
-    try:
-        lines = path.read_bytes().decode("utf-8-sig").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise TrilightError(
-            f"{path.name}: cannot be read ({error}); expected UTF-8 text with one JSON object per "
-            "line. Mend or remove it."
-        ) from error
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        try:
-            row = json.loads(line)
-        except (ValueError, RecursionError) as error:
-            raise TrilightError(
-                f"{path.name}:{number}: not JSON ({error}); expected one object per line such as "
-                '{"uid": "chair", "path": "chair.glb", "licence": "CC0-1.0"}.'
-            ) from error
-        if not isinstance(row, dict):
-            raise TrilightError(
-                f"{path.name}:{number}: got a {type(row).__name__}; expected a JSON object with "
-                "uid and path."
-            )
-        yield number, row
-
-
-def _record(root: Path, row: dict[str, Any], place: str) -> ObjectRecord:
+def _record(root: Path, row: dict[str, Any], place: str, name: str) -> ObjectRecord:
     uid, path = _text(row, "uid", place), _text(row, "path", place)
     if uid != printable(uid) or not uid.strip():
         raise TrilightError(
@@ -82,6 +74,7 @@ def _record(root: Path, row: dict[str, Any], place: str) -> ObjectRecord:
         path=str(_inside(root, path, place)),
         title=printable(_text(row, "title", place, uid)),
         licence=printable(_text(row, "licence", place, UNKNOWN)),
+        licence_source=printable(_text(row, "licence_source", place, name)),
         attribution=printable(_text(row, "attribution", place, "")),
         source_url=printable(_text(row, "source_url", place, "")),
     )
@@ -100,7 +93,7 @@ def _inside(root: Path, path: str, place: str) -> Path:
     shown = printable(path)
     if not path or "\x00" in path or path != path.encode("utf-8", "ignore").decode():
         raise TrilightError(f"{place}: path is {shown!r}; expected the name of a file.")
-    target = (root / path).resolve()
+    target = Path(os.path.realpath(root / path))
     if not target.is_relative_to(root) or target == root:
         raise TrilightError(
             f"{place}: path {shown!r} leads out of the folder; expected a path below it. "

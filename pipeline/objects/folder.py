@@ -1,53 +1,59 @@
-"""Object files of a folder that has no catalogue: taken as the user's own."""
+"""Object files of a folder that has no catalogue."""
 
 import os
 from pathlib import Path
 
-from pipeline.objects.licences import USER_PROVIDED
+from pipeline.objects.licences import StatedLicence
+from pipeline.objects.listing import Listing, failure
 from pipeline.objects.names import printable
+from pipeline.objects.uids import assign_uids, is_object_file
 from storage.errors import TrilightError
 from storage.records import ObjectRecord
 
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 
-
-def scan_folder(folder: Path) -> list[ObjectRecord]:
+def scan_folder(folder: Path, licence: StatedLicence) -> Listing:
     """Return a record for every object file below `folder`, at any depth.
 
-    The uid is the path within the folder without its suffixes (`banner.gltf.glb` is `banner`).
     Hidden files are left out (other systems leave `._name.obj` beside `name.obj`), and linked
-    folders are not entered.
+    folders are not entered. A link out of the folder is a failure `link_outside` of that object.
 
     Raises:
-        TrilightError: a folder cannot be read, two files have the same uid, or a link leads out.
+        TrilightError: a folder cannot be read.
     """
-    root = folder.resolve()
-    records: dict[str, ObjectRecord] = {}
-    for path in _object_files(root):
-        shown = printable(path.relative_to(root).as_posix())
-        if not path.resolve().is_relative_to(root):
-            raise TrilightError(
-                f"{shown}: is a link out of {printable(str(folder))}; expected files below it. "
-                "Copy the file, or name the folder that holds it."
+    root = Path(os.path.realpath(folder))
+    uids, failures = assign_uids(_object_files(root))
+    records = []
+    for name, uid in uids.items():
+        # Not Path.resolve: links that go round in a circle make it raise.
+        if not Path(os.path.realpath(root / name)).is_relative_to(root):
+            message = (
+                f"{printable(name)} is a link out of the folder; copy the file into it, or name "
+                "the folder that holds it"
             )
-        uid = _without_suffixes(shown)
-        if uid in records:
-            raise TrilightError(
-                f"{shown}: has the uid {uid!r} of {printable(Path(records[uid].path).name)}; "
-                f"expected one file per object. Rename one, or list the objects in objects.jsonl."
-            )
-        records[uid] = ObjectRecord(
-            uid=uid,
-            path=str(path),
-            title=uid.rpartition("/")[2],
-            licence=USER_PROVIDED,
-            attribution="",
-            source_url="",
-        )
-    return list(records.values())
+            failures.append(failure(uid, "link_outside", message))
+            continue
+        records.append(file_record(uid, str(root / name), licence))
+    return Listing(records=records, failures=failures)
 
 
-def _object_files(root: Path) -> list[Path]:
+def file_record(
+    uid: str, path: str, licence: StatedLicence, *, source_url: str = ""
+) -> ObjectRecord:
+    """Return the record of a file that nothing is said about."""
+    return ObjectRecord(
+        uid=uid,
+        path=path,
+        title=uid.rpartition("/")[2],
+        licence=licence.licence,
+        licence_source=licence.licence_source,
+        attribution="",
+        source_url=source_url,
+    )
+
+
+def _object_files(root: Path) -> list[str]:
+    """Return the paths of the object files relative to `root`, with / between their parts."""
+
     def stop(error: OSError) -> None:
         raise TrilightError(
             f"{printable(str(error.filename))}: cannot be read ({error.strerror}); expected a "
@@ -57,15 +63,6 @@ def _object_files(root: Path) -> list[Path]:
     found = []
     for place, folders, files in os.walk(root, onerror=stop):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        found += [
-            Path(place, name)
-            for name in files
-            if not name.startswith(".") and name.lower().endswith(SUFFIXES)
-        ]
-    return sorted(found)
-
-
-def _without_suffixes(name: str) -> str:
-    while name.lower().endswith(SUFFIXES):
-        name = name[: name.rindex(".")]
-    return name
+        inner = Path(place).relative_to(root)
+        found += [(inner / name).as_posix() for name in files if is_object_file(name)]
+    return found

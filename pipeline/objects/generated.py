@@ -6,12 +6,10 @@ stages after this one read files and nothing else, and a damaged file is mended.
 
 from pathlib import Path
 
-import numpy as np
-
 from pipeline.objects.builtin.families import FAMILIES
-from pipeline.objects.builtin.grids import Mesh
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
+from storage.ply import encode_ply
 from storage.records import ObjectRecord
 from storage.seeds import rng_for
 
@@ -33,7 +31,7 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
     for index in range(_count(source)):
         family, number = names[index % len(names)], index // len(names)
         path = work_dir / "builtin" / f"{family}-{number:05d}.ply"
-        data = encode_ply(FAMILIES[family](rng_for(0, f"builtin/{family}", number)))
+        data = encode_ply(*FAMILIES[family](rng_for(0, f"builtin/{family}", number)))
         if not path.is_file() or path.read_bytes() != data:
             write_atomically(path, data)
         records.append(
@@ -42,26 +40,12 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
                 path=str(path.resolve()),
                 title=f"{family.replace('_', ' ')} {number}",
                 licence="CC0-1.0",
+                licence_source="Trilight",
                 attribution="Trilight built-in objects",
                 source_url="",
             )
         )
     return records
-
-
-def encode_ply(mesh: Mesh) -> bytes:
-    """Return a mesh as binary PLY: float32 positions, triangles."""
-    positions, faces = mesh
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(positions)}\n"
-        "property float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\n"
-        "property list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.zeros(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
-    rows["count"], rows["corners"] = 3, faces
-    return header.encode() + positions.astype("<f4").tobytes() + rows.tobytes()
 
 
 def _count(source: str) -> int:

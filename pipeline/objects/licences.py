@@ -1,14 +1,19 @@
 """Which objects may enter a dataset by their licence: an allow-list, so that silence refuses."""
 
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+from pipeline.objects.listing import failure
+from pipeline.objects.names import printable
+from storage.errors import TrilightError
 from storage.records import Failure, ObjectRecord
 
 USER_PROVIDED = "LicenseRef-user-provided"
 """Of files that a user names without a catalogue: theirs to use, as far as we can know."""
 
 UNKNOWN = "LicenseRef-unknown"
-"""Of catalogue rows that state no licence."""
+"""Of objects whose source states no licence."""
 
 DEFAULT_ALLOWED: tuple[str, ...] = (
     "CC0-1.0",
@@ -32,6 +37,56 @@ DEFAULT_ALLOWED: tuple[str, ...] = (
 """SPDX identifiers that permit derived and commercial use; attribution and share-alike are kept
 with the object. Not here: unknown, non-commercial (NC) and no-derivatives (ND) licences."""
 
+_IDENTIFIER = re.compile(r"[A-Za-z0-9.+-]{1,64}")
+_COMPOUND = re.compile(r"(?i)\s(?:AND|OR|WITH)\s")
+_EXPECTED = (
+    "expected an SPDX identifier such as CC-BY-4.0, or LicenseRef-NAME: at most 64 letters, "
+    "digits, dots, + and -"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatedLicence:
+    """The licence of files that come without a statement of their own."""
+
+    licence: str
+    """SPDX identifier, or `LicenseRef-...`."""
+    licence_source: str
+    """Who says so."""
+
+
+def stated_licence(licence: str | None) -> StatedLicence:
+    """Return what holds for files without a statement: what the user says, or an assumption.
+
+    Raises:
+        TrilightError: `licence` does not have the form of an identifier.
+    """
+    if licence is None:
+        return StatedLicence(licence=USER_PROVIDED, licence_source="assumed: the user's own files")
+    if not _IDENTIFIER.fullmatch(licence):
+        raise TrilightError(f"--licence is {printable(licence)!r}; {_EXPECTED}.")
+    return StatedLicence(licence=licence, licence_source="stated by the user (--licence)")
+
+
+def require_unstated(licence: str | None, source: str) -> None:
+    """Raise TrilightError where a user states a licence for a source that states its own."""
+    if licence is not None:
+        raise TrilightError(
+            f"--licence is {printable(licence)!r}, but {source} states the licence of every "
+            "object; expected it only for files without a statement. Leave it out; a catalogue "
+            "has the column licence for it."
+        )
+
+
+def check_allowed(allowed: Sequence[str]) -> None:
+    """Raise TrilightError for an entry of the allow-list that no licence can ever equal.
+
+    Compound expressions such as `MIT OR Apache-2.0` are not looked into.
+    """
+    for name in allowed:
+        if not _allowable(name):
+            raise TrilightError(f"--allow-licence has {printable(name)!r}; {_EXPECTED}.")
+
 
 def refuse_licences(
     records: Sequence[ObjectRecord], allowed: Sequence[str]
@@ -44,14 +99,21 @@ def refuse_licences(
     names = {name.casefold() for name in allowed}
     kept = [record for record in records if record.licence.casefold() in names]
     refused = [
-        Failure(
-            stage="objects",
-            item=record.uid,
-            reason="licence_refused",
-            message=f"licence {record.licence} is not on the allow-list; if you may use the "
-            f"object, add --allow-licence '{record.licence}'",
-        )
+        failure(record.uid, "licence_refused", _refusal(record.licence))
         for record in records
         if record.licence.casefold() not in names
     ]
     return kept, refused
+
+
+def _refusal(licence: str) -> str:
+    if _allowable(licence):
+        return (
+            f"licence {licence} is not on the allow-list; if you may use the object, add "
+            f"--allow-licence '{licence}'"
+        )
+    return f"licence {licence!r} is no identifier; {_EXPECTED}, in the catalogue"
+
+
+def _allowable(name: str) -> bool:
+    return bool(_IDENTIFIER.fullmatch(name) or _COMPOUND.search(name))

@@ -1,6 +1,6 @@
-"""Closed surfaces as grids of vertices: a torus, or a sphere with two poles.
+"""Surfaces as grids of vertices: a torus, a sphere with two poles, and an open sheet.
 
-Every built-in family is one such grid with its vertices moved, so it is closed by construction.
+Families move the vertices of such grids, so what is closed is closed by construction.
 """
 
 import numpy as np
@@ -42,3 +42,14 @@ def sphere_faces(rings: int, columns: int) -> NDArray[np.int64]:
     bottom = np.stack([np.full(columns, first), column, beside], axis=1)
     top = np.stack([np.full(columns, last), start + beside, start + column], axis=1)
     return np.concatenate([bottom, body, top])[:, ::-1]
+
+
+def sheet_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """Return the faces of an open grid [rows, columns]: 2 (rows - 1) (columns - 1).
+
+    They face the side from which rows run upwards and columns to the right.
+    """
+    row, column = np.divmod(np.arange((rows - 1) * (columns - 1)), columns - 1)
+    start = row * columns + column
+    corners = np.stack([start, start + 1, start + columns + 1, start + columns], axis=1)
+    return corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)

@@ -1,0 +1,205 @@
+"""Furniture: tables, stools, chairs, benches and shelves, joined from bevelled boards and legs.
+
+Many separate closed parts with flat faces, as in most models that people make.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.objects.builtin.grids import Mesh
+from pipeline.objects.builtin.solids import beam, box, join, lathe, moved
+
+
+@dataclass(frozen=True, kw_only=True)
+class FurnitureParams:
+    """Shape of one piece of furniture; lengths are in about metres."""
+
+    kind: str
+    """`table`, `round` (a round top), `chair` (a seat with a back) or `shelf`."""
+    width: float
+    """Along x."""
+    depth: float
+    """Along y; unused for round tops."""
+    height: float
+    """Of the top, the seat or the shelf."""
+    board: float
+    """Thickness of boards."""
+    leg: float
+    """Half thickness of legs at the top."""
+    leg_style: str
+    """`square`, `tapered` or `turned`."""
+    splay: float
+    """How far feet stand outside the tops of their legs."""
+    stretchers: bool
+    """Whether bars join the legs near the floor."""
+    back: float
+    """Height of a chair's back over its seat."""
+    slats: int
+    """Boards of a chair's back or of a bench-like top; 1 is a plain one."""
+    level_slats: bool
+    """Whether the back's boards lie level rather than upright."""
+    boards: int
+    """Boards of a shelf between its top and bottom."""
+    books: tuple[tuple[float, float], ...]
+    """Thickness and height of what stands on a shelf, from its lowest board upwards."""
+
+
+def furniture(params: FurnitureParams) -> Mesh:
+    """Return closed parts that reach into each other."""
+    if params.kind == "shelf":
+        return join(_shelf(params))
+    parts = [*_top(params), *_legs(params)]
+    if params.kind == "chair":
+        parts += _back(params)
+    return join(parts)
+
+
+def furniture_rand(rng: np.random.Generator) -> Mesh:
+    """Return a random piece of furniture."""
+    kind = str(rng.choice(["table", "round", "chair", "chair", "shelf"]))
+    width, depth, height = {
+        "table": ((0.7, 1.8), (0.5, 0.9), (0.4, 0.8)),
+        "round": ((0.35, 1.1), (0.3, 0.4), (0.42, 0.8)),
+        "chair": ((0.4, 0.55), (0.4, 0.5), (0.4, 0.5)),
+        "shelf": ((0.6, 1.2), (0.22, 0.36), (0.8, 1.8)),
+    }[kind]
+    boards = int(rng.integers(2, 6))
+    books = np.column_stack([rng.uniform(0.02, 0.06, 60), rng.uniform(0.5, 0.92, 60)])
+    return furniture(
+        FurnitureParams(
+            kind=kind,
+            width=float(rng.uniform(*width)),
+            depth=float(rng.uniform(*depth)),
+            height=float(rng.uniform(*height)),
+            board=float(rng.uniform(0.025, 0.06)),
+            leg=float(rng.uniform(0.018, 0.035)),
+            leg_style=str(rng.choice(["square", "tapered", "turned"])),
+            splay=float(rng.choice([0.0, rng.uniform(0.02, 0.09)])),
+            stretchers=bool(rng.random() < 0.5),
+            back=float(rng.uniform(0.35, 0.65)),
+            slats=int(rng.integers(3, 8)),
+            level_slats=bool(rng.random() < 0.4),
+            boards=boards,
+            books=tuple((float(a), float(b)) for a, b in books[: int(rng.integers(15, 60))]),
+        )
+    )
+
+
+def _top(params: FurnitureParams) -> list[Mesh]:
+    """Return the top or seat: a disc, a board, or slats on two battens."""
+    high, half = params.height, params.board / 2
+    if params.kind == "round":
+        radius, cut = params.width / 2, 0.3 * params.board
+        outline = [(radius - cut, -half), (radius, cut - half)]
+        outline += [(r, -z) for r, z in reversed(outline)]
+        return [moved(lathe(outline, 32), [0, 0, high - half])]
+    if params.kind == "chair" or params.slats == 1:
+        size = [params.width / 2, params.depth / 2, half]
+        return [box([0, 0, high - half], size, 0.25 * params.board)]
+    step = params.depth / params.slats
+    parts = [
+        box(
+            [0, (number + 0.5) * step - params.depth / 2, high - half],
+            [params.width / 2, 0.42 * step, half],
+            0.15 * half,
+        )
+        for number in range(params.slats)
+    ]
+    for side in (-1, 1):
+        place = [side * 0.3 * params.width, 0, high - 1.9 * half]
+        parts.append(box(place, [0.02, 0.45 * params.depth, half], 0.15 * half))
+    return parts
+
+
+def _legs(params: FurnitureParams) -> list[Mesh]:
+    """Return four legs, the aprons under the top, and stretchers if any."""
+    inset = 1.3 * params.leg + 0.6 * params.splay
+    x, y = params.width / 2 - inset, params.depth / 2 - inset
+    if params.kind == "round":
+        x = y = 0.62 * params.width / 2
+    feet = [(-x, -y), (x, -y), (x, y), (-x, y)]
+    out = np.sign(np.array(feet)) * params.splay
+    high = params.height - 0.5 * params.board
+    tops = [np.array([*foot, high]) for foot in feet]
+    ends = [np.array([*(np.array(foot) + add), 0.0]) for foot, add in zip(feet, out, strict=True)]
+    parts = [_leg(top, end, params) for top, end in zip(tops, ends, strict=True)]
+    levels = [(params.height - params.board - 0.03, 0.01, 0.035)]
+    if params.stretchers:
+        levels.append((0.22 * params.height, 0.011, 0.014))
+    for number in range(4):
+        other = (number + 1) % 4
+        for level, thick, tall in levels:
+            share = level / high
+            start, end = (ends[n] + share * (tops[n] - ends[n]) for n in (number, other))
+            # Bars of one level cross inside the legs; unequal heights keep their faces apart.
+            lift = np.array([0, 0, 0.004 * (number % 2)])
+            parts.append(beam(start + lift, end + lift, (thick, tall), 0.003))
+    return parts
+
+
+_TURNED = (
+    (0.0, 0.5), (0.02, 0.6), (0.05, 0.45), (0.3, 0.75), (0.48, 1.0), (0.56, 0.55), (0.6, 0.85),
+    (0.64, 0.85), (0.68, 0.55), (0.76, 0.95), (0.8, 1.1), (1.0, 1.1),
+)  # fmt: skip
+"""Height and radius of a turned leg from foot to top, in its height and thickness."""
+
+
+def _leg(top: NDArray[np.float64], foot: NDArray[np.float64], params: FurnitureParams) -> Mesh:
+    """Return one leg between two points."""
+    if params.leg_style == "turned":
+        height = top[2] - foot[2]
+        upright, faces = lathe([(r * params.leg, z * height) for z, r in _TURNED], 10)
+        lean = (top - foot) / height
+        lean[2] = 0.0
+        return upright + foot + upright[:, 2:] * lean, faces
+    taper = 0.5 if params.leg_style == "tapered" else 1.0
+    return beam(top, foot, (params.leg, params.leg), 0.15 * params.leg, taper)
+
+
+def _back(params: FurnitureParams) -> list[Mesh]:
+    """Return two posts that lean back, and boards between them."""
+    x, y = params.width / 2 - 1.4 * params.leg, params.depth / 2 - 1.4 * params.leg
+    low, lean = params.height - 0.6 * params.board, 0.2 * params.back
+    foot, head = np.array([x, y, low]), np.array([x, y + lean, params.height + params.back])
+    mirror, post = np.array([-1, 1, 1]), (0.8 * params.leg, 0.8 * params.leg)
+    parts = [beam(foot * side, head * side, post, 0.12 * params.leg) for side in (mirror, 1)]
+    levels = np.linspace(0.3, 0.93, params.slats) if params.level_slats else np.array([0.93])
+    tall = min(0.1, 0.2 / len(levels)) * params.back
+    for share in levels:
+        end = foot + share * (head - foot)
+        parts.append(beam(end * mirror, end, (0.5 * params.leg, tall), 0.003))
+    if params.level_slats:
+        return parts
+    bottom, rail = foot + 0.02 * (head - foot), foot + 0.93 * (head - foot)
+    for number in range(params.slats):
+        place = np.array([(number + 1) / (params.slats + 1) * 2 - 1, 1, 1])
+        wide = min(0.03, 0.6 * x / params.slats)
+        parts.append(beam(bottom * place, rail * place, (wide, 0.25 * params.leg), 0.002))
+    return parts
+
+
+def _shelf(params: FurnitureParams) -> list[Mesh]:
+    """Return two sides, boards between them, and books."""
+    width, depth, half = params.width / 2, params.depth / 2, params.board / 2
+    cut = 0.1 * params.board
+    parts = [
+        box([side * width, 0, params.height / 2], [half, depth, params.height / 2], cut)
+        for side in (-1, 1)
+    ]
+    levels = np.linspace(0.06, params.height - half - 0.01, params.boards + 2)
+    plank = [width, depth - 0.006, 0.8 * half]
+    parts += [box([0, 0, level], plank, 0.8 * cut) for level in levels]
+    bay = levels[1] - levels[0] - 2 * half
+    place, storey = -width + half + 0.01, 0
+    for thick, tall in params.books:
+        if place + thick > width - half - 0.01:
+            place, storey = -width + half + 0.01, storey + 1
+        if storey > params.boards:
+            break
+        size = [thick / 2, 0.5 * depth * (0.8 + 0.4 * tall), bay * tall / 2]
+        floor = levels[storey] + 0.8 * half - 0.003
+        parts.append(box([place + thick / 2, 0.05 * depth, floor + size[2]], size, 0.002))
+        place += thick + 0.003
+    return parts

@@ -1,0 +1,148 @@
+"""Lattices of square bars: frames, crates, towers, cages and grilles.
+
+Thin parts, right angles and many holes; the surface is one piece, whatever its genus.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.objects.builtin.grids import Mesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class LatticeParams:
+    """Shape of one lattice."""
+
+    cells: tuple[int, int, int]
+    """Holes along x, y and z; 0 is a grille, one bar thick that way."""
+    half_sizes: tuple[float, float, float]
+    """Half extents along x, y and z, before it is warped."""
+    bar: float
+    """Thickness of a bar, in steps of the lattice, in (0, 1)."""
+    hollow: bool
+    """Whether bars are on the outside only, as in a crate."""
+    crate: bool
+    """Whether the lowest layer is a plate and the highest a mere rim."""
+    splits: int
+    """Pieces of a bar between two crossings; more bend better."""
+    roundness: float
+    """From 0, a box, to 1, a ball."""
+    taper: float
+    """Relative growth of width from the middle to the top, in (-1, 1)."""
+    twist_rad: float
+    """Turn about z from the middle to the top."""
+    bend_rad: float
+    """Angle of the arc about z that x is laid along; 0 is straight."""
+
+
+def lattice(params: LatticeParams) -> Mesh:
+    """Return the closed surface; about 10 splits triangles per bar."""
+    places, bars = zip(*(_steps(cells, params) for cells in params.cells), strict=True)
+    x, y, z = np.meshgrid(*bars, indexing="ij")
+    solid = x.astype(np.int64) + y + z >= 2
+    if params.hollow:
+        outside = np.zeros(solid.shape, bool)
+        for axis in range(3):
+            edge = np.moveaxis(outside, axis, 0)
+            edge[[0, -1]] = True
+        solid &= outside
+    if params.crate:
+        solid[:, :, 0] = True
+        solid[1:-1, 1:-1, -1] = False
+    corner, faces = _surface(solid)
+    unit = np.stack([np.array(places[axis])[corner[:, axis]] for axis in range(3)], axis=1)
+    return _warped(unit, params), faces
+
+
+def lattice_rand(rng: np.random.Generator) -> Mesh:
+    """Return a random lattice."""
+    kind = str(rng.choice(["frame", "crate", "tower", "cage", "grille"]))
+    low, high = {
+        "frame": ((2, 1, 1), (3, 2, 2)),
+        "crate": ((3, 3, 2), (5, 4, 3)),
+        "tower": ((1, 1, 5), (2, 2, 7)),
+        "cage": ((2, 2, 3), (4, 3, 3)),
+        "grille": ((5, 0, 3), (8, 0, 5)),
+    }[kind]
+    cells = [int(rng.integers(a, b + 1)) for a, b in zip(low, high, strict=True)]
+    sizes = rng.uniform(0.6, 1.0, 3)
+    if kind == "tower":
+        sizes *= [0.4, 0.4, 1.3]
+    if kind == "grille":
+        sizes *= [1.0, 0.06, 1.0]
+    # A pyramid, a slanting tower, a screen, or straight.
+    taper = float(rng.uniform(-0.75, 0.0)) if kind == "tower" or rng.random() < 0.5 else 0.0
+    bend = float(rng.choice([0.0, rng.uniform(1.0, 3.5)])) if kind == "grille" else 0.0
+    # Holes cannot be decimated away: a lattice of many bars has no triangles to spare.
+    fine = np.prod(np.add(cells, 1)) <= 40 and (kind in ("frame", "tower") or bend > 0)
+    return lattice(
+        LatticeParams(
+            cells=(cells[0], cells[1], cells[2]),
+            half_sizes=(float(sizes[0]), float(sizes[1]), float(sizes[2])),
+            bar=float(rng.uniform(0.14, 0.36)),
+            hollow=kind in ("crate", "tower", "cage"),
+            crate=kind == "crate",
+            splits=2 if fine else 1,
+            roundness=float(rng.uniform(0.6, 1.0)) if kind == "cage" else 0.0,
+            taper=taper if kind in ("tower", "frame") else 0.0,
+            twist_rad=float(rng.uniform(-0.7, 0.7)) if kind == "tower" else 0.0,
+            bend_rad=bend,
+        )
+    )
+
+
+def _steps(cells: int, params: LatticeParams) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the places of grid planes [N + 1] from -1 to 1, and which steps [N] are bars."""
+    gap = [(1 - params.bar) / params.splits] * params.splits
+    widths = np.array([params.bar] + [*gap, params.bar] * cells)
+    bars = np.array([True] + ([False] * params.splits + [True]) * cells)
+    places = np.concatenate([[0.0], np.cumsum(widths)])
+    return 2 * places / places[-1] - 1, bars
+
+
+def _surface(solid: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the grid points [V, 3] and the faces between cells that are solid and not.
+
+    Cells that share an edge and nothing else would make an edge of four faces; bars that meet at
+    crossings never do.
+    """
+    padded = np.pad(solid, 1).astype(np.int64)
+    shape = tuple(size + 1 for size in solid.shape)
+    quads = []
+    for axis in range(3):
+        b, c = (axis + 1) % 3, (axis + 2) % 3
+        change = np.diff(padded, axis=axis)
+        for sign in (1, -1):
+            # A cell begins where occupancy rises: its face looks down the axis.
+            base = np.argwhere(change == sign)
+            base[:, [b, c]] -= 1
+            steps = [np.zeros(3, np.int64) for _ in range(4)]
+            for number in (1, 2):
+                steps[number][c if sign > 0 else b] = 1
+            for number in (2, 3):
+                steps[number][b if sign > 0 else c] = 1
+            corners = base[:, None] + np.array(steps)[None]
+            quads.append(np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), shape))
+    used, flat = np.unique(np.concatenate(quads), return_inverse=True)
+    points = np.stack(np.unravel_index(used, shape), axis=1)
+    return points, flat.reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+
+def _warped(unit: NDArray[np.float64], params: LatticeParams) -> NDArray[np.float64]:
+    """Return points [V, 3] of the cube from -1 to 1 rounded, scaled, tapered, twisted, bent."""
+    largest = np.abs(unit).max(axis=1, keepdims=True)
+    length = np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
+    ball = unit * largest / length
+    points = (unit + params.roundness * (ball - unit)) * np.array(params.half_sizes)
+    points[:, :2] *= 1 + params.taper * unit[:, 2:]
+    angle = params.twist_rad * unit[:, 2]
+    x, y = points[:, 0].copy(), points[:, 1].copy()
+    points[:, 0] = np.cos(angle) * x - np.sin(angle) * y
+    points[:, 1] = np.sin(angle) * x + np.cos(angle) * y
+    if params.bend_rad:
+        radius = 2 * params.half_sizes[0] / params.bend_rad
+        turn, x = points[:, 0] / radius, radius - points[:, 1]
+        points[:, 0], points[:, 1] = x * np.sin(turn), radius - x * np.cos(turn)
+    return points

@@ -1,0 +1,126 @@
+"""Sea shells (after Raup 1966): a growing tube on a spiral about an axis, open at its mouth.
+
+Smooth, with an inside that one looks into, and detail that shrinks towards the tip.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.objects.builtin.grids import Mesh, sphere_faces
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShellParams:
+    """Shape of one shell; lengths are in distances of the mouth's centre from the axis."""
+
+    turns: float
+    """Turns about the axis."""
+    growth: float
+    """Size over that one turn before; above 1."""
+    drop: float
+    """How far the mouth lies below the tip: 0 is a flat spiral, 4 a turret."""
+    tube: float
+    """Radius of the mouth across; about 1 fills the middle."""
+    stretch: float
+    """Height of the mouth over its width."""
+    ribs: int
+    """Ribs across the tube per turn; 0 is none."""
+    rib_height: float
+    """In radii of the tube."""
+    cords: int
+    """Ridges along the tube, around its section; 0 is none."""
+    cord_height: float
+    """In radii of the tube."""
+    spines: float
+    """How much higher the ribs are at the shoulder than elsewhere."""
+    wall: float
+    """Thickness at the mouth, in radii of the tube; below 1."""
+    lean_rad: float
+    """Turn of the axis from upright: pi / 2 is a shell that lies on the ground."""
+    rings_per_turn: int
+    """Rings of vertices in a turn."""
+    columns: int
+    """Vertices of a ring."""
+
+
+def shell(params: ShellParams) -> Mesh:
+    """Return the closed surface: outside, lip, and the inside of the last half turn.
+
+    Turns lie on each other as in nature, so the surface meets itself where they touch.
+    """
+    rings = int(params.turns * params.rings_per_turn)
+    inside = params.rings_per_turn // 2
+    turn = np.linspace(-params.turns, 0, rings)
+    outer = _rings(turn, 1 + _relief(turn, params), params)
+    # The lip's two edges lie on one ring of angles, the mouth's.
+    back = turn[: -inside - 1 : -1]
+    fade = np.linspace(1 - params.wall, 0.5 * (1 - params.wall), inside)[:, None]
+    inner = _rings(back, np.broadcast_to(fade, (inside, params.columns)), params)
+    poles = np.stack([outer[0].mean(axis=0), inner[-1].mean(axis=0)])
+    grid = np.concatenate([outer, inner]).reshape(-1, 3)
+    cosine, sine = np.cos(params.lean_rad), np.sin(params.lean_rad)
+    lean = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    faces = sphere_faces(rings + inside, params.columns)
+    return np.concatenate([grid, poles]) @ lean.T, faces
+
+
+def shell_rand(rng: np.random.Generator) -> Mesh:
+    """Return a random shell."""
+    kind = str(rng.choice(["nautilus", "snail", "turret", "whelk"]))
+    growth, drop, tube, stretch, turns = {
+        "nautilus": ((2.2, 3.2), (0.0, 0.15), (0.6, 0.8), (0.8, 1.1), (2.2, 3.0)),
+        "snail": ((1.6, 2.1), (0.8, 1.5), (0.75, 0.95), (0.9, 1.2), (3.0, 4.2)),
+        "turret": ((1.22, 1.45), (3.0, 7.0), (0.8, 1.1), (0.9, 1.4), (5.0, 8.0)),
+        "whelk": ((1.5, 1.9), (1.8, 2.8), (0.9, 1.1), (1.4, 2.0), (3.5, 4.8)),
+    }[kind]
+    turn_count = float(rng.uniform(*turns))
+    cords = int(rng.choice([0, 0, 5, 7]))
+    columns = int(rng.integers(14, 19)) if not cords else 3 * cords
+    # No more than about 5500 triangles, whatever was drawn.
+    most = int(2700 / (columns * (turn_count + 0.5)))
+    return shell(
+        ShellParams(
+            turns=turn_count,
+            growth=float(rng.uniform(*growth)),
+            drop=float(rng.uniform(*drop)),
+            tube=float(rng.uniform(*tube)),
+            stretch=float(rng.uniform(*stretch)),
+            ribs=int(rng.choice([0, 6, 9, 12])),
+            rib_height=float(rng.uniform(0.1, 0.28)),
+            cords=cords,
+            cord_height=float(rng.uniform(0.06, 0.14)),
+            spines=float(rng.choice([0.0, 0.0, rng.uniform(1.0, 2.5)])),
+            wall=float(rng.uniform(0.06, 0.14)),
+            lean_rad=float(rng.choice([0.0, rng.uniform(0.8, 1.7), rng.uniform(1.7, 2.4)])),
+            rings_per_turn=min(int(rng.integers(22, 37)), most),
+            columns=columns,
+        )
+    )
+
+
+def _relief(turn: NDArray[np.float64], params: ShellParams) -> NDArray[np.float64]:
+    """Return the height [rings, columns] of ribs, spines and cords, at least 0."""
+    around = 2 * np.pi * np.arange(params.columns) / params.columns
+    relief = np.zeros((len(turn), params.columns))
+    if params.ribs:
+        crest = (0.5 + 0.5 * np.cos(2 * np.pi * params.ribs * turn)) ** 2
+        shoulder = np.maximum(np.cos(around + 0.7), 0) ** 6
+        relief += params.rib_height * crest[:, None] * (1 + params.spines * shoulder)
+    if params.cords:
+        relief += params.cord_height * (0.5 + 0.5 * np.cos(params.cords * around))
+    return relief
+
+
+def _rings(
+    turn: NDArray[np.float64], radius: NDArray[np.float64], params: ShellParams
+) -> NDArray[np.float64]:
+    """Return points [rings, columns, 3] of the tube at `turn` [rings], 0 being the mouth."""
+    angle, size = 2 * np.pi * turn, params.growth**turn
+    around = 2 * np.pi * np.arange(params.columns) / params.columns
+    outwards = 1 + params.tube * radius * np.cos(around)
+    height = -params.drop - params.tube * params.stretch * radius * np.sin(around)
+    flat = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    grid = np.concatenate([outwards[..., None] * flat[:, None], height[..., None]], axis=2)
+    return grid * size[:, None, None]

@@ -1,0 +1,158 @@
+"""Closed parts that objects are put together from: lathed bodies, tubes, beams and balls.
+
+Parts of one object may reach into each other, as the leg of a table into its top. They must not
+share a plane there, because what lies in the same place has no front.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.objects.builtin.grids import Mesh, sphere_faces
+
+
+def join(parts: Sequence[Mesh]) -> Mesh:
+    """Return one mesh with all parts, which keep their own vertices."""
+    starts = np.cumsum([0] + [len(positions) for positions, _ in parts])
+    faces = [part[1] + start for part, start in zip(parts, starts, strict=False)]
+    return np.concatenate([positions for positions, _ in parts]), np.concatenate(faces)
+
+
+def moved(mesh: Mesh, offset: ArrayLike, scale: ArrayLike = 1.0) -> Mesh:
+    """Return the mesh scaled (positive numbers) and then moved."""
+    return mesh[0] * np.asarray(scale) + np.asarray(offset), mesh[1]
+
+
+def lathe(outline: Sequence[tuple[float, float]], columns: int) -> Mesh:
+    """Return a solid of revolution about z, of 2 len(outline) columns triangles.
+
+    Args:
+        outline: radius (positive) and height of each ring; the ends are closed by flat discs. A
+            body that has the axis inside runs from the bottom to the top.
+        columns: vertices of a ring.
+    """
+    rings = np.array(outline)
+    turn = 2 * np.pi * np.arange(columns) / columns
+    flat = rings[:, :1, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)[None]
+    grid = np.concatenate(
+        [flat, np.broadcast_to(rings[:, 1:, None], (*flat.shape[:2], 1))], axis=2
+    ).reshape(-1, 3)
+    poles = [[0.0, 0.0, rings[0, 1]], [0.0, 0.0, rings[-1, 1]]]
+    return np.concatenate([grid, poles]), sphere_faces(len(rings), columns)
+
+
+def tube(path: NDArray[np.float64], radii: NDArray[np.float64], sides: int) -> Mesh:
+    """Return a closed tube along `path` [N, 3] with `radii` [N], of 2 N sides triangles.
+
+    Bends must be wider than the tube is thick, or it folds.
+    """
+    tangent = np.gradient(path, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    side = np.zeros_like(path)
+    # The axis that is furthest from the first tangent; carried along from there without turning.
+    last = np.eye(3)[np.abs(tangent[0]).argmin()]
+    for index, direction in enumerate(tangent):
+        last = last - direction * (last @ direction)
+        last = last / np.linalg.norm(last)
+        side[index] = last
+    up = np.cross(tangent, side)
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = np.cos(turn)[None, :, None] * side[:, None] + np.sin(turn)[None, :, None] * up[:, None]
+    grid = (path[:, None] + radii[:, None, None] * ring).reshape(-1, 3)
+    return np.concatenate([grid, path[[0, -1]]]), sphere_faces(len(path), sides)
+
+
+def box(centre: ArrayLike, half_sizes: ArrayLike, chamfer: float) -> Mesh:
+    """Return an upright box with bevelled edges, of 44 triangles.
+
+    `chamfer` is how far edges are cut back: more than 0, less than every half size.
+    """
+    half = np.asarray(half_sizes, np.float64)
+    corners = _SIGNS[:, None, :] * (half - chamfer * (1 - np.eye(3)))[None]
+    return corners.reshape(-1, 3) + np.asarray(centre), _BOX_FACES
+
+
+def beam(
+    start: ArrayLike, end: ArrayLike, sizes: tuple[float, float], chamfer: float, taper: float = 1.0
+) -> Mesh:
+    """Return a bevelled bar of 44 triangles between two points that are not above each other in y.
+
+    Args:
+        start: middle of one end.
+        end: middle of the other.
+        sizes: half widths, across (level or along x) and at right angles to that.
+        chamfer: as for a box.
+        taper: width at the end over that at the start.
+    """
+    first, last = np.asarray(start, np.float64), np.asarray(end, np.float64)
+    length = float(np.linalg.norm(last - first))
+    axis = (last - first) / length
+    upright = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    across = np.cross(upright, axis)
+    across /= np.linalg.norm(across)
+    local, faces = box([0.0, 0.0, 0.0], [*sizes, length / 2], chamfer)
+    width = 1 + (taper - 1) * (local[:, 2:] / length + 0.5)
+    local[:, :2] *= width
+    frame = np.stack([across, np.cross(axis, across), axis])
+    return local @ frame + (first + last) / 2, faces
+
+
+def icosphere(frequency: int) -> Mesh:
+    """Return the unit sphere of 20 frequency^2 even triangles."""
+    golden = (1 + np.sqrt(5)) / 2
+    flat = np.array([[0.0, a, b * golden] for a in (-1, 1) for b in (-1, 1)])
+    corners = np.concatenate([np.roll(flat, turn, axis=1) for turn in range(3)])
+    distance = np.linalg.norm(corners[:, None] - corners[None], axis=2)
+    near = np.abs(distance - 2) < 1e-9
+    sides = np.array(
+        [(i, j, k) for i in range(12) for j in range(i) for k in range(j)
+         if near[i, j] and near[j, k] and near[i, k]]
+    )  # fmt: skip
+    steps = np.array(
+        [(i, j) for i in range(frequency + 1) for j in range(frequency + 1 - i)], np.int64
+    )
+    number = {(int(i), int(j)): index for index, (i, j) in enumerate(steps)}
+    cells = [((i, j), (i + 1, j), (i, j + 1)) for i, j in number if i + j < frequency]
+    cells += [((i + 1, j), (i + 1, j + 1), (i, j + 1)) for i, j in number if i + j < frequency - 1]
+    local = np.array([[number[corner] for corner in cell] for cell in cells])
+    weights = np.column_stack([steps, frequency - steps.sum(axis=1)]) / frequency
+    points = np.einsum("ns,fsd->fnd", weights, corners[sides]).reshape(-1, 3)
+    faces = (local[None] + len(steps) * np.arange(20)[:, None, None]).reshape(-1, 3)
+    _, first, same = np.unique(
+        np.rint(points * 1e6), axis=0, return_index=True, return_inverse=True
+    )
+    points = points[first] / np.linalg.norm(points[first], axis=1, keepdims=True)
+    return points, outward(points, same.reshape(-1)[faces])
+
+
+def outward(positions: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return faces of a body that is star-shaped about the origin, turned to the outside."""
+    a, b, c = positions[faces].transpose(1, 0, 2)
+    inside_out = np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) < 0
+    return np.where(inside_out[:, None], faces[:, ::-1], faces)
+
+
+_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+"""The corners of a box; vertex 3 i + a is that of corner i on the side across axis a."""
+
+
+def _box_faces() -> NDArray[np.int64]:
+    """Return six sides, twelve bevels and eight corners, as triangles."""
+    faces = [(3 * corner, 3 * corner + 1, 3 * corner + 2) for corner in range(8)]
+    steps = (4, 2, 1)
+    for axis in range(3):
+        u, v = (step for other, step in enumerate(steps) if other != axis)
+        b, c = (other for other in range(3) if other != axis)
+        for low in (0, steps[axis]):
+            side = [3 * (low + add) + axis for add in (0, u, u + v, v)]
+            faces += [(side[0], side[1], side[2]), (side[0], side[2], side[3])]
+        for low in (0, u, v, u + v):
+            high = low + steps[axis]
+            edge = [3 * low + b, 3 * high + b, 3 * high + c, 3 * low + c]
+            faces += [(edge[0], edge[1], edge[2]), (edge[0], edge[2], edge[3])]
+    unit = (_SIGNS[:, None, :] * (1 - 0.25 * (1 - np.eye(3)))[None]).reshape(-1, 3)
+    return outward(unit, np.array(faces, np.int64))
+
+
+_BOX_FACES = _box_faces()

@@ -1,0 +1,160 @@
+"""The `objaverse` package, with its rough edges held: one call at a time, bounded, silent.
+
+The package keeps its files in a place of its own (`~/.objaverse`), which other programs use too. It
+fetches metadata without a temporary name, so that a broken transfer leaves a broken file; waits for
+a dead server for ever; prints; and reads its list of all objects anew for each object.
+"""
+
+import contextlib
+import fcntl
+import importlib
+import re
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+from pipeline.objects.transfer import TransferFailed, with_tries
+from storage.atomic import write_error
+from storage.errors import TrilightError
+
+Result = TypeVar("Result")
+
+_SILENCE_S = 60.0
+_PLACE = re.compile(r"glbs/[\w-]+/[\w-]+\.glb")
+_PATHS = "object-paths.json.gz"
+_CATEGORIES = "lvis-annotations.json.gz"
+
+
+class ObjaversePackage:
+    """What we use of the package. Not safe to use from several threads."""
+
+    def __init__(self) -> None:
+        """Import the package.
+
+        Raises:
+            TrilightError: it is not installed, or the list of all objects cannot be had.
+        """
+        try:
+            self._package: ModuleType = importlib.import_module("objaverse")
+        except ImportError as error:
+            raise TrilightError(
+                "objects objaverse: needs the package objaverse; expected it to be installed. Run "
+                "make setup-all."
+            ) from error
+        self._paths: dict[str, str] = self._listing(_PATHS, self._package._load_object_paths)
+
+    def __contains__(self, uid: str) -> bool:
+        """Say whether Objaverse has an object, in the place where the package looks for it."""
+        return bool(_PLACE.fullmatch(str(self._paths.get(uid))))
+
+    def categories(self) -> dict[str, list[str]]:
+        """Return the uids of every LVIS category; raises TrilightError where they cannot be had."""
+        return self._listing(_CATEGORIES, self._package.load_lvis_annotations)
+
+    def groups(self, uids: Sequence[str]) -> list[list[str]]:
+        """Return known uids by the metadata file that describes them, each once."""
+        groups: dict[str, list[str]] = {}
+        for uid in dict.fromkeys(uids):
+            groups.setdefault(self._paths[uid].split("/")[1], []).append(uid)
+        return [groups[name] for name in sorted(groups)]
+
+    def annotations(self, group: list[str]) -> dict[str, dict[str, Any]]:
+        """Return what is known of the uids of one group, by uid; some may be missing.
+
+        Raises:
+            TransferFailed: the file that describes them cannot be had.
+        """
+        name = f"metadata/{self._paths[group[0]].split('/')[1]}.json.gz"
+        return self._metadata(name, lambda: self._package.load_annotations(group))
+
+    def fetch(self, uid: str) -> Path:
+        """Bring a known object here, unless it is here already.
+
+        Raises:
+            TransferFailed: it cannot be had.
+        """
+
+        def load() -> Path:
+            with self._guarded():
+                # One process: with more, the package forks a pool that nobody can end.
+                return Path(self._package.load_objects([uid], download_processes=1)[uid])
+
+        return with_tries(load).absolute()
+
+    def _listing(self, name: str, load: Callable[[], Result]) -> Result:
+        try:
+            return self._metadata(name, load)
+        except TransferFailed as error:
+            raise TrilightError(
+                f"objects objaverse: {name} cannot be had ({error.message}); expected it to be "
+                "downloaded. Check the network and try again."
+            ) from error
+
+    def _metadata(self, name: str, load: Callable[[], Result]) -> Result:
+        """Load a metadata file; one that cannot be read is deleted, and fetched again."""
+
+        def attempt() -> Result:
+            try:
+                with self._guarded():
+                    return load()
+            except TrilightError:
+                raise
+            except Exception:
+                (self._root / name).unlink(missing_ok=True)
+                raise
+
+        return with_tries(attempt)
+
+    @property
+    def _root(self) -> Path:
+        return Path(self._package._VERSIONED_PATH)
+
+    @contextlib.contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Hold the package's folder, its output and its patience while it works.
+
+        Only names of the package are replaced, not `sys.stdout`, so that a progress bar of ours
+        goes on. The limit of time holds for all sockets that are opened meanwhile.
+        """
+        before = socket.getdefaulttimeout()
+        replaced: dict[str, Any] = {"print": _print_nothing, "tqdm": _iterate}
+        if hasattr(self, "_paths"):
+            replaced["_load_object_paths"] = lambda: self._paths
+        missing = object()
+        kept = {name: self._package.__dict__.get(name, missing) for name in replaced}
+        with self._locked():
+            socket.setdefaulttimeout(_SILENCE_S)
+            self._package.__dict__.update(replaced)
+            try:
+                yield
+            finally:
+                socket.setdefaulttimeout(before)
+                for name, value in kept.items():
+                    if value is missing:
+                        del self._package.__dict__[name]
+                    else:
+                        self._package.__dict__[name] = value
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Keep other runs from writing the same unfinished files; the kernel frees the lock."""
+        path = self._root / ".trilight.lock"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stream = path.open("wb")
+        except OSError as error:
+            raise write_error(path, error) from error
+        with stream:
+            fcntl.flock(stream, fcntl.LOCK_EX)
+            yield
+
+
+def _print_nothing(*values: object, **options: object) -> None:
+    """Stand in for print."""
+
+
+def _iterate(items: Result, *values: object, **options: object) -> Result:
+    """Stand in for a progress bar."""
+    return items

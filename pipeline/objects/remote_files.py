@@ -1,0 +1,203 @@
+"""Files of a remote folder on this machine: fetched once, whole or not at all.
+
+A file lies below `files` under its own name, since the parts of a glTF name each other. Beside it,
+below `versions`, stands what the server said about it then: while the server says the same, the
+file is not fetched again.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from fsspec.callbacks import Callback
+
+from pipeline.objects.gltf_buffers import buffer_names
+from pipeline.objects.names import printable
+from pipeline.objects.remote_folder import RemoteFolder
+from pipeline.objects.transfer import Interrupted, TransferFailed, with_tries
+from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_atomically
+from storage.errors import TrilightError
+
+_VERSION_FIELDS = (
+    "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "updated",
+    "md5Hash", "Content-MD5", "blob_id",
+)  # fmt: skip
+"""Under which names the drivers say when a file changed."""
+_MAX_NAME_BYTES = 220
+"""File systems allow 255; the rest is for the name of an unfinished file."""
+_MAX_PATH_BYTES = 2000
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+_NAME_ERRORS = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.EILSEQ)
+_MAX_BUFFERS = 100
+_STALE_S = 24 * 3600.0
+
+
+class RemoteFiles:
+    """The local side of a remote folder. Safe to use from several threads."""
+
+    def __init__(self, folder: RemoteFolder, root: Path, max_bytes: int) -> None:
+        """Remember where files go.
+
+        Args:
+            folder: where they come from.
+            root: where they go; belongs to this folder alone.
+            max_bytes: largest accepted object, with the buffers that it names.
+        """
+        self.files = Path(os.path.realpath(root)) / "files"
+        self.stop = threading.Event()
+        self._versions = self.files.parent / "versions"
+        self._folder = folder
+        self._max_bytes = max_bytes
+        self._lock = threading.Lock()
+        self._outcomes: dict[str, _Outcome] = {}
+        _remove_stale(self.files)
+
+    def path(self, name: str) -> Path:
+        """Return where a file goes; raises TransferFailed `unsafe_name` for names that lead out."""
+        parts = name.split("/")
+        encoded = [os.fsencode(part) for part in parts]
+        if (
+            any(part in ("", ".", "..") or "\x00" in part for part in parts)
+            or max(map(len, encoded)) > _MAX_NAME_BYTES
+            or sum(map(len, encoded)) > _MAX_PATH_BYTES
+        ):
+            message = f"the name {printable(name)[:100]!r} cannot be that of a file here"
+            raise TransferFailed("unsafe_name", message)
+        return self.files / name
+
+    def fetch_object(self, name: str) -> Path:
+        """Bring a file here, and the buffers of a `.gltf`; returns where it is.
+
+        Raises:
+            TransferFailed: unsafe_name, too_large_bytes, too_many_buffers, download_failed.
+            TrilightError: the disk is full or cannot be written.
+        """
+        path = self.fetch(name)
+        if name.lower().endswith(".gltf"):
+            buffers = buffer_names(path, name)
+            if len(buffers) > _MAX_BUFFERS:
+                message = f"names {len(buffers)} buffers; expected at most {_MAX_BUFFERS}"
+                raise TransferFailed("too_many_buffers", message)
+            total = path.stat().st_size
+            for buffer in buffers:
+                try:
+                    total += self.fetch(buffer).stat().st_size
+                except TransferFailed as error:
+                    message = f"buffer {printable(buffer)[:100]}: {error.message}"
+                    raise TransferFailed(error.reason, message) from error
+                self._check_size(total)
+        return path
+
+    def fetch(self, name: str) -> Path:
+        """Bring one file here, once in the life of this object; raises as `fetch_object` does."""
+        with self._lock:
+            outcome = self._outcomes.setdefault(name, _Outcome())
+        with outcome.lock:
+            if outcome.path is None and outcome.error is None:
+                try:
+                    outcome.path = self.path(name)
+                    with_tries(lambda: self._refresh(name, self.path(name)))
+                except TransferFailed as error:
+                    outcome.error = error
+        if outcome.error is not None:
+            raise outcome.error
+        assert outcome.path is not None
+        return outcome.path
+
+    def _refresh(self, name: str, path: Path) -> None:
+        """Fetch a file unless what is here is what the server has."""
+        facts = self._folder.facts(name)
+        if facts.get("type") == "directory":
+            raise TransferFailed("download_failed", "is a folder, not a file")
+        size = facts.get("size")
+        self._check_size(size or 0)
+        version = {key: str(facts[key]) for key in _VERSION_FIELDS if facts.get(key)}
+        if size is not None:
+            version["size"] = str(size)
+        note = self._versions / f"{hashlib.sha256(os.fsencode(name)).hexdigest()}.json"
+        if version and _is_here(path, note, version):
+            return
+        self._transfer(name, path, size)
+        write_atomically(note, json.dumps(version, sort_keys=True).encode())
+
+    def _transfer(self, name: str, path: Path, size: int | None) -> None:
+        try:
+            with atomic_writer(path) as stream:
+                self._fill(name, Path(stream.name), size)
+        except TrilightError as error:
+            if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NAME_ERRORS:
+                message = f"the name {printable(name)[:100]!r} clashes with another one here"
+                raise TransferFailed("unsafe_name", message) from error
+            raise
+
+    def _fill(self, name: str, temporary: Path, size: int | None) -> None:
+        """Write the bytes of a file to a temporary name, which is open for its last sync."""
+        limit = _Limit(self._check_size, self.stop)
+        try:
+            self._folder.driver.get_file(self._folder.address(name), str(temporary), callback=limit)
+        except OSError as error:
+            if error.errno in _DISK_ERRORS:
+                raise
+            # Errors of the network are OSErrors too, and must not pass for those of the disk.
+            raise Interrupted from error
+        found = temporary.stat().st_size
+        self._check_size(found)
+        if size is not None and found != size:
+            raise Interrupted from EOFError(f"got {found} of {size} bytes")
+
+    def _check_size(self, size: int) -> None:
+        if size > self._max_bytes:
+            message = f"{size} bytes; expected <= {self._max_bytes}"
+            raise TransferFailed("too_large_bytes", message)
+
+
+class _Outcome:
+    """What became of one file; the lock is held while it is on its way."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.path: Path | None = None
+        self.error: TransferFailed | None = None
+
+
+class _Limit(Callback):
+    """Ends a transfer that grows too large, or that nobody waits for any more."""
+
+    def __init__(self, check: Any, stop: threading.Event) -> None:
+        super().__init__()
+        self._check = check
+        self._stop = stop
+
+    def set_size(self, size: int | None) -> None:
+        self._check(size or 0)
+
+    def relative_update(self, inc: int = 1) -> None:
+        super().relative_update(inc)
+        self._check(self.value)
+        if self._stop.is_set():
+            raise TransferFailed("download_failed", "the run was ended")
+
+
+def _is_here(path: Path, note: Path, version: dict[str, str]) -> bool:
+    try:
+        known = json.loads(note.read_bytes())
+        return known == version and str(path.stat().st_size) == known.get(
+            "size", str(path.stat().st_size)
+        )
+    except (OSError, ValueError):
+        return False
+
+
+def _remove_stale(files: Path) -> None:
+    """Delete what killed runs left; what is younger may belong to a run that is at work."""
+    for leftover in files.rglob(f"*{TEMPORARY_SUFFIX}"):
+        try:
+            if time.time() - leftover.stat().st_mtime > _STALE_S:
+                leftover.unlink()
+        except OSError:
+            continue

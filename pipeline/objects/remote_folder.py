@@ -1,0 +1,122 @@
+"""A folder on a server: what it holds, and facts about each file. Nothing is written here."""
+
+import html
+from functools import partial
+from typing import Any
+from urllib.parse import quote, unquote
+
+from pipeline.objects.remote_url import RemoteUrl, open_driver
+from pipeline.objects.transfer import TransferFailed, is_absent, with_tries
+from storage.errors import TrilightError
+
+_MAX_FOLDERS = 10_000
+_MAX_DEPTH = 32
+"""A server that answers every address with the same page would otherwise be walked for ever."""
+
+
+class RemoteFolder:
+    """Files by their names: paths below the folder, unquoted, with / between their parts."""
+
+    def __init__(self, url: RemoteUrl) -> None:
+        """Open the driver; raises TrilightError where its package is missing."""
+        self.url = url
+        self.driver = open_driver(url)
+        self._addresses: dict[str, str] = {}
+        self._facts: dict[str, dict[str, Any]] = {}
+
+    def address(self, name: str) -> str:
+        """Return what the driver calls a file."""
+        if name in self._addresses:
+            return self._addresses[name]
+        # Bytes that are no UTF-8 are lone surrogates in `name`.
+        inner = quote(name, errors="surrogateescape") if self.url.is_http else name
+        return f"{self.url.root}/{inner}"
+
+    def facts(self, name: str) -> dict[str, Any]:
+        """Return what the server says about a file; raises what the driver raises."""
+        if name in self._facts:
+            return self._facts[name]
+        return dict(self.driver.info(self.address(name)))
+
+    def has(self, name: str) -> bool:
+        """Say whether there is a file; `no` also where the server does not let us see it.
+
+        Raises:
+            TrilightError: the server gives no answer.
+        """
+
+        def ask() -> bool:
+            try:
+                return self.driver.info(self.address(name))["type"] == "file"
+            except Exception as error:  # drivers raise what they like
+                if is_absent(error):
+                    return False
+                raise
+
+        try:
+            return with_tries(ask)
+        except TransferFailed as error:
+            raise TrilightError(
+                f"objects {self.url.shown!r}: cannot be read ({error.message}); expected a folder "
+                "that can be reached. Check the URL and your access to it."
+            ) from error
+
+    def names(self) -> list[str]:
+        """Return the names of all files, at any depth.
+
+        Raises:
+            TrilightError: the folder cannot be listed, or has no end.
+        """
+        try:
+            return self._names_by_links() if self.url.is_http else self._names_by_find()
+        except TransferFailed as error:
+            hint = " Public buckets need FSSPEC_S3_ANON=true." if self.url.scheme == "s3" else ""
+            raise TrilightError(
+                f"objects {self.url.shown!r}: cannot be listed ({error.message}); expected a "
+                "folder with a page that lists its files, or with objects.jsonl or objects.csv. "
+                f"Check the URL and your access to it.{hint}"
+            ) from error
+
+    def _names_by_find(self) -> list[str]:
+        start = f"{self.url.root}/"
+        found = with_tries(lambda: self.driver.find(self.url.root, detail=True))
+        for address, facts in found.items():
+            name = address.removeprefix(start)
+            if address.startswith(start) and name:
+                self._addresses[name], self._facts[name] = address, facts
+        return sorted(self._addresses)
+
+    def _names_by_links(self) -> list[str]:
+        """Follow the links of the server's own listings; only those to below the folder."""
+        names: dict[str, str] = {}
+        folders = {f"{self.url.root}/"}
+        waiting = list(folders)
+        deepest = self.url.root.count("/") + _MAX_DEPTH
+        while waiting:
+            place = waiting.pop()
+            for link in with_tries(partial(self.driver.ls, place, detail=False)):
+                address = html.unescape(link).replace("/./", "/")
+                inner = _below(address, self.url.root)
+                if inner is None or address in folders:
+                    continue
+                if address.endswith("/"):
+                    folders.add(address)
+                    waiting.append(address)
+                else:
+                    names[inner] = address
+            if len(folders) > _MAX_FOLDERS or place.count("/") > deepest:
+                raise TrilightError(
+                    f"objects {self.url.shown!r}: the listing has no end; expected at most "
+                    f"{_MAX_FOLDERS} folders, {_MAX_DEPTH} deep. Give it objects.jsonl."
+                )
+        self._addresses = names
+        return sorted(names)
+
+
+def _below(address: str, root: str) -> str | None:
+    """Return the name of a link, or None where it leads elsewhere, or sorts the listing."""
+    if not address.startswith(f"{root}/") or "?" in address or "#" in address:
+        return None
+    inner = unquote(address[len(root) + 1 :], errors="surrogateescape")
+    hidden_or_upward = any(part.startswith(".") for part in inner.split("/"))
+    return None if hidden_or_upward or not inner else inner

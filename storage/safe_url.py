@@ -1,0 +1,42 @@
+"""URLs and messages as they may be shown and stored: without names, passwords, tokens, queries."""
+
+import re
+
+_PARTS = re.compile(r"([A-Za-z][A-Za-z0-9+.\-]*)://([^/?#\\]*)([^?#]*)")
+_URL_IN_TEXT = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*://[^\s<>]+")
+_SECRET_FIELD = re.compile(
+    r"(?i)([\w-]*(?:token|secret|passw|signature|credential|api_?key|access_?key)[\w-]*['\"]?"
+    r"\s*[=:]\s*)(?:bearer\s+|basic\s+)?[^\s,;&]+"
+)
+_SECRET_WORD = re.compile(
+    r"(?i)\b(?:(bearer|basic)\s+[\w.~+/=-]{6,}|hf_\w{16,}|(?:AKIA|ASIA)\w{12,})"
+)
+HIDDEN = "..."
+"""Stands for what was taken out."""
+
+
+def safe_url(url: str) -> str:
+    """Return `url` without user, password, query and fragment; other text comes back as it is.
+
+    Where the host cannot be told from a password, as in `http://me:pass/word@host`, everything
+    after the scheme is hidden. A secret within the path itself cannot be seen, and stays.
+    """
+    parts = _PARTS.match(url)
+    if parts is None:
+        return url
+    scheme, authority, path = parts.groups()
+    host = authority.rpartition("@")[2]
+    _, colon, port = host.rpartition("]")[2].partition(":")
+    if colon and port and not port.isdecimal():
+        return f"{scheme}://{HIDDEN}"
+    return f"{scheme}://{host}{path}"
+
+
+def safe_text(text: str) -> str:
+    """Return a message with its URLs made safe and with what looks like a credential hidden.
+
+    Meant for the errors of libraries, which like to quote the whole request.
+    """
+    text = _URL_IN_TEXT.sub(lambda match: safe_url(match[0]), text)
+    text = _SECRET_FIELD.sub(lambda match: f"{match[1]}{HIDDEN}", text)
+    return _SECRET_WORD.sub(HIDDEN, text)

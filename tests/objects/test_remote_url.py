@@ -1,0 +1,170 @@
+"""Which sources are folders, which are servers, and which are refused before anything is opened."""
+
+import builtins
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.objects import remote_source
+from pipeline.objects.licences import DEFAULT_ALLOWED
+from pipeline.objects.remote_url import PACKAGES, RemoteUrl, open_driver, parse_source
+from pipeline.objects.sources import FoundObjects, find_objects
+from storage.errors import TrilightError
+
+
+@pytest.mark.parametrize(
+    ("source", "path"),
+    [
+        ("objects", "objects"),
+        ("/a/b c", "/a/b c"),
+        ("file:///a/b%20c", "/a/b c"),
+        ("file://localhost/a", "/a"),
+        ("FILE:///a", "/a"),
+        ("C:x", "C:x"),
+        ("a::b", "a::b"),
+    ],
+)
+def test_folders_of_this_machine(source: str, path: str) -> None:
+    assert parse_source(source) == Path(path)
+
+
+@pytest.mark.parametrize(
+    ("source", "scheme", "root"),
+    [
+        ("https://host/a/b/", "https", "https://host/a/b"),
+        ("HTTP://host", "http", "http://host"),
+        ("http://host/a b/ä%20", "http", "http://host/a%20b/%C3%A4%20"),
+        ("http://ada:s3@cret@host:1/a?k=1&l#m", "http", "http://host:1/a"),
+        ("http://[::1]:8000/a", "http", "http://[::1]:8000/a"),
+        ("http://ada:x@[fe80::1]/a", "http", "http://[fe80::1]/a"),
+        ("s3://bucket/a b/?#/", "s3", "bucket/a b/?#"),
+        ("gs://bucket", "gs", "bucket"),
+        ("hf://datasets/ada/set@main/a", "hf", "datasets/ada/set@main/a"),
+    ],
+)
+def test_folders_of_servers(source: str, scheme: str, root: str) -> None:
+    url = parse_source(source)
+    assert isinstance(url, RemoteUrl)
+    assert (url.scheme, url.root) == (scheme, root)
+    assert "cret" not in repr(url) and "cret" not in url.shown
+
+
+def test_credentials_are_kept_apart() -> None:
+    url = parse_source("http://a%40da:s3@cret@host/x?k=1&l=&k=2#m")
+    assert isinstance(url, RemoteUrl)
+    assert (url.user, url.password) == ("a@da", "s3@cret")
+    assert url.query == (("k", "1"), ("l", ""), ("k", "2"))
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("pipe:cat x", "pipe: command"),
+        ("pipe://cat x", "pipe: command"),
+        ("simplecache::http://ada:s3cret@host/a", "chained"),
+        ("zip://x::https://host/a.zip", "chained"),
+        ("http://host/a::file://b", "chained"),
+        ("http://[::1]/::b", "chained"),
+        ("ftp://ada:s3cret@host/a?s3cret", "'ftp'"),
+        ("memory://a", "'memory'"),
+        ("ssh://host/a", "'ssh'"),
+        ("github://a:b@c/d", "'github'"),
+        ("reference://a", "'reference'"),
+        ("http://", "no host"),
+        ("https:///a", "no host"),
+        ("s3://", "no host or bucket"),
+        ("s3://ada:s3cret@bucket/a", "came with a user"),
+        ("file://host/a", "three slashes"),
+        ("file://", "three slashes"),
+    ],
+)
+def test_other_urls_are_refused(source: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(TrilightError, match=message) as caught:
+        find_objects(source, work_dir=tmp_path, allowed_licences=DEFAULT_ALLOWED)
+    assert "expected" in str(caught.value)
+    assert "s3cret" not in str(caught.value)
+    assert "ada" not in str(caught.value)
+
+
+@pytest.mark.parametrize("scheme", sorted(PACKAGES))
+def test_a_missing_driver_is_named(scheme: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, PACKAGES[scheme], None)
+    url = parse_source(f"{scheme}://host/a")
+    assert isinstance(url, RemoteUrl)
+    with pytest.raises(TrilightError, match=f"pip install {PACKAGES[scheme]}"):
+        open_driver(url)
+
+
+class _Bucket:
+    """What s3fs, gcsfs and huggingface_hub have in common, over fsspec's own memory."""
+
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self.files = files
+        self.fetched: list[str] = []
+        self.sizes = True
+
+    def info(self, address: str) -> dict[str, Any]:
+        if address not in self.files:
+            raise FileNotFoundError(address)
+        data = self.files[address]
+        size = len(data) if self.sizes else None
+        return {"name": address, "type": "file", "size": size, "ETag": hash(data)}
+
+    def find(self, root: str, *, detail: bool) -> dict[str, dict[str, Any]]:
+        return {name: self.info(name) for name in self.files if name.startswith(root)}
+
+    def get_file(self, address: str, path: str, callback: Any) -> None:
+        self.fetched.append(address)
+        with builtins.open(path, "wb") as stream:
+            stream.write(self.files[address])
+        callback.relative_update(len(self.files[address]))
+
+
+def test_a_bucket_is_listed_at_once(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = (
+        "set/a?b#c%20.obj",
+        "set/x/d.obj",
+        "settee/e.obj",
+        "set/.f.obj",
+        "set/x/",
+        "set//g.obj",
+    )
+    bucket = _Bucket({f"bucket/{name}": name.encode() for name in names})
+    monkeypatch.setattr("pipeline.objects.remote_folder.open_driver", lambda url: bucket)
+
+    def find() -> FoundObjects:
+        source = "s3://bucket/set/"
+        return find_objects(source, work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
+
+    found = find()
+    assert [record.uid for record in found.records] == ["a?b#c%20", "x/d"]
+    assert [failure.reason for failure in found.failures] == ["unsafe_name"]
+    assert Path(found.records[0].path).read_text() == "set/a?b#c%20.obj"
+    assert found.records[1].source_url == "s3://bucket/set/x/d.obj"
+    assert find() == found
+    assert sorted(bucket.fetched) == ["bucket/set/a?b#c%20.obj", "bucket/set/x/d.obj"]
+
+
+def test_a_transfer_that_grows_too_large_is_ended(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server does not say how large it is, and has no end."""
+    bucket = _Bucket({"bucket/a.obj": b"a", "bucket/b.obj": b"b"})
+    chunks: list[int] = []
+
+    def get_file(address: str, path: str, callback: Any) -> None:
+        Path(path).write_bytes(b"x" * 100)
+        for _ in range(1 if address == "bucket/a.obj" else 10_000):
+            chunks.append(100)
+            callback.relative_update(100)
+
+    bucket.sizes = False
+    monkeypatch.setattr(bucket, "get_file", get_file)
+    monkeypatch.setattr(remote_source, "MAX_BYTES", 1000)
+    monkeypatch.setattr("pipeline.objects.remote_folder.open_driver", lambda url: bucket)
+    found = find_objects("gs://bucket", work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
+    assert [record.uid for record in found.records] == ["a"]
+    assert [one.reason for one in found.failures] == ["too_large_bytes"]
+    assert len(chunks) == 1 + 11

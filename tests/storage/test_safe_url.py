@@ -1,0 +1,61 @@
+"""What is shown of a URL: enough to find the place, nothing that opens it."""
+
+import pytest
+
+from storage.safe_url import safe_text, safe_url
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("https://host/a/b.glb", "https://host/a/b.glb"),
+        ("https://host:8443/a", "https://host:8443/a"),
+        ("http://[::1]:8000/a", "http://[::1]:8000/a"),
+        ("https://ada:s3cret@host:1/a", "https://host:1/a"),
+        ("https://ada@host/a", "https://host/a"),
+        ("https://ada:s3@cret@host/a", "https://host/a"),
+        ("https://host/a?token=s3cret", "https://host/a"),
+        ("https://host?s3cret", "https://host"),
+        ("https://host/a#s3cret", "https://host/a"),
+        ("https://ada:s3cret/x@host/a", "https://..."),
+        ("https://ada:s3cret?x@host/a", "https://..."),
+        ("https://ada:s3cret#x@host/a", "https://..."),
+        ("https://ada:s3cret\\x@host/a", "https://..."),
+        ("s3://key:s3cret@bucket/a", "s3://bucket/a"),
+        ("hf://datasets/ada/set@v1/a", "hf://datasets/ada/set@v1/a"),
+        ("https://host/pkg@1.0/a", "https://host/pkg@1.0/a"),
+        ("https://[broken/a?s3cret", "https://[broken/a"),
+        ("/home folder/a?b", "/home folder/a?b"),
+        ("builtin:8", "builtin:8"),
+        ("", ""),
+    ],
+)
+def test_urls(url: str, shown: str) -> None:
+    assert safe_url(url) == shown
+    assert safe_url(shown) == shown
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "404, message='Not Found', url='https://ada:s3cret@host/a?sig=s3cret'",
+        "GET https://host/a?x='s3cret' failed",
+        'cannot open "https://ada:s3cret@host/a", giving up',
+        "two: https://a:s3cret@b/c and s3://d:s3cret@e/f?s3cret",
+        "Authorization: Bearer s3cret.s3cret",
+        "header 'x-amz-security-token': s3cret",
+        "X-Amz-Signature=s3cret&x=1",
+        "password = s3cret",
+        "AccessKeyId is AKIAs3crets3cret, refused",
+        "hf_s3crets3crets3crets3cret is not valid",
+    ],
+)
+def test_messages_lose_their_secrets(text: str) -> None:
+    shown = safe_text(text)
+    assert "s3cret" not in shown
+    assert "ada" not in shown
+
+
+def test_plain_messages_stay() -> None:
+    for text in ("Connection reset by peer", "expected 12 bytes, got 7", "https://host/a: gone"):
+        assert safe_text(text) == text
