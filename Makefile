@@ -1,5 +1,6 @@
 # Two commands on a fresh machine: `make dataset` and `make test`. Both do all the set-up themselves.
 # Prerequisites: python3 (3.11 or later) with venv, make, git.
+# WITHOUT_GPL=1 leaves out what is under the GPL: pymeshlab, and parts of libigl that nobody calls.
 
 PYTHON ?= python3
 VENV := .venv
@@ -43,8 +44,9 @@ clean:  ## everything that make has made, except data/ and runs/
 
 $(VENV)/.dataset-ready: requirements/dataset.txt pyproject.toml infra/setup/system_libraries.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	infra/setup/system_libraries.sh
+	PYTHON=$(BIN)/python infra/setup/system_libraries.sh
 	$(BIN)/python -m pip install --quiet --requirement requirements/dataset.txt
+	$(if $(WITHOUT_GPL),infra/setup/without_gpl.sh $(BIN)/python)
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	touch $@
 

@@ -106,7 +106,25 @@ def _denoiser() -> Finding:
     )
 
 
+def _mesh_decimation() -> Finding:
+    return _probe(
+        "mesh decimation",
+        "import meshoptimizer",
+        found=f"meshoptimizer {metadata.version('meshoptimizer')}",
+        consequence="meshes cannot be decimated where pymeshlab fails",
+        mend="make setup",
+    )
+
+
 def _mesh_filters() -> Finding:
+    if importlib.util.find_spec("pymeshlab") is None:
+        return Finding(
+            name="mesh filters",
+            state="slower",
+            found="no pymeshlab (GPL)",
+            consequence="decimated meshes have twice the error, and the profile uniform is missing",
+            mend="pip install -r requirements/dataset.txt",
+        )
     code = (
         "from pipeline.assets.environment import missing_filters; m = missing_filters(); "
         "raise SystemExit(', '.join(m) if m else 0)"
@@ -115,7 +133,7 @@ def _mesh_filters() -> Finding:
         "mesh filters",
         code,
         found=f"pymeshlab {metadata.version('pymeshlab')}",
-        consequence="meshes cannot be decimated",
+        consequence="every object is rejected, or decimated by meshoptimizer with twice the error",
         mend=f"{_APT} libgl1 libopengl0",
     )
 
@@ -208,6 +226,7 @@ CHECKS: Sequence[Callable[[], Finding]] = (
     _renderer,
     _denoiser,
     _mesh_filters,
+    _mesh_decimation,
     _orchestrator,
     _learning,
     _accelerator,

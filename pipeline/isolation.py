@@ -8,6 +8,7 @@ the child: the kernel itself watches the pipe between the two, no thread of Pyth
 
 import ctypes
 import fcntl
+import math
 import multiprocessing
 import os
 import resource
@@ -33,7 +34,8 @@ class ChildFailed(Exception):
     """The child died, hung, or raised something unexpected: the environment's fault, or a bug.
 
     Attributes:
-        reason: `crashed_signal_N`, `killed`, `timeout_wall`, `out_of_memory` or `exception`.
+        reason: `crashed_signal_N`, `killed`, `timeout_wall`, `timeout_cpu`, `out_of_memory` or
+            `exception`.
         message: one sentence with what is known.
     """
 
@@ -55,6 +57,8 @@ class ChildLimits:
     """Address space; an allocation beyond it fails inside the child."""
     wall_s: float
     """Seconds for one call; a child that takes longer is killed."""
+    cpu_s: int | None = None
+    """Processor seconds for one call, which a busy machine does not use up; None for no limit."""
     calls_per_child: int
     """A fresh child is started after this many calls, so that leaks stay bounded."""
 
@@ -100,6 +104,10 @@ class IsolatedChild:
             self._stop()
             raise
 
+    def retire(self) -> None:
+        """End the child; the next call starts a fresh one. Not while another thread calls."""
+        self._stop()
+
     def close(self) -> None:
         """End the child at once and for good; safe to call while another thread waits in `call`."""
         self._closed = True
@@ -118,9 +126,7 @@ class IsolatedChild:
         self._stop()
         context = multiprocessing.get_context("forkserver")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(
-            target=_serve, args=(theirs, self._limits.memory_bytes), daemon=True
-        )
+        self._process = context.Process(target=_serve, args=(theirs, self._limits), daemon=True)
         self._process.start()
         theirs.close()
         self._calls_left = self._limits.calls_per_child
@@ -153,6 +159,10 @@ class IsolatedChild:
         self._process.join(10)
         code = self._process.exitcode
         if code is not None and code < 0:
+            if -code == signal.SIGXCPU:
+                return ChildFailed(
+                    "timeout_cpu", f"used its {self._limits.cpu_s} processor seconds"
+                )
             if -code == signal.SIGKILL:
                 return ChildFailed("killed", "ended by SIGKILL; the system may be out of memory")
             return ChildFailed(
@@ -195,18 +205,28 @@ def _die_with_owner() -> None:
         os._exit(1)
 
 
-def _serve(connection: Connection, memory_bytes: int) -> None:
+def _serve(connection: Connection, limits: ChildLimits) -> None:
     """Answer calls until the parent closes the connection."""
     _die_with_owner()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    resource.setrlimit(resource.RLIMIT_AS, (limits.memory_bytes, limits.memory_bytes))
     while True:
         try:
             function, args = connection.recv()
         except EOFError:
             os._exit(0)  # the parent is gone: nobody waits for destructors of native libraries
+        _allow_cpu(limits.cpu_s)
         connection.send(_answer(function, args))
+
+
+def _allow_cpu(seconds: int | None) -> None:
+    """Let this process use so much more processor time; the kernel ends it then, in any code."""
+    if seconds is None:
+        return
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    soft = math.ceil(used.ru_utime + used.ru_stime) + seconds
+    resource.setrlimit(resource.RLIMIT_CPU, (soft, resource.getrlimit(resource.RLIMIT_CPU)[1]))
 
 
 def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, ...]:

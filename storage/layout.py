@@ -56,11 +56,6 @@ class DatasetFolder:
         return self.staging / "objects"
 
     @property
-    def staged_assets(self) -> Path:
-        """Prepared assets, named by what they were made from."""
-        return self.staging / "assets"
-
-    @property
     def staged_failures(self) -> Path:
         """Rejections of shards that are packed but not yet in the manifest."""
         return self.staging / "failures"

@@ -25,8 +25,15 @@ class Progress:
 
 
 def announce_objects(folder: DatasetFolder, num_objects: int) -> None:
-    """Write down how many objects the asset stage will look at."""
+    """Write down how many objects the asset stage will look at, and that none is done."""
+    write_atomically(_done(folder), b"")
     write_atomically(_plan(folder), json.dumps({"objects": num_objects}).encode())
+
+
+def count_object(folder: DatasetFolder) -> None:
+    """Write down that one more object is prepared or rejected: a byte, from any thread."""
+    with _done(folder).open("ab") as stream:
+        stream.write(b".")
 
 
 def read_progress(folder: DatasetFolder) -> Progress:
@@ -39,7 +46,7 @@ def read_progress(folder: DatasetFolder) -> Progress:
     plan = json.loads(_plan(folder).read_bytes()) if _plan(folder).exists() else {"objects": 0}
     staged = sum(1 for _ in (folder.staging / "samples").glob("*/*.tar"))
     return Progress(
-        objects_done=min(_count(folder.staged_assets), plan["objects"]),
+        objects_done=_done(folder).stat().st_size if _done(folder).exists() else 0,
         objects_planned=plan["objects"],
         scenes_done=in_shards + staged,
         scenes_planned=scenes_planned,
@@ -50,5 +57,5 @@ def _plan(folder: DatasetFolder) -> Path:
     return folder.staging / "plan.json"
 
 
-def _count(path: Path) -> int:
-    return sum(1 for entry in path.glob("*") if not entry.name.endswith(".part"))
+def _done(folder: DatasetFolder) -> Path:
+    return folder.staging / "objects_done"

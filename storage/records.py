@@ -15,6 +15,8 @@ class ObjectRecord:
     """For people."""
     licence: str
     """SPDX identifier, or `LicenseRef-...`."""
+    licence_source: str
+    """Where the licence is stated, and as of when; for the record of rights."""
     attribution: str
     """Whom to name, as the source states it."""
     source_url: str
@@ -33,6 +35,8 @@ class LockedObject:
     """train, validation or test, by a hash of the cleaned geometry: copies stay together."""
     licence: str
     """SPDX identifier, or `LicenseRef-...`."""
+    licence_source: str
+    """Where the licence is stated, and as of when."""
     title: str
     """For people."""
     attribution: str

@@ -25,6 +25,18 @@ _LIBRARIES = ("trilight", "mitsuba", "drjit", "pyoidn", "numpy", "torch")
 
 
 @dataclass(frozen=True, kw_only=True)
+class Options:
+    """What the user says of a benchmark."""
+
+    quick: bool
+    """Minutes instead of a careful measurement."""
+    objects: tuple[str, ...]
+    """Sources of objects."""
+    allowed_licences: tuple[str, ...]
+    """Of objects that may be measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Spread:
     """One figure over the counted repeats."""
 

@@ -17,7 +17,7 @@ import numpy as np
 matplotlib.use("Agg")  # before pyplot: no display is needed
 import matplotlib.pyplot as plt
 
-from infra.bench.harness import Comparison, compare
+from infra.bench.harness import Comparison, Options, compare
 from pipeline.flows.accept_objects import accept_objects
 from pipeline.flows.builds import smoke
 from pipeline.flows.environment import environment
@@ -35,9 +35,9 @@ _MAX_SPP = 512
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
 
 
-def run(*, quick: bool, round_done: Callable[[], None]) -> Comparison:
-    """Measure; `quick` takes four scenes once, otherwise 32 scenes three times."""
-    num_scenes, repeats = (4, 1) if quick else (32, 3)
+def run(options: Options, round_done: Callable[[], None]) -> Comparison:
+    """Measure on built-in objects; quickly four scenes once, otherwise 32 scenes three times."""
+    num_scenes, repeats = (4, 1) if options.quick else (32, 3)
     with tempfile.TemporaryDirectory() as folder:
         sides, children = {}, []
         for target_db in TARGETS_DB:
@@ -51,9 +51,9 @@ def run(*, quick: bool, round_done: Callable[[], None]) -> Comparison:
                 child.close()
 
 
-def num_rounds(*, quick: bool) -> int:
+def num_rounds(options: Options) -> int:
     """Return how often `round_done` will be called."""
-    return len(TARGETS_DB) * (1 + (1 if quick else 3))
+    return len(TARGETS_DB) * (1 + (1 if options.quick else 3))
 
 
 def _settings(target_db: float) -> BuildSettings:
@@ -66,12 +66,11 @@ def _settings(target_db: float) -> BuildSettings:
 def _render_child(folder: DatasetFolder, target_db: float) -> IsolatedChild:
     variant, build = choose_variant(), smoke()
     publication = begin(folder, build, environment(variant), 1, accept_environment=False)
-    accepted = accept_objects("builtin:", build, publication, workers=os.cpu_count() or 1)
+    accepted = accept_objects("builtin:", None, build, publication, workers=os.cpu_count() or 1)
     source = SceneSource(
         settings=_settings(target_db),
         variant=variant,
         threads=os.cpu_count() or 1,
-        folder=folder,
         objects=accepted.objects,
     )
     return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(source,))

@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import typer
 
-from infra.cli import bench, doctor, generate, inspect, train, verify
+from infra.cli import assets, bench, doctor, generate, inspect, train, verify
 from storage.errors import TrilightError
 
 app = typer.Typer(
@@ -19,6 +19,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("doctor")(doctor.doctor)
+app.command("assets")(assets.assets)
 app.command("generate")(generate.generate)
 app.command("verify")(verify.verify)
 app.command("inspect")(inspect.inspect)

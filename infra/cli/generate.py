@@ -3,6 +3,7 @@
 import contextlib
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,9 +13,11 @@ from rich.progress import Progress as Bars
 
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
+from pipeline.objects.licences import USER_PROVIDED
 from pipeline.renders.variant import choose_variant
 from storage.failures import count_by_reason, read_failures
 from storage.layout import DatasetFolder
+from storage.objects_lock import read_objects_lock
 from storage.progress import read_progress
 
 if TYPE_CHECKING:
@@ -25,7 +28,9 @@ _POLL_S = 0.5
 
 def generate(
     build: Annotated[str, typer.Argument(help="named settings, such as smoke")],
-    objects: Annotated[str, typer.Option(help="folder of 3D objects, or builtin:")] = "builtin:",
+    objects: Annotated[
+        str, typer.Option(help="folder of 3D objects, its URL, builtin: or objaverse:")
+    ] = "builtin:",
     out: Annotated[Path, typer.Option(help="folder of the dataset")] = Path("data/smoke"),
     scenes: Annotated[int, typer.Option(help="scenes, rounded up to whole shards")] = 24,
     seed: Annotated[int | None, typer.Option(help="seed of every draw")] = None,
@@ -35,6 +40,9 @@ def generate(
     ] = None,
     allow_licence: Annotated[
         list[str] | None, typer.Option(help="allow this licence too; may be repeated")
+    ] = None,
+    licence: Annotated[
+        str | None, typer.Option(help="licence of files that state none [yours to use]")
     ] = None,
     workers: Annotated[int, typer.Option(help="render processes that share the cores")] = 1,
     failure_budget: Annotated[
@@ -64,6 +72,7 @@ def generate(
                 resolution=resolution,
                 noise_floor_db=noise_floor,
                 allow_licences=allow_licence,
+                licence=licence,
                 workers=workers,
                 failure_budget=failure_budget,
                 accept_environment=accept_environment,
@@ -130,7 +139,7 @@ def _report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_jso
         )
         return
     used = f"{outcome.num_objects_used} of {outcome.num_objects_found}"
-    rows = [("objects used", used), *statistics.lines()]
+    rows = [("objects used", used), ("licences", _licences(folder)), *statistics.lines()]
     if outcome.num_scenes_given_up:
         rows.append(("scenes given up", str(outcome.num_scenes_given_up)))
     rows += [("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in rejected]
@@ -144,3 +153,9 @@ def _report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_jso
     print_rows("Dataset finished", rows)
     console.print(f"\nNext: trilight verify {folder.root}", style="bold")
     console.print(f"      trilight train smoke --data {folder.root}", style="bold")
+
+
+def _licences(folder: DatasetFolder) -> str:
+    counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))
+    shown = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
+    return shown.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")

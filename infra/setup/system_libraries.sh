@@ -12,6 +12,10 @@ have 'libGL\.so\.1' || missing="$missing libgl1"
 have 'libatomic\.so\.1' || missing="$missing libatomic1"
 # Mitsuba compiles with LLVM; releases before 16 abort in it, so they do not count.
 ldconfig -p 2>/dev/null | grep -qE 'libLLVM(-|\.so\.)(1[6-9]|2[0-9])' || missing="$missing libllvm19"
+# meshoptimizer comes as source: a compiler and Python's own headers.
+command -v c++ >/dev/null 2>&1 || missing="$missing g++"
+"$PYTHON" -c 'import os, sysconfig as s; os.stat(s.get_path("include") + "/Python.h")' 2>/dev/null ||
+    missing="$missing python3-dev"
 [ -n "$missing" ] || exit 0
 
 run=""
@@ -22,6 +26,6 @@ if command -v apt-get >/dev/null 2>&1 && $run true 2>/dev/null; then
     $run apt-get update -qq && $run env DEBIAN_FRONTEND=noninteractive \
         apt-get install -y -qq --no-install-recommends $missing >/dev/null && exit 0
 fi
-echo "Not installed:$missing. Meshes need OpenGL's library, rendering needs libatomic, and is slow"
-echo "without LLVM; trilight doctor tells more."
+echo "Not installed:$missing. Meshes need OpenGL's library and a compiler, rendering needs libatomic,"
+echo "and is slow without LLVM; trilight doctor tells more."
 echo "Ask an administrator for: apt-get install$missing"

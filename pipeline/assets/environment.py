@@ -4,15 +4,21 @@ Without the system library libOpenGL.so.0, pymeshlab imports with a warning and 
 filters. That is a fault of the environment, which stops a run; it must not reject every object.
 """
 
-import pymeshlab
-
-from pipeline.assets.decimation import REQUIRED_FILTERS
+from importlib.util import find_spec
 
 
 def missing_filters() -> list[str]:
     """Return the filters that this stage calls and pymeshlab does not have; empty when all is well.
 
-    Importing this module loads the native libraries (about one second), so ask in a child process.
+    All is well, too, without pymeshlab: `recipe.methods_of` then leaves its methods out.
+
+    It loads the native libraries (about one second), so ask in a child process.
     """
+    if find_spec("pymeshlab") is None:
+        return []
+    import pymeshlab
+
+    from pipeline.assets.decimation.pymeshlab_filters import REQUIRED_FILTERS
+
     present = set(pymeshlab.filter_list())
     return [name for name in REQUIRED_FILTERS if name not in present]

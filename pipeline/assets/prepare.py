@@ -1,87 +1,151 @@
 """One object: from a file to an `Asset`. It runs in a child process: native code may end it."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.assets.clean import clean, geometry_sha256, normalise
-from pipeline.assets.decimation import decimate, safe_method
-from pipeline.assets.distance import Surface
-from pipeline.assets.gate import check_level
-from pipeline.assets.guards import check_clean, check_raw
-from pipeline.assets.load import load_mesh
+from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
+from pipeline.assets.cleaning.guards import check_clean, check_raw
+from pipeline.assets.cleaning.orient import orient_outward
+from pipeline.assets.decimation.by_name import decimate, safe_method
+from pipeline.assets.decimation.smallest import smallest_passing
 from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.orient import orient_outward
-from pipeline.assets.recipe import METHODS, RECIPE
+from pipeline.assets.quality.gate import check_level
+from pipeline.assets.quality.measure import MeasuredSource
+from pipeline.assets.quality.parts import label_parts
+from pipeline.assets.quality.triangles import count_edges
+from pipeline.assets.reading.load import load_mesh
+from pipeline.assets.reading.source_file import read_source
+from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
-from pipeline.assets.source_file import read_source
-from storage.asset import Asset, Level, LevelRecord
+from storage.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 from storage.errors import Rejected
-from storage.records import ObjectRecord
-from storage.seeds import rng_for
-
-_ERROR_SAMPLES = 8192
-"""Points per direction: the 99th percentile is then known to within 98.7 to 99.3 (3 sigma)."""
 
 
-def prepare_asset(record: ObjectRecord, settings: AssetSettings, method: str = METHODS[0]) -> Asset:
-    """Return the clean, outward oriented object at all budgets that keep the error bound.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AssetAttempt:
+    """What one method made of an object."""
+
+    asset: Asset
+    """With the levels that passed the gate, possibly none."""
+    missed: Mapping[int, tuple[str, str]]
+    """Reason and message by budget, for the levels that did not."""
+
+
+def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAttempt:
+    """Return the clean, outward oriented object at all budgets at which it passes the gate.
 
     Args:
-        record: names the file; its path is the only one that is opened, with the buffers that a
-            glTF names below the same folder.
-        settings: budgets and limits.
-        method: one of METHODS, for the levels that need fewer triangles than the source has.
+        path: the only file that is opened, with the buffers that a glTF names below its folder.
+        settings: profile, budgets and limits.
+        method: a name of `recipe.methods_of`, for the levels that are not the source as it is.
 
     Raises:
-        Rejected: the object is unusable; the reason codes are those of the steps.
+        Rejected: the object is unusable by any method; the reason codes are those of the steps.
 
-    What it does not do: close holes, remove inner parts, keep textures, or make the triangles
-    even. Parts below one percent of the area may vanish unnoticed by the error bound.
+    What it does not do: close holes, remove inner parts, or keep textures.
     """
-    source = read_source(Path(record.path), settings)
+    source = read_source(path, settings)
     raw = load_mesh(source)
     check_raw(raw, source.kind, settings)
     cleaned = clean(normalise(raw))
     check_clean(cleaned)
-    mesh = orient_outward(cleaned)
-    return Asset(
-        geometry_sha256=geometry_sha256(cleaned),
-        source_sha256=source.sha256,
-        recipe=RECIPE,
-        levels=_levels(mesh, settings, safe_method(mesh, method)),
+    mesh, front_share = orient_outward(cleaned)
+    levels, missed = _levels(mesh, settings, safe_method(mesh, method))
+    return AssetAttempt(
+        asset=Asset(
+            geometry_sha256=geometry_sha256(cleaned),
+            source_sha256=source.sha256,
+            recipe=RECIPE,
+            source=_facts(raw, cleaned, mesh, front_share),
+            levels=levels,
+        ),
+        missed=missed,
     )
 
 
-def _levels(mesh: TriangleMesh, settings: AssetSettings, method: str) -> tuple[Level, ...]:
-    """Return the levels, from the largest budget; raises the first failure where none is left.
+def _facts(
+    raw: TriangleMesh, cleaned: TriangleMesh, mesh: TriangleMesh, front_share: float
+) -> SourceFacts:
+    edges = count_edges(mesh)
+    before = {tuple(face) for face in cleaned.faces.tolist()}
+    return SourceFacts(
+        num_faces_read=len(raw.faces),
+        num_faces=len(mesh.faces),
+        num_faces_turned=sum(tuple(face) not in before for face in mesh.faces.tolist()),
+        num_parts=int(label_parts(mesh).max()) + 1,
+        open_edges=edges.open,
+        nonmanifold_edges=edges.nonmanifold,
+        front_share=round(front_share, 6),
+    )
+
+
+def _levels(
+    mesh: TriangleMesh, settings: AssetSettings, method: str
+) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]]]:
+    """Return the levels from the largest budget, and why others are missing.
 
     A budget that the level before it meets as well gets no level of its own.
     """
+    maker = _LevelMaker(mesh, settings, method)
     levels: list[Level] = []
-    failures: list[Rejected] = []
-    surface = Surface(mesh, rng_for(0, "asset-error").random((_ERROR_SAMPLES, 3)))
+    missed: dict[int, tuple[str, str]] = {}
     for budget in settings.budgets:
         if levels and len(levels[-1].faces) <= budget:
             continue
-        if len(mesh.faces) <= budget:
-            levels.append(_level(mesh, budget, "source", 0.0))
-            continue
         try:
-            result = decimate(mesh, budget, method)
-            smaller, error = check_level(result, surface, budget, settings.max_error_p99)
-            levels.append(_level(smaller, budget, method, error))
+            finest = budget == settings.budgets[0]
+            levels.append(maker.smallest(budget) if finest else maker.level(budget))
         except Rejected as failure:
-            failures.append(failure)
-    if not levels:
-        raise failures[0]
-    return tuple(levels)
+            missed[budget] = (failure.reason, failure.message)
+    return tuple(levels), missed
 
 
-def _level(mesh: TriangleMesh, budget: int, method: str, error_p99: float) -> Level:
+class _LevelMaker:
+    """Makes levels of one source by one method."""
+
+    def __init__(self, mesh: TriangleMesh, settings: AssetSettings, method: str) -> None:
+        self._mesh = mesh
+        self._source = MeasuredSource(mesh)
+        self._settings = settings
+        self._method = method
+
+    def smallest(self, budget: int) -> Level:
+        """Return the smallest level within epsilon up to `budget`, or the level of that budget."""
+        epsilon = self._settings.epsilon
+        if epsilon is None:
+            return self.level(budget)
+        largest = min(budget, len(self._mesh.faces)) if self._keeps_source else budget
+        try:
+            found = smallest_passing(lambda faces: self._make(faces, epsilon), largest)
+        except Rejected:
+            return self.level(budget)
+        return _level(budget, *found)
+
+    def level(self, budget: int) -> Level:
+        """Return the level of a budget; raises Rejected where it fails the gate."""
+        return _level(budget, *self._make(budget, self._settings.gate.max_error_p99))
+
+    @property
+    def _keeps_source(self) -> bool:
+        """Whether a source within budget is its own level: its triangles need not be even."""
+        return self._settings.profile == "faithful"
+
+    def _make(self, faces: int, max_error_p99: float) -> tuple[str, TriangleMesh, LevelQuality]:
+        if self._keeps_source and len(self._mesh.faces) <= faces:
+            return "source", self._mesh, self._source.quality(self._mesh)
+        result = decimate(self._mesh, faces, self._method)
+        gate = self._settings.gate
+        mesh, quality = check_level(result, self._source, faces, gate, max_error_p99)
+        return self._method, mesh, quality
+
+
+def _level(budget: int, method: str, mesh: TriangleMesh, quality: LevelQuality) -> Level:
     """Clean positions lie on a grid that float32 holds exactly."""
     return Level(
-        record=LevelRecord(budget=budget, method=method, error_p99=error_p99),
+        record=LevelRecord(budget=budget, method=method, quality=quality),
         positions=mesh.positions.astype(np.float32),
         faces=mesh.faces.astype(np.uint32),
     )

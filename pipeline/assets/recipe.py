@@ -1,11 +1,57 @@
 """The recipe by name: its methods and what can change its results; loads no mesh library."""
 
-from importlib.metadata import version
+import hashlib
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
-_LIBRARIES = ("embreex", "libigl", "numpy", "pymeshlab", "trimesh")
+from pipeline.assets.settings import Profile
+from storage.errors import TrilightError
 
-RECIPE = " ".join(["assets-1", *(f"{name}={version(name)}" for name in _LIBRARIES)])
+_LIBRARIES = ("embreex", "libigl", "meshoptimizer", "numpy", "pymeshlab", "trimesh")
+
+
+def _installed(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "absent"
+
+
+RECIPE = " ".join(["assets-2", *(f"{name}={_installed(name)}" for name in _LIBRARIES)])
 """The number advances by hand whenever the same source would give other bytes."""
 
-METHODS = ("pymeshlab_qem", "vertex_clustering")
-"""Decimations in the order in which they are tried: the second where the first kills its child."""
+_METHODS: Mapping[Profile, tuple[str, ...]] = {
+    "faithful": ("pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"),
+    "uniform": (
+        "pymeshlab_uniform",
+        "pymeshlab_collapse",
+        "meshoptimizer",
+        "meshoptimizer_sloppy",
+    ),
+}
+"""Decimations in the order in which they are tried: the next where one kills its child, or where
+its result fails the gate."""
+
+
+def methods_of(profile: Profile) -> tuple[str, ...]:
+    """Return the methods of a profile that are installed: pymeshlab (GPL) may be left out.
+
+    Raises:
+        TrilightError: `uniform` without pymeshlab, since nothing else here makes triangles even.
+    """
+    if _installed("pymeshlab") != "absent":
+        return _METHODS[profile]
+    if profile == "uniform":
+        raise TrilightError(
+            "profile uniform: pymeshlab is not installed; run `make setup`, or use faithful."
+        )
+    return tuple(name for name in _METHODS[profile] if not name.startswith("pymeshlab"))
+
+
+def code_sha256() -> str:
+    """Return the digest of this stage's own source: another program may give another outcome."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -3,25 +3,39 @@
 import csv
 import io
 from collections.abc import Iterable
+from typing import Protocol
 
-from storage.atomic import write_atomically
-from storage.layout import DatasetFolder
-from storage.records import LockedObject
-
-_COLUMNS = ("uid", "title", "licence", "attribution", "source_url", "split", "changes")
+_COLUMNS = ("uid", "title", "licence", "licence_source", "attribution", "source_url", "changes")
 _CHANGES = "cleaned, remeshed and given new materials"
 _FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
-def write_attribution(folder: DatasetFolder, objects: Iterable[LockedObject]) -> None:
-    """Write one row per object that the dataset may use, sorted by uid."""
+class HasRights(Protocol):
+    """An object with the rights to it, whatever else is known of it."""
+
+    @property
+    def uid(self) -> str: ...
+    @property
+    def title(self) -> str: ...
+    @property
+    def licence(self) -> str: ...
+    @property
+    def licence_source(self) -> str: ...
+    @property
+    def attribution(self) -> str: ...
+    @property
+    def source_url(self) -> str: ...
+
+
+def encode_attribution(objects: Iterable[HasRights]) -> bytes:
+    """Return the file: one row per object, sorted by uid."""
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(_COLUMNS)
     for entry in sorted(objects, key=lambda row: row.uid):
-        row = (entry.uid, entry.title, entry.licence, entry.attribution, entry.source_url)
-        writer.writerow([_inert(cell) for cell in (*row, entry.split, _CHANGES)])
-    write_atomically(folder.attribution, stream.getvalue().encode())
+        rights = (entry.licence, entry.licence_source, entry.attribution, entry.source_url)
+        writer.writerow([_inert(cell) for cell in (entry.uid, entry.title, *rights, _CHANGES)])
+    return stream.getvalue().encode()
 
 
 def _inert(cell: str) -> str:

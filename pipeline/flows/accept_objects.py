@@ -1,37 +1,38 @@
 """From a source of objects to the frozen list that scenes draw from."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from pipeline.assets.stage import PreparedAsset, prepare_assets
-from pipeline.flows.children import ChildPool
+from pipeline.assets.stage import PreparedAsset
+from pipeline.flows.prepare_isolated import prepare_isolated
 from pipeline.flows.publication import Publication
 from pipeline.flows.settings import BuildSettings
-from pipeline.isolation import ChildLimits, IsolatedChild, preload
-from pipeline.objects.licences import refuse_licences
-from pipeline.objects.sources import list_objects
+from pipeline.objects.sources import find_objects
 from storage.conventions import SPLITS
 from storage.errors import TrilightError
 from storage.objects_lock import read_objects_lock
-from storage.progress import announce_objects
+from storage.progress import announce_objects, count_object
 from storage.records import LockedObject
+from storage.safe_url import safe_url
 from storage.splits import require_objects, split_of_object, split_of_shard
-
-_ASSET_LIMITS = ChildLimits(memory_bytes=5 << 30, wall_s=60, calls_per_child=50)
-"""Measured on 148 objects and 78 hostile files: a usable mesh takes seconds and far below 1 GiB."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AcceptedObjects:
     """What scenes may use."""
 
-    objects: tuple[tuple[LockedObject, str], ...]
-    """Every locked object with the name of its staged asset file."""
+    objects: tuple[tuple[LockedObject, Path], ...]
+    """Every locked object with its asset file in the store."""
     num_found: int
     """Objects in the source, refused ones included."""
 
 
 def accept_objects(
-    source: str, settings: BuildSettings, publication: Publication, workers: int
+    source: str,
+    licence: str | None,
+    settings: BuildSettings,
+    publication: Publication,
+    workers: int,
 ) -> AcceptedObjects:
     """List, filter and prepare the objects, and freeze them at the first time.
 
@@ -40,37 +41,32 @@ def accept_objects(
             objects are not those that the dataset was begun with.
     """
     folder = publication.folder
-    found = list_objects(source, work_dir=folder.staged_objects)
-    allowed, refused = refuse_licences(found, settings.allowed_licences)
+    found = find_objects(
+        source,
+        work_dir=folder.staged_objects,
+        allowed_licences=settings.allowed_licences,
+        licence=licence,
+    )
+    allowed = list(found.records)
+    shown = safe_url(source)
     frozen = _frozen(publication)
     if frozen is not None:
         allowed = [record for record in allowed if record.uid in frozen]
     announce_objects(folder, len(allowed))
-    preload(["pipeline.assets.prepare"])
-    pool = ChildPool(_asset_child, workers)
-    try:
-        prepared, rejected = prepare_assets(
-            allowed, settings.assets, folder, borrow_child=pool.borrow, workers=workers
-        )
-    finally:
-        pool.close()
-    publication.add_failures([*refused, *rejected])
+    prepared, rejected = prepare_isolated(
+        allowed, settings.assets, workers=workers, done=lambda: count_object(folder)
+    )
+    publication.add_failures([*found.failures, *rejected])
     locked = [_locked(asset, settings) for asset in prepared]
     if frozen is None:
-        _require_enough(locked, settings, publication, source)
+        _require_enough(locked, settings, publication, shown)
         publication.lock_objects(locked)
     else:
-        _require_same_objects(source, frozen, locked)
-    names = [asset.file_name for asset in prepared]
-    return AcceptedObjects(objects=tuple(zip(locked, names, strict=True)), num_found=len(found))
-
-
-def _asset_child() -> IsolatedChild:
-    return IsolatedChild(limits=_ASSET_LIMITS, setup=_nothing_to_set_up)
-
-
-def _nothing_to_set_up() -> None:
-    """The fork server has imported everything already."""
+        _require_same_objects(shown, frozen, locked)
+    paths = [asset.path for asset in prepared]
+    return AcceptedObjects(
+        objects=tuple(zip(locked, paths, strict=True)), num_found=found.num_found
+    )
 
 
 def _frozen(publication: Publication) -> dict[str, LockedObject] | None:
@@ -86,6 +82,7 @@ def _locked(asset: PreparedAsset, settings: BuildSettings) -> LockedObject:
         asset_sha256=asset.asset_sha256,
         split=split_of_object(asset.geometry_sha256, settings.splits),
         licence=record.licence,
+        licence_source=record.licence_source,
         title=record.title,
         attribution=record.attribution,
         source_url=record.source_url,

@@ -15,7 +15,7 @@ from prefect.cache_policies import NO_CACHE
 from prefect.futures import PrefectFuture, as_completed
 from prefect.utilities.annotations import quote
 
-from pipeline.documents.attribution import write_attribution
+from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.contact_sheet import write_contact_sheet
 from pipeline.flows.accept_objects import AcceptedObjects, accept_objects
 from pipeline.flows.builds import named_build
@@ -27,7 +27,7 @@ from pipeline.flows.publication import Publication, begin
 from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import Variant, choose_variant
-from storage.atomic import remove_leftovers
+from storage.atomic import remove_leftovers, write_atomically
 from storage.dataset import open_dataset
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
@@ -66,6 +66,7 @@ def generate_scenes(
     resolution: int | None = None,
     noise_floor_db: float | None = None,
     allow_licences: list[str] | None = None,
+    licence: str | None = None,
     workers: int = 1,
     failure_budget: float = 0.1,
     accept_environment: bool = False,
@@ -74,13 +75,15 @@ def generate_scenes(
 
     Args:
         build: name of the settings, such as `smoke`.
-        objects: a folder of 3D objects, or `builtin:` for procedural ones.
+        objects: a folder of 3D objects here or on a server, `builtin:` for procedural ones, or
+            `objaverse:`.
         out: folder of the dataset.
         scenes: how many scenes; rounded up to whole shards.
         seed: replaces the build's seed.
         resolution: replaces the build's picture width in pixels.
         noise_floor_db: replaces the build's target (psnr_log_db).
         allow_licences: licences allowed in addition to the build's.
+        licence: of object files that come without any statement; otherwise they count as yours.
         workers: render processes; each takes its share of the cores.
         failure_budget: share of scenes that may be given up before the run stops.
         accept_environment: go on with a dataset that was begun with other library versions.
@@ -108,7 +111,9 @@ def generate_scenes(
             scenes,
             accept_environment=accept_environment,
         )
-        accepted = prepare_assets_task(objects, _whole(settings), _whole(publication), workers)
+        accepted = prepare_assets_task(
+            objects, licence, _whole(settings), _whole(publication), workers
+        )
         _make_shards(settings, variant, publication, accepted, workers, failure_budget)
         statistics = write_documents_task(_whole(publication), _whole(accepted))
     return Outcome(
@@ -122,10 +127,14 @@ def generate_scenes(
 
 @task(name="prepare-assets", cache_policy=NO_CACHE)
 def prepare_assets_task(
-    source: str, settings: BuildSettings, publication: Publication, workers: int
+    source: str,
+    licence: str | None,
+    settings: BuildSettings,
+    publication: Publication,
+    workers: int,
 ) -> AcceptedObjects:
     """Turn the source into the frozen objects of the dataset."""
-    return accept_objects(source, settings, publication, workers)
+    return accept_objects(source, licence, settings, publication, workers)
 
 
 @task(name="make-shard", cache_policy=NO_CACHE)
@@ -140,7 +149,8 @@ def write_documents_task(publication: Publication, accepted: AcceptedObjects) ->
     """Write what a person looks at."""
     dataset = open_dataset(str(publication.folder.root))
     statistics = dataset_statistics(dataset)
-    write_attribution(publication.folder, [locked for locked, _ in accepted.objects])
+    attribution = encode_attribution(locked for locked, _ in accepted.objects)
+    write_atomically(publication.folder.attribution, attribution)
     write_contact_sheet(dataset, statistics)
     return statistics
 
@@ -169,7 +179,6 @@ def _make_shards(
         settings=settings,
         variant=variant,
         threads=max(1, (os.cpu_count() or 1) // workers),
-        folder=publication.folder,
         objects=accepted.objects,
     )
 

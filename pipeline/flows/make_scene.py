@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from pipeline.scenes.compose import compose_scene, next_camera
 from pipeline.scenes.pool import PooledAsset
 from storage.asset import decode_asset
 from storage.errors import Rejected
-from storage.layout import DatasetFolder
 from storage.records import Failure, LockedObject
 from storage.sample import Sample, ViewRecord, sample_key
 from storage.scene import Scene
@@ -32,10 +32,8 @@ class SceneSource:
     """What Mitsuba runs on."""
     threads: int
     """Threads of this child."""
-    folder: DatasetFolder
-    """Where the prepared assets are."""
-    objects: tuple[tuple[LockedObject, str], ...]
-    """Every locked object with the name of its staged asset file."""
+    objects: tuple[tuple[LockedObject, Path], ...]
+    """Every locked object with its asset file."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,9 +92,9 @@ def _assets_of(split: str) -> Sequence[PooledAsset]:
         _state.pool[split] = [
             PooledAsset(
                 locked=locked,
-                asset=decode_asset((source.folder.staged_assets / file_name).read_bytes()),
+                asset=decode_asset(path.read_bytes()),
             )
-            for locked, file_name in sorted(source.objects, key=lambda pair: pair[0].uid)
+            for locked, path in sorted(source.objects, key=lambda pair: pair[0].uid)
             if locked.split == split
         ]
     return _state.pool[split]

@@ -7,28 +7,97 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from pipeline.assets.cleaning.clean import clean, normalise
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings
 from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
 from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
+from storage.asset import Asset, Level
 from storage.errors import Rejected
 from storage.records import ObjectRecord
 
 
 def record_of(path: Path, uid: str = "object") -> ObjectRecord:
     return ObjectRecord(
-        uid=uid, path=str(path), title="", licence="CC0-1.0", attribution="", source_url=""
+        uid=uid,
+        path=str(path),
+        title="",
+        licence="CC0-1.0",
+        licence_source="tests",
+        attribution="",
+        source_url="",
     )
 
 
-def reason_of(path: Path, settings: AssetSettings | None = None) -> str:
+def prepare(
+    path: Path, settings: AssetSettings | None = None, method: str = "pymeshlab_collapse"
+) -> Asset:
+    """What one method makes of a file; raises Rejected where it makes no level at all."""
+    wanted = settings or AssetSettings()
+    attempt = prepare_asset(path, wanted, method)
+    if not attempt.asset.levels:
+        raise Rejected(*attempt.missed[wanted.budgets[0]])
+    return attempt.asset
+
+
+def reason_of(
+    path: Path, settings: AssetSettings | None = None, method: str = "pymeshlab_collapse"
+) -> str:
     with pytest.raises(Rejected) as caught:
-        prepare_asset(record_of(path), settings or AssetSettings())
+        prepare(path, settings, method)
     assert caught.value.message.isprintable()
     return caught.value.reason
+
+
+def cleaned(mesh: TriangleMesh) -> TriangleMesh:
+    return clean(normalise(mesh))
+
+
+def mesh_of(level: Level) -> TriangleMesh:
+    return TriangleMesh(
+        positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
+    )
+
+
+def geometry(asset: Asset) -> bytes:
+    return b"".join(level.positions.tobytes() + level.faces.tobytes() for level in asset.levels)
+
+
+def joined(*meshes: TriangleMesh) -> TriangleMesh:
+    """All of them as one mesh."""
+    starts = np.cumsum([0, *(len(mesh.positions) for mesh in meshes)])
+    return TriangleMesh(
+        positions=np.concatenate([mesh.positions for mesh in meshes]),
+        faces=np.concatenate([m.faces + k for m, k in zip(meshes, starts[:-1], strict=True)]),
+    )
+
+
+def moved(mesh: TriangleMesh, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> TriangleMesh:
+    return TriangleMesh(positions=mesh.positions * scale + np.asarray(offset), faces=mesh.faces)
+
+
+def cube(cells: int = 1) -> TriangleMesh:
+    """A closed cube of 12 cells^2 faces, every side a grid of squares."""
+    axis = np.linspace(-0.5, 0.5, cells + 1)
+    u, v = (grid.ravel() for grid in np.meshgrid(axis, axis, indexing="ij"))
+    sheet = grid_faces(cells, cells)
+    sides = []
+    for k in range(3):
+        for end in (-0.5, 0.5):
+            positions = np.roll(np.column_stack([np.full(len(u), end), u, v]), k, axis=1)
+            faces = sheet if end > 0 else sheet[:, ::-1]
+            sides.append(TriangleMesh(positions=positions, faces=faces))
+    return joined(*sides)
+
+
+def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """[2 rows columns, 3] the triangles of a grid of (rows + 1) (columns + 1) vertices."""
+    start = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    quads = start[:, None] + [0, columns + 1, columns + 2, 1]
+    return quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
 
 
 def sphere(rings: int = 15, columns: int = 24) -> TriangleMesh:
@@ -117,7 +186,8 @@ def write_ply(path: Path, mesh: TriangleMesh) -> Path:
 
 def gltf_tree(mesh: TriangleMesh) -> tuple[dict[str, Any], bytes]:
     """A glTF of one node, and its buffer; tests then break the tree in one place."""
-    points = mesh.positions.astype("<f4").tobytes()
+    upright = mesh.positions[:, [0, 2, 1]] * [1, 1, -1]  # glTF has +Y up, we have +Z
+    points = upright.astype("<f4").tobytes()
     indices = mesh.faces.astype("<u4").tobytes()
     tree = {
         "asset": {"version": "2.0"},

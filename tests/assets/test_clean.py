@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.assets.clean import GRID, clean, geometry_sha256, normalise
+from pipeline.assets.cleaning.clean import GRID, geometry_sha256
 from pipeline.assets.mesh import TriangleMesh
-from tests.assets.meshes_by_hand import as_rows, knot, sphere
-
-
-def cleaned(mesh: TriangleMesh) -> TriangleMesh:
-    return clean(normalise(mesh))
+from tests.assets.meshes_by_hand import as_rows, cleaned, knot, sphere
 
 
 def same(a: TriangleMesh, b: TriangleMesh) -> bool:

@@ -3,22 +3,21 @@
 import numpy as np
 import pytest
 
-from pipeline.assets.clean import clean, normalise
+from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.orient import orient_outward
-from tests.assets.meshes_by_hand import flip_some, knot, sphere, volume
+from tests.assets.meshes_by_hand import cleaned, flip_some, knot, sphere, volume
 
 
-def prepared(mesh: TriangleMesh) -> TriangleMesh:
-    return clean(normalise(mesh))
+def oriented(mesh: TriangleMesh) -> TriangleMesh:
+    return orient_outward(cleaned(mesh))[0]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("mesh", [sphere(), knot()], ids=["sphere", "knot"])
 def test_flipped_faces_are_turned_back(mesh: TriangleMesh, share: float) -> None:
-    right = prepared(mesh).faces
-    flipped = prepared(flip_some(mesh, share, np.random.default_rng(2)))
-    assert np.array_equal(orient_outward(flipped).faces, right)
+    right = cleaned(mesh).faces
+    flipped = oriented(flip_some(mesh, share, np.random.default_rng(2)))
+    assert np.array_equal(flipped.faces, right)
 
 
 def test_each_of_several_bodies_is_turned_on_its_own() -> None:
@@ -28,7 +27,7 @@ def test_each_of_several_bodies_is_turned_on_its_own() -> None:
         positions=np.concatenate([ball.positions, ball.positions + 3]),
         faces=np.concatenate([ball.faces, ball.faces[:, ::-1] + count]),
     )
-    mesh = orient_outward(prepared(both))
+    mesh = oriented(both)
     centres = mesh.corners.mean(axis=1)
     middle = np.where(centres[:, :1] > 0, 1, -1) * np.abs(centres).mean(axis=0)
     outward = np.einsum("ij,ij->i", mesh.double_area_vectors, centres - middle)
@@ -41,7 +40,7 @@ def test_a_body_that_nobody_sees_is_turned_by_its_volume() -> None:
         positions=np.concatenate([outer.positions, 0.3 * inner.positions]),
         faces=np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.positions)]),
     )
-    mesh = orient_outward(prepared(nested))
+    mesh = oriented(nested)
     alone = np.linalg.norm(mesh.corners, axis=2).max(axis=1) < 0.2
     inside = TriangleMesh(positions=mesh.positions, faces=mesh.faces[alone])
     assert alone.sum() == len(inner.faces)
@@ -52,6 +51,6 @@ def test_an_open_cup_keeps_its_outside_out() -> None:
     ball = sphere()
     below = ball.positions[ball.faces].mean(axis=1)[:, 2] < 0.2
     cup = TriangleMesh(positions=ball.positions, faces=ball.faces[below])
-    right = prepared(cup).faces
-    flipped = prepared(flip_some(cup, 0.3, np.random.default_rng(3)))
-    assert np.array_equal(orient_outward(flipped).faces, right)
+    right = cleaned(cup).faces
+    flipped = oriented(flip_some(cup, 0.3, np.random.default_rng(3)))
+    assert np.array_equal(flipped.faces, right)

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.prepare import prepare_asset
-from pipeline.assets.settings import AssetSettings
+from pipeline.assets.settings import AssetSettings, GateSettings
 from storage.errors import Rejected
 from tests.assets.meshes_by_hand import (
     gltf_tree,
     knot,
+    prepare,
     reason_of,
-    record_of,
     sphere,
     write_glb,
     write_obj,
@@ -73,8 +72,8 @@ def test_bad_numbers(tmp_path: Path, name: str) -> None:
 def test_an_offset_is_judged_by_the_precision_of_the_format(tmp_path: Path) -> None:
     far = moved(1.0, 1e6)
     assert reason_of(write_stl(tmp_path / "a.stl", far)) == "offset_precision"
-    near = prepare_asset(record_of(write_obj(tmp_path / "a.obj", BALL)), AssetSettings())
-    exact = prepare_asset(record_of(write_obj(tmp_path / "b.obj", far)), AssetSettings())
+    near = prepare(write_obj(tmp_path / "a.obj", BALL))
+    exact = prepare(write_obj(tmp_path / "b.obj", far))
     # Text keeps 17 digits: at 1e6 the ball is still known to 1e-10, far below the grid of 1e-6.
     assert exact.geometry_sha256 == near.geometry_sha256
 
@@ -83,8 +82,8 @@ def test_unused_vertices_do_not_count(tmp_path: Path) -> None:
     """A vertex without a face may be anything: exporters leave them behind."""
     positions = np.concatenate([[[1e30, np.nan, 0]], BALL.positions])
     mesh = TriangleMesh(positions=positions, faces=BALL.faces + 1)
-    dirty = prepare_asset(record_of(write_off(tmp_path / "a.off", mesh)), AssetSettings())
-    tidy = prepare_asset(record_of(write_off(tmp_path / "b.off", BALL)), AssetSettings())
+    dirty = prepare(write_off(tmp_path / "a.off", mesh))
+    tidy = prepare(write_off(tmp_path / "b.off", BALL))
     assert dirty.geometry_sha256 == tidy.geometry_sha256
 
 
@@ -121,46 +120,61 @@ def _ply(header: str, body: bytes = b"") -> bytes:
 _XYZ = "property float x\nproperty float y\nproperty float z"
 _LIST = "property list uchar int vertex_indices"
 
-RAW_FILES: dict[str, tuple[str, str, bytes]] = {
-    "empty obj": ("no_faces", ".obj", b""),
-    "empty stl": ("header_size_mismatch", ".stl", b""),
-    "empty ply": ("load_error", ".ply", b""),
-    "empty off": ("load_error", ".off", b""),
-    "empty glb": ("load_error", ".glb", b""),
-    "text in glb": ("load_error", ".glb", b"hello " * 50),
-    "text in obj": ("no_faces", ".obj", b"hello " * 50),
-    "noise in stl": ("header_size_mismatch", ".stl", bytes(range(256)) * 4),
-    "noise in off": ("load_error", ".off", bytes(range(256)) * 4),
-    "list in gltf": ("load_error", ".gltf", b"[1, 2]"),
-    "number as meshes": ("load_error", ".gltf", b'{"meshes": 7}'),
-    "deep json": ("load_error", ".gltf", b'{"a":' + b"[" * 100_000),
-    "no scene": ("no_faces", ".gltf", b'{"asset": {"version": "2.0"}}'),
-    "stl bomb": ("header_size_mismatch", ".stl", bytes(80) + b"\xff" * 4 + bytes(500)),
-    "points": ("point_cloud", ".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"),
-    "obj range": ("index_range", ".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
-    "ply strips": (
-        "unsupported_primitive",
-        ".ply",
-        _ply(f"element vertex 3\n{_XYZ}\nelement tristrips 1\n{_LIST}", bytes(100)),
-    ),
-    "ply range": (
-        "index_range",
-        ".ply",
-        _ply(
-            f"element vertex 3\n{_XYZ}\nelement face 1\n{_LIST}",
-            np.eye(3, dtype="<f4").tobytes() + struct.pack("<B3i", 3, 0, 1, 77),
+RAW_FILES: dict[str, tuple[str, str, bytes]] = (
+    {
+        "empty obj": ("no_faces", ".obj", b""),
+        "empty stl": ("header_size_mismatch", ".stl", b""),
+        "empty ply": ("load_error", ".ply", b""),
+        "empty off": ("load_error", ".off", b""),
+        "empty glb": ("load_error", ".glb", b""),
+        "text in glb": ("load_error", ".glb", b"hello " * 50),
+        "text in obj": ("no_faces", ".obj", b"hello " * 50),
+        "noise in stl": ("header_size_mismatch", ".stl", bytes(range(256)) * 4),
+        "noise in off": ("load_error", ".off", bytes(range(256)) * 4),
+        "list in gltf": ("load_error", ".gltf", b"[1, 2]"),
+        "number as meshes": ("load_error", ".gltf", b'{"meshes": 7}'),
+        "deep json": ("load_error", ".gltf", b'{"a":' + b"[" * 100_000),
+        "no scene": ("no_faces", ".gltf", b'{"asset": {"version": "2.0"}}'),
+        "stl bomb": ("header_size_mismatch", ".stl", bytes(80) + b"\xff" * 4 + bytes(500)),
+        "points": ("point_cloud", ".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"),
+        "obj range": ("index_range", ".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
+        "ply strips": (
+            "unsupported_primitive",
+            ".ply",
+            _ply(f"element vertex 3\n{_XYZ}\nelement tristrips 1\n{_LIST}", bytes(100)),
         ),
-    ),
-    "text as archive": ("unsupported_format", ".zip", b"v 0 0 0"),
-} | {
-    f"ply bomb {count} {element}": (
-        "header_size_mismatch",
-        ".ply",
-        _ply(f"element {element} {count}\n{_XYZ if element == 'vertex' else _LIST}", bytes(64)),
-    )
-    for count in (2**31 - 1, 2**31, 10**18, -5)
-    for element in ("vertex", "face")
-}
+        "ply range": (
+            "index_range",
+            ".ply",
+            _ply(
+                f"element vertex 3\n{_XYZ}\nelement face 1\n{_LIST}",
+                np.eye(3, dtype="<f4").tobytes() + struct.pack("<B3i", 3, 0, 1, 77),
+            ),
+        ),
+        "text as archive": ("unsupported_format", ".zip", b"v 0 0 0"),
+    }
+    | {
+        f"ply bomb {count} {element}": (
+            "header_size_mismatch",
+            ".ply",
+            _ply(f"element {element} {count}\n{_XYZ if element == 'vertex' else _LIST}", bytes(64)),
+        )
+        for count in (2**31 - 1, 2**31, 10**18, -5)
+        for element in ("vertex", "face")
+    }
+    | {
+        f"ascii ply bomb {count} {element}": (
+            "header_size_mismatch",
+            ".ply",
+            _ply(
+                f"element {element} {count}\n{_XYZ if element == 'vertex' else _LIST}",
+                b"0 0 0\n" * 9,
+            ).replace(b"binary_little_endian", b"ascii"),
+        )
+        for count in (10, 2**31 - 1, 2**31, 10**18, -5)
+        for element in ("vertex", "face")
+    }
+)
 
 
 @pytest.mark.parametrize("name", RAW_FILES)
@@ -198,14 +212,15 @@ def test_limits_of_size(tmp_path: Path, write: Callable[[Path, TriangleMesh], Pa
 
 def test_an_error_beyond_the_bound_is_stated(tmp_path: Path) -> None:
     path = write_obj(tmp_path / "a.obj", knot())
-    settings = AssetSettings(budgets=(1000,), max_error_p99=1e-4)
+    settings = AssetSettings(budgets=(1000,), gate=GateSettings(max_error_p99=1e-4))
     with pytest.raises(Rejected, match=r"error_over_bound: p99 distance \d+\.\d+%"):
-        prepare_asset(record_of(path), settings)
+        prepare(path, settings)
 
 
 def test_levels_beyond_the_bound_are_left_out(tmp_path: Path) -> None:
     path = write_obj(tmp_path / "a.obj", knot())
-    asset = prepare_asset(record_of(path), AssetSettings(budgets=(1400, 60), max_error_p99=0.01))
+    gate = GateSettings(max_error_p99=0.01)
+    asset = prepare(path, AssetSettings(budgets=(1400, 60), gate=gate))
     assert [level.record.budget for level in asset.levels] == [1400]
 
 

@@ -49,6 +49,18 @@ def hang() -> None:
     time.sleep(60)
 
 
+def burn(seconds: float) -> int:
+    """Use processor time, and none of it waiting."""
+    start = time.process_time()
+    while time.process_time() - start < seconds:
+        pass
+    return os.getpid()
+
+
+def process_id() -> int:
+    return os.getpid()
+
+
 def kill_itself() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -119,6 +131,45 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
     assert failures
     with pytest.raises(ChildClosed):
         child.call(double, 1)
+
+
+def test_processor_seconds_are_for_one_call_each() -> None:
+    """A call that uses them up ends its child; several that stay below do not add up."""
+    limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, cpu_s=1, calls_per_child=9)
+    child = IsolatedChild(limits=limits, setup=process_id)
+    try:
+        assert len({child.call(burn, 0.6) for _ in range(3)}) == 1
+        with pytest.raises(ChildFailed, match="timeout_cpu: used its 1 processor seconds"):
+            child.call(burn, 30.0)
+        assert child.call(double, 4) == 8
+    finally:
+        child.close()
+
+
+def test_waiting_uses_no_processor_seconds() -> None:
+    limits = ChildLimits(memory_bytes=2 << 30, wall_s=1, cpu_s=1, calls_per_child=9)
+    child = IsolatedChild(limits=limits, setup=process_id)
+    try:
+        with pytest.raises(ChildFailed, match="timeout_wall"):
+            child.call(hang)
+    finally:
+        child.close()
+
+
+def test_a_retired_child_is_replaced(child: IsolatedChild) -> None:
+    first = child.call(process_id)
+    assert child.call(process_id) == first
+    child.retire()
+    child.retire()
+    second = child.call(process_id)
+    assert second != first
+    assert not _alive(first)
+    assert child.call(double, 4) == 8
+
+
+def test_a_call_to_exit_is_a_crash(child: IsolatedChild) -> None:
+    with pytest.raises(ChildFailed, match="crashed: the child ended with status 3"):
+        child.call(os._exit, 3)
 
 
 def _alive(pid: int) -> bool:

@@ -41,6 +41,7 @@ def _locked() -> LockedObject:
         asset_sha256="0" * 64,
         split="train",
         licence="CC0-1.0",
+        licence_source="tests",
         title="A",
         attribution="",
         source_url="",

@@ -9,10 +9,35 @@ import trimesh
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.settings import SceneSettings
-from storage.asset import Asset, Level, LevelRecord
+from storage.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 from storage.errors import Rejected
 from storage.records import LockedObject
 from storage.scene import Scene
+
+QUALITY = LevelQuality(
+    error_mean=0.0,
+    error_p99=0.0,
+    error_max=0.0,
+    normal_error_deg=0.0,
+    area_ratio=1.0,
+    silhouette_iou=1.0,
+    lost_area=0.0,
+    area_variation=0.5,
+    min_angle_p5_deg=30.0,
+    open_edges=0,
+)
+"""Of a level that is its source."""
+
+SOURCE = SourceFacts(
+    num_faces_read=1280,
+    num_faces=1280,
+    num_faces_turned=0,
+    num_parts=1,
+    open_edges=0,
+    nonmanifold_edges=0,
+    front_share=1.0,
+)
+"""Of a closed object that needed no repair."""
 
 
 def level(mesh: trimesh.Trimesh) -> Level:
@@ -20,7 +45,7 @@ def level(mesh: trimesh.Trimesh) -> Level:
     centred = mesh.vertices - mesh.bounds.mean(axis=0)
     count = len(mesh.faces)
     return Level(
-        record=LevelRecord(budget=count, method="source", error_p99=0.0),
+        record=LevelRecord(budget=count, method="source", quality=QUALITY),
         positions=(centred / mesh.extents.max()).astype(np.float32),
         faces=mesh.faces.astype(np.uint32),
     )
@@ -35,6 +60,7 @@ def pooled(uid: str, meshes: Iterable[trimesh.Trimesh]) -> PooledAsset:
             asset_sha256=digest,
             split="train",
             licence="CC0-1.0",
+            licence_source="tests",
             title=uid,
             attribution=f"maker of {uid}",
             source_url=f"https://example.org/{uid}",
@@ -43,6 +69,7 @@ def pooled(uid: str, meshes: Iterable[trimesh.Trimesh]) -> PooledAsset:
             geometry_sha256=digest,
             source_sha256=digest,
             recipe="trimesh creation",
+            source=SOURCE,
             levels=tuple(level(mesh) for mesh in meshes),
         ),
     )

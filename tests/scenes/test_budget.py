@@ -6,18 +6,21 @@ import pytest
 from pipeline.scenes.budget import levels_within
 from storage.asset import Asset, Level, LevelRecord
 from storage.errors import Rejected
+from tests.scenes.small_pool import QUALITY, SOURCE
 
 
 def _asset(counts: list[int]) -> Asset:
     levels = tuple(
         Level(
-            record=LevelRecord(budget=count, method="by hand", error_p99=0.0),
+            record=LevelRecord(budget=count, method="by hand", quality=QUALITY),
             positions=np.zeros((3, 3), np.float32),
             faces=np.zeros((count, 3), np.uint32),
         )
         for count in sorted(counts, reverse=True)
     )
-    return Asset(geometry_sha256="", source_sha256="", recipe="by hand", levels=levels)
+    return Asset(
+        geometry_sha256="", source_sha256="", recipe="by hand", source=SOURCE, levels=levels
+    )
 
 
 def test_budgets_hold_and_no_object_could_be_finer() -> None:

@@ -1,6 +1,7 @@
 """Laws of composed scenes."""
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import os
@@ -236,9 +237,7 @@ def test_a_mesh_without_usable_triangles_is_rejected(pool: list[PooledAsset]) ->
     positions = mesh.positions.copy()
     positions[0] = np.nan
     levels = (type(mesh)(record=mesh.record, positions=positions, faces=mesh.faces),)
-    asset = type(broken.asset)(
-        geometry_sha256="", source_sha256="", recipe="broken by hand", levels=levels
-    )
+    asset = dataclasses.replace(broken.asset, levels=levels)
     pool = [PooledAsset(locked=broken.locked, asset=asset)]
     with pytest.raises(Rejected) as caught:
         compose_scene(SETTINGS, pool, seed=0, scene_index=0, attempt=0)

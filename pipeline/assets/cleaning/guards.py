@@ -56,7 +56,7 @@ def check_clean(mesh: TriangleMesh) -> None:
     """Raise Rejected where nothing worth rendering is left of a cleaned mesh."""
     double_areas = np.linalg.norm(mesh.double_area_vectors, axis=1)
     area = 0.5 * float(double_areas.sum())
-    bulk = _bulk_extent(mesh.corners.mean(axis=1), double_areas) if area else 0.0
+    bulk = _bulk_extent(mesh.corners.reshape(-1, 3), np.repeat(double_areas, 3)) if area else 0.0
     if area and bulk < MIN_BULK:
         raise Rejected(
             "far_outlier", f"99 % of the area lies within {bulk:.2g} of the box; >= {MIN_BULK}"
@@ -65,10 +65,10 @@ def check_clean(mesh: TriangleMesh) -> None:
         raise Rejected("degenerate", f"area {area:.3g} in the unit box; expected >= {MIN_AREA}")
 
 
-def _bulk_extent(centres: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+def _bulk_extent(points: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     """Return the longest side of the box that leaves out 0.5 % of the area at either end."""
     sides = []
-    for axis in centres.T:
+    for axis in points.T:
         order = np.argsort(axis, kind="stable")
         share = np.cumsum(weights[order])
         low, high = np.searchsorted(share, [0.005 * share[-1], 0.995 * share[-1]])

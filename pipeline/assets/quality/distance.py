@@ -2,8 +2,10 @@
 
 The 99th percentile rather than the largest value, because one vertex rules the latter; rather than
 the mean, because a mean accepts almost anything. What it cannot see is a part that holds less than
-one percent of the area.
+one percent of the area; `parts.py` looks for those.
 """
+
+from dataclasses import dataclass
 
 import igl
 import numpy as np
@@ -12,8 +14,36 @@ from numpy.typing import NDArray
 from pipeline.assets.mesh import TriangleMesh
 
 
-def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points [N, 3] spread evenly by area: one from each of N equal shares of it.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfacePoints:
+    """Points spread evenly over a surface."""
+
+    positions: NDArray[np.float64]
+    """[N, 3]"""
+    faces: NDArray[np.int64]
+    """[N] the face on which each lies."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Deviation:
+    """What separates a surface from another one, point by point."""
+
+    there: NDArray[np.float64]
+    """[N] distances from points of the first surface to the second, as shares of the diagonal of
+    the first one's bounding box."""
+    back: NDArray[np.float64]
+    """[N] distances from points of the second surface to the first, likewise."""
+    angle_deg: NDArray[np.float64]
+    """[N] between the normal at each point of the first surface and at the nearest point of the
+    second; 0 to 90, because the nearest point of a thin part may lie on its other side."""
+
+    def two_way(self, percentile: float) -> float:
+        """Return the larger of the two directions' percentiles."""
+        return float(max(np.percentile(way, percentile) for way in (self.there, self.back)))
+
+
+def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> SurfacePoints:
+    """Return N points spread evenly by area: one from each of N equal shares of it.
 
     Args:
         mesh: at least one face with area.
@@ -24,7 +54,7 @@ def sample_surface(mesh: TriangleMesh, uniform: NDArray[np.float64]) -> NDArray[
     face = np.minimum(np.searchsorted(total, share, side="right"), len(total) - 1)
     root = np.sqrt(uniform[:, 1])
     weights = np.stack([1 - root, root * (1 - uniform[:, 2]), root * uniform[:, 2]], axis=1)
-    return np.einsum("ij,ijk->ik", weights, mesh.corners[face])
+    return SurfacePoints(positions=np.einsum("ij,ijk->ik", weights, mesh.corners[face]), faces=face)
 
 
 class Surface:
@@ -33,21 +63,29 @@ class Surface:
     def __init__(self, mesh: TriangleMesh, uniform: NDArray[np.float64]) -> None:
         """Sample `mesh`, and later whatever it is compared with, at `uniform` [N, 3]."""
         self.mesh = mesh
+        self.points = sample_surface(mesh, uniform)
         self._uniform = uniform
-        self._points = sample_surface(mesh, uniform)
+        self._normals = _unit_normals(mesh)
         self._tree = igl.AABB()
         self._tree.init(mesh.positions, mesh.faces)
 
-    def distances_to(self, other: TriangleMesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the distances from here to `other` and back, [N] each, as shares of the diagonal.
+    def deviation(self, other: TriangleMesh) -> Deviation:
+        """Return how far `other` is from this surface, and this surface from it."""
+        points = self.points.positions
+        squared, nearest, _ = igl.point_mesh_squared_distance(points, other.positions, other.faces)
+        cosine = np.einsum(
+            "ij,ij->i", self._normals[self.points.faces], _unit_normals(other)[nearest]
+        )
+        back = self._tree.squared_distance(
+            self.mesh.positions, self.mesh.faces, sample_surface(other, self._uniform).positions
+        )[0]
+        return Deviation(
+            there=np.sqrt(squared) / self.mesh.diagonal,
+            back=np.sqrt(back) / self.mesh.diagonal,
+            angle_deg=np.degrees(np.arccos(np.minimum(np.abs(cosine), 1.0))),
+        )
 
-        The diagonal is that of this surface's bounding box.
-        """
-        there = igl.point_mesh_squared_distance(self._points, other.positions, other.faces)[0]
-        points = sample_surface(other, self._uniform)
-        back = self._tree.squared_distance(self.mesh.positions, self.mesh.faces, points)[0]
-        return np.sqrt(there) / self.mesh.diagonal, np.sqrt(back) / self.mesh.diagonal
 
-    def p99_to(self, other: TriangleMesh) -> float:
-        """Return the larger 99th percentile of the two directions, as a share of the diagonal."""
-        return float(max(np.percentile(way, 99) for way in self.distances_to(other)))
+def _unit_normals(mesh: TriangleMesh) -> NDArray[np.float64]:
+    vectors = mesh.double_area_vectors
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

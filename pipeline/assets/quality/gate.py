@@ -1,40 +1,86 @@
-"""The gate at the end: what a level must fulfil whatever made it."""
+"""The gate at the end: what a level must fulfil whatever made it. Cheap checks come first."""
 
 import numpy as np
 
-from pipeline.assets.clean import clean
-from pipeline.assets.distance import Surface
+from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.quality.measure import MeasuredSource
+from pipeline.assets.settings import GateSettings
+from storage.asset import LevelQuality
 from storage.errors import Rejected
-
-BOX_MARGIN = 0.01
-"""How far a level may stick out of its source's bounding box, as a share of its diagonal."""
 
 
 def check_level(
-    result: TriangleMesh, source: Surface, budget: int, max_error_p99: float
-) -> tuple[TriangleMesh, float]:
-    """Return the cleaned result of a decimation, and its two-way p99 distance to the source.
+    result: TriangleMesh,
+    source: MeasuredSource,
+    budget: int,
+    gate: GateSettings,
+    max_error_p99: float,
+) -> tuple[TriangleMesh, LevelQuality]:
+    """Return the cleaned result of a decimation with its measures.
+
+    Args:
+        result: what a decimation returned, unchecked.
+        source: what it was made from.
+        budget: most faces.
+        gate: the other limits.
+        max_error_p99: the limit on the error, at most that of `gate`.
 
     Raises:
-        Rejected: nonfinite_result, bbox_escaped, budget_missed, error_over_bound.
+        Rejected: budget_missed, nonfinite_result, bbox_escaped, area_changed, error_over_bound,
+            normals_changed, silhouette_changed, parts_lost.
     """
-    used = result.positions[np.unique(result.faces)]
-    if len(used) == 0:
-        raise Rejected("budget_missed", f"no face is left; expected 1 to {budget}")
-    if not np.isfinite(used).all():
-        raise Rejected("nonfinite_result", "a vertex of the result is not finite")
-    low, high = source.mesh.positions.min(axis=0), source.mesh.positions.max(axis=0)
-    outside = float(np.maximum(low - used, used - high).max()) / source.mesh.diagonal
-    if outside > BOX_MARGIN:
-        raise Rejected("bbox_escaped", f"a vertex is {outside:.2%} of the diagonal outside the box")
+    _check_vertices(result, source.mesh, gate.max_outside)
     mesh = clean(result)
     if not 1 <= len(mesh.faces) <= budget:
         raise Rejected("budget_missed", f"{len(mesh.faces)} faces; expected 1 to {budget}")
-    error = source.p99_to(mesh)
+    low, high = gate.area_ratio
+    if not low <= source.area_ratio(mesh) <= high:
+        raise Rejected(
+            "area_changed",
+            f"{source.area_ratio(mesh):.2f} times the source's area at {budget} faces; "
+            f"expected {low} to {high}",
+        )
+    deviation = source.surface.deviation(mesh)
+    error = deviation.two_way(99)
     if error > max_error_p99:
         raise Rejected(
             "error_over_bound",
-            f"p99 distance {error:.2%} at {budget} faces; <= {max_error_p99:.2%}",
+            f"p99 distance {error:.2%} at {budget} faces; expected <= {max_error_p99:.2%}",
         )
-    return mesh, error
+    quality = source.quality(mesh, deviation)
+    _check_shape(quality, budget, gate)
+    return mesh, quality
+
+
+def _check_vertices(result: TriangleMesh, source: TriangleMesh, max_outside: float) -> None:
+    used = result.positions[np.unique(result.faces)]
+    if len(used) == 0:
+        raise Rejected("budget_missed", "no face is left")
+    if not np.isfinite(used).all():
+        raise Rejected("nonfinite_result", "a vertex of the result is not finite")
+    low, high = source.positions.min(axis=0), source.positions.max(axis=0)
+    outside = float(np.maximum(low - used, used - high).max()) / source.diagonal
+    if outside > max_outside:
+        raise Rejected("bbox_escaped", f"a vertex is {outside:.2%} of the diagonal outside the box")
+
+
+def _check_shape(quality: LevelQuality, budget: int, gate: GateSettings) -> None:
+    if quality.normal_error_deg > gate.max_normal_error_deg:
+        raise Rejected(
+            "normals_changed",
+            f"normals are off by {quality.normal_error_deg:.0f} degrees on average at {budget} "
+            f"faces; expected <= {gate.max_normal_error_deg:.0f}",
+        )
+    if quality.silhouette_iou < gate.min_silhouette_iou:
+        raise Rejected(
+            "silhouette_changed",
+            f"outlines agree by {quality.silhouette_iou:.1%} at {budget} faces; "
+            f"expected >= {gate.min_silhouette_iou:.0%}",
+        )
+    if quality.lost_area > gate.max_lost_area:
+        raise Rejected(
+            "parts_lost",
+            f"parts with {quality.lost_area:.1%} of the area are gone at {budget} faces; "
+            f"expected <= {gate.max_lost_area:.1%}",
+        )

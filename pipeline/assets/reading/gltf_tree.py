@@ -16,6 +16,7 @@ from storage.errors import Rejected
 _MAX_JSON_BYTES = 64_000_000
 _HARMLESS_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_")
 """A file may require these: they change how a surface looks, which we replace."""
+_COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 _FLOAT = 5126
 _POINTS_AND_LINES = (0, 1, 2, 3)
 _TRIANGLES = 4
@@ -44,9 +45,7 @@ def read_tree(data: bytes, suffix: str) -> dict[str, Any]:
 def check_tree(tree: dict[str, Any], settings: AssetSettings) -> None:
     """Raise Rejected for a tree that would load wrongly, or as more than the limits."""
     try:
-        for name in tree.get("extensionsRequired", ()):
-            if not name.startswith(_HARMLESS_EXTENSIONS):
-                raise Rejected("unsupported_extension", f"the file requires {name[:80]!r}")
+        _check_extensions(tree)
         faces = [
             sum(_count_faces(tree, primitive, settings) for primitive in mesh["primitives"])
             for mesh in tree.get("meshes", ())
@@ -57,6 +56,25 @@ def check_tree(tree: dict[str, Any], settings: AssetSettings) -> None:
         raise Rejected("load_error", f"the glTF tree is malformed ({error!r:.120})") from error
     if total > settings.max_source_faces:
         raise Rejected("too_many_faces", f"{total} faces; expected <= {settings.max_source_faces}")
+
+
+def _check_extensions(tree: dict[str, Any]) -> None:
+    """Refuse what the file cannot be read without.
+
+    A file that uses compression without requiring it holds plain data as well, or marks its buffer
+    as a mere place-holder.
+    """
+    for buffer in tree.get("buffers", ()):
+        if any(entry.get("fallback") for entry in buffer.get("extensions", {}).values()):
+            raise Rejected("compressed_geometry", "a buffer holds compressed geometry only")
+    for name in tree.get("extensionsRequired", ()):
+        if name in _COMPRESSED:
+            raise Rejected(
+                "compressed_geometry",
+                f"the file requires {name}; unpack it first, for example with gltf-transform",
+            )
+        if not name.startswith(_HARMLESS_EXTENSIONS):
+            raise Rejected("unsupported_extension", f"the file requires {name[:80]!r}")
 
 
 def buffer_paths(tree: dict[str, Any], folder: Path) -> dict[str, Path]:
@@ -115,7 +133,20 @@ def _placed_meshes(tree: dict[str, Any], max_instances: int) -> list[int]:
         seen.add(index)
         waiting.extend(nodes[index].get("children", ()))
         if "mesh" in nodes[index]:
+            _check_pose(tree, nodes[index])
             placed.append(nodes[index]["mesh"])
         if len(placed) > max_instances:
             raise Rejected("too_many_instances", f"more than {max_instances} nodes place a mesh")
     return placed
+
+
+def _check_pose(tree: dict[str, Any], node: dict[str, Any]) -> None:
+    """Refuse a mesh whose vertices are moved by bones or morph targets: the library ignores both.
+
+    Targets that all weigh nothing leave the mesh as it is.
+    """
+    if "skin" in node:
+        raise Rejected("skinned_mesh", "bones pose a mesh; apply the skin before exporting")
+    weights = node.get("weights", tree["meshes"][node["mesh"]].get("weights", ()))
+    if any(weights):
+        raise Rejected("morphed_mesh", "morph targets shape a mesh; apply them before exporting")

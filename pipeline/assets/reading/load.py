@@ -6,14 +6,15 @@ import numpy as np
 import trimesh
 
 from pipeline.assets.mesh import TriangleMesh
-from pipeline.assets.source_file import SourceFile
+from pipeline.assets.reading.source_file import SourceFile
 from storage.errors import Rejected
 
 
 def load_mesh(source: SourceFile) -> TriangleMesh:
-    """Return all triangles of a source in its own units, node transforms applied.
+    """Return all triangles of a source in its own units, node transforms applied, +Z up.
 
-    The vertices are as the file has them: unwelded, some unused, possibly not finite.
+    glTF defines +Y as up and is turned; the other formats define nothing and stay as they are. The
+    vertices are as the file has them: unwelded, some unused, possibly not finite.
 
     Raises:
         Rejected: load_error, index_range, point_cloud, no_faces.
@@ -36,9 +37,10 @@ def load_mesh(source: SourceFile) -> TriangleMesh:
         raise Rejected(reason, f"trimesh: {type(error).__name__}: {error!s:.200}") from error
     if len(mesh.faces) == 0:
         raise Rejected("no_faces", "the file holds no triangles, or no node places them")
-    return TriangleMesh(
-        positions=np.asarray(mesh.vertices, np.float64), faces=np.asarray(mesh.faces, np.int64)
-    )
+    positions = np.asarray(mesh.vertices, np.float64)
+    if source.kind in ("glb", "gltf"):
+        positions = np.stack([positions[:, 0], -positions[:, 2], positions[:, 1]], axis=1)
+    return TriangleMesh(positions=positions, faces=np.asarray(mesh.faces, np.int64))
 
 
 def _check_geometries(scene: trimesh.Scene) -> None:

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.assets.gltf_tree import buffer_paths, check_tree, read_tree
-from pipeline.assets.headers import check_header
+from pipeline.assets.reading.gltf_tree import buffer_paths, check_tree, read_tree
+from pipeline.assets.reading.headers import check_header
 from pipeline.assets.settings import AssetSettings
 from storage.errors import Rejected
 
@@ -40,7 +40,8 @@ def read_source(path: Path, settings: AssetSettings) -> SourceFile:
     Raises:
         Rejected: missing_file, unsupported_format, too_large_bytes, archive_refused,
             header_size_mismatch, too_many_faces, unsupported_primitive, unsupported_extension,
-            unsupported_accessor, scene_cycle, too_many_instances, external_uri, load_error.
+            unsupported_accessor, compressed_geometry, skinned_mesh, morphed_mesh, scene_cycle,
+            too_many_instances, external_uri, load_error.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:

@@ -1,0 +1,41 @@
+"""meshoptimizer's two simplifiers: no crash, hang or escape from the box has been seen of them.
+
+Their vertices are a subset of the source's, which costs about twice the error of edge collapse with
+free placement, at a twentieth of its time.
+"""
+
+import meshoptimizer
+import numpy as np
+
+from pipeline.assets.mesh import TriangleMesh
+
+_ANY_ERROR = 1e9
+"""The budget decides and the gate judges; the library's own bound would stop it half-way."""
+
+
+def simplify(mesh: TriangleMesh, budget: int) -> TriangleMesh:
+    """Return the mesh with at most `budget` faces where its topology allows that many collapses."""
+    return _run(meshoptimizer.simplify, mesh, budget)
+
+
+def simplify_sloppily(mesh: TriangleMesh, budget: int) -> TriangleMesh:
+    """Return the mesh with at most `budget` faces whatever its topology.
+
+    Vertices that share a cell of a grid become one (Rossignac and Borrel 1993).
+    """
+    return _run(meshoptimizer.simplify_sloppy, mesh, budget)
+
+
+def _run(function, mesh: TriangleMesh, budget: int) -> TriangleMesh:  # type: ignore[no-untyped-def]
+    """The library works on float32; clean positions lie on a grid that float32 holds exactly."""
+    corners = np.ascontiguousarray(mesh.faces, np.uint32).reshape(-1)
+    kept = np.zeros_like(corners)
+    count = function(
+        kept,
+        corners,
+        np.ascontiguousarray(mesh.positions, np.float32),
+        target_index_count=3 * budget,
+        target_error=_ANY_ERROR,
+    )
+    faces = kept[:count].reshape(-1, 3).astype(np.int64)
+    return TriangleMesh(positions=mesh.positions, faces=faces)

@@ -1,0 +1,94 @@
+"""A quick picture of a mesh, for people who compare it with another: grey, lit from the camera."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.orient import orient_outward
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.outside_rays import first_faces
+from pipeline.assets.reading.load import load_mesh
+from pipeline.assets.reading.source_file import read_source
+from pipeline.assets.settings import AssetSettings
+from storage.asset import Level
+
+_TOWARDS_CAMERA = np.array([0.62, -0.62, 0.48])
+_BACKGROUND = 1.0
+_LINE_PX = 0.7
+_LINED_PX = (3.0, 9.0)
+"""Sizes of triangles in pixels: no lines below the first, which would only blacken the picture, and
+full ones above the second."""
+_SUPERSAMPLE = 2
+
+
+def preview_source(path: Path, settings: AssetSettings, width_px: int) -> NDArray[np.uint8]:
+    """Return a grey picture [W, W] of a source file as the stage cleans it.
+
+    Raises Rejected as `prepare_asset`.
+    """
+    mesh, _ = orient_outward(clean(normalise(load_mesh(read_source(path, settings)))))
+    return preview(mesh, width_px)
+
+
+def preview_level(level: Level, width_px: int) -> NDArray[np.uint8]:
+    """Return a grey picture [W, W] of a level of an asset."""
+    mesh = TriangleMesh(
+        positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
+    )
+    return preview(mesh, width_px)
+
+
+def preview(mesh: TriangleMesh, width_px: int) -> NDArray[np.uint8]:
+    """Return a grey picture [W, W] of a mesh in the unit box, +Z up, with its triangles drawn.
+
+    Parallel projection from the front right and above; back faces are darker.
+    """
+    wide = width_px * _SUPERSAMPLE
+    origins, directions, pixel = _camera_rays(wide)
+    face = first_faces(mesh, origins.astype(np.float32), directions.astype(np.float32))
+    shade = np.full(len(face), _BACKGROUND)
+    hit = face >= 0
+    shade[hit] = _shade(mesh, face[hit], origins[hit], directions[hit], pixel)
+    blocks = shade.reshape(width_px, _SUPERSAMPLE, width_px, _SUPERSAMPLE).mean(axis=(1, 3))
+    return np.round(255 * blocks).astype(np.uint8)
+
+
+def _camera_rays(width_px: int) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return origins and directions [W x W, 3] from the top left, and the width of a pixel."""
+    back = _TOWARDS_CAMERA / np.linalg.norm(_TOWARDS_CAMERA)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    up = np.cross(back, right)
+    half = 0.72
+    offset = half * ((np.arange(width_px) + 0.5) / width_px * 2 - 1)
+    origins = -offset[:, None, None] * up + offset[None, :, None] * right + 2 * back
+    origins = origins.reshape(-1, 3)
+    return origins, np.broadcast_to(-back, origins.shape), 2 * half / width_px
+
+
+def _shade(
+    mesh: TriangleMesh,
+    face: NDArray[np.int64],
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    pixel: float,
+) -> NDArray[np.float64]:
+    """Return the grey of each hit: brighter towards the camera, dark along the edges."""
+    normal = mesh.double_area_vectors[face]
+    unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    corner = mesh.corners[face]
+    facing = np.einsum("ij,ij->i", unit, -directions)
+    steep = np.where(np.abs(facing) > 1e-6, facing, 1e-6)
+    distance = np.einsum("ij,ij->i", unit, origins - corner[:, 0]) / steep
+    point = origins + distance[:, None] * directions
+    grey = np.where(facing >= 0, 0.25 + 0.65 * facing, 0.10 - 0.25 * facing)
+    nearest = np.full(len(face), np.inf)
+    for k in range(3):
+        edge = corner[:, (k + 1) % 3] - corner[:, k]
+        edge /= np.linalg.norm(edge, axis=1, keepdims=True)
+        nearest = np.minimum(nearest, np.linalg.norm(np.cross(point - corner[:, k], edge), axis=1))
+    size_px = np.sqrt(np.linalg.norm(normal, axis=1)) / pixel
+    strength = np.interp(size_px, _LINED_PX, (0.0, 0.55))
+    return np.where(nearest < _LINE_PX * pixel, (1 - strength) * grey, grey)

@@ -1,0 +1,45 @@
+"""The triangles themselves: how even they are, and how they hang together."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.assets.mesh import TriangleMesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeCounts:
+    """Edges by how many faces share them."""
+
+    open: int
+    """One face: a border."""
+    nonmanifold: int
+    """Three or more."""
+    most_faces: int
+    """Of any edge."""
+
+
+def area_variation(mesh: TriangleMesh) -> float:
+    """Return the standard deviation of the areas over their mean: 0 where all are equal."""
+    areas = np.linalg.norm(mesh.double_area_vectors, axis=1)
+    return float(areas.std() / areas.mean())
+
+
+def smallest_angles_deg(mesh: TriangleMesh) -> np.ndarray:
+    """Return the smallest angle [F] of each face; 60 where it is equilateral."""
+    edges = np.roll(mesh.corners, -1, axis=1) - mesh.corners
+    lengths = np.sort(np.linalg.norm(edges, axis=2), axis=1)
+    a, b, c = lengths.T  # the smallest angle lies opposite the shortest side
+    cosine = (b * b + c * c - a * a) / (2 * b * c)
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def count_edges(mesh: TriangleMesh) -> EdgeCounts:
+    """Return how many edges are open or non-manifold."""
+    ends = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    shared = np.unique(ends[:, 0] * len(mesh.positions) + ends[:, 1], return_counts=True)[1]
+    return EdgeCounts(
+        open=int((shared == 1).sum()),
+        nonmanifold=int((shared > 2).sum()),
+        most_faces=int(shared.max()),
+    )

@@ -1,0 +1,89 @@
+"""The asset store: what became of each source, made once and shared by every dataset and process.
+
+An outcome's name says what it depends on: the bytes of the source, the settings, the recipe and
+the code of this stage. It is either an asset file or a refusal. Whoever makes one holds a lock that
+ends with the process, so that others wait for the outcome instead of making it too. The folder may
+be deleted while nobody uses it; then it is made again.
+"""
+
+import contextlib
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from pipeline.assets.reading.source_file import read_source
+from pipeline.assets.recipe import RECIPE, code_sha256
+from pipeline.assets.settings import AssetSettings
+from storage.asset import Asset, encode_asset
+from storage.atomic import write_atomically, write_error
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import Rejected
+
+_FAN_OUT = 2
+"""Letters of the name that choose a sub-folder, so that no folder holds every outcome."""
+
+_LOCKS = 3
+"""Letters of the name that choose a lock: 4096 files that need no clearing away, at the price of a
+rare wait for another object."""
+
+
+@dataclass(frozen=True)
+class AssetStore:
+    """The folder of outcomes."""
+
+    root: Path
+    """Shared by everybody who names it; file locks must work there."""
+
+    def key(self, source: Path, settings: AssetSettings) -> str:
+        """Return the name of the outcome of a source file.
+
+        Raises:
+            Rejected: the pre-flight refuses the file.
+            OSError: it cannot be read.
+        """
+        found = read_source(source, settings)
+        parts = [found.kind, found.sha256, asdict(settings), RECIPE, code_sha256()]
+        return sha256_hex(canonical_json(parts))[:32]
+
+    def asset_path(self, key: str) -> Path:
+        """Return where the asset of a key is, or would be."""
+        return self.root / key[:_FAN_OUT] / f"{key}.safetensors"
+
+    def refusal(self, key: str) -> Rejected | None:
+        """Return why the source was refused, where it was."""
+        path = self._refusal_path(key)
+        return Rejected(**json.loads(path.read_bytes())) if path.exists() else None
+
+    def keep(self, key: str, asset: Asset) -> None:
+        """Store an asset; raises TrilightError where that cannot be written."""
+        write_atomically(self.asset_path(key), encode_asset(asset))
+
+    def refuse(self, key: str, reason: str, message: str) -> None:
+        """Store a refusal; raises TrilightError where that cannot be written."""
+        outcome = canonical_json({"reason": reason, "message": message})
+        write_atomically(self._refusal_path(key), outcome)
+
+    @contextlib.contextmanager
+    def making(self, key: str) -> Iterator[None]:
+        """Wait until nobody else makes the outcome of this key, and keep others out meanwhile.
+
+        Raises:
+            TrilightError: the store cannot be written.
+        """
+        path = self.root / "locks" / key[:_LOCKS]
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise write_error(path, error) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(descriptor)
+
+    def _refusal_path(self, key: str) -> Path:
+        return self.asset_path(key).with_suffix(".json")

@@ -1,0 +1,205 @@
+"""The stage: the next method where one fails, each object once, and only lasting refusals kept."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pipeline.assets.settings import AssetSettings, GateSettings
+from pipeline.assets.stage import PreparedAsset, prepare_assets
+from pipeline.assets.store import AssetStore
+from storage.asset import Asset, decode_asset
+from storage.errors import TrilightError
+from storage.records import Failure
+from tests.assets.child_kit import Bench
+from tests.assets.meshes_by_hand import knot, write_obj
+
+FIRST, SECOND, THIRD = "pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"
+SETTINGS = AssetSettings(budgets=(1000, 500, 340))
+
+
+def run(
+    bench: Bench, *names: str, settings: AssetSettings = SETTINGS
+) -> tuple[list[PreparedAsset], list[Failure]]:
+    """Prepare objects with the store beside the sources."""
+    return prepare_assets(
+        [bench.record(name) for name in names],
+        settings,
+        AssetStore(bench.root.parent / "store"),
+        borrow_child=bench.borrow,
+        workers=1,
+        done=lambda: None,
+    )
+
+
+def made(bench: Bench, settings: AssetSettings = SETTINGS) -> Asset:
+    (prepared,), failures = run(bench, "knot.obj", settings=settings)
+    assert not failures
+    return decode_asset(prepared.path.read_bytes())
+
+
+def methods(asset: Asset) -> list[tuple[int, str]]:
+    return [(level.record.budget, level.record.method) for level in asset.levels]
+
+
+@pytest.fixture(autouse=True)
+def source(bench: Bench) -> Path:
+    """3840 faces: every level needs a method."""
+    return write_obj(bench.root / "knot.obj", knot())
+
+
+def test_the_first_method_is_enough_where_it_works(bench: Bench) -> None:
+    assert methods(made(bench)) == [(1000, FIRST), (500, FIRST), (340, FIRST)]
+    assert [call["method"] for call in bench.calls] == [FIRST]
+
+
+def test_the_next_method_starts_in_a_new_child_where_one_crashed(bench: Bench) -> None:
+    bench.set(pymeshlab_collapse="crash")
+    assert methods(made(bench)) == [(1000, SECOND), (500, SECOND), (340, SECOND)]
+    first, second = bench.calls
+    assert (first["method"], second["method"]) == (FIRST, SECOND)
+    assert first["pid"] != second["pid"]
+    assert first["budgets"] == second["budgets"] == [1000, 500, 340]
+
+
+def test_the_next_method_makes_only_what_the_first_one_missed(bench: Bench) -> None:
+    bench.set(**{f"{FIRST} misses": "900"})
+    asset = made(bench)
+    assert methods(asset) == [(1000, FIRST), (500, SECOND), (340, SECOND)]
+    first, second = bench.calls
+    assert second["budgets"] == [500, 340]
+    assert first["pid"] != second["pid"]
+
+
+def test_epsilon_goes_with_the_finest_level(bench: Bench) -> None:
+    """A second method that only fills in coarser levels must not search for the smallest."""
+    bench.set(**{f"{FIRST} misses": "900"})
+    made(bench, AssetSettings(budgets=(1000, 240, 200), epsilon=0.005))
+    first, *others = (call["epsilon"] for call in bench.calls)
+    assert first == 0.005
+    assert others and set(others) == {None}
+
+
+def test_levels_of_different_methods_fall_in_size(bench: Bench) -> None:
+    bench.set(**{f"{FIRST} misses": "900", SECOND: "crash"})
+    asset = made(bench, AssetSettings(budgets=(1000, 900, 500)))
+    sizes = [len(level.faces) for level in asset.levels]
+    assert sizes == sorted(set(sizes), reverse=True)
+    assert (900, FIRST) in methods(asset)
+
+
+def test_an_object_that_no_method_serves_is_refused_as_the_first_one_failed(bench: Bench) -> None:
+    gate = GateSettings(max_error_p99=1e-4)
+    prepared, (failure,) = run(bench, "knot.obj", settings=AssetSettings(budgets=(240,), gate=gate))
+    assert not prepared
+    assert (failure.stage, failure.item, failure.reason) == (
+        "assets",
+        "knot.obj",
+        "error_over_bound",
+    )
+    assert "p99 distance 1.3" in failure.message  # as collapse came out; sloppy has 5 %
+    assert [call["method"] for call in bench.calls] == [FIRST, SECOND, THIRD]
+    assert len({call["pid"] for call in bench.calls}) == 3
+
+
+def test_an_unusable_object_is_tried_once(bench: Bench) -> None:
+    bench.set(pymeshlab_collapse="refuse")
+    _, (failure,) = run(bench, "knot.obj")
+    assert failure.reason == "degenerate"
+    assert len(bench.calls) == 1
+
+
+@pytest.mark.parametrize(
+    ("action", "reason", "remembered"),
+    [
+        ("crash", "crashed_signal_11", True),
+        ("fail", "exception", False),
+        ("die", "killed", False),
+        ("eat", "out_of_memory", False),
+        ("leave", "crashed", False),
+        ("refuse", "degenerate", True),
+    ],
+)
+def test_only_what_is_the_objects_own_fault_is_remembered(
+    bench: Bench, action: str, reason: str, remembered: bool
+) -> None:
+    bench.set(**dict.fromkeys((FIRST, SECOND, THIRD), action))
+    _, (failure,) = run(bench, "knot.obj")
+    assert failure.reason == reason
+    tried = len(bench.calls)
+    bench.set()
+    prepared, failures = run(bench, "knot.obj")
+    if remembered:
+        assert (failures, prepared) == ([failure], [])
+        assert len(bench.calls) == tried
+    else:
+        assert [asset.record.uid for asset in prepared] == ["knot.obj"]
+
+
+def test_a_mistake_of_the_user_stops_the_run(bench: Bench) -> None:
+    bench.set(pymeshlab_collapse="mistake")
+    with pytest.raises(TrilightError, match="planned mistake"):
+        run(bench, "knot.obj")
+
+
+def test_the_second_run_makes_nothing_and_says_the_same(bench: Bench) -> None:
+    (bench.root / "junk.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 7\n")
+    first = run(bench, "knot.obj", "junk.obj", "gone.obj")
+    assert [failure.reason for failure in first[1]] == ["index_range", "missing_file"]
+    calls = len(bench.calls)
+    second = run(bench, "knot.obj", "junk.obj", "gone.obj")
+    assert second == first
+    assert len(bench.calls) == calls
+
+
+def test_copies_are_made_once_and_keep_their_names(bench: Bench) -> None:
+    write_obj(bench.root / "copy.obj", knot())
+    prepared, _ = run(bench, "knot.obj", "copy.obj")
+    assert [asset.record.uid for asset in prepared] == ["knot.obj", "copy.obj"]
+    assert prepared[0].path == prepared[1].path
+    assert len(bench.calls) == 1
+
+
+def test_other_settings_are_another_outcome(bench: Bench) -> None:
+    for budget in (500, 340):
+        (level,) = made(bench, AssetSettings(budgets=(budget,))).levels
+        assert len(level.faces) == budget
+    assert len(bench.calls) == 2
+
+
+def test_done_is_called_for_every_object(bench: Bench) -> None:
+    count = iter(range(1, 100))
+    last = [0]
+    prepare_assets(
+        [bench.record(name) for name in ("knot.obj", "gone.obj")],
+        SETTINGS,
+        AssetStore(bench.root.parent / "store"),
+        borrow_child=bench.borrow,
+        workers=2,
+        done=lambda: last.append(next(count)),
+    )
+    assert last == [0, 1, 2]
+
+
+def test_a_store_that_cannot_be_written_stops_the_run(bench: Bench) -> None:
+    (bench.root.parent / "store").write_text("a file where the folder should be")
+    with pytest.raises(TrilightError, match="cannot write"):
+        run(bench, "knot.obj")
+    assert not bench.calls
+
+
+def test_refusals_are_plain_text(bench: Bench) -> None:
+    bench.set(pymeshlab_collapse="refuse")
+    run(bench, "knot.obj")
+    (path,) = (bench.root.parent / "store").rglob("*.json")
+    assert json.loads(path.read_text()) == {"reason": "degenerate", "message": "planned"}
+
+
+def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: Bench) -> None:
+    loop = bench.root / "loop.obj"
+    loop.symlink_to(loop)
+    _, (failure,) = run(bench, "loop.obj")
+    assert failure.reason == "unreadable_file"
+    loop.unlink()
+    write_obj(loop, knot())
+    assert run(bench, "loop.obj")[1] == []
