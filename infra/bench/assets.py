@@ -22,7 +22,7 @@ from pipeline.assets.store import AssetStore
 from pipeline.flows.children import ChildPool
 from pipeline.flows.prepare_isolated import asset_child
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, preload
-from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
+from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
 from pipeline.objects.sources import find_objects
 from storage.asset import decode_asset
 from storage.cache import cache_folder
@@ -163,7 +163,7 @@ def _growth(
     sides: dict[str, Callable[[], Mapping[str, float]]] = {}
     for faces in effort.sizes:
         path = work / f"{faces}.ply"
-        path.write_bytes(encode_ply(*_ball(faces)))
+        path.write_bytes(encode_ply(*_knot(faces)))
         method = remeshing.METHODS["faithful"]
         sides[f"source of {faces}"] = functools.partial(
             child.call, remeshing.prepare, path, settings, method
@@ -171,18 +171,21 @@ def _growth(
     return sides
 
 
-def _ball(faces: int):  # type: ignore[no-untyped-def]
-    rings = round((faces / 3) ** 0.5)
-    params = SuperquadricParams(
-        exponent_profile=0.6,
-        exponent_plan=1.3,
-        half_sizes=(1.0, 0.8, 0.6),
-        taper=0.2,
-        twist_rad=0.8,
-        rings=rings,
-        columns=round(faces / (2 * rings)),
+def _knot(faces: int):  # type: ignore[no-untyped-def]
+    """A closed tube of about so many triangles."""
+    sides = max(8, round((faces / 26) ** 0.5))
+    params = TorusKnotParams(
+        windings=(2, 3),
+        minor_radius=0.45,
+        fill=0.6,
+        ribs=3,
+        rib_depth=0.4,
+        rib_turns=1,
+        flatten=0.8,
+        segments=round(faces / (2 * sides)),
+        sides=sides,
     )
-    return superquadric(params)
+    return torus_knot(params)
 
 
 def _workers() -> tuple[int, ...]:

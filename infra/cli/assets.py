@@ -69,6 +69,7 @@ def assets(
     rows = [
         ("accepted", f"{len(report.rows)}, of which {report.num_repaired} repaired"),
         ("decimated", f"{len(decimated)}; the others are within the budget as they are"),
+        *_epsilon_rows(report, settings),
         ("rejected", f"{len(report.failures)}"),
         *(("", f"{count} x {reason}") for _, reason, count in count_by_reason(report.failures)),
         ("meshes, catalogue", f"{folder.meshes}, {folder.catalogue}"),
@@ -76,6 +77,18 @@ def assets(
     print_rows("Assets finished", rows)
     console.print(f"\nLook at {folder.page}", style="bold")
     console.print(f"Next: trilight generate smoke --objects {out}", style="bold")
+
+
+def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:
+    epsilon = settings.epsilon
+    if epsilon is None or not report.rows:
+        return []
+    within = sum(row.quality.error_p99 <= epsilon for row in report.rows)
+    mean = sum(row.num_faces for row in report.rows) / len(report.rows)
+    return [
+        (f"within {epsilon:.2%}", f"{within} of {len(report.rows)}"),
+        ("triangles", f"{mean:.0f} on average, at most {settings.budgets[0]}"),
+    ]
 
 
 def _settings(budget: int | None, epsilon: str | None, profile: str) -> AssetSettings:

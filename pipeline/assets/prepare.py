@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
 from pipeline.assets.cleaning.guards import check_clean, check_raw
@@ -14,7 +15,6 @@ from pipeline.assets.decimation.smallest import smallest_passing
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.gate import check_level
 from pipeline.assets.quality.measure import MeasuredSource
-from pipeline.assets.quality.parts import label_parts
 from pipeline.assets.quality.triangles import count_edges
 from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
@@ -53,13 +53,14 @@ def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAtte
     cleaned = clean(normalise(raw))
     check_clean(cleaned)
     mesh, front_share = orient_outward(cleaned)
-    levels, missed = _levels(mesh, settings, safe_method(mesh, method))
+    measured = MeasuredSource(mesh)
+    levels, missed = _levels(measured, settings, safe_method(mesh, method))
     return AssetAttempt(
         asset=Asset(
             geometry_sha256=geometry_sha256(cleaned),
             source_sha256=source.sha256,
             recipe=RECIPE,
-            source=_facts(raw, cleaned, mesh, front_share),
+            source=_facts(raw, cleaned, measured, front_share),
             levels=levels,
         ),
         missed=missed,
@@ -67,29 +68,38 @@ def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAtte
 
 
 def _facts(
-    raw: TriangleMesh, cleaned: TriangleMesh, mesh: TriangleMesh, front_share: float
+    raw: TriangleMesh, cleaned: TriangleMesh, source: MeasuredSource, front_share: float
 ) -> SourceFacts:
-    edges = count_edges(mesh)
-    before = {tuple(face) for face in cleaned.faces.tolist()}
+    edges = count_edges(source.mesh)
     return SourceFacts(
         num_faces_read=len(raw.faces),
-        num_faces=len(mesh.faces),
-        num_faces_turned=sum(tuple(face) not in before for face in mesh.faces.tolist()),
-        num_parts=int(label_parts(mesh).max()) + 1,
+        num_faces=len(source.mesh.faces),
+        num_faces_turned=_count_turned(cleaned, source.mesh),
+        num_parts=source.parts.count,
         open_edges=edges.open,
         nonmanifold_edges=edges.nonmanifold,
         front_share=round(front_share, 6),
     )
 
 
+def _count_turned(before: TriangleMesh, after: TriangleMesh) -> int:
+    """Count the faces that changed their winding: canonical rows differ in their last two."""
+
+    def second_corners(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+        low, high = faces[:, 1:].min(axis=1), faces[:, 1:].max(axis=1)
+        return faces[np.lexsort((high, low, faces[:, 0])), 1]
+
+    return int((second_corners(before.faces) != second_corners(after.faces)).sum())
+
+
 def _levels(
-    mesh: TriangleMesh, settings: AssetSettings, method: str
+    source: MeasuredSource, settings: AssetSettings, method: str
 ) -> tuple[tuple[Level, ...], dict[int, tuple[str, str]]]:
     """Return the levels from the largest budget, and why others are missing.
 
     A budget that the level before it meets as well gets no level of its own.
     """
-    maker = _LevelMaker(mesh, settings, method)
+    maker = _LevelMaker(source, settings, method)
     levels: list[Level] = []
     missed: dict[int, tuple[str, str]] = {}
     for budget in settings.budgets:
@@ -106,9 +116,9 @@ def _levels(
 class _LevelMaker:
     """Makes levels of one source by one method."""
 
-    def __init__(self, mesh: TriangleMesh, settings: AssetSettings, method: str) -> None:
-        self._mesh = mesh
-        self._source = MeasuredSource(mesh)
+    def __init__(self, source: MeasuredSource, settings: AssetSettings, method: str) -> None:
+        self._mesh = source.mesh
+        self._source = source
         self._settings = settings
         self._method = method
 

@@ -12,7 +12,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -113,12 +113,12 @@ class Bench:
 
     root: Path
     limits: ChildLimits = LIMITS
-    plan: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.root.mkdir(parents=True, exist_ok=True)
-        self.set(**self.plan)
-        preload(["pipeline.assets.prepare", "tests.assets.child_kit"])
+        if not (self.root / PLAN).exists():
+            self.set()
+        preload(["pipeline.assets.decimation.pymeshlab_filters", "tests.assets.child_kit"])
         self.child = IsolatedChild(limits=self.limits, setup=nothing)
 
     def set(self, **plan: str) -> None:

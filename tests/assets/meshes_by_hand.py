@@ -76,7 +76,8 @@ def joined(*meshes: TriangleMesh) -> TriangleMesh:
 
 
 def moved(mesh: TriangleMesh, scale: ArrayLike = 1.0, offset: ArrayLike = 0.0) -> TriangleMesh:
-    return TriangleMesh(positions=mesh.positions * scale + np.asarray(offset), faces=mesh.faces)
+    positions = mesh.positions * np.asarray(scale, float) + np.asarray(offset, float)
+    return TriangleMesh(positions=positions, faces=mesh.faces)
 
 
 def cube(cells: int = 1) -> TriangleMesh:
@@ -95,8 +96,8 @@ def cube(cells: int = 1) -> TriangleMesh:
 
 def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
     """[2 rows columns, 3] the triangles of a grid of (rows + 1) (columns + 1) vertices."""
-    start = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
-    quads = start[:, None] + [0, columns + 1, columns + 2, 1]
+    start: NDArray[np.int64] = np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)
+    quads = start.reshape(-1, 1) + np.array([0, columns + 1, columns + 2, 1])
     return quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
 
 

@@ -196,7 +196,7 @@ def test_a_floor_of_two_triangles_is_an_object(
     corners = np.array([[0, 0, 0], [4, 0, 0], [4, 3, 0], [0, 3, 0]], float)
     floor = TriangleMesh(positions=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]))
     for profile in ("faithful", "uniform"):
-        settings = AssetSettings(profile=profile)  # type: ignore[arg-type]
+        settings = AssetSettings(profile=profile)
         asset, _ = outcome(write_off(tmp_path / "a.off", floor), settings)
         assert check(asset).source.num_parts == 1
         assert asset is not None and asset.source.front_share == pytest.approx(0.5, abs=0.2)

@@ -96,7 +96,7 @@ def test_every_object_has_its_outcome(made: tuple[Path, AssetReport]) -> None:
 def test_the_meshes_open_elsewhere(made: tuple[Path, AssetReport]) -> None:
     out, report = made
     for row in report.rows:
-        mesh = trimesh.load(out / row.path, process=False)
+        mesh = trimesh.load_mesh(out / row.path, process=False)
         assert len(mesh.faces) == row.num_faces
         # The box of the source is 1 wide; a vertex may leave it by 1 % of its diagonal.
         assert mesh.extents.max() == pytest.approx(1, abs=2 * 0.01 * 3**0.5)

@@ -171,7 +171,7 @@ RAW_FILES: dict[str, tuple[str, str, bytes]] = (
                 b"0 0 0\n" * 9,
             ).replace(b"binary_little_endian", b"ascii"),
         )
-        for count in (10, 2**31 - 1, 2**31, 10**18, -5)
+        for count in (11, 2**31 - 1, 2**31, 10**18, -5)
         for element in ("vertex", "face")
     }
 )

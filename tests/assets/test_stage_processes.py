@@ -25,7 +25,7 @@ from tests.assets import child_kit
 def main():
     stage.attempt_in_child = child_kit.recorded_attempt
     root = Path(sys.argv[1])
-    bench = child_kit.Bench(root, plan=json.loads((root / child_kit.PLAN).read_text()))
+    bench = child_kit.Bench(root)
     names = sorted(path.name for path in root.glob("*.obj"))
     prepared, failures = stage.prepare_assets(
         [bench.record(name) for name in names],

@@ -27,22 +27,22 @@ def quality(path: Path, method: str, budget: int = 1000) -> LevelQuality:
     return level.record.quality
 
 
-def test_smooth_objects_get_even_triangles(tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "a.obj", stretched_sphere())
-    even, faithful = quality(path, UNIFORM), quality(path, "pymeshlab_collapse")
-    # Measured 0.19 against 0.32, and 39 degrees against 24.
-    assert even.area_variation < 0.75 * faithful.area_variation
-    assert even.min_angle_p5_deg > 1.25 * faithful.min_angle_p5_deg
-
-
-@pytest.mark.xfail(
-    strict=True, reason="feature edges of 30 degrees keep remeshing from the target length"
+@pytest.mark.parametrize(
+    ("mesh", "variation", "angle"),
+    [(stretched_sphere(), 0.5, 1.5), (knot(400, 48), 0.7, 1.5), (knot(), 0.9, 1.2)],
+    ids=["smooth", "fine", "coarse"],
 )
-def test_ribbed_objects_get_even_triangles(tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "a.obj", knot())
+def test_triangles_are_more_even_than_the_faithful_ones(
+    tmp_path: Path, mesh: TriangleMesh, variation: float, angle: float
+) -> None:
+    """Measured 0.16, 0.24, 0.31 against 0.56, 0.43, 0.42; and 40, 32, 23 against 19, 11, 14.5.
+
+    The coarse knot has many edges sharper than the features that remeshing keeps.
+    """
+    path = write_obj(tmp_path / "a.obj", mesh)
     even, faithful = quality(path, UNIFORM), quality(path, "pymeshlab_collapse")
-    assert even.area_variation < 0.75 * faithful.area_variation
-    assert even.min_angle_p5_deg > 1.25 * faithful.min_angle_p5_deg
+    assert even.area_variation < variation * faithful.area_variation
+    assert even.min_angle_p5_deg > angle * faithful.min_angle_p5_deg
 
 
 def test_evenness_is_paid_for_with_error(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_a_coarse_box_gains_triangles(tmp_path: Path) -> None:
     levels = prepare(path, settings, UNIFORM).levels
     assert [level.record.method for level in levels] == [UNIFORM, UNIFORM]
     for level in levels:
-        # Remeshing aims at 85 % of the budget, and meets the edge length only roughly.
+        # Remeshing aims at most of the budget, and meets the edge length only roughly.
         assert 0.5 * level.record.budget < len(level.faces) <= level.record.budget
         # A plane stays a plane: distances are double precision, of points on the 2^-20 grid.
         assert level.record.quality.error_p99 < 2**-20

@@ -24,6 +24,10 @@ def _prepare(folder: str) -> None:
     (Path(folder) / f"started-{os.getpid()}").touch()
 
 
+def _nothing() -> None:
+    """Set up nothing."""
+
+
 def double(value: int) -> int:
     return 2 * value
 
@@ -136,7 +140,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
 def test_processor_seconds_are_for_one_call_each() -> None:
     """A call that uses them up ends its child; several that stay below do not add up."""
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=process_id)
+    child = IsolatedChild(limits=limits, setup=_nothing)
     try:
         assert len({child.call(burn, 0.6) for _ in range(3)}) == 1
         with pytest.raises(ChildFailed, match="timeout_cpu: used its 1 processor seconds"):
@@ -148,7 +152,7 @@ def test_processor_seconds_are_for_one_call_each() -> None:
 
 def test_waiting_uses_no_processor_seconds() -> None:
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=1, cpu_s=1, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=process_id)
+    child = IsolatedChild(limits=limits, setup=_nothing)
     try:
         with pytest.raises(ChildFailed, match="timeout_wall"):
             child.call(hang)

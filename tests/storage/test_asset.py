@@ -82,6 +82,6 @@ def test_ply_reads_back_in_another_program(num_faces: int) -> None:
     header = data[: data.index(b"end_header\n") + 11]
     assert len(data) == len(header) + 50 * 12 + num_faces * 13
     if num_faces:
-        mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
+        mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
         assert np.array_equal(np.asarray(mesh.vertices, np.float32), positions)
         assert np.array_equal(np.asarray(mesh.faces), faces)

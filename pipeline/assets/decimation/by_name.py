@@ -2,9 +2,15 @@
 
 import numpy as np
 
+from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.decimation import meshopt
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.triangles import count_edges
+
+_DETOUR = 8
+"""Sources with more than this many times the budget, and a quarter, are first simplified to it by
+meshoptimizer: its mistakes at that size are far below those of the collapse that follows. Measured
+on 71 objects (LOG.md): a third to a twentieth of the time, and no more error."""
 
 _MAX_VALENCE = 512
 _MAX_FACES_PER_EDGE = 8
@@ -16,6 +22,8 @@ def decimate(mesh: TriangleMesh, budget: int, method: str) -> TriangleMesh:
     if method.startswith("pymeshlab"):
         from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
 
+        if len(mesh.faces) > 1.25 * _DETOUR * budget:
+            mesh = clean(meshopt.simplify(mesh, _DETOUR * budget))
         if method == "pymeshlab_uniform":
             return pymeshlab_filters.remesh_evenly(mesh, budget)
         return pymeshlab_filters.collapse(mesh, budget)

@@ -51,11 +51,6 @@ _FILL = 0.9
 """Share of the budget that remeshing aims at: its edge length is met on average only, and the
 collapse that trims what is over would undo the evenness."""
 
-_DETOUR = 8
-"""Sources with this many times the budget are collapsed first: remeshing time grows with the
-source, and six times the budget holds all that the remeshed surface can show."""
-_DETOUR_TARGET = 6
-
 
 def collapse(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     """Return the mesh collapsed to at most `budget` faces, in almost all cases.
@@ -75,8 +70,6 @@ def remesh_evenly(mesh: TriangleMesh, budget: int) -> TriangleMesh:
     that fills most of the budget with equilateral triangles. A source with fewer triangles than the
     budget gains some. Raises Rejected as `collapse`.
     """
-    if len(mesh.faces) > _DETOUR * budget:
-        mesh = collapse(mesh, _DETOUR_TARGET * budget)
     area = 0.5 * float(np.linalg.norm(mesh.double_area_vectors, axis=1).sum())
     edge = float(np.sqrt(4 * area / (np.sqrt(3) * _FILL * budget)))
     length = {"targetlen": pymeshlab.PureValue(edge)}
