@@ -57,7 +57,7 @@ def assets(
             settings,
             allowed_licences=(*DEFAULT_ALLOWED, *(allow_licence or ())),
             licence=licence,
-            workers=workers or os.cpu_count() or 1,
+            workers=os.cpu_count() or 1 if workers is None else workers,
             planned=lambda total: bars.update(task, total=total),
             done=lambda: bars.advance(task),
         )

@@ -28,6 +28,8 @@ from storage.errors import Rejected
 class AssetAttempt:
     """What one method made of an object."""
 
+    method: str
+    """The one that was used: another than asked for where that one is not safe for the mesh."""
     asset: Asset
     """With the levels that passed the gate, possibly none."""
     missed: Mapping[int, tuple[str, str]]
@@ -54,8 +56,10 @@ def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAtte
     check_clean(cleaned)
     mesh, front_share = orient_outward(cleaned)
     measured = MeasuredSource(mesh)
-    levels, missed = _levels(measured, settings, safe_method(mesh, method))
+    used = safe_method(mesh, method)
+    levels, missed = _levels(measured, settings, used)
     return AssetAttempt(
+        method=used,
         asset=Asset(
             geometry_sha256=geometry_sha256(cleaned),
             source_sha256=source.sha256,
@@ -145,7 +149,7 @@ class _LevelMaker:
 
     def _make(self, faces: int, max_error_p99: float) -> tuple[str, TriangleMesh, LevelQuality]:
         if self._keeps_source and len(self._mesh.faces) <= faces:
-            return "source", self._mesh, self._source.quality(self._mesh)
+            return "source", self._mesh, self._source.own_quality()
         result = decimate(self._mesh, faces, self._method)
         gate = self._settings.gate
         mesh, quality = check_level(result, self._source, faces, gate, max_error_p99)

@@ -127,8 +127,9 @@ def _by_any_method(
     levels: list[Level] = []
     first_miss: tuple[str, str] | None = None
     death: ChildFailed | None = None
-    missing = settings.budgets
-    for method in methods:
+    missing, waiting = settings.budgets, list(methods)
+    while waiting:
+        method = waiting.pop(0)
         finest = missing[0] == settings.budgets[0]  # epsilon is about this level
         wanted = dataclasses.replace(
             settings, budgets=missing, epsilon=settings.epsilon if finest else None
@@ -139,6 +140,8 @@ def _by_any_method(
             death = failure
             continue
         asset = attempt.asset
+        if attempt.method in waiting:  # it stood in for what is not safe for this mesh
+            waiting = waiting[waiting.index(attempt.method) + 1 :]
         levels += asset.levels
         missing = tuple(budget for budget in missing if budget in attempt.missed)
         if not missing:

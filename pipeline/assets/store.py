@@ -10,6 +10,7 @@ import contextlib
 import fcntl
 import json
 import os
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,12 +19,14 @@ from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.recipe import RECIPE, code_sha256
 from pipeline.assets.settings import AssetSettings
 from storage.asset import Asset, encode_asset
-from storage.atomic import write_atomically, write_error
+from storage.atomic import TEMPORARY_SUFFIX, write_atomically, write_error
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
 
 _FAN_OUT = 2
 """Letters of the name that choose a sub-folder, so that no folder holds every outcome."""
+
+_OLD_S = 24 * 3600
 
 _LOCKS = 3
 """Letters of the name that choose a lock: 4096 files that need no clearing away, at the price of a
@@ -59,7 +62,9 @@ class AssetStore:
 
     def keep(self, key: str, asset: Asset) -> None:
         """Store an asset; raises TrilightError where that cannot be written."""
-        write_atomically(self.asset_path(key), encode_asset(asset))
+        path = self.asset_path(key)
+        write_atomically(path, encode_asset(asset))
+        _remove_old_leftovers(path.parent)
 
     def refuse(self, key: str, reason: str, message: str) -> None:
         """Store a refusal; raises TrilightError where that cannot be written."""
@@ -87,3 +92,11 @@ class AssetStore:
 
     def _refusal_path(self, key: str) -> Path:
         return self.asset_path(key).with_suffix(".json")
+
+
+def _remove_old_leftovers(folder: Path) -> None:
+    """Delete what writers that were killed left behind: nobody writes one file for a day."""
+    for leftover in folder.glob(f"*{TEMPORARY_SUFFIX}"):
+        with contextlib.suppress(OSError):  # another process may have been quicker
+            if time.time() - leftover.stat().st_mtime > _OLD_S:
+                leftover.unlink()

@@ -117,6 +117,8 @@ def make_assets(
         TrilightError: the source is unusable, or the folder holds something else or cannot be
             written.
     """
+    if workers < 1:
+        raise TrilightError(f"workers is {workers}; expected at least 1.")
     _require_ours(folder)
     found = find_objects(
         source,
@@ -124,6 +126,7 @@ def make_assets(
         allowed_licences=allowed_licences,
         licence=licence,
     )
+    write_atomically(folder.summary, b"{}")  # from here on the folder is ours
     planned(len(found.records))
     prepared, rejected = prepare_isolated(list(found.records), settings, workers=workers, done=done)
     levels = [_only_level(asset) for asset in prepared]
@@ -149,7 +152,6 @@ def _require_ours(folder: AssetFolder) -> None:
             f"{folder.root}: holds files that are not of `trilight assets`; expected a new or "
             "empty folder. Choose another --out."
         )
-    write_atomically(folder.summary, b"{}")
 
 
 def _target(settings: AssetSettings) -> str:

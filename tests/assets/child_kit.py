@@ -53,7 +53,7 @@ def _without(attempt: AssetAttempt, below: int) -> AssetAttempt:
         if level.record.budget < below
     }
     asset = dataclasses.replace(attempt.asset, levels=kept)
-    return AssetAttempt(asset=asset, missed={**attempt.missed, **gone})
+    return dataclasses.replace(attempt, asset=asset, missed={**attempt.missed, **gone})
 
 
 def crash() -> None:

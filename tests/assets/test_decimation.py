@@ -50,37 +50,40 @@ def test_free_vertices_come_closer_than_those_of_the_source_and_these_than_clust
     assert free < 0.8 * subset < 0.5 * clusters
 
 
+def _call_with(flag: bool) -> None:
+    """Call both filters with one of two values of every parameter."""
+    mesh = cleaned(knot(80, 8))
+    other = pymeshlab.MeshSet(verbose=False)
+    other.add_mesh(pymeshlab.Mesh(mesh.positions, mesh.faces.astype(np.int32)))
+    collapse = ("preserveboundary", "preservenormal", "preservetopology", "optimalplacement")
+    other.meshing_decimation_quadric_edge_collapse(
+        targetfacenum=600 if flag else 300,
+        qualitythr=1.0 if flag else 0.01,
+        boundaryweight=5.0 if flag else 0.01,
+        planarweight=0.1 if flag else 1e-6,
+        **dict.fromkeys((*collapse, "planarquadric", "qualityweight", "autoclean"), flag),
+    )
+    remesh = ("splitflag", "collapseflag", "swapflag", "smoothflag", "reprojectflag")
+    other.meshing_isotropic_explicit_remeshing(
+        iterations=2 if flag else 1,
+        featuredeg=5.0 if flag else 170.0,
+        targetlen=pymeshlab.PercentageValue(7.0 if flag else 3.0),
+        maxsurfdist=pymeshlab.PercentageValue(7.0 if flag else 0.1),
+        **dict.fromkeys((*remesh, "adaptive", "checksurfdist"), flag),
+    )
+
+
 @pytest.mark.parametrize("method", ["pymeshlab_collapse", "pymeshlab_uniform"])
 def test_earlier_calls_leave_no_trace(method: str) -> None:
     """pymeshlab takes omitted parameters from the previous call of the process."""
     mesh = cleaned(knot())
-    before = decimate(mesh, 500, method)
-    other = pymeshlab.MeshSet(verbose=False)
-    other.add_mesh(pymeshlab.Mesh(mesh.positions, mesh.faces.astype(np.int32)))
-    other.meshing_decimation_quadric_edge_collapse(
-        targetfacenum=300,
-        qualitythr=1.0,
-        preserveboundary=True,
-        boundaryweight=5.0,
-        preservenormal=True,
-        preservetopology=True,
-        optimalplacement=False,
-        planarquadric=False,
-        planarweight=0.1,
-        qualityweight=True,
-    )
-    other.meshing_isotropic_explicit_remeshing(
-        iterations=2,
-        adaptive=True,
-        featuredeg=5.0,
-        checksurfdist=False,
-        smoothflag=False,
-        reprojectflag=False,
-        targetlen=pymeshlab.PercentageValue(7.0),
-    )
-    after = decimate(mesh, 500, method)
-    assert np.array_equal(before.positions, after.positions)
-    assert np.array_equal(before.faces, after.faces)
+    results = []
+    for flag in (True, False):
+        _call_with(flag)
+        results.append(decimate(mesh, 500, method))
+    first, second = results
+    assert np.array_equal(first.positions, second.positions)
+    assert np.array_equal(first.faces, second.faces)
 
 
 @pytest.mark.parametrize(

@@ -91,6 +91,23 @@ def test_each_limit_alone_decides(name: str) -> None:
     gate(source, spoil(source), **lifted)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_vertex_may_leave_the_box_by_one_percent(axis: int, side: int) -> None:
+    """Of the diagonal: rounded shapes bulge a little when their vertices are placed freely."""
+    ball = BALL.positions
+    end = int(np.argmax(side * ball[:, axis]))
+
+    def pulled(share: float) -> TriangleMesh:
+        positions = ball.copy()
+        positions[end, axis] += side * share * BALL.diagonal
+        return TriangleMesh(positions=positions, faces=BALL.faces)
+
+    gate(BALL, pulled(0.009))
+    with pytest.raises(Rejected, match="bbox_escaped"):
+        gate(BALL, pulled(0.011))
+
+
 def test_the_gate_counts_faces() -> None:
     settings = GateSettings()
     with pytest.raises(Rejected, match=f"budget_missed: {len(BALL.faces)} faces"):

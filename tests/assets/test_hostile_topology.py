@@ -146,7 +146,7 @@ def test_a_random_soup_ends_with_a_reason(
     outcome: Callable[..., Outcome], tmp_path: Path, profile: str
 ) -> None:
     settings = AssetSettings(budgets=(700,), profile=profile)  # type: ignore[arg-type]
-    asset, reason = outcome(write_obj(tmp_path / "a.obj", soup(3000)), settings)
+    asset, reason = outcome(write_obj(tmp_path / "a.obj", soup(1500)), settings)
     assert asset is None
     assert reason in {"area_changed", "budget_missed", "error_over_bound", "crashed_signal_11"}
 

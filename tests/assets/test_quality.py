@@ -97,6 +97,7 @@ def test_the_outline_of_a_half_is_half_an_outline() -> None:
     agreement = intersection_over_union(silhouette(whole), silhouette(half))
     # 8 bundles of rays 2.8 % apart: the cut goes between rows of about 35, on either side of it.
     assert agreement == pytest.approx(0.5, abs=0.02)
+    assert intersection_over_union(silhouette(half), silhouette(whole)) == agreement
     assert intersection_over_union(silhouette(whole), silhouette(whole)) == 1
 
 

@@ -18,7 +18,7 @@ from tests.assets.meshes_by_hand import geometry, knot, mesh_of, moved, prepare,
 BUDGETS = (1000, 500)
 SETTINGS = AssetSettings(budgets=BUDGETS)
 QUICK = settings(
-    max_examples=8,
+    max_examples=5,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

@@ -113,6 +113,7 @@ def test_after_a_kill_the_next_run_makes_only_what_is_missing(sources: Path) -> 
     assert [call["name"] for call in calls(sources)[3:]] == ["knot1.obj", "knot1.obj"]
 
 
+@pytest.mark.slow
 def test_half_written_files_are_never_read(sources: Path) -> None:
     """A writer that was killed leaves a file with another ending beside the place of its own."""
     whole = finish(start(sources))

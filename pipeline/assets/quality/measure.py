@@ -37,6 +37,11 @@ class MeasuredSource:
         """Return how far the outlines agree, 0 to 1."""
         return intersection_over_union(self._silhouette, silhouette(result))
 
+    def own_quality(self) -> LevelQuality:
+        """Return the measures of the source as a level of itself: exactly no error."""
+        none = np.zeros(len(self.surface.points.faces))
+        return self.quality(self.mesh, Deviation(there=none, back=none, angle_deg=none))
+
     def quality(self, result: TriangleMesh, deviation: Deviation | None = None) -> LevelQuality:
         """Return all measures of a clean result; `deviation` saves the time to find it again."""
         found = deviation or self.surface.deviation(result)
