@@ -21,7 +21,17 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "bench"
 
-_LIBRARIES = ("trilight", "mitsuba", "drjit", "pyoidn", "numpy", "torch")
+_LIBRARIES = (
+    "trilight",
+    "mitsuba",
+    "drjit",
+    "pyoidn",
+    "numpy",
+    "torch",
+    "pymeshlab",
+    "meshoptimizer",
+    "libigl",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
