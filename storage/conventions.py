@@ -88,12 +88,17 @@ def radiance_from_log10(log10_rgb: ArrayLike) -> NDArray:
     return np.power(10.0, np.asarray(log10_rgb)) - 1.0
 
 
+def srgb8(linear: ArrayLike) -> NDArray[np.uint8]:
+    """Return linear values as sRGB in 8 bits, clamped to [0, 1]: an albedo as a screen shows it."""
+    clamped = np.clip(np.asarray(linear, np.float64), 0, 1)
+    encoded = np.where(clamped <= 0.0031308, 12.92 * clamped, 1.055 * clamped ** (1 / 2.4) - 0.055)
+    return np.round(encoded * 255).astype(np.uint8)
+
+
 def preview_srgb8(radiance_rgb: ArrayLike) -> NDArray[np.uint8]:
     """Return a picture for people: log2(1 + radiance) clamped to [0, 1], sRGB-encoded, 8 bits.
 
     The curve is the tone map of RenderFormer's perceptual loss (Zeng et al. 2025, section 4), so
     what a person sees is what the loss sees. It is not invertible: values above 1 are clipped.
     """
-    mapped = np.clip(np.log2(1.0 + np.maximum(np.asarray(radiance_rgb, np.float64), 0)), 0, 1)
-    encoded = np.where(mapped <= 0.0031308, 12.92 * mapped, 1.055 * mapped ** (1 / 2.4) - 0.055)
-    return np.round(encoded * 255).astype(np.uint8)
+    return srgb8(np.log2(1.0 + np.maximum(np.asarray(radiance_rgb, np.float64), 0)))

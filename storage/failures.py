@@ -8,6 +8,7 @@ from pathlib import Path
 
 from storage.atomic import write_atomically
 from storage.digests import canonical_json
+from storage.errors import TrilightError
 from storage.records import Failure
 
 
@@ -18,8 +19,15 @@ def encode_failures(failures: Iterable[Failure]) -> bytes:
 
 
 def decode_failures(data: bytes) -> list[Failure]:
-    """Return the failures of a file that `encode_failures` made."""
-    return [Failure(**json.loads(line)) for line in data.splitlines()]
+    """Return the failures of a file that `encode_failures` made.
+
+    Raises:
+        TrilightError: a line is not a failure.
+    """
+    try:
+        return [Failure(**json.loads(line)) for line in data.splitlines()]
+    except (TypeError, ValueError) as error:
+        raise TrilightError(f"failures.jsonl: a line is not a failure ({error}).") from error
 
 
 def read_failures(path: Path) -> list[Failure]:

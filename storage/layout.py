@@ -43,6 +43,15 @@ class DatasetFolder:
         return self.root / "contact_sheet.png"
 
     @property
+    def report(self) -> Path:
+        return self.root / "report.html"
+
+    @property
+    def report_pages(self) -> Path:
+        """Folder of the report's pages, one per scene that it shows."""
+        return self.root / "report"
+
+    @property
     def logs(self) -> Path:
         return self.root / "logs"
 

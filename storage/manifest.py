@@ -17,7 +17,7 @@ from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION, SPLITS
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
-from storage.shard_reader import iterate_members
+from storage.shard_reader import MAX_MEMBER_BYTES, MEMBER_NAME, iterate_members
 
 SHARD_NAME = re.compile(rf"({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
@@ -39,6 +39,15 @@ class ShardEntry:
     """Digest of the file."""
     members: tuple[tuple[str, int, int], ...]
     """Name, offset of the first byte, and number of bytes of each member."""
+
+    @property
+    def index(self) -> Mapping[str, Mapping[str, tuple[int, int]]]:
+        """Offset and number of bytes of each member, by key and suffix."""
+        index: dict[str, dict[str, tuple[int, int]]] = {}
+        for name, offset, num_bytes in self.members:
+            key, _, suffix = name.partition(".")
+            index.setdefault(key, {})[suffix] = (offset, num_bytes)
+        return index
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,5 +147,8 @@ def _decode(record: dict[str, Any]) -> Manifest:
         if not SHARD_NAME.fullmatch(row["name"]):
             raise ValueError(f"shard name {row['name']!r}")
         row["members"] = tuple((str(n), int(at), int(size)) for n, at, size in row["members"])
+        for name, at, size in row["members"]:
+            if not (MEMBER_NAME.fullmatch(name) and at >= 0 and 0 <= size <= MAX_MEMBER_BYTES):
+                raise ValueError(f"member {name!r} of {size} bytes at {at}")
         shards.append(ShardEntry(**row))
     return Manifest(shards=tuple(shards), **record)

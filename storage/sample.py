@@ -44,6 +44,18 @@ class ViewRecord:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class SceneRecord:
+    """A sample without its pictures: all that counting and plotting need."""
+
+    key: str
+    """The scene's index, nine digits."""
+    scene: Scene
+    """What the pictures show."""
+    views: tuple[ViewRecord, ...]
+    """One record per camera."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
     """One scene with its views."""
 
@@ -85,6 +97,23 @@ def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
         TrilightError: a member is missing, unreadable or of another schema version. The laws of
             the scene are not checked here: readers trust what `trilight verify` has passed.
     """
+    record = decode_scene(key, members)
+    try:
+        pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(record.views))]
+        radiance_rgb = np.stack(pictures)
+    except KeyError as error:
+        raise TrilightError(f"sample {key}: {error} is missing.") from error
+    except ValueError as error:
+        raise TrilightError(f"sample {key}: {error}") from error
+    return Sample(key=key, scene=record.scene, radiance_rgb=radiance_rgb, views=record.views)
+
+
+def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
+    """Return a sample without its pictures, whose members may be absent.
+
+    Raises:
+        TrilightError: as `decode_sample`.
+    """
     for suffix in ("json", "scene.safetensors"):
         if suffix not in members:
             raise TrilightError(f"sample {key}: member {key}.{suffix} is missing.")
@@ -95,13 +124,11 @@ def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
         arrays, _ = read_safetensors(members["scene.safetensors"])
         fields = {name: arrays[name] for name in ARRAY_FIELDS}
         scene = Scene(objects=objects, provenance=record["provenance"], **fields)
-        pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(views))]
-        radiance_rgb = np.stack(pictures)
     except KeyError as error:
         raise TrilightError(f"sample {key}: {error} is missing.") from error
     except (TypeError, ValueError) as error:
         raise TrilightError(f"sample {key}: {error}") from error
-    return Sample(key=key, scene=scene, radiance_rgb=radiance_rgb, views=views)
+    return SceneRecord(key=key, scene=scene, views=views)
 
 
 def _decode_record(key: str, data: bytes) -> dict[str, Any]:

@@ -10,7 +10,8 @@ from storage.errors import TrilightError
 MAX_MEMBER_BYTES = 1 << 30
 """A 512 x 512 picture takes about 1 MiB; a gigabyte is a mistake or an attack."""
 
-_MEMBER_NAME = re.compile(r"([0-9A-Za-z_\-]+)\.([0-9A-Za-z_.\-]+)")
+MEMBER_NAME = re.compile(r"([0-9A-Za-z_\-]+)\.([0-9A-Za-z_.\-]+)")
+"""Key and suffix of a member; neither can leave a folder."""
 
 
 def iterate_members(path: Path) -> Iterator[tuple[str, str, int, bytes]]:
@@ -61,7 +62,7 @@ def iterate_samples(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
 
 
 def _checked_name(path: Path, member: tarfile.TarInfo) -> tuple[str, str]:
-    match = _MEMBER_NAME.fullmatch(member.name)
+    match = MEMBER_NAME.fullmatch(member.name)
     if not member.isreg() or match is None:
         raise TrilightError(
             f"{path.name}: member {member.name!r} is refused; expected a plain file named "

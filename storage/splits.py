@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from storage.conventions import SPLITS
 from storage.errors import TrilightError
 
+LISTED_SPLIT = "test"
+"""Split of scenes that somebody wrote down: they are judged by, never learnt from."""
+
 _VALIDATION_SLOT, _TEST_SLOT = 2, 5
 """Places in a cycle of shards: early, so that a small dataset has all three splits."""
 
@@ -25,6 +28,9 @@ class SplitSettings:
     """Of this many shards in a row one is for validation and one is for testing."""
     held_out_objects: float = 0.125
     """Share of objects kept for validation, and again for testing."""
+    listed_scenes: int | None = None
+    """How many scenes there are where they come from files instead of being drawn: all are of one
+    split (LISTED_SPLIT), the last shard may hold fewer, and the dataset cannot grow."""
 
     def __post_init__(self) -> None:
         if self.scenes_per_shard < 1:
@@ -36,6 +42,8 @@ class SplitSettings:
                 f"shards_per_cycle is {self.shards_per_cycle}; expected at least {_TEST_SLOT + 1}, "
                 "so that each cycle has its validation and its test shard."
             )
+        if self.listed_scenes is not None and self.listed_scenes < 1:
+            raise TrilightError(f"listed_scenes is {self.listed_scenes}; expected at least 1.")
         if not 0 < self.held_out_objects < 0.5:
             raise TrilightError(
                 f"held_out_objects is {self.held_out_objects}; expected a share between 0 and 0.5."
@@ -52,6 +60,8 @@ def split_of_object(geometry_sha256: str, settings: SplitSettings) -> str:
 
 def split_of_shard(shard_index: int, settings: SplitSettings) -> str:
     """Return the split of a shard from its number."""
+    if settings.listed_scenes is not None:
+        return LISTED_SPLIT
     slot = shard_index % settings.shards_per_cycle
     return {_VALIDATION_SLOT: "validation", _TEST_SLOT: "test"}.get(slot, "train")
 
@@ -64,11 +74,21 @@ def shard_name(shard_index: int, settings: SplitSettings) -> str:
 def scenes_of_shard(shard_index: int, settings: SplitSettings) -> range:
     """Return the indices of the scenes of a shard."""
     first = shard_index * settings.scenes_per_shard
-    return range(first, first + settings.scenes_per_shard)
+    last = first + settings.scenes_per_shard
+    if settings.listed_scenes is not None:
+        last = min(last, settings.listed_scenes)
+    return range(first, last)
+
+
+def planned_scenes(num_scenes: int, settings: SplitSettings) -> int:
+    """Return how many scenes are made when `num_scenes` are wanted: those of whole shards."""
+    if settings.listed_scenes is not None:
+        return settings.listed_scenes
+    return shards_for(num_scenes, settings) * settings.scenes_per_shard
 
 
 def shards_for(num_scenes: int, settings: SplitSettings) -> int:
-    """Return how many whole shards hold at least `num_scenes` scenes."""
+    """Return how many shards hold at least `num_scenes` scenes."""
     return -(-num_scenes // settings.scenes_per_shard)
 
 

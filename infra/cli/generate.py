@@ -1,15 +1,16 @@
-"""`trilight generate`: objects to shards."""
+"""`trilight generate`: objects, or scenes in files, to shards."""
 
 import contextlib
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import Progress as Bars
+from rich.text import Text
 
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from pipeline.flows.generate_scenes import Outcome
 
 _POLL_S = 0.5
+
+_MAX_NOTES = 20
+"""Most notes that are printed."""
 
 
 def generate(
@@ -51,6 +55,17 @@ def generate(
     accept_environment: Annotated[
         bool, typer.Option(help="go on with a dataset begun with other library versions")
     ] = False,
+    scenes_from: Annotated[
+        Path | None,
+        typer.Option(
+            help="render every *.json of this folder (RenderFormer scenes) instead; objects, "
+            "scenes and the build's limits on scenes do not apply"
+        ),
+    ] = None,
+    views: Annotated[
+        int | None,
+        typer.Option(help="with --scenes-from: first cameras of each file [all that every has]"),
+    ] = None,
     json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
 ) -> None:
     """Turn objects into a verified, resumable dataset; run it again to go on after any stop."""
@@ -76,6 +91,8 @@ def generate(
                 workers=workers,
                 failure_budget=failure_budget,
                 accept_environment=accept_environment,
+                scenes_from=None if scenes_from is None else str(scenes_from),
+                views=views,
             )
     _report(folder, outcome, time.monotonic() - started, as_json=json)
 
@@ -132,6 +149,7 @@ def _report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_jso
                 "scenes": statistics.num_scenes,
                 "views": statistics.num_views,
                 "bytes": statistics.num_bytes,
+                "notes": list(outcome.notes),
                 "scenes_given_up": outcome.num_scenes_given_up,
                 "rejections": [list(row) for row in rejected],
                 "seconds": round(seconds, 1),
@@ -146,13 +164,22 @@ def _report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_jso
     rows += [
         ("dataset digest", outcome.digest),
         ("wall time", f"{seconds:.0f} s"),
-        ("look at", str(folder.contact_sheet)),
+        ("look at", f"{folder.contact_sheet}, {folder.report}"),
         ("shards, manifest", str(folder.root)),
         ("why rejected", str(folder.failures)),
     ]
+    _print_notes(outcome.notes)
     print_rows("Dataset finished", rows)
     console.print(f"\nNext: trilight verify {folder.root}", style="bold")
-    console.print(f"      trilight train smoke --data {folder.root}", style="bold")
+    if statistics.scenes_by_split.get("train"):
+        console.print(f"      trilight train smoke --data {folder.root}", style="bold")
+
+
+def _print_notes(notes: Sequence[str]) -> None:
+    for note in notes[:_MAX_NOTES]:
+        console.print(Text(f"Note: {note}.", style="yellow"))
+    if len(notes) > _MAX_NOTES:
+        console.print(f"Note: {len(notes) - _MAX_NOTES} more; --json has all.", style="yellow")
 
 
 def _licences(folder: DatasetFolder) -> str:

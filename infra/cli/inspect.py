@@ -1,47 +1,93 @@
 """`trilight inspect`: what is in a dataset, for a person."""
 
+import os
 from collections import Counter
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from infra.cli.console import console, print_json, print_rows
-from pipeline.documents.contact_sheet import write_contact_sheet
-from storage.dataset import open_dataset
-from storage.failures import count_by_reason, read_failures
-from storage.objects_lock import read_objects_lock
-from storage.statistics import dataset_statistics
+from infra.cli.console import console, print_json, print_rows, progress_bars
+from storage.dataset import Dataset, open_dataset
+from storage.failures import count_by_reason
+from storage.layout import DatasetFolder
+from storage.statistics import Statistics, dataset_statistics
+
+if TYPE_CHECKING:
+    from pipeline.documents.distributions import Distributions
+
+
+_READ_ONLY = "The folder cannot be written: choose one for report and contact sheet with --out."
 
 
 def inspect(
     dataset: Annotated[Path, typer.Argument(help="folder of the dataset")],
     scenes: Annotated[int, typer.Option(help="scenes on the contact sheet")] = 16,
+    out: Annotated[
+        Path | None, typer.Option(help="write the report and the sheet here [the dataset]")
+    ] = None,
     json: Annotated[bool, typer.Option(help="print the summary as JSON")] = False,
 ) -> None:
-    """Write the contact sheet anew and print what the dataset holds."""
+    """Write report, gallery and contact sheet anew, and print what the dataset holds.
+
+    A dataset that is read-only is only summed up, unless there is an --out.
+    """
+    from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
+
     opened = open_dataset(str(dataset))
-    statistics = dataset_statistics(opened)
-    write_contact_sheet(opened, statistics, max_scenes=scenes)
-    objects = read_objects_lock(opened.folder.objects_lock)
-    licences = Counter(entry.licence for entry in objects)
-    splits = Counter(entry.split for entry in objects)
-    rejected = count_by_reason(read_failures(opened.folder.failures))
+    with progress_bars() as bars:
+        total = len(opened.manifest.shards)
+        task = bars.add_task("shards", total=total, note="", visible=not json)
+        statistics = dataset_statistics(opened)
+        found = dataset_distributions(opened, shard_done=lambda _: bars.advance(task))
+    folder = opened.folder if out is None else DatasetFolder(out)
+    writable = out is not None or os.access(folder.root, os.W_OK | os.X_OK)
+    if writable:
+        _write(opened, statistics, found, folder, max_scenes=scenes)
     if json:
-        print_json(
-            {
-                "bytes": statistics.num_bytes,
-                "dataset_digest": opened.digest,
-                "licences": licences,
-                "noise_floor_db": [round(float(v), 2) for v in statistics.noise_floor_db],
-                "objects_by_split": splits,
-                "rejections": [list(row) for row in rejected],
-                "scenes_by_split": statistics.scenes_by_split,
-                "scenes_by_template": statistics.scenes_by_template,
-                "spp": [int(v) for v in statistics.spp],
-            }
-        )
+        print_json(_as_json(opened, statistics, found))
         return
+    _print_summary(str(dataset), opened, statistics, found)
+    look = f"Look at {folder.report} and {folder.contact_sheet}"
+    console.print(f"\n{look if writable else _READ_ONLY}", style="bold")
+
+
+def _write(
+    opened: Dataset,
+    statistics: Statistics,
+    found: "Distributions",
+    folder: DatasetFolder,
+    *,
+    max_scenes: int,
+) -> None:
+    from pipeline.documents.contact_sheet import write_contact_sheet
+    from pipeline.documents.report import write_report
+
+    write_contact_sheet(opened, statistics, max_scenes=max_scenes, out=folder)
+    write_report(opened, found, out=folder)
+
+
+def _as_json(opened: Dataset, statistics: Statistics, found: "Distributions") -> dict[str, object]:
+    return {
+        "bytes": statistics.num_bytes,
+        "dataset_digest": opened.digest,
+        "distributions": found.as_json(),
+        "licences": Counter(entry.licence for entry in found.objects),
+        "noise_floor_db": [round(float(v), 2) for v in statistics.noise_floor_db],
+        "objects_by_split": Counter(entry.split for entry in found.objects),
+        "rejections": [list(row) for row in count_by_reason(found.failures)],
+        "scenes_by_split": statistics.scenes_by_split,
+        "scenes_by_template": statistics.scenes_by_template,
+        "spp": [int(v) for v in statistics.spp],
+    }
+
+
+def _print_summary(
+    title: str, opened: Dataset, statistics: Statistics, found: "Distributions"
+) -> None:
+    licences = Counter(entry.licence for entry in found.objects)
+    splits = Counter(entry.split for entry in found.objects)
+    rejected = count_by_reason(found.failures)
     rows = [
         ("build", opened.manifest.build),
         *statistics.lines(),
@@ -50,5 +96,4 @@ def inspect(
         *(("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in rejected),
         ("dataset digest", opened.digest),
     ]
-    print_rows(str(dataset), rows)
-    console.print(f"\nLook at {opened.folder.contact_sheet}", style="bold")
+    print_rows(title, rows)

@@ -6,7 +6,9 @@ from collections.abc import Iterable
 from typing import Protocol
 
 _COLUMNS = ("uid", "title", "licence", "licence_source", "attribution", "source_url", "changes")
-_CHANGES = "cleaned, remeshed and given new materials"
+_REMESHED = "cleaned, remeshed and given new materials"
+AS_IN_FILE = "rendered as its scene file says"
+"""What is done to the meshes of scene files."""
 _FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -27,14 +29,14 @@ class HasRights(Protocol):
     def source_url(self) -> str: ...
 
 
-def encode_attribution(objects: Iterable[HasRights]) -> bytes:
-    """Return the file: one row per object, sorted by uid."""
+def encode_attribution(objects: Iterable[HasRights], *, changes: str = _REMESHED) -> bytes:
+    """Return the file: one row per object, sorted by uid, each with what was done to it."""
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(_COLUMNS)
     for entry in sorted(objects, key=lambda row: row.uid):
         rights = (entry.licence, entry.licence_source, entry.attribution, entry.source_url)
-        writer.writerow([_inert(cell) for cell in (entry.uid, entry.title, *rights, _CHANGES)])
+        writer.writerow([_inert(cell) for cell in (entry.uid, entry.title, *rights, changes)])
     return stream.getvalue().encode()
 
 

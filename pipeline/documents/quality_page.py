@@ -3,32 +3,21 @@
 One file without scripts or links to elsewhere; text from outside is escaped.
 """
 
-import base64
-import html
-import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import matplotlib
-
-matplotlib.use("Agg")  # before pyplot: no display is needed
-import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from pipeline.documents.figures import drawing, encoded, histogram, panels
+from pipeline.documents.html import Markup, element, image, joined, page, png_uri, table
 from storage.asset_rows import AssetRow
 from storage.records import Failure
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; color: #222 }
-h1, h2 { font-weight: 600 } table { border-collapse: collapse; width: 100% }
-td, th { text-align: left; padding: .2rem .7rem .2rem 0; border-bottom: 1px solid #ddd }
-td.n, th.n { text-align: right }
 .pair { display: inline-block; width: 530px; margin: 0 1.2rem 1.2rem 0; vertical-align: top }
 .pair img { width: 256px; background: #fff; border: 1px solid #ddd } .pair p { margin: .2rem 0 }
-.faint { color: #777 } img.wide { max-width: 100% }
 """
 
 
@@ -62,76 +51,88 @@ def encode_quality_page(
         target: what was asked for, in words.
     """
     parts = [
-        f"<h1>Assets: {target}</h1>",
+        element("h1", f"Assets: {target}"),
         _summary(rows, failures),
-        f'<img class="wide" alt="histograms" src="{_histograms(rows, budget)}">' if rows else "",
+        *([_histograms(rows, budget)] if rows else []),
         *(_group(name, group) for name, group in pairs.items() if group),
-        _rejected(failures),
+        *([_rejected(failures)] if failures else []),
         _accepted(rows),
     ]
-    body = "\n".join(part for part in parts if part)
-    page = (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>Assets</title>'
-        f"<style>{_STYLE}</style></head><body>\n{body}\n</body></html>\n"
-    )
-    return page.encode()
+    return page("Assets", joined(parts), style=_STYLE)
 
 
-def _summary(rows: Sequence[AssetRow], failures: Sequence[Failure]) -> str:
+def _summary(rows: Sequence[AssetRow], failures: Sequence[Failure]) -> Markup:
     repaired = sum(row.source.repaired for row in rows)
     closed = sum(row.source.watertight for row in rows)
     licences = Counter(row.licence for row in rows)
-    shown = ", ".join(f"{html.escape(name)} ({count})" for name, count in licences.most_common())
-    return (
-        f"<p>{len(rows)} objects accepted, {repaired} of them repaired (triangles dropped or "
-        f"turned outward), {closed} watertight; {len(failures)} rejected.<br>Licences: "
-        f"{shown or 'none'}.</p>"
+    shown = ", ".join(f"{name} ({count})" for name, count in licences.most_common())
+    return element(
+        "p",
+        f"{len(rows)} objects accepted, {repaired} of them repaired (triangles dropped or turned "
+        f"outward), {closed} watertight; {len(failures)} rejected.",
+        Markup("<br>"),
+        f"Licences: {shown or 'none'}.",
     )
 
 
-def _histograms(rows: Sequence[AssetRow], budget: int) -> str:
+def _histograms(rows: Sequence[AssetRow], budget: int) -> Markup:
     """Draw error, triangle quality and budget as one picture."""
-    figure, axes = plt.subplots(1, 4, figsize=(14, 2.8), layout="constrained")
     changed = [row.quality for row in rows if row.method != "source"]
-    axes[0].hist([100 * quality.error_p99 for quality in changed], bins=24)
-    axes[0].set_xlabel(f"p99 distance, % of the diagonal\n({len(changed)} decimated objects)")
-    axes[0].set_ylabel("objects")
-    axes[1].hist([row.quality.min_angle_p5_deg for row in rows], bins=24, range=(0, 60))
-    axes[1].set_xlabel("smallest angles, 5th percentile, degrees\n(60: equilateral)")
-    axes[2].hist([row.quality.area_variation for row in rows], bins=24)
-    axes[2].set_xlabel("variation of triangle areas\n(0: all equal)")
-    axes[3].hist([row.num_faces for row in rows], bins=24, range=(0, budget))
-    axes[3].set_xlabel(f"triangles\n(budget {budget})")
-    stream = io.BytesIO()
-    figure.savefig(stream, dpi=110, metadata={"Software": None})
-    plt.close(figure)
-    return _data_uri(stream.getvalue())
+    with drawing():
+        figure, axes = panels(4, columns=4)
+        histogram(
+            axes[0],
+            [100 * quality.error_p99 for quality in changed],
+            f"p99 distance, % of the diagonal\n({len(changed)} decimated objects)",
+            ylabel="objects",
+        )
+        histogram(
+            axes[1],
+            [row.quality.min_angle_p5_deg for row in rows],
+            "smallest angles, 5th percentile, degrees\n(60: equilateral)",
+            bounds=(0, 60),
+        )
+        histogram(
+            axes[2],
+            [row.quality.area_variation for row in rows],
+            "variation of triangle areas\n(0: all equal)",
+        )
+        histogram(
+            axes[3],
+            [row.num_faces for row in rows],
+            f"triangles\n(budget {budget})",
+            bounds=(0, budget),
+        )
+        return encoded(figure, "histograms")
 
 
-def _group(name: str, pairs: Sequence[Pair]) -> str:
-    return f"<h2>{name}</h2>\n" + "\n".join(_pair(pair) for pair in pairs)
+def _group(name: str, pairs: Sequence[Pair]) -> Markup:
+    return joined([element("h2", name), *(_pair(pair) for pair in pairs)])
 
 
-def _pair(pair: Pair) -> str:
+def _pair(pair: Pair) -> Markup:
     row, quality = pair.row, pair.row.quality
-    return (
-        f'<div class="pair"><img alt="source" src="{_png(pair.source)}"> '
-        f'<img alt="result" src="{_png(pair.result)}">'
-        f'<p>{html.escape(row.uid)} <span class="faint">{row.source.num_faces} to {row.num_faces} '
-        f"triangles by {row.method}; p99 {quality.error_p99:.2%}, largest {quality.error_max:.2%}, "
-        f"normals {quality.normal_error_deg:.1f}&deg;, outline "
-        f"{quality.silhouette_iou:.1%}</span></p></div>"
+    facts = (
+        f"{row.source.num_faces} to {row.num_faces} triangles by {row.method}; p99 "
+        f"{quality.error_p99:.2%}, largest {quality.error_max:.2%}, normals "
+        f"{quality.normal_error_deg:.1f}°, outline {quality.silhouette_iou:.1%}"
+    )
+    return element(
+        "div",
+        image(png_uri(pair.source), "source"),
+        " ",
+        image(png_uri(pair.result), "result"),
+        element("p", row.uid, " ", element("span", facts, class_="faint")),
+        class_="pair",
     )
 
 
-def _rejected(failures: Sequence[Failure]) -> str:
-    if not failures:
-        return ""
+def _rejected(failures: Sequence[Failure]) -> Markup:
     cells = [(row.item, row.reason, row.message) for row in failures]
-    return "<h2>Rejected</h2>\n" + _table(("object", "reason", "what was found"), cells, numbers=0)
+    return joined([element("h2", "Rejected"), table(("object", "reason", "what was found"), cells)])
 
 
-def _accepted(rows: Sequence[AssetRow]) -> str:
+def _accepted(rows: Sequence[AssetRow]) -> Markup:
     head = ("object", "licence", "method", "read", "triangles", "p99 %", "normals", "open edges")
     cells = [
         (
@@ -146,28 +147,5 @@ def _accepted(rows: Sequence[AssetRow]) -> str:
         )
         for row in sorted(rows, key=lambda row: (-row.quality.error_p99, row.uid))
     ]
-    return "<h2>Accepted, the largest error first</h2>\n" + _table(head, cells, numbers=5)
-
-
-def _table(head: Sequence[str], cells: Sequence[Sequence[str]], *, numbers: int) -> str:
-    """Return a table whose last `numbers` columns are aligned to the right."""
-    first = len(head) - numbers
-
-    def line(tag: str, row: Sequence[str]) -> str:
-        return "".join(
-            f"<{tag}{' class=n' if k >= first else ''}>{html.escape(cell)}</{tag}>"
-            for k, cell in enumerate(row)
-        )
-
-    body = "\n".join(f"<tr>{line('td', row)}</tr>" for row in cells)
-    return f"<table><tr>{line('th', head)}</tr>\n{body}</table>"
-
-
-def _png(grey: NDArray[np.uint8]) -> str:
-    stream = io.BytesIO()
-    Image.fromarray(grey).save(stream, "PNG", optimize=True)
-    return _data_uri(stream.getvalue())
-
-
-def _data_uri(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+    heading = element("h2", "Accepted, the largest error first")
+    return joined([heading, table(head, cells, numbers=5)])

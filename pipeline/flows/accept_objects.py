@@ -6,6 +6,7 @@ from pathlib import Path
 from pipeline.assets.stage import PreparedAsset
 from pipeline.flows.prepare_isolated import prepare_isolated
 from pipeline.flows.publication import Publication
+from pipeline.flows.scene_files import SceneFiles
 from pipeline.flows.settings import BuildSettings
 from pipeline.objects.sources import find_objects
 from storage.conventions import SPLITS
@@ -25,6 +26,8 @@ class AcceptedObjects:
     """Every locked object with its asset file in the store."""
     num_found: int
     """Objects in the source, refused ones included."""
+    files: SceneFiles | None = None
+    """Where scenes come from files: those, and `objects` are the files themselves."""
 
 
 def accept_objects(
@@ -49,7 +52,7 @@ def accept_objects(
     )
     allowed = list(found.records)
     shown = safe_url(source)
-    frozen = _frozen(publication)
+    frozen = frozen_objects(publication)
     if frozen is not None:
         allowed = [record for record in allowed if record.uid in frozen]
     announce_objects(folder, len(allowed))
@@ -69,7 +72,8 @@ def accept_objects(
     )
 
 
-def _frozen(publication: Publication) -> dict[str, LockedObject] | None:
+def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
+    """Return what the dataset was begun with by uid, or None where nothing is frozen yet."""
     if not publication.manifest.objects_lock_sha256:
         return None
     return {entry.uid: entry for entry in read_objects_lock(publication.folder.objects_lock)}

@@ -1,4 +1,4 @@
-"""The flow `generate-scenes`: objects to shards, resumable at any moment.
+"""The flow `generate-scenes`: objects, or scenes in files, to shards, resumable at any moment.
 
 Prefect schedules and displays; files are the truth. The flow looks at what is there, makes what is
 missing, and publishes each shard as it is done. A task run is one shard: one to a few minutes.
@@ -15,15 +15,19 @@ from prefect.cache_policies import NO_CACHE
 from prefect.futures import PrefectFuture, as_completed
 from prefect.utilities.annotations import quote
 
-from pipeline.documents.attribution import encode_attribution
+from pipeline.documents.attribution import AS_IN_FILE, encode_attribution
 from pipeline.documents.contact_sheet import write_contact_sheet
+from pipeline.documents.distributions import dataset_distributions
+from pipeline.documents.report import write_report
 from pipeline.flows.accept_objects import AcceptedObjects, accept_objects
+from pipeline.flows.accept_scene_files import accept_scene_files, settings_for_files
 from pipeline.flows.builds import named_build
 from pipeline.flows.children import ChildPool
 from pipeline.flows.environment import environment
 from pipeline.flows.make_scene import SceneSource, set_up_child
 from pipeline.flows.make_shard import make_shard
 from pipeline.flows.publication import Publication, begin
+from pipeline.flows.scene_files import SceneFolder, find_scene_files
 from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import Variant, choose_variant
@@ -47,13 +51,15 @@ class Outcome:
     digest: str
     """The dataset digest."""
     num_objects_found: int
-    """Objects in the source."""
+    """Objects in the source, or the files that scenes are made of."""
     num_objects_used: int
     """Objects that scenes may draw from."""
     num_scenes_given_up: int
     """Scenes that no attempt could save."""
     statistics: Statistics
     """What the dataset holds."""
+    notes: tuple[str, ...] = ()
+    """What a person should know of the scene files: unknown fields, cameras not used."""
 
 
 @flow(name="generate-scenes", persist_result=False, validate_parameters=True)
@@ -70,8 +76,13 @@ def generate_scenes(
     workers: int = 1,
     failure_budget: float = 0.1,
     accept_environment: bool = False,
+    scenes_from: str | None = None,
+    views: int | None = None,
 ) -> Outcome:
     """Make a dataset, or what is missing of it.
+
+    With `scenes_from`, scene k is the k-th `*.json` of a folder, with the first of its cameras, and
+    all are of the split `test`; `objects`, `scenes` and the build's limits on scenes do not apply.
 
     Args:
         build: name of the settings, such as `smoke`.
@@ -87,6 +98,8 @@ def generate_scenes(
         workers: render processes; each takes its share of the cores.
         failure_budget: share of scenes that may be given up before the run stops.
         accept_environment: go on with a dataset that was begun with other library versions.
+        scenes_from: folder of scene files (RenderFormer JSON) to render instead of new scenes.
+        views: cameras of each scene file; by default as many as every file has.
 
     Raises:
         TrilightError: what the user can mend; what is finished is safe.
@@ -100,6 +113,8 @@ def generate_scenes(
     )
     if workers < 1:
         raise TrilightError(f"workers is {workers}; expected at least 1.")
+    listed = None if scenes_from is None else find_scene_files(scenes_from)
+    settings = settings_for_files(settings, listed, views)
     folder = DatasetFolder(Path(out).resolve())
     with folder.locked():
         remove_leftovers(folder.root)
@@ -111,8 +126,12 @@ def generate_scenes(
             scenes,
             accept_environment=accept_environment,
         )
-        accepted = prepare_assets_task(
-            objects, licence, _whole(settings), _whole(publication), workers
+        accepted = (
+            read_scenes_task(_whole(listed), licence, _whole(settings), _whole(publication))
+            if listed
+            else prepare_assets_task(
+                objects, licence, _whole(settings), _whole(publication), workers
+            )
         )
         _make_shards(settings, variant, publication, accepted, workers, failure_budget)
         statistics = write_documents_task(_whole(publication), _whole(accepted))
@@ -122,6 +141,7 @@ def generate_scenes(
         num_objects_used=len(accepted.objects),
         num_scenes_given_up=publication.num_given_up(),
         statistics=statistics,
+        notes=listed.notes(settings.scenes.num_views) if listed else (),
     )
 
 
@@ -137,6 +157,17 @@ def prepare_assets_task(
     return accept_objects(source, licence, settings, publication, workers)
 
 
+@task(name="read-scenes", cache_policy=NO_CACHE)
+def read_scenes_task(
+    folder: SceneFolder,
+    licence: str | None,
+    settings: BuildSettings,
+    publication: Publication,
+) -> AcceptedObjects:
+    """Build every scene of the folder once, and freeze its files."""
+    return accept_scene_files(folder, licence, settings, publication)
+
+
 @task(name="make-shard", cache_policy=NO_CACHE)
 def make_shard_task(shard_index: int, job: "_ShardJob") -> ShardEntry:
     """Make one shard with a borrowed render child."""
@@ -149,9 +180,11 @@ def write_documents_task(publication: Publication, accepted: AcceptedObjects) ->
     """Write what a person looks at."""
     dataset = open_dataset(str(publication.folder.root))
     statistics = dataset_statistics(dataset)
-    attribution = encode_attribution(locked for locked, _ in accepted.objects)
-    write_atomically(publication.folder.attribution, attribution)
+    objects = [locked for locked, _ in accepted.objects]
+    changes = {"changes": AS_IN_FILE} if accepted.files else {}
+    write_atomically(publication.folder.attribution, encode_attribution(objects, **changes))
     write_contact_sheet(dataset, statistics)
+    write_report(dataset, dataset_distributions(dataset))
     return statistics
 
 
@@ -180,6 +213,7 @@ def _make_shards(
         variant=variant,
         threads=max(1, (os.cpu_count() or 1) // workers),
         objects=accepted.objects,
+        files=accepted.files,
     )
 
     def render_child() -> IsolatedChild:

@@ -1,4 +1,4 @@
-"""One attempt at one scene, inside a render child: compose it, render its views, encode it."""
+"""One attempt at one scene, inside a render child: compose or read it, render its views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.flows.scene_files import SceneFiles
 from pipeline.flows.settings import BuildSettings
 from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.renders.variant import Variant, activate
@@ -34,6 +35,8 @@ class SceneSource:
     """Threads of this child."""
     objects: tuple[tuple[LockedObject, Path], ...]
     """Every locked object with its asset file."""
+    files: SceneFiles | None = None
+    """Where scenes are read from files; otherwise they are composed of the objects."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,19 +74,26 @@ def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
     failures: list[Failure] = []
     stage = "scenes"
     try:
-        scene = compose_scene(
-            settings.scenes,
-            _assets_of(split),
-            seed=settings.seed,
-            scene_index=scene_index,
-            attempt=attempt,
-        )
+        scene = _scene(split, scene_index, attempt)
         stage = "renders"
         sample = _render_sample(key, scene, settings, failures)
     except Rejected as rejection:
         failures.append(_failure(stage, key, rejection, attempt))
         return SceneAttempt(sample=None, failures=failures)
     return SceneAttempt(sample=sample, failures=failures)
+
+
+def _scene(split: str, scene_index: int, attempt: int) -> Scene:
+    source = _state.source
+    if source.files is not None:
+        return source.files.scene(scene_index, source.settings)
+    return compose_scene(
+        source.settings.scenes,
+        _assets_of(split),
+        seed=source.settings.seed,
+        scene_index=scene_index,
+        attempt=attempt,
+    )
 
 
 def _assets_of(split: str) -> Sequence[PooledAsset]:
@@ -103,7 +113,10 @@ def _assets_of(split: str) -> Sequence[PooledAsset]:
 def _render_sample(
     key: str, scene: Scene, settings: BuildSettings, failures: list[Failure]
 ) -> Sample:
-    """Render every view, replacing the cameras of rejected ones by their next attempts."""
+    """Render every view, replacing the cameras of rejected ones by their next attempts.
+
+    The cameras of a scene that was read from a file are what they are: a rejected one is fatal.
+    """
     renderer = SceneRenderer(scene, settings.renders)
     pictures, records = [], []
     for view in range(scene.num_views):
@@ -114,6 +127,8 @@ def _render_sample(
                 rendered = renderer.render_view(scene.c2w[view], float(scene.fov_deg[view]), seed)
                 break
             except Rejected as rejection:
+                if _state.source.files is not None:
+                    raise Rejected(rejection.reason, f"view {view}: {rejection.message}") from None
                 failures.append(_failure("renders", f"{key}.{view}", rejection, camera_attempt))
                 scene = next_camera(scene, settings.scenes, view=view)
         pictures.append(rendered.radiance_rgb)

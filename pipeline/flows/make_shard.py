@@ -33,17 +33,23 @@ def make_shard(
         if is_staged(staged, scene_index):
             continue
         started = time.monotonic()
-        sample, failures = _make_scene(split_of_shard(shard_index, splits), scene_index, child)
+        split, attempts = split_of_shard(shard_index, splits), _attempts(splits)
+        sample, failures = _make_scene(split, scene_index, attempts, child)
         stage_scene(staged, scene_index, sample, failures)
         _log(folder.logs / f"{name}.jsonl", scene_index, time.monotonic() - started, failures)
     return pack_shard(folder, name, scenes_of_shard(shard_index, splits))
 
 
+def _attempts(splits: SplitSettings) -> int:
+    """Return how often a scene may be tried: one that was written down is always the same."""
+    return MAX_ATTEMPTS if splits.listed_scenes is None else 1
+
+
 def _make_scene(
-    split: str, scene_index: int, child: IsolatedChild
+    split: str, scene_index: int, attempts: int, child: IsolatedChild
 ) -> tuple[Sample | None, list[Failure]]:
     failures: list[Failure] = []
-    for attempt in range(MAX_ATTEMPTS):
+    for attempt in range(attempts):
         outcome = _attempt(split, scene_index, attempt, child)
         failures += outcome.failures
         if outcome.sample:

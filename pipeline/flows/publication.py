@@ -13,7 +13,13 @@ from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry, index_shard, read_manifest, write_manifest
 from storage.objects_lock import encode_objects_lock, write_objects_lock
 from storage.records import Failure, LockedObject
-from storage.splits import SplitSettings, shard_name, shards_for
+from storage.splits import (
+    SplitSettings,
+    planned_scenes,
+    scenes_of_shard,
+    shard_name,
+    shards_for,
+)
 
 
 class Publication:
@@ -64,7 +70,12 @@ class Publication:
 
     def num_given_up(self) -> int:
         """Return how many scenes of the finished shards could not be made."""
-        wanted = len(self.manifest.shards) * self._splits.scenes_per_shard
+        listed = {entry.name for entry in self.manifest.shards}
+        wanted = sum(
+            len(scenes_of_shard(index, self._splits))
+            for index in range(self.num_shards)
+            if shard_name(index, self._splits) in listed
+        )
         return wanted - self.manifest.num_samples
 
     def _publish(self, **changes: Any) -> None:
@@ -90,7 +101,7 @@ def begin(
     """
     if num_scenes < 1:
         raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
-    whole = shards_for(num_scenes, settings.splits) * settings.splits.scenes_per_shard
+    whole = planned_scenes(num_scenes, settings.splits)
     if folder.manifest.exists():
         manifest = read_manifest(folder.manifest)
         _require_same(

@@ -1,7 +1,6 @@
 """`quality.html` shows what there is, and nothing that comes from outside is markup."""
 
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -9,43 +8,8 @@ import pytest
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from storage.asset_rows import AssetRow
 from storage.records import Failure
+from tests.documents.pages_read import HARM, Tags, read
 from tests.documents.rows_by_hand import row
-
-HARM = """<script>alert(1)</script><img src=x onerror=alert(2)>"'&"""
-VOID = {"meta", "img", "br"}
-
-
-class Tags(HTMLParser):
-    """Collects tags, attributes and text, and checks that tags close in order."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.links: list[str] = []
-        self.names: set[str] = set()
-        self.text: list[str] = []
-        self._open: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.names.update(name for name, _ in attrs)
-        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
-        if tag not in VOID:
-            self._open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text.append(data)
-
-
-def read(page: bytes) -> Tags:
-    tags = Tags()
-    tags.feed(page.decode())
-    tags.close()
-    assert tags._open == []
-    return tags
 
 
 def failure(item: str = "bad", message: str = "a sentence") -> Failure:

@@ -11,6 +11,7 @@ from storage.conventions import (
     look_at_c2w,
     preview_srgb8,
     radiance_from_log10,
+    srgb8,
 )
 
 angles = st.floats(1, 170)
@@ -54,3 +55,8 @@ def test_a_preview_is_monotone_and_ends_at_white() -> None:
     assert preview[0] == 0
     assert (np.diff(preview) >= 0).all()
     assert (preview[100:] == 255).all()  # radiance 1 and above
+
+
+def test_srgb_of_known_values() -> None:
+    # 0.2140 is what IEC 61966-2-1 gives for code 127.5 of 255; the first piece ends at 0.0031308
+    assert srgb8([-1, 0, 0.003, 0.2140, 1, 7]).tolist() == [0, 0, 10, 127, 255, 255]

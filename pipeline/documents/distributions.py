@@ -1,0 +1,191 @@
+"""What a dataset holds, as distributions: read scene by scene, without the pictures."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pipeline.documents.quantities import QUANTITIES, summary
+from pipeline.documents.scene_facts import Values, scene_values, surfaces
+from storage.conventions import SPLITS
+from storage.dataset import Dataset
+from storage.errors import TrilightError
+from storage.failures import read_failures
+from storage.manifest import Manifest
+from storage.objects_lock import read_objects_lock
+from storage.records import Failure, LockedObject
+from storage.sample import SceneRecord
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Distributions:
+    """Counts and values over all scenes of a dataset."""
+
+    values: Mapping[str, Mapping[str, Values]]
+    """By split, then by name (pipeline.documents.quantities): every value, float32."""
+    scenes: Mapping[tuple[str, str], int]
+    """Scenes by (template, split)."""
+    placements: Mapping[str, int]
+    """How often each object stands in a scene, by uid; objects that stand in none are missing."""
+    surfaces: Mapping[tuple[str, str], int]
+    """Surfaces by (object or shell; all, smooth or many_colours)."""
+    views_at_cap: Mapping[str, int]
+    """Views whose sampling ended at the cap, by split."""
+    objects: Sequence[LockedObject]
+    """The objects that scenes may draw from."""
+    failures: Sequence[Failure]
+    """What was rejected."""
+    targets: Mapping[str, float | None]
+    """What the settings ask for: max_triangles, noise_floor_db, min_spp, max_spp; None where the
+    manifest does not say."""
+
+    def all(self, name: str) -> Values:
+        """Return the values of one quantity over all splits."""
+        chunks = [by_name[name] for by_name in self.values.values()]
+        return np.concatenate(chunks) if chunks else np.zeros(0, np.float32)
+
+    @property
+    def splits(self) -> list[str]:
+        """The splits that have scenes, in their usual order."""
+        return [split for split in SPLITS if split in self.values]
+
+    @property
+    def templates(self) -> list[str]:
+        return sorted({template for template, _ in self.scenes})
+
+    @property
+    def rejections(self) -> Mapping[tuple[str, str], Counter[int]]:
+        """Rejections per attempt, by (stage, reason), the most frequent first."""
+        counts: dict[tuple[str, str], Counter[int]] = {}
+        for failure in self.failures:
+            counts.setdefault((failure.stage, failure.reason), Counter())[failure.attempt] += 1
+        return dict(sorted(counts.items(), key=lambda entry: (-entry[1].total(), entry[0])))
+
+    @property
+    def licences(self) -> Mapping[str, tuple[int, int, int]]:
+        """Per licence: objects, those of them that a scene uses, and their places in scenes."""
+        rows: dict[str, tuple[int, int, int]] = {}
+        for entry in self.objects:
+            count, used, places = rows.get(entry.licence, (0, 0, 0))
+            here = self.placements.get(entry.uid, 0)
+            rows[entry.licence] = (count + 1, used + (here > 0), places + here)
+        return dict(sorted(rows.items()))
+
+    def uses_per_object(self) -> list[int]:
+        """Return how often each object is used, zeros included, the most used first."""
+        unused = [entry.uid for entry in self.objects if entry.uid not in self.placements]
+        return sorted([*self.placements.values(), *(0 for _ in unused)], reverse=True)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the numbers as JSON values."""
+        return {
+            "licences": {
+                name: {"objects": count, "used": used, "placements": places}
+                for name, (count, used, places) in self.licences.items()
+            },
+            "object_uses": summary(self.uses_per_object()),
+            "quantities": {name: summary(self.all(name)) for name in QUANTITIES},
+            "rejections": [
+                {"stage": stage, "reason": reason, "attempts": dict(sorted(counts.items()))}
+                for (stage, reason), counts in self.rejections.items()
+            ],
+            "scenes": [
+                {"template": template, "split": split, "count": count}
+                for (template, split), count in sorted(self.scenes.items())
+            ],
+            "surfaces": {
+                kind: {name: self.surfaces[kind, name] for name in SURFACE_COUNTS}
+                for kind in ("object", "shell")
+            },
+            "targets": dict(self.targets),
+            "views_at_cap": {split: self.views_at_cap[split] for split in self.splits},
+        }
+
+
+SURFACE_COUNTS = ("all", "smooth", "many_colours")
+
+
+@dataclass(kw_only=True, eq=False)
+class _Tally:
+    """Counts in the making."""
+
+    values: dict[str, list[Mapping[str, Values]]] = field(default_factory=dict)
+    scenes: Counter[tuple[str, str]] = field(default_factory=Counter)
+    placements: Counter[str] = field(default_factory=Counter)
+    surfaces: Counter[tuple[str, str]] = field(default_factory=Counter)
+    views_at_cap: Counter[str] = field(default_factory=Counter)
+
+    def add(self, record: SceneRecord, split: str) -> Mapping[str, Values]:
+        """Count one scene and return its values."""
+        self.scenes[str(record.scene.provenance["template"]), split] += 1
+        self.views_at_cap[split] += sum(bool(view.at_cap) for view in record.views)
+        for surface in surfaces(record.scene):
+            self.surfaces[surface.kind, "all"] += 1
+            self.surfaces[surface.kind, "smooth"] += surface.smooth
+            self.surfaces[surface.kind, "many_colours"] += surface.num_colours > 1
+            if surface.kind == "object":
+                self.placements[str(record.scene.objects[surface.row].uid)] += 1
+        return scene_values(record)
+
+
+def dataset_distributions(
+    dataset: Dataset, *, shard_done: Callable[[str], None] = lambda name: None
+) -> Distributions:
+    """Read every scene of a dataset, one at a time and without its pictures.
+
+    What is kept is about 200 bytes a scene. The digests of the shards are not checked.
+
+    Args:
+        dataset: the dataset.
+        shard_done: called with the name of each shard that was read.
+
+    Raises:
+        TrilightError: a shard is missing, or a sample is unreadable or breaks a law.
+    """
+    tally = _Tally()
+    for shard in dataset.manifest.shards:
+        rows = []
+        for record in dataset.read_scenes(shard):
+            try:
+                rows.append(tally.add(record, shard.split))
+            except (KeyError, TypeError, ValueError) as error:
+                raise TrilightError(
+                    f"sample {record.key}: its JSON member is not as expected ({error!r}); run "
+                    "`trilight verify`."
+                ) from error
+        if rows:
+            tally.values.setdefault(shard.split, []).append(_concatenated(rows))
+        shard_done(shard.name)
+    lock = dataset.folder.objects_lock
+    return Distributions(
+        values={split: _concatenated(chunks) for split, chunks in tally.values.items()},
+        scenes=tally.scenes,
+        placements=tally.placements,
+        surfaces=tally.surfaces,
+        views_at_cap=tally.views_at_cap,
+        objects=read_objects_lock(lock) if lock.exists() else (),
+        failures=read_failures(dataset.folder.failures),
+        targets=_targets(dataset.manifest),
+    )
+
+
+def _concatenated(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:
+    return {name: np.concatenate([row[name] for row in rows]) for name in QUANTITIES}
+
+
+def _targets(manifest: Manifest) -> dict[str, float | None]:
+    """Return what the settings ask for; a dataset that was not generated here may not say."""
+    places = {
+        "max_triangles": "scenes",
+        "noise_floor_db": "renders",
+        "min_spp": "renders",
+        "max_spp": "renders",
+    }
+    found: dict[str, float | None] = {}
+    for name, group in places.items():
+        settings = manifest.settings.get(group)
+        value = settings.get(name) if isinstance(settings, Mapping) else None
+        found[name] = value if isinstance(value, int | float) else None
+    return found

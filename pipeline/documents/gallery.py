@@ -1,0 +1,81 @@
+"""The gallery of a report: cards that lead to a page of each scene."""
+
+from collections.abc import Mapping, Sequence
+
+from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
+from pipeline.documents.html import Markup, element, image, joined, png_uri
+from pipeline.documents.scene_page import Neighbours, encode_scene_page, preview
+from storage.atomic import write_atomically
+from storage.dataset import Dataset
+from storage.errors import TrilightError
+from storage.layout import DatasetFolder
+from storage.records import Failure
+from storage.sample import Sample
+
+MOST_SCENES = 1000
+"""Pages that one folder may hold."""
+
+_CARD_PX = 176
+
+
+def write_gallery(
+    dataset: Dataset, failures: Sequence[Failure], out: DatasetFolder, max_scenes: int
+) -> Markup:
+    """Write the pages of up to `max_scenes` scenes and return the cards that lead to them.
+
+    Pages of scenes that are no longer shown are deleted.
+
+    Raises:
+        TrilightError: too many scenes are asked for, a sample is unreadable, or the folder cannot
+            be written.
+    """
+    if not 0 <= max_scenes <= MOST_SCENES:
+        raise TrilightError(
+            f"gallery: {max_scenes} scenes; expected 0 to {MOST_SCENES}, one page each."
+        )
+    chosen = choose_scenes(dataset.manifest, max_scenes)
+    rejected = _by_scene(failures, chosen)
+    names = [f"{entry.key}.html" for entry in chosen]
+    cards: dict[str, list[Markup]] = {}
+    for row, (entry, sample) in enumerate(read_chosen(dataset, chosen)):
+        links = Neighbours(
+            report=f"../{out.report.name}#gallery",
+            before=names[row - 1] if row else None,
+            after=names[row + 1] if row + 1 < len(names) else None,
+        )
+        page = encode_scene_page(sample, entry.split, rejected[entry.key], links)
+        write_atomically(out.report_pages / names[row], page)
+        link = f"{out.report_pages.name}/{names[row]}"
+        cards.setdefault(entry.split, []).append(_card(sample, link))
+    _remove_others(out, names)
+    shown = f"{len(chosen)} of {dataset.manifest.num_samples} scenes, by their first view."
+    parts = [element("p", shown)]
+    for split, of_split in cards.items():
+        parts += [element("h3", split), element("div", *of_split, class_="cards")]
+    return joined(parts)
+
+
+def _card(sample: Sample, link: str) -> Markup:
+    picture = image(png_uri(preview(sample.radiance_rgb[0], _CARD_PX)), f"scene {sample.key}")
+    template = sample.scene.provenance.get("template", "")
+    num_objects = sum(entry.kind == "object" for entry in sample.scene.objects)
+    caption = f"{template}, {num_objects} {'object' if num_objects == 1 else 'objects'}"
+    text = element("span", sample.key, Markup("<br>"), element("span", caption, class_="faint"))
+    return element("a", picture, text, href=link, class_="card")
+
+
+def _by_scene(failures: Sequence[Failure], chosen: Sequence[Chosen]) -> Mapping[str, list[Failure]]:
+    """Return the rejections of each chosen scene, those of its views included."""
+    rejected: dict[str, list[Failure]] = {entry.key: [] for entry in chosen}
+    for failure in failures:
+        key = str(failure.item).partition(".")[0]
+        if failure.stage in ("scenes", "renders") and key in rejected:
+            rejected[key].append(failure)
+    return rejected
+
+
+def _remove_others(out: DatasetFolder, names: Sequence[str]) -> None:
+    """Delete pages of an earlier report; what else lies in the folder is not ours."""
+    for old in sorted(out.report_pages.glob("[0-9]" * 9 + ".html")):
+        if old.name not in names:
+            old.unlink(missing_ok=True)

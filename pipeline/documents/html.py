@@ -1,0 +1,125 @@
+"""Pages without scripts and without anything from elsewhere; text from outside never is markup.
+
+Every function here escapes what it is given, unless it is `Markup`, which only these functions and
+the documents themselves make.
+"""
+
+import base64
+import html
+import io
+from collections.abc import Iterable, Sequence
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+Cell = str | int | float
+
+
+class Markup(str):
+    """Text that is HTML already. Nothing that comes from a file may become one unescaped."""
+
+    __slots__ = ()
+
+
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; color: #222;
+  padding: 0 1rem }
+h1, h2, h3 { font-weight: 600; line-height: 1.25 } h2 { margin: 2.4rem 0 .6rem }
+h3 { font-size: 1rem; margin: 1.2rem 0 .2rem }
+a { color: #1f5f99; text-decoration: none } a:hover { text-decoration: underline }
+table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums }
+td, th { text-align: left; padding: .2rem .7rem .2rem 0; border-bottom: 1px solid #ddd;
+  vertical-align: top; overflow-wrap: anywhere }
+th { font-weight: 600; overflow-wrap: normal }
+td.n, th.n { text-align: right; overflow-wrap: normal }
+.faint { color: #777 } img.wide { max-width: 100% }
+table.narrow { width: auto } table.narrow td, table.narrow th { padding-right: 1.6rem }
+"""
+"""What all pages look like."""
+
+
+def escape(text: object) -> Markup:
+    """Return text as HTML that shows exactly it; Markup comes back as it is."""
+    return text if isinstance(text, Markup) else Markup(html.escape(str(text)))
+
+
+def joined(parts: Iterable[str], separator: str = "\n") -> Markup:
+    """Return parts one after another, escaped where they are not Markup."""
+    return Markup(separator.join(escape(part) for part in parts))
+
+
+def element(tag: str, *content: object, **attributes: object) -> Markup:
+    """Return `<tag ...>content</tag>`; a trailing `_` in an attribute's name is left out."""
+    inner = "".join(escape(part) for part in content)
+    return Markup(f"<{tag}{_attributes(attributes)}>{inner}</{tag}>")
+
+
+def image(uri: str, alt: str, **attributes: object) -> Markup:
+    """Return a picture."""
+    return Markup(f"<img{_attributes({'alt': alt, **attributes, 'src': uri})}>")
+
+
+def table(
+    head: Sequence[str], rows: Sequence[Sequence[Cell]], *, numbers: int = 0, **attributes: object
+) -> Markup:
+    """Return a table whose last `numbers` columns are aligned to the right; `head` may be empty."""
+    first = max(len(head), *(len(row) for row in rows), 0) - numbers
+
+    def line(tag: str, cells: Sequence[Cell]) -> Markup:
+        return joined(
+            (
+                element(tag, cell, class_="n") if column >= first else element(tag, cell)
+                for column, cell in enumerate(cells)
+            ),
+            "",
+        )
+
+    lines = [element("tr", line("td", row)) for row in rows]
+    if head:
+        lines.insert(0, element("tr", line("th", head)))
+    return element("table", joined(lines), **attributes)
+
+
+def page(title: str, body: str, *, style: str = "") -> bytes:
+    """Return a whole page; `style` is added to that of all pages."""
+    text = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width">'
+        f"<title>{escape(title)}</title><style>{STYLE}{style}</style></head><body>\n"
+        f"{escape(body)}\n</body></html>\n"
+    )
+    # a lone surrogate, which JSON from outside may hold, has no UTF-8
+    return text.encode(errors="replace")
+
+
+def outside_link(url: str) -> Markup:
+    """Return a link to a page elsewhere, or only its text where it is not plain http or https."""
+    text = str(url)
+    try:
+        parts = urlsplit(text)
+        harmless = parts.scheme in ("http", "https") and bool(parts.hostname)
+    except ValueError:
+        harmless = False
+    if not harmless or "@" in parts.netloc or not text.isprintable() or " " in text:
+        return escape(text)
+    return element("a", text, href=text, rel="noreferrer noopener nofollow")
+
+
+def png_uri(pixels: NDArray[np.uint8]) -> str:
+    """Return a picture, [H, W] grey or [H, W, 3] RGB, as a data URI."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG")
+    return data_uri(stream.getvalue())
+
+
+def data_uri(png: bytes) -> str:
+    """Return the bytes of a PNG file as a data URI."""
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def _attributes(attributes: dict[str, object]) -> str:
+    return "".join(
+        f' {name.rstrip("_")}="{html.escape(str(value))}"' for name, value in attributes.items()
+    )

@@ -1,0 +1,125 @@
+"""`report.html`: the distributions of a dataset and a gallery, for people to look at.
+
+The report is one file without scripts; the pages of its gallery lie beside it in `report/`. It
+tells nothing of the clock or the machine: equal datasets give equal reports.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from pipeline.documents import report_sections
+from pipeline.documents.distributions import Distributions
+from pipeline.documents.gallery import write_gallery
+from pipeline.documents.html import Markup, element, joined, page, table
+from pipeline.documents.quantities import summary
+from storage.atomic import write_atomically
+from storage.dataset import Dataset
+from storage.layout import DatasetFolder
+
+_STYLE = """
+.pair { display: flex; gap: 2rem; align-items: flex-start }
+.figure { flex: 0 0 590px; width: 590px } .numbers { flex: 1 1 0; min-width: 0; font-size: .87rem }
+.numbers table { margin-bottom: 1rem }
+@media (max-width: 60rem) { .pair { display: block } .figure { width: auto } }
+.toc a { margin-right: 1rem } .bar { display: inline-block; height: .7em; background: #3b6ea5 }
+.cards { display: flex; flex-wrap: wrap; gap: 1rem }
+.card { width: 176px; overflow-wrap: anywhere; font-size: .85rem; line-height: 1.35 }
+.card img { display: block; width: 176px; background: #111; margin-bottom: .25rem }
+pre { columns: 2; font-size: .8rem; line-height: 1.45; background: #f6f6f6; padding: .7rem;
+  white-space: pre-wrap;  overflow-wrap: anywhere }
+"""
+
+_SECTIONS = (
+    report_sections.scenes_section,
+    report_sections.objects_section,
+    report_sections.triangles_section,
+    report_sections.materials_section,
+    report_sections.lights_section,
+    report_sections.cameras_section,
+    report_sections.pictures_section,
+    report_sections.rejections_section,
+    report_sections.licences_section,
+)
+_ANCHORS = (
+    "scenes", "objects", "triangles", "materials", "lights", "cameras", "pictures", "rejections",
+    "licences", "gallery", "settings",
+)  # fmt: skip
+
+
+def write_report(
+    dataset: Dataset,
+    found: Distributions,
+    *,
+    max_scenes: int = 48,
+    out: DatasetFolder | None = None,
+) -> Path:
+    """Write `report.html` and the pages of its gallery, and return the path of the former.
+
+    Args:
+        dataset: the dataset.
+        found: its distributions.
+        max_scenes: most scenes in the gallery, up to 1000; they are spread over splits and shards.
+        out: the folder to write into; that of the dataset where None.
+
+    Raises:
+        TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
+    """
+    folder = out or dataset.folder
+    cards = write_gallery(dataset, found.failures, folder, max_scenes)
+    sections = [section(found) for section in _SECTIONS] if found.scenes else []
+    body = [
+        element("h1", f"Dataset {dataset.manifest.build}"),
+        _overview(dataset, found),
+        element("p", *(element("a", name, href=f"#{name}") for name in _ANCHORS), class_="toc"),
+        *sections,
+        element("h2", "Gallery", id="gallery"),
+        cards,
+        _settings(dataset),
+    ]
+    data = page(f"Dataset {dataset.manifest.build}", joined(body), style=_STYLE)
+    write_atomically(folder.report, data)
+    return folder.report
+
+
+def _overview(dataset: Dataset, found: Distributions) -> Markup:
+    manifest = dataset.manifest
+    per_split = {split: 0 for split in found.splits}
+    for (_, split), count in found.scenes.items():
+        per_split[split] += count
+    floors = summary(found.all("noise_floor_db"))
+    scenes = ", ".join(f"{count} {split}" for split, count in per_split.items())
+    rows = [
+        ("scenes", f"{sum(per_split.values())} ({scenes or 'none'})"),
+        ("views", f"{floors['count']:.0f}, {manifest.num_views} of each scene"),
+    ]
+    if floors["count"]:
+        text = f"median {floors['median']:.1f} dB, 5th percentile {floors['p5']:.1f} dB"
+        rows.append(("noise floor", f"{text} (psnr_log_db)"))
+    rows += [
+        ("objects", f"{len(found.objects)}, {len(found.placements)} of them in scenes"),
+        ("rejections", f"{len(found.failures)}"),
+        ("size", f"{manifest.num_bytes / 1e6:.1f} MB in {len(manifest.shards)} shards"),
+        ("dataset digest", manifest.dataset_digest),
+    ]
+    return table((), rows, class_="narrow")
+
+
+def _settings(dataset: Dataset) -> Markup:
+    return joined(
+        [
+            element("h2", "Settings", id="settings"),
+            element("pre", *_lines(dataset.manifest.settings)),
+            element("h3", "What the bytes depend on besides"),
+            element("pre", *_lines(dataset.manifest.environment)),
+        ]
+    )
+
+
+def _lines(values: Mapping[str, object], prefix: str = "") -> Iterator[str]:
+    """Yield one line for each setting, under its dotted name."""
+    for name, value in sorted(values.items()):
+        if isinstance(value, Mapping):
+            yield from _lines(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}: {json.dumps(value, sort_keys=True)}\n"

@@ -1,0 +1,269 @@
+"""The sections of a report: what a dataset holds, as figures and as numbers beside them."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pipeline.documents.distributions import SURFACE_COUNTS, Distributions
+from pipeline.documents.figures import drawing, encoded, histogram, panels, rose, stacked_bars
+from pipeline.documents.html import Cell, Markup, element, joined, table
+from pipeline.documents.quantities import QUANTITIES, STATISTICS, summary
+
+_MOST_USED = 20
+_SHOWN = tuple(name for name in STATISTICS if name not in ("p5", "p95"))
+_MOST_BARS = 16
+"""More templates or reasons than this stand in the table only."""
+_ATTEMPTS = (
+    ("first attempt", 0, 0),
+    ("second", 1, 1),
+    ("third, fourth", 2, 3),
+    ("later", 4, math.inf),
+)
+
+
+def scenes_section(found: Distributions) -> Markup:
+    """Return how many scenes there are of each template and split."""
+    splits, templates = found.splits, found.templates
+    counts = {split: [found.scenes.get((name, split), 0) for name in templates] for split in splits}
+    with drawing():
+        shown = {split: counts[split][:_MOST_BARS] for split in splits}
+        figure, _ = stacked_bars(templates[:_MOST_BARS], shown, xlabel="scenes")
+        picture = encoded(figure, "scenes by template and split")
+    rows: list[list[Cell]] = [
+        [name, *(counts[split][row] for split in splits), sum(counts[s][row] for s in splits)]
+        for row, name in enumerate(templates)
+    ]
+    totals = [sum(counts[split]) for split in splits]
+    rows.append(["all", *totals, sum(totals)])
+    head = ("template", *splits, "all")
+    return _section("scenes", "Scenes", picture, table(head, rows, numbers=len(splits) + 1))
+
+
+def objects_section(found: Distributions) -> Markup:
+    """Return how many objects scenes hold, and how evenly the objects are used."""
+    uses = np.array(found.uses_per_object())
+    with drawing():
+        figure, axes = panels(2)
+        histogram(
+            axes[0],
+            found.all("objects_per_scene"),
+            "objects in a scene",
+            ylabel="scenes",
+        )
+        histogram(axes[1], uses, "places of an object in scenes", ylabel="objects")
+        picture = encoded(figure, "objects of a scene, and places of an object")
+    numbers = _summaries(found, "objects_per_scene", extra=[("places of an object", 0, uses)])
+    note = element("p", f"{int((uses > 0).sum())} of {len(uses)} objects stand in a scene.")
+    return joined([_section("objects", "Objects", picture, numbers, note), _most_used(found)])
+
+
+def triangles_section(found: Distributions) -> Markup:
+    """Return the triangles of scenes and objects."""
+    budget = found.targets["max_triangles"]
+    with drawing():
+        figure, axes = panels(2)
+        marks = {f"budget {budget:.0f}": budget} if budget is not None else None
+        values = found.all("triangles_per_scene")
+        histogram(axes[0], values, "triangles of a scene", ylabel="scenes", marks=marks)
+        values = found.all("triangles_per_object")
+        histogram(axes[1], values, "triangles of an object", ylabel="places")
+        picture = encoded(figure, "triangles of scenes and objects")
+    numbers = _summaries(found, "triangles_per_scene", "triangles_per_object")
+    return _section("triangles", "Triangles", picture, numbers)
+
+
+def materials_section(found: Distributions) -> Markup:
+    """Return albedos, roughness and shading of the surfaces that are not lights."""
+    picture = _histograms(
+        found,
+        ("diffuse", "specular", "albedo_sum", "roughness"),
+        ylabel="surfaces",
+        bounds=(0, 1),
+    )
+    numbers = _summaries(found, "diffuse", "specular", "albedo_sum", "roughness")
+    rows: list[list[Cell]] = []
+    for kind in ("object", "shell"):
+        count, smooth, coloured = (found.surfaces.get((kind, name), 0) for name in SURFACE_COUNTS)
+        name = {"object": "objects", "shell": "floors and walls"}[kind]
+        rows.append([name, count, _share(smooth, count), _share(coloured, count)])
+    shares = table(("surfaces", "count", "smooth", "many colours"), rows, numbers=3)
+    note = element(
+        "p",
+        "A surface is an object, a floor or a wall in one scene; where it has many colours, its "
+        "mean over triangles counts. Albedos are those of the strongest channel. Smooth surfaces "
+        "share vertices between triangles; the others are flat.",
+        class_="faint",
+    )
+    return _section("materials", "Materials", picture, numbers, shares, note)
+
+
+def lights_section(found: Distributions) -> Markup:
+    """Return number, radiance, distance and size of the lights."""
+    names = ("lights_per_scene", "total_emission", "light_distance", "light_size")
+    picture = _histograms(found, names, ylabel=("scenes", "scenes", "lights", "lights"))
+    return _section("lights", "Lights", picture, _summaries(found, *names))
+
+
+def cameras_section(found: Distributions) -> Markup:
+    """Return where cameras stand and how wide they look."""
+    names = ("camera_distance", "elevation_deg", "fov_deg")
+    with drawing():
+        figure, axes = panels(4, polar=(3,))
+        for panel, name in zip(axes, names, strict=False):
+            histogram(panel, found.all(name), QUANTITIES[name].label, ylabel="views")
+        rose(axes[3], found.all("azimuth_deg"), "azimuth: area of a petal = views")
+        picture = encoded(figure, "cameras")
+    replaced = int((found.all("camera_attempt") > 0).sum())
+    note = element("p", f"{replaced} cameras stand in for rejected ones.")
+    return _section("cameras", "Cameras", picture, _summaries(found, *names, "azimuth_deg"), note)
+
+
+def pictures_section(found: Distributions) -> Markup:
+    """Return the measured errors of the pictures and what they cost."""
+    target, cap = found.targets["noise_floor_db"], found.targets["max_spp"]
+    with drawing():
+        figure, axes = panels(2)
+        floors = found.all("noise_floor_db")
+        histogram(
+            axes[0],
+            floors,
+            "noise floor, dB (psnr_log_db)",
+            ylabel="views",
+            marks={f"target {target:g} dB": target} if target is not None else None,
+        )
+        histogram(
+            axes[1],
+            found.all("spp"),
+            "samples per pixel",
+            ylabel="views",
+            marks={f"cap {cap:g}": cap} if cap is not None else None,
+        )
+        picture = encoded(figure, "noise floors and samples per pixel")
+    numbers = _summaries(found, "noise_floor_db", "spp", statistics=STATISTICS)
+    return _section("pictures", "Pictures", picture, numbers, _floors_by_split(found, target))
+
+
+def rejections_section(found: Distributions) -> Markup:
+    """Return what was rejected, by stage and reason, and at which attempt."""
+    rejections = found.rejections
+    if not rejections:
+        return joined([_heading("rejections", "Rejections"), element("p", "Nothing was rejected.")])
+    names = [f"{stage}: {reason}" for stage, reason in rejections]
+    with drawing():
+        parts = {
+            label: [_between(counts, low, high) for counts in rejections.values()]
+            for label, low, high in _ATTEMPTS
+        }
+        shown = {label: lengths[:_MOST_BARS] for label, lengths in parts.items() if any(lengths)}
+        figure, _ = stacked_bars(names[:_MOST_BARS], shown, xlabel="rejections")
+        picture = encoded(figure, "rejections by stage and reason")
+    rows: list[list[Cell]] = [
+        [stage, reason, counts.total(), *(parts[label][row] for label in parts)]
+        for row, ((stage, reason), counts) in enumerate(rejections.items())
+    ]
+    head = ("stage", "reason", "all", *parts)
+    numbers = table(head, rows, numbers=len(parts) + 1)
+    return _section("rejections", "Rejections", picture, numbers)
+
+
+def licences_section(found: Distributions) -> Markup:
+    """Return the licences of the objects."""
+    rows = [(name, *counts) for name, counts in found.licences.items()]
+    head = ("licence", "objects", "of them in scenes", "places in scenes")
+    whom = element("p", "Whom to name for each object stands in attribution.csv.", class_="faint")
+    numbers = table(head, rows, numbers=3, class_="narrow")
+    return joined([_heading("licences", "Licences"), numbers, whom])
+
+
+def _most_used(found: Distributions) -> Markup:
+    titles = {entry.uid: entry for entry in found.objects}
+    ranked = sorted(found.placements.items(), key=lambda entry: (-entry[1], entry[0]))[:_MOST_USED]
+    if not ranked:
+        return Markup()
+    most = ranked[0][1]
+    rows: list[list[Cell]] = []
+    for uid, count in ranked:
+        entry = titles.get(uid)
+        bar = element("span", class_="bar", style=f"width: {140 * count / most:.0f}px")
+        title, split = (entry.title, entry.split) if entry else ("", "")
+        rows.append([uid, title, split, bar, count])
+    head = ("object", "title", "split", "", "places")
+    heading = element("h3", f"The {len(ranked)} most used objects")
+    return joined([heading, table(head, rows, numbers=1)])
+
+
+def _floors_by_split(found: Distributions, target: float | None) -> Markup:
+    rows: list[list[Cell]] = []
+    for split in found.splits:
+        floors = found.values[split]["noise_floor_db"]
+        numbers = summary(floors)
+        reached = int((floors >= target).sum()) if target is not None else 0
+        rows.append(
+            [
+                split,
+                len(floors),
+                *(f"{numbers[name]:.1f}" if name in numbers else "" for name in ("median", "p5")),
+                _share(reached, len(floors)) if target is not None else "",
+                _share(found.views_at_cap.get(split, 0), len(floors)),
+            ]
+        )
+    head = ("split", "views", "median dB", "p5 dB", "reach the target", "at the cap")
+    return table(head, rows, numbers=5)
+
+
+def _histograms(
+    found: Distributions,
+    names: Sequence[str],
+    *,
+    ylabel: str | Sequence[str],
+    bounds: tuple[float, float] | None = None,
+) -> Markup:
+    ylabels = [ylabel] * len(names) if isinstance(ylabel, str) else ylabel
+    with drawing():
+        figure, axes = panels(len(names))
+        for panel, name, unit in zip(axes, names, ylabels, strict=True):
+            values, label = found.all(name), QUANTITIES[name].label
+            histogram(panel, values, label, ylabel=unit, bounds=bounds)
+        return encoded(figure, ", ".join(QUANTITIES[name].label for name in names))
+
+
+def _summaries(
+    found: Distributions,
+    *names: str,
+    extra: Sequence[tuple[str, int, np.ndarray]] = (),
+    statistics: Sequence[str] = _SHOWN,
+) -> Markup:
+    """Return a table of statistics with one row per quantity."""
+    named = [(QUANTITIES[name].label, QUANTITIES[name].digits, found.all(name)) for name in names]
+    rows: list[list[Cell]] = []
+    for label, digits, values in [*named, *extra]:
+        numbers = summary(values)
+        rows.append([label, *(_number(numbers, name, digits) for name in statistics)])
+    return table(("", *statistics), rows, numbers=len(statistics))
+
+
+def _number(numbers: dict[str, float], name: str, digits: int) -> str:
+    if name not in numbers:
+        return ""
+    if name == "count":
+        return f"{numbers[name]:.0f}"
+    return f"{numbers[name]:.{max(digits, 1) if name == 'mean' else digits}f}"
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part / whole:.1%}" if whole else ""
+
+
+def _between(counts: Mapping[int, int], low: float, high: float) -> int:
+    return sum(number for attempt, number in counts.items() if low <= attempt <= high)
+
+
+def _heading(anchor: str, title: str) -> Markup:
+    return element("h2", title, id=anchor)
+
+
+def _section(anchor: str, title: str, picture: Markup, *beside: Markup) -> Markup:
+    left = element("div", picture, class_="figure")
+    right = element("div", *beside, class_="numbers")
+    return joined([_heading(anchor, title), element("div", left, right, class_="pair")])

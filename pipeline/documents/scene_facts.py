@@ -1,0 +1,177 @@
+"""The numbers of one scene that a report counts: surfaces, lights and cameras, from its arrays."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.sample import SceneRecord
+from storage.scene import Scene
+
+Values = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """One row of `Scene.objects` that reflects: an object, the floor or a wall."""
+
+    row: int
+    """Row of `Scene.objects`."""
+    kind: str
+    """object or shell."""
+    num_triangles: int
+    """Triangles of it."""
+    smooth: bool
+    """Whether triangles share vertices, and with them normals; a flat face has its own three."""
+    num_colours: int
+    """Rows of the palette that it uses."""
+    diffuse: float
+    """Largest channel of the diffuse albedo, mean over the triangles."""
+    specular: float
+    """The same of the specular albedo."""
+    albedo_sum: float
+    """The same of both together."""
+    roughness: float
+    """Mean over the triangles."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """One emitter."""
+
+    row: int
+    """Row of `Scene.objects`."""
+    radiance_rgb: tuple[float, float, float]
+    """Mean over its triangles."""
+    centre: tuple[float, float, float]
+    """Mean of its triangles' middles, weighted by area, world units."""
+    area: float
+    """World units squared, one side."""
+
+    @property
+    def emission(self) -> float:
+        """Mean of the channels of its radiance: the unit of the setting `total_emission`."""
+        return sum(self.radiance_rgb) / 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """Where one camera stands, seen from the origin."""
+
+    position: tuple[float, float, float]
+    """World units."""
+    distance: float
+    """From the origin, world units."""
+    elevation_deg: float
+    """Above the horizon."""
+    azimuth_deg: float
+    """From +X towards +Y, in [0, 360)."""
+    fov_deg: float
+    """Full angle."""
+
+
+def surfaces(scene: Scene) -> list[Surface]:
+    """Return the objects and shell parts of a lawful scene that have triangles."""
+    found = []
+    for row, entry in enumerate(scene.objects):
+        mine = scene.object_index == row
+        if entry.kind == "emitter" or not mine.any():
+            continue
+        rows = scene.material_index[mine]
+        materials = scene.materials[rows].astype(np.float64)
+        diffuse, specular = materials[:, DIFFUSE], materials[:, SPECULAR]
+        faces = scene.faces[mine]
+        found.append(
+            Surface(
+                row=row,
+                kind=entry.kind,
+                num_triangles=len(rows),
+                smooth=len(np.unique(faces)) < faces.size,
+                num_colours=len(np.unique(rows)),
+                diffuse=float(diffuse.max(axis=1).mean()),
+                specular=float(specular.max(axis=1).mean()),
+                albedo_sum=float((diffuse + specular).max(axis=1).mean()),
+                roughness=float(materials[:, ROUGHNESS].mean()),
+            )
+        )
+    return found
+
+
+def lights(scene: Scene) -> list[Light]:
+    """Return the emitters of a lawful scene that have triangles."""
+    found = []
+    for row, entry in enumerate(scene.objects):
+        mine = scene.object_index == row
+        if entry.kind != "emitter" or not mine.any():
+            continue
+        corners = scene.vertex_positions[scene.faces[mine]].astype(np.float64)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.sqrt(np.sum(np.square(cross), axis=1)) / 2
+        weights = areas if areas.sum() > 0 else np.ones_like(areas)
+        centre = np.average(corners.mean(axis=1), axis=0, weights=weights)
+        radiance = scene.materials[scene.material_index[mine], EMISSION].mean(axis=0)
+        found.append(
+            Light(
+                row=row,
+                radiance_rgb=_three(radiance),
+                centre=_three(centre),
+                area=float(areas.sum()),
+            )
+        )
+    return found
+
+
+def cameras(scene: Scene) -> list[Camera]:
+    """Return where the cameras of a scene stand; at the origin itself all angles are 0."""
+    found = []
+    for c2w, fov_deg in zip(scene.c2w, scene.fov_deg, strict=True):
+        x, y, z = (float(value) for value in c2w[:3, 3])
+        found.append(
+            Camera(
+                position=(x, y, z),
+                distance=float(np.sqrt(x * x + y * y + z * z)),
+                elevation_deg=float(np.degrees(np.arctan2(z, np.hypot(x, y)))),
+                azimuth_deg=float(np.degrees(np.arctan2(y, x)) % 360),
+                fov_deg=float(fov_deg),
+            )
+        )
+    return found
+
+
+def scene_values(record: SceneRecord) -> Mapping[str, Values]:
+    """Return the values that one scene adds to each distribution (pipeline.documents.quantities).
+
+    Raises:
+        TypeError, ValueError: a view's record holds something that is not a number.
+    """
+    scene = record.scene
+    reflecting, emitting, seen_from = surfaces(scene), lights(scene), cameras(scene)
+    objects = [surface for surface in reflecting if surface.kind == "object"]
+    values: Mapping[str, Sequence[float]] = {
+        "objects_per_scene": [len(objects)],
+        "triangles_per_scene": [scene.num_triangles],
+        "triangles_per_object": [surface.num_triangles for surface in objects],
+        "diffuse": [surface.diffuse for surface in reflecting],
+        "specular": [surface.specular for surface in reflecting],
+        "albedo_sum": [surface.albedo_sum for surface in reflecting],
+        "roughness": [surface.roughness for surface in reflecting],
+        "lights_per_scene": [len(emitting)],
+        "total_emission": [sum(light.emission for light in emitting)],
+        "light_distance": [float(np.sqrt(np.sum(np.square(light.centre)))) for light in emitting],
+        "light_size": [float(np.sqrt(light.area)) for light in emitting],
+        "camera_distance": [camera.distance for camera in seen_from],
+        "elevation_deg": [camera.elevation_deg for camera in seen_from],
+        "azimuth_deg": [camera.azimuth_deg for camera in seen_from],
+        "fov_deg": [camera.fov_deg for camera in seen_from],
+        "noise_floor_db": [view.noise_floor_db for view in record.views],
+        "spp": [view.spp for view in record.views],
+        "camera_attempt": [view.camera_attempt for view in record.views],
+    }
+    return {name: np.asarray(entries, np.float32) for name, entries in values.items()}
+
+
+def _three(values: NDArray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

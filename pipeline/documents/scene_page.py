@@ -1,0 +1,224 @@
+"""The page of one scene: its pictures, and what stands behind them, in tables."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.documents.html import (
+    Cell,
+    Markup,
+    element,
+    image,
+    joined,
+    outside_link,
+    page,
+    png_uri,
+    table,
+)
+from pipeline.documents.scene_facts import cameras, lights, surfaces
+from storage.conventions import DIFFUSE, preview_srgb8, srgb8
+from storage.records import Failure
+from storage.sample import Sample
+from storage.scene import Scene
+
+_PICTURE_PX = 384
+_MOST_SWATCHES = 128
+_STYLE = """
+.views { display: flex; flex-wrap: wrap; gap: 1rem }
+figure { margin: 0 } figure img { display: block; width: 272px; background: #111 }
+figcaption { font-size: .85rem; color: #555; margin-top: .2rem }
+.swatches { font-size: 0; line-height: 0 }
+.swatches i { display: inline-block; width: 13px; height: 13px; margin: 1px }
+nav { display: flex; gap: 1.5rem } td:first-child { min-width: 9rem }
+.objects td:nth-child(2) { white-space: nowrap }
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Neighbours:
+    """Where a page leads to, as relative links."""
+
+    report: str
+    """The report."""
+    before: str | None
+    """The scene before, if there is one."""
+    after: str | None
+    """The scene after."""
+
+
+def encode_scene_page(
+    sample: Sample, split: str, rejected: Sequence[Failure], links: Neighbours
+) -> bytes:
+    """Return the page of one scene.
+
+    Args:
+        sample: the scene with its pictures, lawful.
+        split: its split.
+        rejected: the rejected attempts at it and its views.
+        links: relative links to the other pages.
+    """
+    scene = sample.scene
+    title = f"Scene {sample.key}"
+    template = scene.provenance.get("template", "")
+    summary = f"{split}, template {template}, {scene.num_triangles} triangles"
+    body = [
+        _navigation(links),
+        element("h1", title),
+        element("p", summary),
+        element("div", *_figures(sample), class_="views"),
+        element("h2", "Views"),
+        _views(sample),
+        element("h2", "Objects"),
+        _objects(scene),
+        element("h2", "Materials"),
+        _materials(scene),
+        element("h2", "Lights"),
+        _lights(scene),
+        *_attempts(rejected),
+        element("h2", "Provenance"),
+        _provenance(scene.provenance),
+    ]
+    return page(title, joined(body), style=_STYLE)
+
+
+def preview(radiance_rgb: NDArray[np.float32], width: int) -> NDArray[np.uint8]:
+    """Return a picture tone-mapped for people, reduced to at most `width` pixels [W, W, 3]."""
+    pixels = preview_srgb8(radiance_rgb)
+    if pixels.shape[1] <= width:
+        return pixels
+    height = max(1, round(pixels.shape[0] * width / pixels.shape[1]))
+    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+
+
+def _navigation(links: Neighbours) -> Markup:
+    shown = [element("a", "All scenes", href=links.report)]
+    if links.before is not None:
+        shown.append(element("a", "← before", href=links.before))
+    if links.after is not None:
+        shown.append(element("a", "next →", href=links.after))
+    return element("nav", *shown)
+
+
+def _figures(sample: Sample) -> list[Markup]:
+    figures = []
+    for view, (picture, record) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
+        uri = png_uri(preview(picture, _PICTURE_PX))
+        mark = ", at the cap" if record.at_cap else ""
+        caption = f"view {view}: {float(record.noise_floor_db):.1f} dB, {record.spp} spp{mark}"
+        figures.append(
+            element("figure", image(uri, f"view {view}"), element("figcaption", caption))
+        )
+    return figures
+
+
+def _views(sample: Sample) -> Markup:
+    rows: list[list[Cell]] = []
+    pairs = zip(cameras(sample.scene), sample.views, strict=True)
+    for view, (camera, record) in enumerate(pairs):
+        rows.append(
+            [
+                view,
+                _triple(camera.position, 3),
+                f"{camera.distance:.3f}",
+                f"{camera.elevation_deg:.1f}",
+                f"{camera.azimuth_deg:.1f}",
+                f"{camera.fov_deg:.1f}",
+                record.spp,
+                f"{float(record.noise_floor_db):.2f}",
+                f"{float(record.noise_floor_linear_db):.2f}",
+                "yes" if record.at_cap else "no",
+                record.camera_attempt,
+                record.seed,
+            ]
+        )
+    head = (
+        "view", "camera at, m", "distance", "elevation °", "azimuth °", "fov °", "spp",
+        "floor dB", "linear dB", "at cap", "attempt", "seed",
+    )  # fmt: skip
+    return table(head, rows, numbers=len(head) - 1)
+
+
+def _objects(scene: Scene) -> Markup:
+    counts = np.bincount(scene.object_index, minlength=len(scene.objects))
+    shading = {s.row: "smooth" if s.smooth else "flat" for s in surfaces(scene)}
+    rows: list[list[Cell]] = [
+        [
+            entry.name,
+            entry.kind,
+            entry.uid,
+            entry.licence,
+            entry.attribution,
+            outside_link(entry.source_url),
+            shading.get(row, ""),
+            int(counts[row]),
+        ]
+        for row, entry in enumerate(scene.objects)
+    ]
+    head = ("name", "kind", "uid", "licence", "attribution", "source", "shading", "triangles")
+    return table(head, rows, numbers=1, class_="objects")
+
+
+def _materials(scene: Scene) -> Markup:
+    rows: list[list[Cell]] = [
+        [
+            scene.objects[surface.row].name,
+            _swatches(scene, surface.row),
+            surface.num_colours,
+            f"{surface.diffuse:.3f}",
+            f"{surface.specular:.3f}",
+            f"{surface.albedo_sum:.3f}",
+            f"{surface.roughness:.3f}",
+        ]
+        for surface in surfaces(scene)
+    ]
+    head = ("surface", "diffuse colours", "colours", "diffuse", "specular", "sum", "roughness")
+    return table(head, rows, numbers=5)
+
+
+def _swatches(scene: Scene, row: int) -> Markup:
+    used = np.unique(scene.material_index[scene.object_index == row])
+    colours = srgb8(scene.materials[used[:_MOST_SWATCHES], DIFFUSE])
+    shown = [
+        element("i", style=f"background: #{red:02x}{green:02x}{blue:02x}")
+        for red, green, blue in colours.tolist()
+    ]
+    return element("div", *shown, class_="swatches")
+
+
+def _lights(scene: Scene) -> Markup:
+    rows: list[list[Cell]] = [
+        [
+            scene.objects[light.row].name,
+            _triple(light.centre, 3),
+            f"{float(np.sqrt(np.sum(np.square(light.centre)))):.3f}",
+            _triple(light.radiance_rgb, 1),
+            f"{light.area:.5f}",
+        ]
+        for light in lights(scene)
+    ]
+    head = ("light", "centre, m", "distance, m", "radiance rgb", "area, m²")
+    return table(head, rows, numbers=4)
+
+
+def _attempts(rejected: Sequence[Failure]) -> list[Markup]:
+    if not rejected:
+        return []
+    rows = [(row.item, row.attempt, row.stage, row.reason, row.message) for row in rejected]
+    head = ("item", "attempt", "stage", "reason", "what was found")
+    return [element("h2", "Rejected before"), table(head, rows)]
+
+
+def _provenance(provenance: Mapping[str, object]) -> Markup:
+    rows = [
+        (name, value if isinstance(value, str) else json.dumps(value, sort_keys=True))
+        for name, value in sorted(provenance.items())
+    ]
+    return table(("field", "value"), rows)
+
+
+def _triple(values: tuple[float, float, float], digits: int) -> str:
+    return ", ".join(f"{value:.{digits}f}" for value in values)

@@ -1,0 +1,132 @@
+"""From a folder of scene files to the frozen list of files that its dataset is made of."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.flows.accept_objects import AcceptedObjects, frozen_objects
+from pipeline.flows.prepare_isolated import asset_child
+from pipeline.flows.publication import Publication
+from pipeline.flows.scene_files import SceneFiles, SceneFolder, build_scene
+from pipeline.flows.settings import BuildSettings
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
+from pipeline.objects.licences import StatedLicence, stated_licence
+from storage.errors import TrilightError
+from storage.progress import announce_objects, count_object
+from storage.records import LockedObject
+from storage.splits import LISTED_SPLIT
+
+
+def settings_for_files(
+    settings: BuildSettings, folder: SceneFolder | None, views: int | None
+) -> BuildSettings:
+    """Return the build's settings for the scenes of a folder: how many they are, and their views.
+
+    Without a folder, the settings stay as they are.
+
+    Raises:
+        TrilightError: a file has fewer cameras than `views`, or there are no files.
+    """
+    if folder is None:
+        if views is not None:
+            raise TrilightError(f"--views is {views}; expected it only with --scenes-from.")
+        return settings
+    return dataclasses.replace(
+        settings,
+        scenes=dataclasses.replace(settings.scenes, num_views=folder.views(views)),
+        splits=dataclasses.replace(settings.splits, listed_scenes=len(folder.descriptions)),
+    )
+
+
+def accept_scene_files(
+    folder: SceneFolder,
+    licence: str | None,
+    settings: BuildSettings,
+    publication: Publication,
+) -> AcceptedObjects:
+    """Build every scene once, without a picture, and freeze their files at the first time.
+
+    Raises:
+        TrilightError: a scene cannot be built, the licence is not allowed, or the files are not
+            those that the dataset was begun with.
+    """
+    stated = _allowed(stated_licence(licence), settings)
+    names = tuple(description.file for description in folder.descriptions)
+    announce_objects(publication.folder, len(names))
+    sha256: dict[str, str] = {}
+    child = asset_child()
+    try:
+        for name in names:
+            sha256 |= _digests(child, folder.root, name, settings)
+            count_object(publication.folder)
+    finally:
+        child.close()
+    locked = [_locked(uid, digest, stated) for uid, digest in sorted(sha256.items())]
+    frozen = frozen_objects(publication)
+    if frozen is None:
+        publication.lock_objects(locked)
+    else:
+        _require_same_files(frozen, locked)
+    return AcceptedObjects(
+        objects=tuple((entry, folder.root / entry.uid) for entry in locked),
+        num_found=len(locked),
+        files=SceneFiles(root=folder.root, names=names, sha256=sha256, licence=stated.licence),
+    )
+
+
+def digests_of_scene(
+    root: Path, name: str, settings: AssetSettings, num_views: int
+) -> Mapping[str, str]:
+    """Build a scene and return the digests of its files; raises TrilightError as `build_scene`."""
+    _, digests = build_scene(
+        root, name, settings, licence="", num_views=num_views, scene_index=0, seed=0
+    )
+    return digests
+
+
+def _digests(
+    child: IsolatedChild, root: Path, name: str, settings: BuildSettings
+) -> Mapping[str, str]:
+    try:
+        return call_with_retries(
+            child, digests_of_scene, root, name, settings.assets, settings.scenes.num_views
+        )
+    except ChildFailed as failure:
+        raise TrilightError(
+            f"{name}: its meshes cannot be read ({failure}); mend or remove the file."
+        ) from failure
+
+
+def _allowed(stated: StatedLicence, settings: BuildSettings) -> StatedLicence:
+    if stated.licence.casefold() not in {name.casefold() for name in settings.allowed_licences}:
+        raise TrilightError(
+            f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "
+            f"scenes, add --allow-licence '{stated.licence}'."
+        )
+    return stated
+
+
+def _locked(uid: str, sha256: str, stated: StatedLicence) -> LockedObject:
+    return LockedObject(
+        uid=uid,
+        asset_sha256=sha256,
+        split=LISTED_SPLIT,
+        licence=stated.licence,
+        licence_source=stated.licence_source,
+        title=uid,
+        attribution="",
+        source_url="",
+    )
+
+
+def _require_same_files(frozen: Mapping[str, LockedObject], now: list[LockedObject]) -> None:
+    by_uid = {entry.uid: entry for entry in now}
+    for uid in sorted({*frozen, *by_uid}):
+        if frozen.get(uid) != by_uid.get(uid):
+            state = "has changed" if uid in frozen and uid in by_uid else "is new"
+            raise TrilightError(
+                f"scene file {uid}: {'is missing' if uid not in by_uid else state}; expected the "
+                "files that the dataset was begun with (objects.lock.jsonl). Restore them, or "
+                "choose another --out."
+            )

@@ -1,0 +1,243 @@
+"""A folder of scene files: what is in it, and each of its scenes, built in a child process.
+
+Scene k is the k-th `*.json` of the folder by name. Everything that a scene is made of lies in that
+folder: a path that leads out of it, by dots or by a link, is refused. What a scene is made of is
+known by its digests, so that none is ever built from other bytes than the ones that were locked.
+"""
+
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.flows.settings import BuildSettings
+from pipeline.scenes.description import DescribedObject, SceneDescription
+from pipeline.scenes.from_description import LoadedMesh, scene_from_description
+from pipeline.scenes.renderformer_json import MAX_BYTES, read_description
+from storage.digests import sha256_hex
+from storage.errors import Rejected, TrilightError
+from storage.scene import Scene
+
+MAX_SCENES = 100_000
+"""Most scene files of one folder."""
+
+TEMPLATE = "renderformer-json"
+"""What stands as the template of such scenes in their provenance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFolder:
+    """The scene files of one folder."""
+
+    root: Path
+    """The folder, without links; nothing outside of it is read."""
+    descriptions: tuple[SceneDescription, ...]
+    """What each file describes, sorted by name."""
+
+    def views(self, wanted: int | None) -> int:
+        """Return how many views every scene gets: `wanted`, or as many as every file has.
+
+        No camera is ever invented: the pictures show what the files say.
+
+        Raises:
+            TrilightError: a file has fewer cameras than wanted.
+        """
+        fewest = min(self.descriptions, key=lambda description: len(description.cameras))
+        if wanted is None:
+            return len(fewest.cameras)
+        if not 1 <= wanted <= len(fewest.cameras):
+            raise TrilightError(
+                f"--views is {wanted}; expected 1 to {len(fewest.cameras)}, the number of cameras "
+                f"in {fewest.file}: choose fewer views, or add cameras to the file."
+            )
+        return wanted
+
+    def notes(self, num_views: int) -> tuple[str, ...]:
+        """Return what a person should know: fields without meaning, and cameras not used."""
+        found = []
+        for description in self.descriptions:
+            found += [
+                f"{description.file}: unknown field {name}" for name in description.unknown_fields
+            ]
+            if (unused := len(description.cameras) - num_views) > 0:
+                found.append(
+                    f"{description.file}: {unused} of {len(description.cameras)} cameras not used, "
+                    f"from cameras[{num_views}] on"
+                )
+        return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFiles:
+    """What a render child needs to build any scene of the folder."""
+
+    root: Path
+    """The folder, without links."""
+    names: tuple[str, ...]
+    """The scene files; the position is the index of the scene."""
+    sha256: Mapping[str, str]
+    """Digest of every locked file by its path below `root`."""
+    licence: str
+    """Of every object."""
+
+    def scene(self, scene_index: int, settings: BuildSettings) -> Scene:
+        """Build a scene; only children come here.
+
+        Raises:
+            TrilightError: a file is not the one that was locked.
+        """
+        scene, digests = build_scene(
+            self.root,
+            self.names[scene_index],
+            settings.assets,
+            licence=self.licence,
+            num_views=settings.scenes.num_views,
+            scene_index=scene_index,
+            seed=settings.seed,
+        )
+        for uid, digest in digests.items():
+            if self.sha256.get(uid) != digest:
+                raise TrilightError(
+                    f"{uid}: has changed while the dataset was being made; restore it and run the "
+                    "same command again."
+                )
+        return scene
+
+
+def find_scene_files(folder: str) -> SceneFolder:
+    """Read every `*.json` of a local folder, not of those below it.
+
+    Raises:
+        TrilightError: no such folder, no scene file in it or too many, or a file that is not
+            usable, named with its field.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise TrilightError(f"--scenes-from {folder}: no such folder; expected one of *.json.")
+    root = root.resolve()
+    names = sorted(path.name for path in root.glob("*.json"))
+    if not 1 <= len(names) <= MAX_SCENES:
+        raise TrilightError(
+            f"--scenes-from {folder}: {len(names)} files *.json; expected 1 to {MAX_SCENES}."
+        )
+    for name in names:
+        if not name.isprintable():
+            raise TrilightError(
+                f"--scenes-from {folder}: rename {name!r}; expected printable text."
+            )
+    described = tuple(read_description(_read_scene_file(root, name), name) for name in names)
+    return SceneFolder(root=root, descriptions=described)
+
+
+def build_scene(
+    root: Path,
+    name: str,
+    settings: AssetSettings,
+    *,
+    licence: str,
+    num_views: int,
+    scene_index: int,
+    seed: int,
+) -> tuple[Scene, Mapping[str, str]]:
+    """Build the scene of one file; only children come here, since it reads meshes.
+
+    Args:
+        root: the folder, without links.
+        name: of the scene file in it.
+        settings: limits on meshes.
+        licence: of the objects.
+        num_views: cameras to take from the file.
+        scene_index: which scene of the dataset this is; stands in its provenance.
+        seed: of the dataset; stands in the provenance, and decides nothing here.
+
+    Returns:
+        The scene, and the sha256 of every file that it was made of by path below `root`.
+
+    Raises:
+        TrilightError: anything in the file or its meshes is unusable, named.
+    """
+    data = _read_scene_file(root, name)
+    description = read_description(data, name)
+    digests = {name: sha256_hex(data)}
+    meshes: dict[tuple[str, int | None], LoadedMesh] = {}
+    for described in description.objects:
+        key = (described.mesh_path, described.remesh_faces)
+        if key not in meshes:
+            meshes[key], digest = _load(root, described, name, settings, licence)
+            digests[meshes[key].uid] = digest
+    scene = scene_from_description(
+        description,
+        [meshes[described.mesh_path, described.remesh_faces] for described in description.objects],
+        num_views=num_views,
+        provenance={
+            "template": TEMPLATE,
+            "scene_index": scene_index,
+            "attempt": 0,
+            "seed": seed,
+            "camera_attempts": [0] * num_views,
+            "scene_file": {
+                "name": name,
+                "sha256": digests[name],
+                "scene_name": description.scene_name,
+                "cameras": list(range(num_views)),
+            },
+        },
+    )
+    return scene, digests
+
+
+def _load(
+    root: Path, described: DescribedObject, name: str, settings: AssetSettings, licence: str
+) -> tuple[LoadedMesh, str]:
+    """Return the mesh of an object, and the digest of its file."""
+    from pipeline.assets.scene_mesh import load_scene_mesh  # mesh libraries: in children only
+
+    where = f"{name}: objects.{described.name}.mesh_path"
+    path = _below(root, described.mesh_path, where)
+    try:
+        loaded = load_scene_mesh(path, settings, described.remesh_faces)
+    except Rejected as rejection:
+        raise TrilightError(
+            f"{where} is {described.mesh_path}: {rejection}; expected a usable mesh."
+        ) from rejection
+    except OSError as error:
+        raise TrilightError(
+            f"{where} is {described.mesh_path}: cannot be read ({error.strerror})."
+        ) from error
+    mesh = LoadedMesh(
+        uid=path.relative_to(root).as_posix(),
+        licence=licence,
+        positions=loaded.mesh.positions,
+        faces=loaded.mesh.faces,
+        centre=loaded.centre,
+        reach=loaded.reach,
+    )
+    return mesh, loaded.sha256
+
+
+def _read_scene_file(root: Path, name: str) -> bytes:
+    path = _below(root, name, name)
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
+            raise TrilightError(f"{name}: expected a regular file of at most {MAX_BYTES} bytes.")
+        return path.read_bytes()
+    except OSError as error:
+        raise TrilightError(f"{name}: cannot be read ({error.strerror}).") from error
+
+
+def _below(root: Path, relative: str, where: str) -> Path:
+    """Return the file that a path means, links followed, if it is below `root`."""
+    try:
+        path = (root / relative).resolve()
+    except (OSError, RuntimeError) as error:  # links in a circle
+        raise TrilightError(
+            f"{where} is {relative}, which cannot be followed ({error})."
+        ) from error
+    if not path.is_relative_to(root) or path == root:
+        raise TrilightError(
+            f"{where} is {relative}, which leads out of the folder of the scenes; expected a file "
+            "below it: copy it there."
+        )
+    return path

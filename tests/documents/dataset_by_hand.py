@@ -1,0 +1,130 @@
+"""A small dataset made with storage's own writers, whose numbers can be counted by hand.
+
+Every scene has the floor (two triangles, smooth, one material) and the light of the tiny scene, and
+per object two flat triangles of two colours, seen by two cameras.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from storage.dataset import Dataset, open_dataset
+from storage.failures import write_failures
+from storage.layout import DatasetFolder
+from storage.manifest import Manifest, index_shard, write_manifest
+from storage.objects_lock import write_objects_lock
+from storage.records import Failure, LockedObject
+from storage.sample import Sample, encode_sample, sample_key
+from storage.scene import Scene, SceneObject
+from storage.shard_writer import write_shard
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+RED, GREEN = [0.6, 0, 0, 0.1, 0.1, 0.1, 0.3, 0, 0, 0], [0.2, 0.4, 0, 0.1, 0.1, 0.1, 0.3, 0, 0, 0]
+SETTINGS = {
+    "renders": {"noise_floor_db": 40.0, "min_spp": 64, "max_spp": 256, "resolution": 16},
+    "scenes": {"max_triangles": 9},
+}
+
+
+def furnished(uids: Sequence[str], template: str = "plane", **entry: Any) -> Scene:
+    """Return the tiny scene with an object per uid; `entry` holds the rights of all of them."""
+    scene = tiny_scene()
+    parts: dict[str, list[Any]] = {
+        name: [getattr(scene, name)]
+        for name in (
+            "vertex_positions", "vertex_normals", "faces", "material_index", "materials",
+            "object_index",
+        )
+    }  # fmt: skip
+    quad = np.array([[0, 0, 0.1], [1, 0, 0.1], [1, 1, 0.1], [0, 0, 0.1], [1, 1, 0.1], [0, 1, 0.1]])
+    for row in range(len(uids)):
+        parts["vertex_positions"].append(quad.astype(np.float32))
+        parts["vertex_normals"].append(np.tile(np.array([[0, 0, 1]], np.float32), (6, 1)))
+        parts["faces"].append(np.arange(6, dtype=np.uint32).reshape(2, 3) + 7 + 6 * row)
+        parts["material_index"].append(np.array([2, 3], np.uint16) + 2 * row)
+        parts["materials"].append(np.array([RED, GREEN], np.float32))
+        parts["object_index"].append(np.full(2, 2 + row, np.uint16))
+    objects = tuple(
+        SceneObject(name=f"{row} {uid}", kind="object", uid=uid, **entry)
+        for row, uid in enumerate(uids)
+    )
+    arrays = {name: np.concatenate(chunks) for name, chunks in parts.items()}
+    arrays = {name: values.astype(getattr(scene, name).dtype) for name, values in arrays.items()}
+    provenance = {**scene.provenance, "template": template}
+    return tiny_scene(**arrays, objects=(*scene.objects, *objects), provenance=provenance)
+
+
+def sample(index: int, scene: Scene, **changes: Any) -> Sample:
+    """Return a sample with pictures of noise; `changes` apply to its view records."""
+    plain = tiny_sample(sample_key(index), seed=index)
+    views = tuple(dataclasses.replace(view, **changes) for view in plain.views)
+    return dataclasses.replace(plain, scene=scene, views=views)
+
+
+def locked(uid: str, licence: str = "CC0-1.0", **changes: str) -> LockedObject:
+    plain = {"title": uid.upper(), "attribution": "its maker", "source_url": "", "split": "train"}
+    return LockedObject(
+        uid=uid, asset_sha256="0" * 64, licence=licence, licence_source="tests", **plain | changes
+    )
+
+
+def write_dataset(
+    root: Path,
+    shards: Mapping[str, Sequence[Sample]],
+    *,
+    objects: Sequence[LockedObject] = (),
+    failures: Sequence[Failure] = (),
+) -> Dataset:
+    """Write shards (samples by file name) with all that stands beside them, and open the whole."""
+    folder = DatasetFolder(root)
+    for name, samples in shards.items():
+        write_shard(folder.shard(name), [(entry.key, encode_sample(entry)) for entry in samples])
+    write_objects_lock(folder.objects_lock, objects)
+    write_failures(folder.failures, failures)
+    manifest = Manifest(
+        build="by-hand",
+        settings=SETTINGS,
+        environment={"mitsuba_variant": "none"},
+        num_scenes=sum(len(samples) for samples in shards.values()),
+        num_views=2,
+        objects_lock_sha256="",
+        shards=tuple(index_shard(folder.shard(name)) for name in sorted(shards)),
+    )
+    write_manifest(folder.manifest, manifest)
+    return open_dataset(str(root))
+
+
+def five_scenes(root: Path) -> Dataset:
+    """Return four scenes for training in two shards and one for testing; none for validation."""
+    return write_dataset(
+        root,
+        {
+            "train-000000.tar": [
+                sample(0, furnished(["a"]), noise_floor_db=38.0, spp=256, at_cap=True),
+                sample(1, furnished(["a", "b"], "wall"), noise_floor_db=42.0),
+            ],
+            "train-000001.tar": [
+                sample(2, furnished([])),
+                sample(3, furnished(["a", "a"]), camera_attempt=2),
+            ],
+            "test-000005.tar": [sample(20, furnished(["c"], "wall"), noise_floor_db=44.0)],
+        },
+        objects=[locked("a"), locked("b", "CC-BY-4.0"), locked("c", split="test"), locked("d")],
+        failures=[
+            Failure(stage="scenes", item="000000001", reason="no_room", message="m", attempt=0),
+            Failure(stage="scenes", item="000000001", reason="no_room", message="m", attempt=1),
+            Failure(stage="renders", item="000000003.1", reason="black_view", message="m"),
+            Failure(stage="objects", item="e", reason="no_faces", message="m"),
+        ],
+    )
+
+
+def edit_manifest(dataset: Dataset, **changes: Any) -> Path:
+    """Change fields of a manifest on disk, and return its folder."""
+    path = dataset.folder.manifest
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+    return dataset.folder.root

@@ -1,0 +1,43 @@
+"""Reads pages as a browser would, and holds text that means harm."""
+
+from html.parser import HTMLParser
+
+HARM = """<script>alert(1)</script><img src=x onerror=alert(2)>"'&"""
+VOID = {"meta", "img", "br"}
+
+
+class Tags(HTMLParser):
+    """Collects tags, attributes and text, and checks that tags close in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self.names: set[str] = set()
+        self.ids: set[str] = set()
+        self.styles: set[str] = set()
+        self.text: list[str] = []
+        self._open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.names.update(name for name, _ in attrs)
+        self.styles.update(value or "" for name, value in attrs if name == "style")
+        self.ids.update(value or "" for name, value in attrs if name == "id")
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def read(page: bytes) -> Tags:
+    tags = Tags()
+    tags.feed(page.decode())
+    tags.close()
+    assert tags._open == []
+    return tags

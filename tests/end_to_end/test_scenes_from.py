@@ -1,0 +1,95 @@
+"""`trilight generate --scenes-from`: two of the example scenes, small, and resumed."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from storage.dataset import open_dataset
+from storage.failures import read_failures
+from storage.layout import DatasetFolder
+from storage.staging import stage_scene
+from tests.end_to_end.conftest import Trilight
+
+SMALL = ("--resolution", "64", "--noise-floor", "20", "--json")
+
+
+@pytest.fixture
+def scenes(shared: Path, tmp_path: Path) -> Path:
+    """A folder with two scenes, and with the meshes of all."""
+    source = shared / "renderformer_scenes"
+    for name in ("objects", "templates"):
+        shutil.copytree(source / name, tmp_path / "scenes" / name)
+    for name in ("cbox", "crystals"):
+        shutil.copy(source / f"{name}.json", tmp_path / "scenes")
+    return tmp_path / "scenes"
+
+
+def test_existing_scenes_become_a_dataset(trilight: Trilight, scenes: Path, tmp_path: Path) -> None:
+    def generate(out: str, *more: str) -> dict[str, object]:
+        made = trilight("generate", "smoke", "--scenes-from", "scenes", "--out", out, *SMALL, *more)
+        assert made.returncode == 0, made.stderr
+        return dict(json.loads(made.stdout[made.stdout.index("{") :]))
+
+    outcome = generate("set")
+    assert (outcome["scenes"], outcome["views"], outcome["notes"]) == (2, 2, [])
+    assert trilight("verify", "set").returncode == 0
+    inspected = trilight("inspect", "set", "--json")
+    assert inspected.returncode == 0, inspected.stderr
+
+    dataset = open_dataset(str(tmp_path / "set"))
+    (shard,) = dataset.manifest.shards
+    assert (shard.name, shard.split) == ("test-000000.tar", "test")
+    samples = list(dataset.read_shard(shard))
+    assert [sample.scene.provenance["scene_file"]["name"] for sample in samples] == [
+        "cbox.json",
+        "crystals.json",
+    ]
+    for sample in samples:
+        assert sample.radiance_rgb.shape == (1, 64, 64, 3)
+        assert sample.radiance_rgb.mean() > 0.01
+
+    # as a kill leaves it: no shard, and one of its two scenes finished
+    (tmp_path / "set" / shard.name).unlink()
+    stage_scene(dataset.folder.staged_shard(shard.name), 0, samples[0], [])
+    log = dataset.folder.logs / f"{shard.name}.jsonl"
+    before = len(log.read_text().splitlines())
+    assert generate("set")["dataset_digest"] == outcome["dataset_digest"]
+    assert len(log.read_text().splitlines()) == before + 1
+    assert generate("other", "--workers", "2")["dataset_digest"] == outcome["dataset_digest"]
+
+    with (scenes / "objects/cbox/tall-box.obj").open("a") as stream:
+        stream.write("\n")
+    changed = trilight("generate", "smoke", "--scenes-from", "scenes", "--out", "set", *SMALL)
+    assert changed.returncode == 1
+    assert "scene file objects/cbox/tall-box.obj: has changed" in changed.stderr
+    assert DatasetFolder(tmp_path / "set").shard(shard.name).exists()
+
+
+def test_bad_scenes_are_one_clear_line(trilight: Trilight, scenes: Path, tmp_path: Path) -> None:
+    (scenes / "bad.json").write_text('{"scene_name": "x", "version": "1.0", "objects": {}}')
+    for arguments, message in (
+        (("--scenes-from", "scenes"), "bad.json: cameras is missing"),
+        (("--scenes-from", "nowhere"), "no such folder"),
+        (("--views", "2"), "--views is 2"),
+    ):
+        result = trilight("generate", "smoke", "--out", "set", *arguments)
+        assert result.returncode == 1, result.stdout
+        (line,) = [line for line in result.stderr.splitlines() if line.strip()]
+        assert line.startswith("trilight: ")
+        assert message in line
+
+
+def test_a_dark_scene_is_given_up_at_once(trilight: Trilight, scenes: Path, tmp_path: Path) -> None:
+    dark = json.loads((scenes / "cbox.json").read_text())
+    dark["objects"]["light_0"]["material"]["emissive"] = [0.1, 0.1, 0.1]
+    (scenes / "cbox.json").write_text(json.dumps(dark))
+    arguments = ("--scenes-from", "scenes", "--out", "set", "--failure-budget", "0.5")
+    made = trilight("generate", "smoke", *arguments, *SMALL)
+    assert made.returncode == 0, made.stderr
+    (failure,) = read_failures(DatasetFolder(tmp_path / "set").failures)
+    assert (failure.item, failure.reason, failure.attempt) == ("000000000", "black_view", 0)
+    outcome = json.loads(made.stdout[made.stdout.index("{") :])
+    assert (outcome["scenes"], outcome["scenes_given_up"]) == (1, 1)
+    assert trilight("verify", "set").returncode == 0

@@ -1,0 +1,255 @@
+"""A folder of scene files: nothing outside of it is read, and its files are frozen by digest."""
+
+import dataclasses
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.flows.accept_scene_files import (
+    accept_scene_files,
+    digests_of_scene,
+    settings_for_files,
+)
+from pipeline.flows.builds import named_build
+from pipeline.flows.prepare_isolated import asset_child
+from pipeline.flows.publication import begin
+from pipeline.flows.scene_files import SceneFiles, build_scene, find_scene_files
+from pipeline.flows.settings import BuildSettings
+from pipeline.isolation import IsolatedChild
+from storage.errors import TrilightError
+from storage.layout import DatasetFolder
+from storage.manifest import read_manifest
+from storage.objects_lock import read_objects_lock
+from storage.scene import Scene
+from storage.splits import scenes_of_shard, shard_name
+
+CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
+
+
+@pytest.fixture(scope="module")
+def child() -> Iterator[IsolatedChild]:
+    """One child for all, as a run has it."""
+    shared_child = asset_child()
+    yield shared_child
+    shared_child.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, shared: Path) -> Path:
+    """A folder of two small scenes that share a mesh."""
+    root = tmp_path / "scenes"
+    (root / "meshes").mkdir(parents=True)
+    source = shared / "renderformer_scenes"
+    shutil.copy(source / "objects/crystals/green.obj", root / "meshes/green.obj")
+    shutil.copy(source / "templates/lighting/tri.obj", root / "meshes/tri.obj")
+    example = json.loads((source / "crystals.json").read_text())
+    scene = {**example, "objects": {n: example["objects"][n] for n in ("green", "light_0")}}
+    scene["objects"]["green"]["mesh_path"] = "meshes/green.obj"
+    scene["objects"]["light_0"]["mesh_path"] = "meshes/tri.obj"
+    (root / "a.json").write_text(json.dumps(scene))
+    scene["cameras"] = [CAMERA, CAMERA]
+    (root / "b.json").write_text(json.dumps(scene))
+    return root
+
+
+def _change(folder: Path, name: str, **change: Any) -> None:
+    """Change the object `green` of a scene file."""
+    scene = json.loads((folder / name).read_text())
+    scene["objects"]["green"].update(change)
+    (folder / name).write_text(json.dumps(scene))
+
+
+def _build(folder: Path, name: str = "a.json") -> Scene:
+    scene, _ = build_scene(
+        folder.resolve(),
+        name,
+        named_build("smoke").assets,
+        licence="MIT",
+        num_views=1,
+        scene_index=3,
+        seed=9,
+    )
+    return scene
+
+
+def _digests(folder: Path, name: str) -> dict[str, str]:
+    assets = named_build("smoke").assets
+    return dict(digests_of_scene(folder.resolve(), name, assets, num_views=1))
+
+
+def _settings(folder: Path, views: int | None = None) -> BuildSettings:
+    return settings_for_files(named_build("smoke"), find_scene_files(str(folder)), views)
+
+
+def _accept(folder: Path, out: Path, licence: str | None = None) -> None:
+    found, settings = find_scene_files(str(folder)), _settings(folder)
+    publication = begin(DatasetFolder(out), settings, {}, 1, accept_environment=False)
+    accept_scene_files(found, licence, settings, publication)
+
+
+def test_a_scene_says_where_it_comes_from(folder: Path) -> None:
+    scene = _build(folder)
+    assert [(entry.name, entry.kind, entry.uid) for entry in scene.objects] == [
+        ("green", "object", "meshes/green.obj"),
+        ("light_0", "emitter", ""),
+    ]
+    assert scene.provenance["template"] == "renderformer-json"
+    assert (scene.provenance["scene_index"], scene.provenance["seed"]) == (3, 9)
+    assert scene.provenance["scene_file"]["name"] == "a.json"
+    assert str(folder) not in json.dumps(dict(scene.provenance))
+
+
+@pytest.mark.parametrize(
+    "path", ["../out.obj", "/etc/passwd", "meshes/../../out.obj", ".", "link.obj"]
+)
+def test_a_mesh_outside_of_the_folder_is_refused(folder: Path, path: str) -> None:
+    shutil.copy(folder / "meshes/green.obj", folder.parent / "out.obj")
+    (folder / "link.obj").symlink_to(folder.parent / "out.obj")
+    _change(folder, "a.json", mesh_path=path)
+    with pytest.raises(TrilightError, match="a.json: objects.green.mesh_path is .*leads out of"):
+        _build(folder)
+
+
+def test_a_link_that_stays_inside_is_followed(folder: Path) -> None:
+    (folder / "link.obj").symlink_to("meshes/green.obj")
+    _change(folder, "a.json", mesh_path="./meshes/../link.obj")
+    assert _build(folder).objects[0].uid == "meshes/green.obj"
+
+
+def test_links_in_a_circle_are_refused(folder: Path) -> None:
+    (folder / "x.obj").symlink_to("y.obj")
+    (folder / "y.obj").symlink_to("x.obj")
+    _change(folder, "a.json", mesh_path="x.obj")
+    with pytest.raises(TrilightError, match="objects.green.mesh_path is x.obj"):
+        _build(folder)
+
+
+def test_a_scene_file_that_links_out_is_refused(folder: Path) -> None:
+    shutil.move(folder / "a.json", folder.parent / "a.json")
+    (folder / "a.json").symlink_to(folder.parent / "a.json")
+    with pytest.raises(TrilightError, match="a.json is a.json, which leads out"):
+        find_scene_files(str(folder))
+
+
+def test_a_pipe_is_no_scene_file_and_no_mesh(folder: Path) -> None:
+    os.mkfifo(folder / "pipe.obj")
+    _change(folder, "a.json", mesh_path="pipe.obj")
+    with pytest.raises(TrilightError, match="not a regular file"):
+        _build(folder)
+    os.mkfifo(folder / "c.json")
+    with pytest.raises(TrilightError, match="c.json: expected a regular file"):
+        find_scene_files(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [(b"", "no_faces"), (b"v 0 0 0\nv 1 0 0\nv nan 1 0\nf 1 2 3\n", "nonfinite_vertices")],
+)
+def test_a_broken_mesh_is_named(folder: Path, data: bytes, reason: str) -> None:
+    (folder / "broken.obj").write_bytes(data)
+    _change(folder, "a.json", mesh_path="broken.obj")
+    with pytest.raises(TrilightError, match="a.json: objects.green.mesh_path is broken.obj: ") as e:
+        _build(folder)
+    assert reason in str(e.value) or "load_error" in str(e.value)
+
+
+def test_remesh_keeps_the_place_and_the_number(folder: Path, child: IsolatedChild) -> None:
+    plain = _build(folder)
+    _change(folder, "a.json", remesh=True, remesh_target_face_num=60)
+    scene = child.call(_build, folder)
+    mine, theirs = scene.object_index == 0, plain.object_index == 0
+    assert 30 < mine.sum() <= 60
+    assert theirs.sum() == 84
+    for corner in ("min", "max"):
+        found = getattr(scene.vertex_positions[scene.faces[mine]], corner)(axis=(0, 1))
+        wanted = getattr(plain.vertex_positions[plain.faces[theirs]], corner)(axis=(0, 1))
+        assert abs(found - wanted).max() < 0.05  # of an object that is 0.3 high
+
+
+def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) -> None:
+    assert _settings(folder).scenes.num_views == 1
+    found = find_scene_files(str(folder))
+    assert found.notes(1) == ("b.json: 1 of 2 cameras not used, from cameras[1] on",)
+    with pytest.raises(TrilightError, match="--views is 2; expected 1 to 1.*in a.json"):
+        _settings(folder, views=2)
+    with pytest.raises(TrilightError, match="--views is 0"):
+        _settings(folder, views=0)
+    with pytest.raises(TrilightError, match="only with --scenes-from"):
+        settings_for_files(named_build("smoke"), None, 1)
+
+
+def test_unknown_fields_become_notes(folder: Path) -> None:
+    _change(folder, "a.json", colour="red")
+    assert find_scene_files(str(folder)).notes(1)[0] == "a.json: unknown field objects.green.colour"
+
+
+def test_all_scenes_are_for_testing_and_the_last_shard_may_be_small(folder: Path) -> None:
+    settings = _settings(folder)
+    splits = dataclasses.replace(settings.splits, listed_scenes=6)
+    assert [shard_name(index, splits) for index in (0, 1)] == [
+        "test-000000.tar",
+        "test-000001.tar",
+    ]
+    assert [list(scenes_of_shard(index, splits)) for index in (0, 1)] == [[0, 1, 2, 3], [4, 5]]
+
+
+def test_files_are_frozen_by_digest(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    _accept(folder, out)
+    locked = read_objects_lock(DatasetFolder(out).objects_lock)
+    assert [entry.uid for entry in locked] == [
+        "a.json",
+        "b.json",
+        "meshes/green.obj",
+        "meshes/tri.obj",
+    ]
+    assert {entry.split for entry in locked} == {"test"}
+    assert read_manifest(DatasetFolder(out).manifest).num_scenes == 2
+    _accept(folder, out)  # the same again
+    mesh = folder / "meshes/green.obj"
+    before = mesh.read_bytes()
+    mesh.write_bytes(before + b"\n")
+    with pytest.raises(TrilightError, match="scene file meshes/green.obj: has changed"):
+        _accept(folder, out)
+    mesh.write_bytes(before)
+    _change(folder, "b.json", remesh=False)
+    with pytest.raises(TrilightError, match="scene file b.json: has changed"):
+        _accept(folder, out)
+    shutil.copy(folder / "a.json", folder / "c.json")
+    with pytest.raises(TrilightError, match="listed_scenes was 2, now 3"):
+        _accept(folder, out)
+
+
+def test_a_file_that_changes_during_a_run_stops_it(folder: Path) -> None:
+    files = SceneFiles(
+        root=folder.resolve(),
+        names=("a.json", "b.json"),
+        sha256=_digests(folder, "a.json") | _digests(folder, "b.json"),
+        licence="MIT",
+    )
+    settings = _settings(folder)
+    assert files.scene(1, settings).provenance["scene_file"]["name"] == "b.json"
+    with (folder / "meshes/tri.obj").open("a") as stream:
+        stream.write("# later\n")
+    with pytest.raises(TrilightError, match="meshes/tri.obj: has changed while"):
+        files.scene(1, settings)
+
+
+def test_the_licence_is_the_users_word(folder: Path, tmp_path: Path) -> None:
+    _accept(folder, tmp_path / "mine", "CC-BY-4.0")
+    locked = read_objects_lock(DatasetFolder(tmp_path / "mine").objects_lock)
+    assert {entry.licence for entry in locked} == {"CC-BY-4.0"}
+    with pytest.raises(TrilightError, match="--allow-licence 'CC-BY-NC-4.0'"):
+        _accept(folder, tmp_path / "theirs", "CC-BY-NC-4.0")
+
+
+def test_a_folder_without_scenes_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TrilightError, match="no such folder"):
+        find_scene_files(str(tmp_path / "nowhere"))
+    with pytest.raises(TrilightError, match=r"0 files \*.json"):
+        find_scene_files(str(tmp_path))

@@ -1,0 +1,61 @@
+"""`trilight inspect` writes where it may, and prints what it found."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from infra.cli.app import app
+from tests.documents.dataset_by_hand import five_scenes, write_dataset
+
+
+def inspect(*arguments: str | Path) -> str:
+    result = CliRunner().invoke(app, ["inspect", *(str(argument) for argument in arguments)])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
+    five_scenes(tmp_path)
+    printed = inspect(tmp_path)
+    assert "5 (1 test, 4 train)" in printed
+    assert "report.html" in printed
+    assert (tmp_path / "report.html").exists()
+    assert (tmp_path / "contact_sheet.png").exists()
+    assert len(list((tmp_path / "report").iterdir())) == 5
+
+
+def test_another_folder(tmp_path: Path) -> None:
+    five_scenes(tmp_path / "set")
+    before = {path: path.read_bytes() for path in (tmp_path / "set").iterdir()}
+    inspect(tmp_path / "set", "--out", tmp_path / "out")
+    assert {path: path.read_bytes() for path in (tmp_path / "set").iterdir()} == before
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert written == ["contact_sheet.png", "report", "report.html"]
+
+
+def test_a_read_only_dataset_is_summed_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    five_scenes(tmp_path)
+    # the superuser may write anywhere, so that permissions alone would not do
+    monkeypatch.setattr("os.access", lambda path, mode: not mode & os.W_OK)
+    printed = inspect(tmp_path)
+    assert "5 (1 test, 4 train)" in printed
+    assert "--out" in printed
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_json_holds_the_distributions(tmp_path: Path) -> None:
+    five_scenes(tmp_path)
+    read = json.loads(inspect(tmp_path, "--json"))
+    assert read["distributions"]["quantities"]["objects_per_scene"]["max"] == 2
+    assert read["licences"] == {"CC-BY-4.0": 1, "CC0-1.0": 3}
+    assert read["rejections"][0] == ["scenes", "no_room", 2]
+    assert (tmp_path / "report.html").exists()
+
+
+def test_a_dataset_without_scenes(tmp_path: Path) -> None:
+    write_dataset(tmp_path, {})
+    assert "scenes" in inspect(tmp_path)
+    assert (tmp_path / "report.html").exists()
