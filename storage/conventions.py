@@ -10,7 +10,7 @@ Pictures: row 0 is the top, pixel (i, j) covers the square around its centre (j 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Version of everything that Trilight stores; a change of meaning needs a new one."""
 
 SPLITS = ("train", "validation", "test")

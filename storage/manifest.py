@@ -132,7 +132,8 @@ def read_manifest(path: Path) -> Manifest:
         raise TrilightError(f"{path}: not a readable manifest ({error}).") from error
     if version != SCHEMA_VERSION:
         raise TrilightError(
-            f"{path}: schema version {version}; this Trilight reads {SCHEMA_VERSION}."
+            f"{path}: schema version {version}; this Trilight reads {SCHEMA_VERSION}. Use the "
+            "release that made it, or make it again with `trilight generate`."
         )
     try:
         return _decode(record)

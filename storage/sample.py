@@ -35,6 +35,10 @@ class ViewRecord:
     """Measured error of the picture as psnr_log_db (storage.metrics)."""
     noise_floor_linear_db: float
     """The same error as psnr_linear_db."""
+    object_noise_floor_db: float
+    """The same error as object_psnr_log_db: over pixels that show geometry."""
+    coverage: float
+    """Share of the picture in which an object is seen first, from a coarse grid of rays."""
     at_cap: bool
     """Whether sampling ended at the cap before the target was reached."""
     seed: int
@@ -139,6 +143,7 @@ def _decode_record(key: str, data: bytes) -> dict[str, Any]:
     version = record.get("schema_version") if isinstance(record, dict) else None
     if version != SCHEMA_VERSION:
         raise TrilightError(
-            f"sample {key}: schema version {version}; this Trilight reads {SCHEMA_VERSION}."
+            f"sample {key}: schema version {version}; this Trilight reads {SCHEMA_VERSION}. Use the "
+            "release that made it, or make it again with `trilight generate`."
         )
     return record

@@ -57,6 +57,8 @@ def tiny_sample(key: str = "000000000", resolution: int = 16, seed: int = 0) -> 
         spp=128,
         noise_floor_db=41.5,
         noise_floor_linear_db=33.25,
+        object_noise_floor_db=40.5,
+        coverage=0.25,
         at_cap=False,
         seed=7,
         camera_attempt=0,

@@ -37,7 +37,9 @@ QUANTITIES: Mapping[str, Quantity] = {
     "elevation_deg": _quantity("elevation, degrees", 1),
     "azimuth_deg": _quantity("azimuth, degrees", 1),
     "fov_deg": _quantity("field of view, degrees", 1),
+    "coverage": _quantity("share of the view on objects", 3),
     "noise_floor_db": _quantity("noise floor, dB", 1),
+    "object_noise_floor_db": _quantity("noise floor over geometry, dB", 1),
     "spp": _quantity("samples per pixel", 0),
     "camera_attempt": _quantity("cameras rejected before", 0),
 }

@@ -123,7 +123,7 @@ def pictures_section(found: Distributions) -> Markup:
     """Return the measured errors of the pictures and what they cost."""
     target, cap = found.targets["noise_floor_db"], found.targets["max_spp"]
     with drawing():
-        figure, axes = panels(2)
+        figure, axes = panels(4)
         floors = found.all("noise_floor_db")
         histogram(
             axes[0],
@@ -139,8 +139,11 @@ def pictures_section(found: Distributions) -> Markup:
             ylabel="views",
             marks={f"cap {cap:g}": cap} if cap is not None else None,
         )
-        picture = encoded(figure, "noise floors and samples per pixel")
-    numbers = _summaries(found, "noise_floor_db", "spp", statistics=STATISTICS)
+        for panel, name in zip(axes[2:], ("object_noise_floor_db", "coverage"), strict=True):
+            histogram(panel, found.all(name), QUANTITIES[name].label, ylabel="views")
+        picture = encoded(figure, "noise floors, samples per pixel and coverage")
+    names = ("noise_floor_db", "object_noise_floor_db", "spp", "coverage")
+    numbers = _summaries(found, *names, statistics=STATISTICS)
     return _section("pictures", "Pictures", picture, numbers, _floors_by_split(found, target))
 
 

@@ -165,7 +165,9 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
         "elevation_deg": [camera.elevation_deg for camera in seen_from],
         "azimuth_deg": [camera.azimuth_deg for camera in seen_from],
         "fov_deg": [camera.fov_deg for camera in seen_from],
+        "coverage": [view.coverage for view in record.views],
         "noise_floor_db": [view.noise_floor_db for view in record.views],
+        "object_noise_floor_db": [view.object_noise_floor_db for view in record.views],
         "spp": [view.spp for view in record.views],
         "camera_attempt": [view.camera_attempt for view in record.views],
     }

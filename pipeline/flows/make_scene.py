@@ -12,6 +12,7 @@ from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.renders.variant import Variant, activate
 from pipeline.scenes.compose import compose_scene, next_camera
 from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.sight import Sight, ViewFacts
 from storage.asset import decode_asset
 from storage.errors import Rejected
 from storage.records import Failure, LockedObject
@@ -117,7 +118,7 @@ def _render_sample(
 
     The cameras of a scene that was read from a file are what they are: a rejected one is fatal.
     """
-    renderer = SceneRenderer(scene, settings.renders)
+    renderer, sight = SceneRenderer(scene, settings.renders), Sight(scene)
     pictures, records = [], []
     for view in range(scene.num_views):
         while True:
@@ -132,7 +133,9 @@ def _render_sample(
                 failures.append(_failure("renders", f"{key}.{view}", rejection, camera_attempt))
                 scene = next_camera(scene, settings.scenes, view=view)
         pictures.append(rendered.radiance_rgb)
-        records.append(_record(rendered, seed, camera_attempt))
+        camera = (scene.c2w[view], float(scene.fov_deg[view]))
+        facts = sight.facts(*camera, settings.scenes.coverage_grid)
+        records.append(_record(rendered, facts, seed, camera_attempt))
     scene.check()
     return Sample(
         key=key,
@@ -147,11 +150,13 @@ def _with_digest(scene: Scene, settings: BuildSettings) -> Scene:
     return scene.with_provenance(provenance)
 
 
-def _record(rendered: RenderedView, seed: int, camera_attempt: int) -> ViewRecord:
+def _record(rendered: RenderedView, facts: ViewFacts, seed: int, camera_attempt: int) -> ViewRecord:
     return ViewRecord(
         spp=rendered.spp,
         noise_floor_db=round(rendered.noise_floor_db, 3),
         noise_floor_linear_db=round(rendered.noise_floor_linear_db, 3),
+        object_noise_floor_db=round(rendered.object_noise_floor_db, 3),
+        coverage=round(facts.coverage, 6),
         at_cap=rendered.at_cap,
         seed=seed,
         camera_attempt=camera_attempt,

@@ -111,7 +111,9 @@ def five_scenes(root: Path) -> Dataset:
                 sample(2, furnished([])),
                 sample(3, furnished(["a", "a"]), camera_attempt=2),
             ],
-            "test-000005.tar": [sample(20, furnished(["c"], "wall"), noise_floor_db=44.0)],
+            "test-000005.tar": [
+                sample(20, furnished(["c"], "wall"), noise_floor_db=44.0, coverage=0.5)
+            ],
         },
         objects=[locked("a"), locked("b", "CC-BY-4.0"), locked("c", split="test"), locked("d")],
         failures=[

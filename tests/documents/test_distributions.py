@@ -56,6 +56,8 @@ def test_uses_of_objects(found: Distributions) -> None:
         ("azimuth_deg", [0, 90] * 5),
         ("fov_deg", [45, 40] * 5),
         ("noise_floor_db", [38, 38, 42, 42, 41.5, 41.5, 41.5, 41.5, 44, 44]),
+        ("object_noise_floor_db", [40.5] * 10),
+        ("coverage", [0.25] * 8 + [0.5] * 2),
         ("spp", [256, 256] + [128] * 8),
         ("camera_attempt", [0] * 4 + [0, 0, 2, 2] + [0] * 2),
     ],

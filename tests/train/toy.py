@@ -103,6 +103,8 @@ def toy_sample(index: int, *, resolution: int = RESOLUTION, views: int = VIEWS) 
         spp=1,
         noise_floor_db=100.0,
         noise_floor_linear_db=100.0,
+        object_noise_floor_db=100.0,
+        coverage=0.5,
         at_cap=False,
         seed=0,
         camera_attempt=0,
