@@ -143,7 +143,7 @@ def _decode_record(key: str, data: bytes) -> dict[str, Any]:
     version = record.get("schema_version") if isinstance(record, dict) else None
     if version != SCHEMA_VERSION:
         raise TrilightError(
-            f"sample {key}: schema version {version}; this Trilight reads {SCHEMA_VERSION}. Use the "
-            "release that made it, or make it again with `trilight generate`."
+            f"sample {key}: schema version {version}; this Trilight reads {SCHEMA_VERSION}. "
+            "Use the release that made it, or make it again with `trilight generate`."
         )
     return record
