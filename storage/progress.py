@@ -14,6 +14,10 @@ from storage.manifest import read_manifest
 class Progress:
     """Counts of what is finished and of what is planned; 0 planned where it is not known yet."""
 
+    downloads_done: int
+    """Object files that have come from a server, or failed to."""
+    downloads_planned: int
+    """Object files to fetch; 0 for sources on this machine."""
     objects_done: int
     """Objects that are prepared or rejected."""
     objects_planned: int
@@ -22,6 +26,11 @@ class Progress:
     """Scenes in shards or waiting for their shard."""
     scenes_planned: int
     """Scenes to make."""
+
+
+def announce_downloads(folder: DatasetFolder, done: int, total: int) -> None:
+    """Write down how many object files have come from a server."""
+    write_atomically(_downloads(folder), json.dumps([done, total]).encode())
 
 
 def announce_objects(folder: DatasetFolder, num_objects: int) -> None:
@@ -45,7 +54,12 @@ def read_progress(folder: DatasetFolder) -> Progress:
         scenes_planned = in_shards = 0
     plan = json.loads(_plan(folder).read_bytes()) if _plan(folder).exists() else {"objects": 0}
     staged = sum(1 for _ in (folder.staging / "samples").glob("*/*.tar"))
+    done, total = (
+        json.loads(_downloads(folder).read_bytes()) if _downloads(folder).exists() else (0, 0)
+    )
     return Progress(
+        downloads_done=done,
+        downloads_planned=total,
         objects_done=_done(folder).stat().st_size if _done(folder).exists() else 0,
         objects_planned=plan["objects"],
         scenes_done=in_shards + staged,
@@ -55,6 +69,10 @@ def read_progress(folder: DatasetFolder) -> Progress:
 
 def _plan(folder: DatasetFolder) -> Path:
     return folder.staging / "plan.json"
+
+
+def _downloads(folder: DatasetFolder) -> Path:
+    return folder.staging / "downloads.json"
 
 
 def _done(folder: DatasetFolder) -> Path:

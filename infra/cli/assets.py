@@ -50,6 +50,7 @@ def assets(
     settings = _settings(budget, epsilon, profile)
     folder = AssetFolder(out)
     with progress_bars() as bars:
+        fetched = bars.add_task("download", total=None, note="", visible=False)
         task = bars.add_task("objects", total=None, note="", visible=not json)
         report = make_assets(
             source,
@@ -58,6 +59,9 @@ def assets(
             allowed_licences=(*DEFAULT_ALLOWED, *(allow_licence or ())),
             licence=licence,
             workers=os.cpu_count() or 1 if workers is None else workers,
+            downloaded=lambda done, total: bars.update(
+                fetched, completed=done, total=total, visible=not json
+            ),
             planned=lambda total: bars.update(task, total=total),
             done=lambda: bars.advance(task),
         )

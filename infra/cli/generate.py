@@ -112,6 +112,7 @@ def _progress(folder: DatasetFolder) -> Iterator[None]:
 
 
 def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event) -> None:
+    downloads = bars.add_task("download", total=None, note="", visible=False)
     objects = bars.add_task("objects", total=None, note="")
     scenes = bars.add_task("scenes", total=None, start=False, note="")
     already: int | None = None
@@ -120,6 +121,12 @@ def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event) -> None:
         last = ended.wait(_POLL_S)
         with contextlib.suppress(OSError, ValueError):  # a file may vanish between two looks
             now = read_progress(folder)
+            bars.update(
+                downloads,
+                completed=now.downloads_done,
+                total=now.downloads_planned,
+                visible=now.downloads_planned > 0,
+            )
             bars.update(objects, completed=now.objects_done, total=now.objects_planned or None)
             if not now.scenes_planned:
                 continue

@@ -12,7 +12,7 @@ from pipeline.objects.sources import find_objects
 from storage.conventions import SPLITS
 from storage.errors import TrilightError
 from storage.objects_lock import read_objects_lock
-from storage.progress import announce_objects, count_object
+from storage.progress import announce_downloads, announce_objects, count_object
 from storage.records import LockedObject
 from storage.safe_url import safe_url
 from storage.splits import require_objects, split_of_object, split_of_shard
@@ -49,6 +49,7 @@ def accept_objects(
         work_dir=folder.staged_objects,
         allowed_licences=settings.allowed_licences,
         licence=licence,
+        downloaded=lambda done, total: announce_downloads(folder, done, total),
     )
     allowed = list(found.records)
     shown = safe_url(source)

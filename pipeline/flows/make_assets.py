@@ -98,6 +98,7 @@ def make_assets(
     allowed_licences: Sequence[str],
     licence: str | None,
     workers: int,
+    downloaded: Callable[[int, int], None],
     planned: Callable[[int], None],
     done: Callable[[], None],
 ) -> AssetReport:
@@ -110,6 +111,7 @@ def make_assets(
         allowed_licences: objects under others are refused.
         licence: of files that come without any statement.
         workers: objects at a time.
+        downloaded: called with how many downloads are done and how many there are.
         planned: called with the number of objects, once they are known.
         done: called after each object, from any thread.
 
@@ -125,6 +127,7 @@ def make_assets(
         work_dir=cache_folder("objects"),
         allowed_licences=allowed_licences,
         licence=licence,
+        downloaded=downloaded,
     )
     write_atomically(folder.summary, b"{}")  # from here on the folder is ours
     planned(len(found.records))

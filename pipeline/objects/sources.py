@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
-from pipeline.objects.folder_source import list_folder
 from pipeline.objects.generated import PREFIX as BUILTIN
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.licences import (
@@ -18,11 +17,12 @@ from pipeline.objects.licences import (
     stated_licence,
 )
 from pipeline.objects.listing import Listing
+from pipeline.objects.local.source import list_folder
 from pipeline.objects.names import printable
-from pipeline.objects.objaverse_source import PREFIX as OBJAVERSE
-from pipeline.objects.objaverse_source import list_objaverse
-from pipeline.objects.remote_source import list_remote
-from pipeline.objects.remote_url import parse_source
+from pipeline.objects.objaverse.source import PREFIX as OBJAVERSE
+from pipeline.objects.objaverse.source import list_objaverse
+from pipeline.objects.remote.source import list_remote
+from pipeline.objects.remote.url import parse_source
 from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
 from storage.records import Failure, ObjectRecord

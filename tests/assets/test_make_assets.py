@@ -62,6 +62,10 @@ def source(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def _nothing_to_fetch(done: int, total: int) -> None:
+    raise AssertionError("these sources lie on this machine")
+
+
 def run(source: Path | str, out: Path, settings: AssetSettings | None = None) -> AssetReport:
     counts: list[int] = []
     report = make_assets(
@@ -71,6 +75,7 @@ def run(source: Path | str, out: Path, settings: AssetSettings | None = None) ->
         allowed_licences=DEFAULT_ALLOWED,
         licence=None,
         workers=2,
+        downloaded=_nothing_to_fetch,
         planned=counts.append,
         done=lambda: counts.append(-1),
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.objects import objaverse_package
+from pipeline.objects.objaverse import package as objaverse_package
 from storage.errors import TrilightError
 from tests.objects.http_kit import Site
 from tests.objects.objaverse_kit import FREE, UID, find, found_names, glb, reasons

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.objects import remote_source, remote_url
+from pipeline.objects.remote import source as remote_source
+from pipeline.objects.remote import url as remote_url
 from storage.errors import TrilightError
 from tests.objects.find_kit import find, reasons
 from tests.objects.http_kit import Site

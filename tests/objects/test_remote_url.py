@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.objects import remote_source
 from pipeline.objects.licences import DEFAULT_ALLOWED
-from pipeline.objects.remote_url import PACKAGES, RemoteUrl, open_driver, parse_source
+from pipeline.objects.remote import source as remote_source
+from pipeline.objects.remote.url import PACKAGES, RemoteUrl, open_driver, parse_source
 from pipeline.objects.sources import FoundObjects, find_objects
 from storage.errors import TrilightError
 
@@ -132,7 +132,7 @@ def test_a_bucket_is_listed_at_once(cache: Path, monkeypatch: pytest.MonkeyPatch
         "set//g.obj",
     )
     bucket = _Bucket({f"bucket/{name}": name.encode() for name in names})
-    monkeypatch.setattr("pipeline.objects.remote_folder.open_driver", lambda url: bucket)
+    monkeypatch.setattr("pipeline.objects.remote.folder.open_driver", lambda url: bucket)
 
     def find() -> FoundObjects:
         source = "s3://bucket/set/"
@@ -163,7 +163,7 @@ def test_a_transfer_that_grows_too_large_is_ended(
     bucket.sizes = False
     monkeypatch.setattr(bucket, "get_file", get_file)
     monkeypatch.setattr(remote_source, "MAX_BYTES", 1000)
-    monkeypatch.setattr("pipeline.objects.remote_folder.open_driver", lambda url: bucket)
+    monkeypatch.setattr("pipeline.objects.remote.folder.open_driver", lambda url: bucket)
     found = find_objects("gs://bucket", work_dir=cache, allowed_licences=DEFAULT_ALLOWED)
     assert [record.uid for record in found.records] == ["a"]
     assert [one.reason for one in found.failures] == ["too_large_bytes"]

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pipeline.objects.catalogue_rows import csv_rows, jsonl_rows
 from pipeline.objects.licences import UNKNOWN
+from pipeline.objects.local.catalogue_rows import csv_rows, jsonl_rows
 from pipeline.objects.names import printable
 from storage.errors import TrilightError
 from storage.records import ObjectRecord

@@ -16,9 +16,9 @@ from typing import Any
 
 from fsspec.callbacks import Callback
 
-from pipeline.objects.gltf_buffers import buffer_names
 from pipeline.objects.names import printable
-from pipeline.objects.remote_folder import RemoteFolder
+from pipeline.objects.remote.folder import RemoteFolder
+from pipeline.objects.remote.gltf_buffers import buffer_names
 from pipeline.objects.transfer import Interrupted, TransferFailed, with_tries
 from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_atomically
 from storage.errors import TrilightError

@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 from urllib.parse import quote, unquote
 
-from pipeline.objects.remote_url import RemoteUrl, open_driver
+from pipeline.objects.remote.url import RemoteUrl, open_driver
 from pipeline.objects.transfer import TransferFailed, is_absent, with_tries
 from storage.errors import TrilightError
 

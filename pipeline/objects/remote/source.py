@@ -4,14 +4,14 @@ import dataclasses
 from functools import partial
 from pathlib import Path
 
-from pipeline.objects.catalogue import CATALOGUE_NAMES, only_catalogue, read_catalogue
-from pipeline.objects.folder import file_record
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
 from pipeline.objects.listing import Fetched, Listing, Progress, failure
+from pipeline.objects.local.catalogue import CATALOGUE_NAMES, only_catalogue, read_catalogue
+from pipeline.objects.local.folder import file_record
 from pipeline.objects.names import printable
-from pipeline.objects.remote_files import RemoteFiles
-from pipeline.objects.remote_folder import RemoteFolder
-from pipeline.objects.remote_url import RemoteUrl
+from pipeline.objects.remote.files import RemoteFiles
+from pipeline.objects.remote.folder import RemoteFolder
+from pipeline.objects.remote.url import RemoteUrl
 from pipeline.objects.transfer import TransferFailed, fetch_all
 from pipeline.objects.uids import assign_uids, is_object_file
 from storage.cache import cache_folder
