@@ -1,12 +1,16 @@
-"""What a template proposes: a shell, spheres for objects to fill, emitters, and surfaces.
+"""What a template returns: a shell, objects in their places, emitters, and surfaces.
 
-A layout knows no object meshes. It gives each object a sphere; `pipeline.scenes` puts a mesh in.
+A layout holds no object meshes: an object has a pose, and `pipeline.scenes` puts its mesh there.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+RGB = tuple[float, float, float]
+"""Linear, Rec.709 primaries."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,36 +18,37 @@ class Surface:
     """How a shell part or an object reflects, in linear colour."""
 
     diffuse_scale: float
-    """Largest diffuse albedo that a channel may have; plus `specular` at most 1."""
-    diffuse_rgb: tuple[float, float, float]
+    """Largest diffuse albedo that a channel may have; plus `specular_rgb` at most 1."""
+    diffuse_rgb: RGB
     """Diffuse albedo where the surface has one colour."""
-    specular: float
-    """Specular albedo, the same in every channel."""
+    specular_rgb: RGB
+    """Specular albedo."""
     roughness: float
     """In [0, 1]; the GGX width is its square."""
     smooth: bool
     """Normals interpolated across edges below the smoothing angle; otherwise flat."""
-    coloured: bool
-    """Many colours, each channel uniform in [0, diffuse_scale], instead of `diffuse_rgb`."""
+    colours: Literal["one", "groups", "triangles"]
+    """`one`: `diffuse_rgb`. Otherwise a colour for each shading group or for each triangle, each
+    channel uniform in [0, diffuse_scale]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ShellPart:
-    """A floor or wall: a flat patch of 128 triangles that faces the room."""
+    """A floor or wall: a flat patch of 128 triangles."""
 
     name: str
     """floor, wall0, wall1 or wall2."""
     positions: NDArray[np.float64]
     """[81, 3] world units."""
     faces: NDArray[np.uint32]
-    """[128, 3], counter-clockwise seen from the room."""
+    """[128, 3], counter-clockwise seen from the room (but see SeparateSides.wall2_faces_out)."""
     surface: Surface
     """Its material."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectPlacement:
-    """Room for one object: a sphere that its mesh is scaled into."""
+class Pose:
+    """Where an object is: a sphere that its mesh is scaled into, and its rotation."""
 
     centre: NDArray[np.float64]
     """[3] world units."""
@@ -51,9 +56,14 @@ class ObjectPlacement:
     """World units."""
     rotation: NDArray[np.float64]
     """[3, 3], applied to the mesh about the centre."""
-    rests: bool
-    """The mesh is to be lowered along the floor's normal until it touches; the sphere already
-    does, and nothing else is in the way."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectPlacement:
+    """An object without its mesh."""
+
+    pose: Pose
+    """Where it is."""
     surface: Surface
     """Its material."""
 
@@ -64,21 +74,21 @@ class Emitter:
 
     triangle: NDArray[np.float64]
     """[3, 3] corners in world units."""
-    radiance: float
-    """The same in every channel."""
+    radiance_rgb: RGB
+    """Emitted radiance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Floor:
-    """The plane that objects rest on."""
+class Plane:
+    """The infinite plane of a floor or wall."""
 
     point: NDArray[np.float64]
     """[3] a point of it."""
     normal: NDArray[np.float64]
-    """[3] unit, upwards."""
+    """[3] unit, into the room."""
 
     def height(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distance of `points` [..., 3] above the plane."""
+        """Return the signed distance of `points` [..., 3] on the side of the room."""
         return np.einsum("...i,i->...", points - self.point, self.normal)
 
 
@@ -88,12 +98,10 @@ class Layout:
 
     shell: tuple[ShellPart, ...]
     """The floor first."""
-    floor: Floor
-    """Where objects rest."""
     objects: tuple[ObjectPlacement, ...]
-    """Bounding spheres; no two overlap, resting ones leave the way down free."""
+    """In the order of the shapes that they were placed with."""
     emitters: tuple[Emitter, ...]
-    """Outside the room."""
+    """Outside the room, but for those that the settings put inside objects."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,12 +1,15 @@
 """Emitters: a few small bright triangles outside the room, on its open side."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_templates.checks import Counts, Range, check_numbers, require
 from scene_templates.layout import Emitter
-from scene_templates.rotations import rotated, uniform_rotation
+from scene_templates.rotations import Orientation, rotated, rotation_rand
 from scene_templates.sectors import Sector
-from scene_templates.settings import SceneSettings
 
 TRIANGLE = 0.025 * np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
 """The published emitter before scaling: equilateral, edge 0.0707."""
@@ -18,17 +21,56 @@ SPACING_TRIES = 256
 """Eight emitters 0.3 apart claim four tenths of the narrowest sector, so that this is hardly ever
 used up; the candidate farthest from the others is taken if it is."""
 
+PALEST = 0.2
+"""Least channel of a coloured light before its mean is made 1: no light is quite monochrome."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightSettings:
+    """What emitters are drawn from."""
+
+    count: Counts = (1, 8)
+    """Fewest and most emitters, each count equally likely."""
+    total_emission: Range = (2500.0, 5000.0)
+    """Radiance summed over the emitters: one of n emits a number from this range divided by n."""
+    scale: Range = (2.0, 2.5)
+    """Scale per axis of the emitter triangle (edge 0.0707), which is not halved."""
+    distance: Range = (2.1, 2.7)
+    """Distance of an emitter from a point near the origin (see `target_jitter`), world units."""
+    target_jitter: float = 0.2
+    """Most offset per axis from the origin of the point that an emitter hangs around."""
+    spacing: float = 0.3
+    """Least distance between two emitters as seen from the origin, on a sphere of radius 0.866."""
+    orientation: Orientation = "uniform"
+    """How emitters are turned; see `PlacementSettings.orientation`."""
+    coloured_share: float = 0.0
+    """Share of emitters that are coloured at the same mean radiance. An option: published lights
+    are white, and a network trained on white ones alone has never seen another."""
+    num_inside: int = 0
+    """How many of the emitters hang in the middle of objects instead, for tests out of range."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, shares=("coloured_share",))
+        require(self.count[0] >= 1, "count", self.count, "at least 1 emitter")
+        for name in ("total_emission", "scale", "distance"):
+            bounds = getattr(self, name)
+            require(bounds[0] > 0, name, bounds, "numbers above 0")
+
 
 def emitters_rand(
-    rng: np.random.Generator, settings: SceneSettings, sector: Sector
+    rng: np.random.Generator,
+    settings: LightSettings,
+    sector: Sector,
+    count: int,
+    object_centres: Sequence[NDArray[np.float64]],
 ) -> tuple[Emitter, ...]:
-    """Draw the emitters of a scene."""
-    low, high = settings.num_lights
-    count = int(rng.integers(low, high + 1))
+    """Draw `count` emitters of a scene; the first `num_inside` go into objects, as far as any."""
     directions: list[NDArray[np.float64]] = []
     for _ in range(count):
-        directions.append(_spaced_direction(rng, sector, directions, settings.light_spacing))
-    return tuple(_emitter_rand(rng, settings, towards, count) for towards in directions)
+        directions.append(_spaced_direction(rng, sector, directions, settings.spacing))
+    inside = list(object_centres)[: settings.num_inside]
+    outside = [_centre_rand(rng, settings, towards) for towards in directions[len(inside) :]]
+    return tuple(_emitter_rand(rng, settings, centre, count) for centre in [*inside, *outside])
 
 
 def _spaced_direction(
@@ -49,12 +91,26 @@ def _spaced_direction(
     return best
 
 
-def _emitter_rand(
-    rng: np.random.Generator, settings: SceneSettings, towards: NDArray[np.float64], count: int
-) -> Emitter:
+def _centre_rand(
+    rng: np.random.Generator, settings: LightSettings, towards: NDArray[np.float64]
+) -> NDArray[np.float64]:
     target = rng.uniform(-settings.target_jitter, settings.target_jitter, size=3)
-    centre = target + rng.uniform(*settings.light_distance) * towards
+    return target + rng.uniform(*settings.distance) * towards
+
+
+def _emitter_rand(
+    rng: np.random.Generator, settings: LightSettings, centre: NDArray[np.float64], count: int
+) -> Emitter:
     # About its own middle, so that its distance is the one drawn.
-    turned = rotated(TRIANGLE - TRIANGLE.mean(axis=0), uniform_rotation(rng))
-    triangle = turned * rng.uniform(*settings.light_scale, size=3) + centre
-    return Emitter(triangle=triangle, radiance=rng.uniform(*settings.total_emission) / count)
+    turned = rotated(TRIANGLE - TRIANGLE.mean(axis=0), rotation_rand(rng, settings.orientation))
+    triangle = turned * rng.uniform(*settings.scale, size=3) + centre
+    radiance = rng.uniform(*settings.total_emission) / count
+    red, green, blue = radiance * _tint_rand(rng, settings.coloured_share)
+    return Emitter(triangle=triangle, radiance_rgb=(red, green, blue))
+
+
+def _tint_rand(rng: np.random.Generator, coloured_share: float) -> NDArray[np.float64]:
+    if rng.random() >= coloured_share:
+        return np.ones(3)
+    channels = rng.uniform(PALEST, 1, size=3)
+    return channels / channels.mean()

@@ -1,23 +1,23 @@
-"""Where objects go: spheres in the room that do not meet, some of them on the floor.
+"""Where objects go: in the room, on the floor or over it, and clear of each other.
 
-Sizes are drawn first, then places, the largest first and each several times over, before sizes
-are given up and drawn anew. Drawing whole arrangements until one fits would be exactly uniform,
-but takes ten times as long and prefers small objects; here sizes stay near their stated range. A
-resting object will be lowered until its mesh touches the floor, so it claims the way down as well.
+Sizes and rotations are drawn first, then places, the largest object first and each several times
+over, before sizes are given up and drawn anew. Drawing whole arrangements until one fits would be
+exactly uniform, but takes ten times as long and prefers small objects; here sizes stay near their
+stated range. What an object looks like is asked of its `Shape`; a template knows no meshes.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.layout import Floor, ObjectPlacement
-from scene_templates.materials import surface_rand
+from scene_templates.checks import Range, check_numbers, require
+from scene_templates.layout import Plane, Pose
 from scene_templates.patches import SIDES
 from scene_templates.rooms import Room
-from scene_templates.rotations import uniform_rotation
-from scene_templates.settings import SceneSettings
+from scene_templates.rotations import Orientation, rotated, rotation_rand
 from storage.errors import Rejected
 
 ARRANGEMENT_TRIES = 100
@@ -26,109 +26,152 @@ ARRANGEMENT_TRIES = 100
 PLACE_TRIES = 16
 """Draws of one place before the sizes are drawn anew."""
 
+TOUCHING = 1e-9
+"""World units below which a resting object still counts as inside: rounding of float64 sums."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacementSettings:
+    """How objects are put into the room."""
+
+    orientation: Orientation = "uniform"
+    """How objects are turned: uniformly on SO(3), where the published Euler angles prefer poles."""
+    resting_share: float = 0.5
+    """Share of objects that rest on the floor; the others float. The published ones all float."""
+    overlap_share: float = 0.1
+    """Share of scenes whose objects may run into each other, so that contact and penetration are
+    not unknown to a network. In the others no two meshes meet; in the published ones all may."""
+    inside: bool = True
+    """Objects stay on the room's side of the floor and walls. Otherwise, as published, their
+    centres are uniform in the cube [-0.5, 0.5]^3 and they may stick through."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, shares=("resting_share", "overlap_share"))
+        known = self.orientation in ("uniform", "euler")
+        require(known, "orientation", self.orientation, "uniform or euler")
+
+
+class Shape(Protocol):
+    """An object's mesh, scaled into the unit sphere around the origin."""
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """Vertices [V, 3] whose hull holds the mesh."""
+        ...
+
+    def meets(self, pose: Pose, other: Self, its_pose: Pose) -> bool:
+        """Return whether two meshes in their places share a point, or one holds the other."""
+        ...
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectSpace:
-    """Where the centres of objects may be."""
+    """Where objects may be."""
 
     room: Room
     """The space between the shell parts."""
     parts: tuple[str, ...]
-    """The shell parts that exist."""
-    floor: Floor
-    """Where objects rest."""
+    """The shell parts that exist, the floor first."""
+    planes: tuple[Plane, ...]
+    """Their planes."""
 
-    def centre_range(self, radius: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and greatest centre [3] of a sphere.
+    @property
+    def floor(self) -> Plane:
+        """The plane that objects rest on."""
+        return self.planes[0]
 
-        A sphere keeps clear of walls; through an open side it may stick out by half its radius.
+    def centre_range(
+        self, points: NDArray[np.float64], radius: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and greatest centre [3] of an object with `points` [V, 3] around it.
+
+        It keeps clear of walls; through an open side it may stick out by half its radius.
         """
         low = np.clip(self.room.low, -0.5, 0.5) + radius / 2
         high = np.clip(self.room.high, -0.5, 0.5) - radius / 2
         for name in self.parts:
-            axis, clear = SIDES[name].axis, radius + self.room.lean
+            axis, lean = SIDES[name].axis, self.room.lean
             if SIDES[name].sign > 0:
-                high[axis] = self.room.high[axis] - clear
+                high[axis] = self.room.high[axis] - lean - points[:, axis].max()
             else:
-                low[axis] = self.room.low[axis] + clear
+                low[axis] = self.room.low[axis] + lean - points[:, axis].min()
         return low, high
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Sphere:
-    centre: NDArray[np.float64]
-    radius: float
-    rests: bool
+    def holds(self, points: NDArray[np.float64]) -> bool:
+        """Return whether all points [V, 3] are on the room's side of every part."""
+        return all(bool((plane.height(points) >= -TOUCHING).all()) for plane in self.planes)
 
 
-def objects_rand(
-    rng: np.random.Generator, settings: SceneSettings, space: ObjectSpace, count: int
-) -> tuple[ObjectPlacement, ...]:
-    """Draw `count` placements; raises Rejected("no_room") if none was found without overlap."""
-    for _ in range(ARRANGEMENT_TRIES):
-        spheres = _spheres_rand(rng, settings, space, count)
-        if spheres is not None:
-            break
-    else:
-        raise Rejected("no_room", f"{count} objects met in {ARRANGEMENT_TRIES} arrangements")
-    return tuple(
-        ObjectPlacement(
-            centre=sphere.centre,
-            radius=sphere.radius,
-            rotation=uniform_rotation(rng),
-            rests=sphere.rests,
-            surface=surface_rand(rng, settings),
-        )
-        for sphere in spheres
-    )
-
-
-def _spheres_rand(
-    rng: np.random.Generator, settings: SceneSettings, space: ObjectSpace, count: int
-) -> list[_Sphere] | None:
-    """Draw one arrangement, or None where no place was found for one of the objects."""
-    scale = settings.single_object_scale if count == 1 else settings.object_scale
-    # A recipe's size is a diameter in a room of side 2: half of it here, and half again.
-    radii = np.sort(rng.uniform(*scale, size=count) / 4)[::-1]
-    spheres: list[_Sphere] = []
-    for radius in radii.tolist():
-        rests = bool(rng.random() < settings.resting_share)
-        sphere = _placed_rand(rng, space, spheres, radius, rests)
-        if sphere is None:
-            return None
-        spheres.append(sphere)
-    return spheres
-
-
-def _placed_rand(
+def poses_rand(
     rng: np.random.Generator,
+    settings: PlacementSettings,
     space: ObjectSpace,
-    others: Sequence[_Sphere],
+    shapes: Sequence[Shape],
+    *,
+    object_scale: Range,
+    overlaps: bool,
+) -> tuple[Pose, ...]:
+    """Draw a pose for each shape.
+
+    Args:
+        rng: where the numbers come from.
+        settings: how objects are put.
+        space: where.
+        shapes: what they look like.
+        object_scale: range of the bounding spheres' diameters, before halving.
+        overlaps: whether objects may meet.
+
+    Raises:
+        Rejected: "no_room" if no arrangement was found.
+    """
+    for _ in range(ARRANGEMENT_TRIES):
+        # A recipe's size is a diameter in a room of side 2: half of it here, and half again.
+        radii = rng.uniform(*object_scale, size=len(shapes)) / 4
+        poses: dict[int, Pose] = {}
+        for row in np.argsort(-radii, kind="stable").tolist():
+            others = [] if overlaps else [(shapes[other], at) for other, at in poses.items()]
+            pose = _pose_rand(rng, settings, space, shapes[row], float(radii[row]), others)
+            if pose is None:
+                break
+            poses[row] = pose
+        if len(poses) == len(shapes):
+            return tuple(poses[row] for row in range(len(shapes)))
+    raise Rejected("no_room", f"{len(shapes)} objects met in {ARRANGEMENT_TRIES} arrangements")
+
+
+def _pose_rand(
+    rng: np.random.Generator,
+    settings: PlacementSettings,
+    space: ObjectSpace,
+    shape: Shape,
     radius: float,
-    rests: bool,
-) -> _Sphere | None:
-    low, high = space.centre_range(radius)
+    others: Sequence[tuple[Shape, Pose]],
+) -> Pose | None:
+    """Draw a place for an object clear of others, or None where none was found."""
+    rotation = rotation_rand(rng, settings.orientation)
+    rests = bool(rng.random() < settings.resting_share)
+    points = radius * rotated(shape.points, rotation)
+    low, high = np.full(3, -0.5), np.full(3, 0.5)
+    if settings.inside:
+        low, high = space.centre_range(points, radius)
+        if rests:
+            low[2], high[2] = 0.0, 0.0  # it is set down below
     if (low > high).any():
         return None
     for _ in range(PLACE_TRIES):
         centre = rng.uniform(low, high)
-        height = float(space.floor.height(centre))
         if rests:
-            centre[2] += (radius - height) / space.floor.normal[2]
-        elif height < radius:
+            centre = _set_down(centre, points, space.floor)
+        if settings.inside and not space.holds(points + centre):
             continue
-        sphere = _Sphere(centre=centre, radius=radius, rests=rests)
-        if not any(_gap(space.floor, sphere, other) < 0 for other in others):
-            return sphere
+        pose = Pose(centre=centre, radius=radius, rotation=rotation)
+        if not any(shape.meets(pose, other, at) for other, at in others):
+            return pose
     return None
 
 
-def _gap(floor: Floor, a: _Sphere, b: _Sphere) -> float:
-    """Return the distance between two spheres, counting the way down of those that rest."""
-    top_a, top_b = float(floor.height(a.centre)), float(floor.height(b.centre))
-    # The centre of a resting mesh comes to lie between 0 and its radius above the floor.
-    bottom_a, bottom_b = (0.0 if a.rests else top_a), (0.0 if b.rests else top_b)
-    above = max(0.0, bottom_a - top_b, bottom_b - top_a)
-    apart = a.centre - b.centre
-    aside_squared = float(np.sum(np.square(apart))) - (top_a - top_b) ** 2
-    return float(np.sqrt(max(0.0, aside_squared) + above**2)) - a.radius - b.radius
+def _set_down(
+    centre: NDArray[np.float64], points: NDArray[np.float64], floor: Plane
+) -> NDArray[np.float64]:
+    """Return the centre from which the lowest point touches; it need not be in balance."""
+    return centre - floor.height(points + centre).min() / floor.normal[2] * np.array([0, 0, 1.0])

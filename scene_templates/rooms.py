@@ -1,8 +1,7 @@
-"""Shells: the floor and walls of one room, whose seams are always closed.
+"""Shells whose seams are always closed: the floor and walls of one room.
 
-The published shells turn every square by any angle in its own plane, so that no fixed diagonal of
-the triangulation can be learnt, and place each by itself: walls then hang over gaps. Here the
-parts share one room. In square rooms a spin is a multiple of 90 degrees, which still swaps the
+The published shells place each square by itself (`separate_sides`): walls then hang over gaps. Here
+the parts share one room. In square rooms a spin is a multiple of 90 degrees, which still swaps the
 diagonals, and edges meet exactly. In the others the spin is free, parts tilt a little, and every
 square is made just large enough to cover its side of the room: parts cross instead of gaping, at
 the price of some hidden triangles.
@@ -15,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.layout import Floor
+from scene_templates.checks import Range, check_numbers, require
+from scene_templates.layout import Plane
 from scene_templates.patches import SIDES, PatchPlacement
-from scene_templates.settings import SceneSettings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,32 +33,54 @@ class Room:
     """How far a tilted wall may stand inside of these bounds at most."""
 
 
-def room_rand(rng: np.random.Generator, settings: SceneSettings, names: Sequence[str]) -> Room:
-    """Draw a room with the parts `names`."""
-    scale = rng.uniform(*settings.room_scale, size=3)
-    shift = rng.uniform(-settings.room_shift, settings.room_shift, size=2)
-    translation = np.array([*shift, rng.uniform(*settings.room_raise)])
-    square = rng.random() < settings.square_share
-    tilt_deg = 0.0 if square else settings.shell_tilt_deg
-    patches = []
-    for name in names:
-        spin_deg = 90.0 * rng.integers(4) if square else rng.uniform(-180, 180)
-        angles_deg = rng.uniform(-tilt_deg, tilt_deg, size=3)
-        angles_deg[SIDES[name].axis] = spin_deg
-        patches.append(
-            PatchPlacement(
-                rotation_deg=tuple(angles_deg),
-                reach=1.0 if square else _covering_reach(spin_deg, tilt_deg),
-                scale=tuple(scale),
-                translation=tuple(translation),
+@dataclass(frozen=True, kw_only=True)
+class SharedRoom:
+    """Ranges of rooms whose parts meet."""
+
+    square_share: float = 0.5
+    """Share of scenes whose floor and walls are exact rectangles of one room, edge to edge."""
+    scale: Range = (1.0, 1.35)
+    """Size of the room per axis, before halving; shared by its parts, so that they meet."""
+    shift: float = 0.05
+    """How far the room is moved sideways at most, before halving."""
+    raise_z: Range = (-0.05, 0.25)
+    """How far the room is raised, before halving: no fixed height of the floor to learn."""
+    tilt_deg: float = 3.0
+    """Most tilt of a floor or wall out of its plane, in rooms that are not square. The recipes
+    allow 10 for open layouts and 3 for the box; parts tilted by 10 must be half as large again
+    for their seams to stay closed."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, shares=("square_share",), signed=("raise_z",))
+        require(self.scale[0] > 0, "scale", self.scale, "numbers above 0")
+        require(self.tilt_deg <= 10, "tilt_deg", self.tilt_deg, "at most 10 degrees")
+
+    def room_rand(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
+        """Draw a room with the parts `names`."""
+        scale = rng.uniform(*self.scale, size=3)
+        shift = rng.uniform(-self.shift, self.shift, size=2)
+        translation = np.array([*shift, rng.uniform(*self.raise_z)])
+        square = rng.random() < self.square_share
+        tilt_deg = 0.0 if square else self.tilt_deg
+        patches = []
+        for name in names:
+            spin_deg = 90.0 * rng.integers(4) if square else rng.uniform(-180, 180)
+            angles_deg = rng.uniform(-tilt_deg, tilt_deg, size=3)
+            angles_deg[SIDES[name].axis] = spin_deg
+            patches.append(
+                PatchPlacement(
+                    rotation_deg=tuple(angles_deg),
+                    reach=1.0 if square else _covering_reach(spin_deg, tilt_deg),
+                    scale=tuple(scale),
+                    translation=tuple(translation),
+                )
             )
+        return Room(
+            patches=tuple(patches),
+            low=(translation - scale) / 2,
+            high=(translation + scale) / 2,
+            lean=math.tan(math.radians(tilt_deg)) * float(scale.max()),
         )
-    return Room(
-        patches=tuple(patches),
-        low=(translation - scale) / 2,
-        high=(translation + scale) / 2,
-        lean=math.tan(math.radians(tilt_deg)) * float(scale.max()),
-    )
 
 
 def _covering_reach(spin_deg: float, tilt_deg: float) -> float:
@@ -73,8 +94,8 @@ def _covering_reach(spin_deg: float, tilt_deg: float) -> float:
     return (abs(math.cos(spin)) + abs(math.sin(spin))) * (1 + 3 * math.tan(math.radians(tilt_deg)))
 
 
-def floor_plane(positions: NDArray[np.float64]) -> Floor:
-    """Return the plane of a floor from its patch, vertices [81, 3]."""
+def plane_of(positions: NDArray[np.float64]) -> Plane:
+    """Return the plane of a floor or wall from its patch, vertices [81, 3]."""
     origin, along, across = positions[0], positions[-9], positions[8]
     normal = np.cross(along - origin, across - origin)
-    return Floor(point=positions.mean(axis=0), normal=normal / np.sqrt(np.sum(np.square(normal))))
+    return Plane(point=positions.mean(axis=0), normal=normal / np.sqrt(np.sum(np.square(normal))))

@@ -1,7 +1,19 @@
 """Rotations: uniform ones for objects and emitters, Euler angles for the shell."""
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+Orientation = Literal["uniform", "euler"]
+"""`uniform` on SO(3), or three `euler` angles as published, which prefer the poles."""
+
+
+def rotation_rand(rng: np.random.Generator, orientation: Orientation) -> NDArray[np.float64]:
+    """Return a rotation [3, 3] of the stated distribution."""
+    if orientation == "euler":
+        return rotation_xyz(rng.uniform(-180, 180, size=3))
+    return uniform_rotation(rng)
 
 
 def uniform_rotation(rng: np.random.Generator) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""`SceneSettings`: every range from which a scene is drawn, with its published origin.
+"""`SceneSettings`: everything from which a scene is drawn, in the groups of this folder.
 
 Numbers follow the RenderFormer V1 recipes where they are known and sound; each deviation says why.
 World units throughout: the nominal shell is the cube [-0.5, 0.5]^3, so sizes that the recipes
@@ -6,103 +6,27 @@ state for a cube of side 2 are halved on use (fields that hold such numbers say 
 """
 
 import dataclasses
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
-from storage.errors import TrilightError
-
-Range = tuple[float, float]
-
-SHARES = (
-    "square_share",
-    "resting_share",
-    "smooth_share",
-    "coloured_share",
-    "min_coverage",
-    "min_lit",
-    "max_shell_back",
-)
-"""Fields that are shares of something, and so at most 1."""
-
-SHELL_TRIANGLES = {"plane": 128, "wall": 256, "corner": 384, "open_box": 512}
-"""The layouts that exist, and the triangles of their shells: 128 for the floor and each wall."""
+from scene_templates.cameras import CameraSettings
+from scene_templates.checks import check_numbers, require
+from scene_templates.excursions import Excursion
+from scene_templates.families import Family
+from scene_templates.lights import LightSettings
+from scene_templates.materials import MaterialSettings
+from scene_templates.placement import PlacementSettings
+from storage.changes import changed
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneSettings:
-    """What scenes are drawn from. Ranges are (low, high), both ends included."""
-
-    templates: tuple[str, ...] = tuple(SHELL_TRIANGLES)
-    """Layouts to draw from, with equal weight; a name given twice weighs double."""
-    max_triangles: int = 1536
-    """Most triangles of a whole scene, shell and emitters included."""
-    num_views: int = 4
-    """Cameras of every scene."""
-
-    square_share: float = 0.5
-    """Share of scenes whose floor and walls are exact rectangles of one room, edge to edge."""
-    room_scale: Range = (1.0, 1.35)
-    """Size of the room per axis, before halving; shared by its parts, so that they meet."""
-    room_shift: float = 0.05
-    """How far the room is moved sideways at most, before halving."""
-    room_raise: Range = (-0.05, 0.25)
-    """How far the room is raised, before halving: no fixed height of the floor to learn."""
-    shell_tilt_deg: float = 3.0
-    """Most tilt of a floor or wall out of its plane, in rooms that are not square. The recipes
-    allow 10 for open layouts and 3 for the box; parts tilted by 10 must be half as large again
-    for their seams to stay closed."""
-
-    num_objects: tuple[int, int] = (1, 3)
-    """Fewest and most objects, each count equally likely."""
-    single_object_scale: Range = (1.2, 2.2)
-    """Diameter of the bounding sphere of an object that is alone, before halving. A size that
-    does not fit between the walls of a small room is drawn again."""
-    object_scale: Range = (0.8, 1.8)
-    """The same for an object among others. Where no place without overlap is found, all sizes are
-    drawn again: the mean of three objects is 1.04 to 1.1 instead of 1.3."""
-    resting_share: float = 0.5
-    """Share of objects that rest on the floor; the others float."""
-
-    num_lights: tuple[int, int] = (1, 8)
-    """Fewest and most emitters, each count equally likely."""
-    total_emission: Range = (2500.0, 5000.0)
-    """Radiance summed over the emitters: one of n emits a number from this range divided by n."""
-    light_scale: Range = (2.0, 2.5)
-    """Scale per axis of the emitter triangle (edge 0.0707), which is not halved."""
-    light_distance: Range = (2.1, 2.7)
-    """Distance of an emitter from a point near the origin (see `target_jitter`)."""
-    light_spacing: float = 0.3
-    """Least distance between two emitters as seen from the origin, on a sphere of radius 0.866."""
-
-    albedo_sum: Range = (0.9, 1.0)
-    """Diffuse scale plus specular of a surface."""
-    roughness_log: Range = (0.06, 1.055)
-    """Range whose logarithm is drawn evenly; `roughness_bias` is then taken off."""
-    roughness_bias: float = 0.05
-    """See `roughness_log`; makes smooth surfaces common without a pile at the smallest value."""
-    roughness_clip: Range = (0.01, 1.0)
-    """Least and greatest roughness."""
-    smooth_share: float = 0.5
-    """Share of objects and shell parts with interpolated normals; the others are flat."""
-    coloured_share: float = 0.5
-    """Share of the smooth ones that have many colours: per triangle on the shell, per shading
-    group on objects."""
-    smooth_angle_deg: float = 30.0
-    """An edge sharper than this separates shading groups."""
-
-    camera_distance: Range = (1.5, 2.0)
-    """From the camera to the point it looks at."""
-    target_jitter: float = 0.2
-    """Most offset per axis from the origin of what a camera looks at or an emitter hangs around."""
-    up_jitter: float = 0.1
-    """Most offset per axis of a camera's up vector from +Z."""
-    fov_deg: Range = (30.0, 60.0)
-    """Full field of view, horizontal and vertical."""
+class ViewLaws:
+    """What a camera must see for its view to be rendered."""
 
     coverage_grid: int = 32
     """Camera rays per side with which a view is judged."""
     min_coverage: float = 0.02
-    """Least share of the camera rays that meet an object first."""
+    """Least share of the camera rays that meet an object first, where the scene has objects."""
     min_lit: float = 0.05
     """Least share of what the camera sees that some emitter shines upon, on the side seen."""
     max_shell_back: float = 0.1
@@ -111,68 +35,80 @@ class SceneSettings:
     """Least distance from the camera to anything, and to the bounding box of any object."""
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            _check_numbers(field.name, getattr(self, field.name))
-        _check_templates(self.templates)
-        _check_counts(self)
-        _check_ranges(self)
+        check_numbers(self, shares=("min_coverage", "min_lit", "max_shell_back"))
+        grid = self.coverage_grid
+        require(grid > 0, "coverage_grid", grid, "a whole number above 0")
 
 
-def _check_ranges(settings: SceneSettings) -> None:
-    for name in SHARES:
-        share = getattr(settings, name)
-        _require(share <= 1, name, share, "a share in [0, 1]")
-    for name in ("albedo_sum", "roughness_clip"):
-        bounds = getattr(settings, name)
-        _require(bounds[1] <= 1, name, bounds, "a range within [0, 1]")
-    _require(settings.fov_deg[1] < 180, "fov_deg", settings.fov_deg, "degrees below 180")
-    tilt_deg = settings.shell_tilt_deg
-    _require(tilt_deg <= 10, "shell_tilt_deg", tilt_deg, "at most 10 degrees")
-    lowest = settings.roughness_log[0] - settings.roughness_bias
-    _require(lowest >= 0, "roughness_bias", settings.roughness_bias, "at most roughness_log's low")
+@dataclass(frozen=True, kw_only=True)
+class SceneSettings:
+    """What scenes are drawn from. Ranges are (low, high), both ends included."""
 
+    families: tuple[Family, ...]
+    """The layouts with their objects, drawn by weight."""
+    families_in_turn: bool = False
+    """Take the families one after the other instead, so that each has exactly its share."""
+    max_triangles: int = 1536
+    """Most triangles of a whole scene, shell and emitters included."""
+    enough_error: float = 0.005
+    """Distance to its source (99th percentile, share of the diagonal) from which an object gets no
+    finer: half a percent is about a pixel of a picture of 256. 0 gives all that the budget has."""
+    centring: Literal["vertex_mean", "box"] = "box"
+    """What becomes the centre of an object: the middle of its source's bounding box, or as
+    published the mean of its vertices, which moves with the tessellation."""
+    fill_to: int | None = None
+    """Split the triangles of objects until the scene has so many, with the surface unchanged."""
+    num_views: int = 4
+    """Cameras of every scene."""
+    placement: PlacementSettings = field(default_factory=PlacementSettings)
+    """How objects are put into the room."""
+    materials: MaterialSettings = field(default_factory=MaterialSettings)
+    """What things are made of."""
+    lights: LightSettings = field(default_factory=LightSettings)
+    """What shines on them."""
+    cameras: CameraSettings = field(default_factory=CameraSettings)
+    """From where they are seen."""
+    views: ViewLaws = field(default_factory=ViewLaws)
+    """What a view must show."""
+    excursions: tuple[Excursion, ...] = ()
+    """Where given, scenes leave the ranges above along one axis each, in turn."""
 
-def _check_numbers(name: str, value: object) -> None:
-    """Check that numbers are finite and from 0, and ranges in order and (but one) above 0."""
-    if name == "templates":
-        return
-    if not isinstance(value, tuple):
-        usable = isinstance(value, int | float) and math.isfinite(value) and value >= 0
-        _require(usable, name, value, "a finite number from 0")
-        return
-    low, high = value
-    _require(math.isfinite(low) and math.isfinite(high), name, value, "finite numbers")
-    _require(low <= high, name, value, "the lower number first")
-    if name != "room_raise":
-        _require(low > 0, name, value, "numbers above 0")
+    def __post_init__(self) -> None:
+        check_numbers(self, shares=("enough_error",))
+        require(len(self.families) > 0, "families", self.families, "at least one")
+        names = [family.name for family in self.families]
+        require(len(set(names)) == len(names), "families", names, "unique names")
+        require(self.num_views > 0, "num_views", self.num_views, "a whole number above 0")
+        known = self.centring in ("vertex_mean", "box")
+        require(known, "centring", self.centring, "vertex_mean or box")
+        self._check_budget()
+        for excursion in self.excursions:
+            self._after(excursion)
 
+    def of_scene(self, scene_index: int) -> "SceneSettings":
+        """Return what a scene is drawn from: these settings, changed by its excursion if any."""
+        excursion = self.excursion_of(scene_index)
+        return self if excursion is None else self._after(excursion)
 
-def _check_templates(templates: tuple[str, ...]) -> None:
-    known = ", ".join(SHELL_TRIANGLES)
-    _require(len(templates) > 0, "templates", templates, f"some of {known}")
-    for name in templates:
-        _require(name in SHELL_TRIANGLES, "templates", name, f"one of {known}")
+    def excursion_of(self, scene_index: int) -> Excursion | None:
+        """Return the excursion of a scene; they take turns."""
+        return self.excursions[scene_index % len(self.excursions)] if self.excursions else None
 
+    def _after(self, excursion: Excursion) -> "SceneSettings":
+        plain = dataclasses.replace(self, excursions=())
+        return changed(plain, dict(excursion.changes))
 
-def _check_counts(settings: SceneSettings) -> None:
-    for name in ("num_views", "coverage_grid"):
-        count = getattr(settings, name)
-        _require(isinstance(count, int) and count > 0, name, count, "a whole number above 0")
-    for name in ("num_objects", "num_lights"):
-        counts = getattr(settings, name)
-        whole = all(isinstance(count, int) for count in counts)
-        _require(whole, name, counts, "two whole numbers")
-    shell = max(SHELL_TRIANGLES[name] for name in settings.templates)
-    least = shell + settings.num_lights[1] + settings.num_objects[1]
-    _require(
-        settings.max_triangles >= least,
-        "max_triangles",
-        settings.max_triangles,
-        f"at least {least}: a shell of {shell}, {settings.num_lights[1]} emitters, and a triangle "
-        "for each object",
-    )
-
-
-def _require(law: bool, name: str, value: object, expected: str) -> None:
-    if not law:
-        raise TrilightError(f"scene settings: {name} is {value!r}; expected {expected}.")
+    def _check_budget(self) -> None:
+        for family in self.families:
+            lights, objects = self.lights.count[1], family.num_objects[1]
+            least = family.shell_triangles + lights + 4 * objects
+            require(
+                self.max_triangles >= least,
+                "max_triangles",
+                self.max_triangles,
+                f"at least {least} for {family.name}: a shell of {family.shell_triangles}, "
+                f"{lights} emitters, and four triangles for each of {objects} objects",
+            )
+        fill_to = self.max_triangles if self.fill_to is None else self.fill_to
+        fits = 0 < fill_to <= self.max_triangles
+        require(fits, "fill_to", self.fill_to, "a number of at most max_triangles")

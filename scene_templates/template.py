@@ -1,16 +1,16 @@
-"""`Template`: a layout family as data, and the two functions that every family offers.
+"""`Template`: a layout as data, and the function that builds one from its parameters.
 
-Following infinigen's convention, `layout(params)` builds and draws nothing, while
-`layout_rand(rng, ...)` draws the parameters and builds. The families differ in the walls that they
-have and the side from which they are seen and lit, and in nothing else, so that each is one value
-in a file of its own.
+Following infinigen's convention, `Template.layout(params)` builds and draws nothing, while
+`layout_rand(rng, ...)` in the file of that name draws the parameters and builds. The layouts differ
+in the walls that they have and the side from which they are seen and lit, and in nothing else, so
+that each is one value in a file of its own.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from scene_templates.cameras import camera_rand
+from scene_templates.cameras import CameraSettings, camera_rand
 from scene_templates.layout import (
     CameraPose,
     Emitter,
@@ -19,13 +19,8 @@ from scene_templates.layout import (
     ShellPart,
     Surface,
 )
-from scene_templates.lights import emitters_rand
-from scene_templates.materials import surface_rand
 from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
-from scene_templates.placement import ObjectSpace, objects_rand
-from scene_templates.rooms import floor_plane, room_rand
 from scene_templates.sectors import Sector
-from scene_templates.settings import SceneSettings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,23 +32,30 @@ class LayoutParams:
     surfaces: tuple[Surface, ...]
     """What each shell part is made of."""
     objects: tuple[ObjectPlacement, ...]
-    """Room for the objects."""
+    """Where the objects are, and what they are made of."""
     emitters: tuple[Emitter, ...]
     """The lights."""
+    wall2_faces_out: bool = False
+    """See SeparateSides."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Template:
-    """A family of layouts."""
+    """A layout."""
 
     name: str
-    """As in `SceneSettings.templates`."""
+    """As in `Family.template`."""
     parts: tuple[str, ...]
     """Names of its shell parts (scene_templates.patches.SIDES), the floor first."""
     cameras: Sector
     """From where it is seen."""
     lights: Sector
     """From where it is lit."""
+
+    @property
+    def shell_triangles(self) -> int:
+        """Triangles of floor and walls: 128 each."""
+        return len(PATCH_FACES) * len(self.parts)
 
     def layout(self, params: LayoutParams) -> Layout:
         """Build a layout; a pure function of its parameters."""
@@ -62,37 +64,15 @@ class Template:
             ShellPart(
                 name=name,
                 positions=patch(SIDES[name], placement),
-                faces=PATCH_FACES,
+                faces=PATCH_FACES[:, ::-1]
+                if name == "wall2" and params.wall2_faces_out
+                else PATCH_FACES,
                 surface=surface,
             )
             for name, placement, surface in rows
         )
-        return Layout(
-            shell=shell,
-            floor=floor_plane(shell[0].positions),
-            objects=params.objects,
-            emitters=params.emitters,
-        )
+        return Layout(shell=shell, objects=params.objects, emitters=params.emitters)
 
-    def layout_rand(
-        self, rng: np.random.Generator, settings: SceneSettings, num_objects: int
-    ) -> Layout:
-        """Draw a layout; raises Rejected("no_room") if the objects do not fit."""
-        room = room_rand(rng, settings, self.parts)
-        surfaces = tuple(surface_rand(rng, settings) for _ in self.parts)
-        emitters = emitters_rand(rng, settings, self.lights)
-        space = ObjectSpace(
-            room=room,
-            parts=self.parts,
-            floor=floor_plane(patch(SIDES["floor"], room.patches[0])),
-        )
-        objects = objects_rand(rng, settings, space, num_objects)
-        return self.layout(
-            LayoutParams(
-                patches=room.patches, surfaces=surfaces, objects=objects, emitters=emitters
-            )
-        )
-
-    def camera_rand(self, rng: np.random.Generator, settings: SceneSettings) -> CameraPose:
+    def camera_rand(self, rng: np.random.Generator, settings: CameraSettings) -> CameraPose:
         """Draw one camera."""
         return camera_rand(rng, settings, self.cameras)

@@ -43,6 +43,10 @@ class DatasetFolder:
         return self.root / "contact_sheet.png"
 
     @property
+    def template_sheet(self) -> Path:
+        return self.root / "templates.png"
+
+    @property
     def report(self) -> Path:
         return self.root / "report.html"
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from storage.conventions import SPLITS
 from storage.errors import TrilightError
 
-LISTED_SPLIT = "test"
-"""Split of scenes that somebody wrote down: they are judged by, never learnt from."""
+JUDGED_SPLIT = "test"
+"""Split of whole sets that are judged by, never learnt from."""
 
 _VALIDATION_SLOT, _TEST_SLOT = 2, 5
 """Places in a cycle of shards: early, so that a small dataset has all three splits."""
@@ -28,9 +28,11 @@ class SplitSettings:
     """Of this many shards in a row one is for validation and one is for testing."""
     held_out_objects: float = 0.125
     """Share of objects kept for validation, and again for testing."""
+    one_split: bool = False
+    """All objects and scenes are of the split `test`: a set to be judged by."""
     listed_scenes: int | None = None
-    """How many scenes there are where they come from files instead of being drawn: all are of one
-    split (LISTED_SPLIT), the last shard may hold fewer, and the dataset cannot grow."""
+    """How many scenes there are where they come from files instead of being drawn: the last shard
+    may hold fewer, and the dataset cannot grow."""
 
     def __post_init__(self) -> None:
         if self.scenes_per_shard < 1:
@@ -52,6 +54,8 @@ class SplitSettings:
 
 def split_of_object(geometry_sha256: str, settings: SplitSettings) -> str:
     """Return the split of an object from the digest of its cleaned geometry (64 hex digits)."""
+    if settings.one_split:
+        return JUDGED_SPLIT
     position = int(geometry_sha256[:16], 16) / 2**64
     if position < settings.held_out_objects:
         return "validation"
@@ -60,8 +64,8 @@ def split_of_object(geometry_sha256: str, settings: SplitSettings) -> str:
 
 def split_of_shard(shard_index: int, settings: SplitSettings) -> str:
     """Return the split of a shard from its number."""
-    if settings.listed_scenes is not None:
-        return LISTED_SPLIT
+    if settings.one_split:
+        return JUDGED_SPLIT
     slot = shard_index % settings.shards_per_cycle
     return {_VALIDATION_SLOT: "validation", _TEST_SLOT: "test"}.get(slot, "train")
 

@@ -1,4 +1,4 @@
-"""What a dataset holds, from the JSON members of its samples alone: no picture is decoded."""
+"""What a dataset holds, without its pictures."""
 
 import json
 from collections import Counter
@@ -10,6 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.dataset import Dataset
+from storage.digests import sha256_hex
+
+SCENE_SUFFIX = ".scene.safetensors"
+"""Of the member that holds a scene's arrays (storage.sample)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -22,6 +26,11 @@ class Statistics:
     """Scenes per split."""
     scenes_by_template: Mapping[str, int]
     """Scenes per layout template."""
+    scenes_by_excursion: Mapping[str, int]
+    """Scenes per axis along which they leave the usual range; empty where none does."""
+    scene_digest: str
+    """sha256 over the keys and arrays of all scenes, without pictures: equal for equal scenes,
+    whatever they were rendered with."""
     num_bytes: int
     """Bytes of all shards."""
     spp: NDArray[np.int64]
@@ -43,10 +52,16 @@ class Statistics:
         return [
             ("scenes", f"{self.num_scenes} ({_counts(self.scenes_by_split)})"),
             ("templates", _counts(self.scenes_by_template)),
+            *(
+                [("beyond the range", beyond)]
+                if (beyond := _counts(self.scenes_by_excursion))
+                else []
+            ),
             ("views", f"{self.num_views}"),
             ("noise floor", f"median {median:.1f} dB, 5th percentile {low:.1f} dB (psnr_log_db)"),
             ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),
             ("samples per pixel", f"median {np.median(self.spp):.0f}, most {self.spp.max()}"),
+            ("scene digest", self.scene_digest),
             ("size", f"{self.num_bytes / 1e6:.1f} MB, {self.bytes_per_scene / 1e3:.0f} kB a scene"),
         ]
 
@@ -56,28 +71,38 @@ class Statistics:
 
 
 def dataset_statistics(dataset: Dataset) -> Statistics:
-    """Read the JSON member of every sample through the manifest's index.
+    """Read every sample but its pictures through the manifest's index.
 
     Raises:
         TrilightError, OSError: a shard is missing or shorter than its index.
     """
     splits: Counter[str] = Counter()
     templates: Counter[str] = Counter()
+    excursions: Counter[str] = Counter()
     views: list[Any] = []
+    scene_digests: list[str] = []
     for shard in dataset.manifest.shards:
         with dataset.folder.shard(shard.name).open("rb") as stream:
             for name, offset, num_bytes in shard.members:
-                if not name.endswith(".json"):
+                if not name.endswith((".json", SCENE_SUFFIX)):
                     continue
                 stream.seek(offset)
-                record = json.loads(stream.read(num_bytes))
+                member = stream.read(num_bytes)
+                if name.endswith(SCENE_SUFFIX):
+                    scene_digests.append(f"{name} {sha256_hex(member)}")
+                    continue
+                record = json.loads(member)
                 splits[shard.split] += 1
                 templates[record["provenance"]["template"]] += 1
+                if excursion := record["provenance"].get("excursion"):
+                    excursions[excursion["axis"]] += 1
                 views.extend(record["views"])
     return Statistics(
         num_scenes=dataset.manifest.num_samples,
         scenes_by_split=splits,
         scenes_by_template=templates,
+        scenes_by_excursion=excursions,
+        scene_digest=sha256_hex("\n".join(sorted(scene_digests)).encode()),
         num_bytes=dataset.manifest.num_bytes,
         spp=np.array([view["spp"] for view in views], np.int64),
         noise_floor_db=np.array([view["noise_floor_db"] for view in views], np.float64),

@@ -19,11 +19,11 @@ import matplotlib.pyplot as plt
 
 from infra.bench.harness import Comparison, Options, compare
 from pipeline.flows.accept_objects import accept_objects
-from pipeline.flows.builds import smoke
 from pipeline.flows.environment import environment
 from pipeline.flows.make_scene import MAX_ATTEMPTS, SceneSource, attempt_scene, set_up_child
 from pipeline.flows.publication import begin
 from pipeline.flows.settings import BuildSettings
+from pipeline.flows.training_builds import smoke
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import choose_variant
 from storage.layout import DatasetFolder

@@ -14,7 +14,7 @@ from storage.errors import TrilightError
 if TYPE_CHECKING:
     from infra.bench.harness import Comparison, Options
 
-_NAMES = ("assets", "render")
+_NAMES = ("assets", "render", "scenes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,5 +71,11 @@ def _named(name: str) -> _Benchmark:
 
         return _Benchmark(
             num_rounds=render.num_rounds, run=render.run, rows=render.rows, plot=render.plot
+        )
+    if name == "scenes":
+        from infra.bench import scenes
+
+        return _Benchmark(
+            num_rounds=scenes.num_rounds, run=scenes.run, rows=scenes.rows, plot=scenes.plot
         )
     raise TrilightError(f"benchmark {name!r} is unknown; expected one of {', '.join(_NAMES)}.")

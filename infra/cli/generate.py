@@ -12,6 +12,7 @@ import typer
 from rich.progress import Progress as Bars
 from rich.text import Text
 
+from infra.cli.changes import parse_changes
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.objects.licences import USER_PROVIDED
@@ -33,10 +34,13 @@ _MAX_NOTES = 20
 def generate(
     build: Annotated[str, typer.Argument(help="named settings, such as smoke")],
     objects: Annotated[
-        str, typer.Option(help="folder of 3D objects, its URL, builtin: or objaverse:")
-    ] = "builtin:",
+        str | None,
+        typer.Option(help="folder of 3D objects, its URL, builtin: or objaverse: [builtin:]"),
+    ] = None,
     out: Annotated[Path, typer.Option(help="folder of the dataset")] = Path("data/smoke"),
-    scenes: Annotated[int, typer.Option(help="scenes, rounded up to whole shards")] = 24,
+    scenes: Annotated[
+        int | None, typer.Option(help="scenes, rounded up to whole shards [as the build says]")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="seed of every draw")] = None,
     resolution: Annotated[int | None, typer.Option(help="picture width in pixels")] = None,
     noise_floor: Annotated[
@@ -58,17 +62,26 @@ def generate(
     scenes_from: Annotated[
         Path | None,
         typer.Option(
-            help="render every *.json of this folder (RenderFormer scenes) instead; objects, "
-            "scenes and the build's limits on scenes do not apply"
+            help="render every *.json of this folder (RenderFormer scenes) instead; the build's "
+            "limits on scenes do not apply"
         ),
     ] = None,
     views: Annotated[
         int | None,
         typer.Option(help="with --scenes-from: first cameras of each file [all that every has]"),
     ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="any other setting by its name in manifest.json, with its value in JSON, such as "
+            "scenes.lights.coloured_share=0.5; may be repeated",
+        ),
+    ] = None,
     json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
 ) -> None:
     """Turn objects into a verified, resumable dataset; run it again to go on after any stop."""
+    changes = parse_changes(set_ or ())
     quiet_prefect()
     folder = DatasetFolder(out)
     started = time.monotonic()
@@ -93,6 +106,7 @@ def generate(
                 accept_environment=accept_environment,
                 scenes_from=None if scenes_from is None else str(scenes_from),
                 views=views,
+                changes=changes,
             )
     _report(folder, outcome, time.monotonic() - started, as_json=json)
 

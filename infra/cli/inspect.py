@@ -9,6 +9,7 @@ import typer
 
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from storage.dataset import Dataset, open_dataset
+from storage.errors import TrilightError
 from storage.failures import count_by_reason
 from storage.layout import DatasetFolder
 from storage.statistics import Statistics, dataset_statistics
@@ -23,6 +24,9 @@ _READ_ONLY = "The folder cannot be written: choose one for report and contact sh
 def inspect(
     dataset: Annotated[Path, typer.Argument(help="folder of the dataset")],
     scenes: Annotated[int, typer.Option(help="scenes on the contact sheet")] = 16,
+    by_template: Annotated[
+        int | None, typer.Option(help="write templates.png too: so many scenes of each layout")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="write the report and the sheet here [the dataset]")
     ] = None,
@@ -44,6 +48,8 @@ def inspect(
     writable = out is not None or os.access(folder.root, os.W_OK | os.X_OK)
     if writable:
         _write(opened, statistics, found, folder, max_scenes=scenes)
+        if by_template is not None:
+            _write_templates(opened, folder, per_template=by_template)
     if json:
         print_json(_as_json(opened, statistics, found))
         return
@@ -65,6 +71,14 @@ def _write(
 
     write_contact_sheet(opened, statistics, max_scenes=max_scenes, out=folder)
     write_report(opened, found, out=folder)
+
+
+def _write_templates(opened: Dataset, folder: DatasetFolder, *, per_template: int) -> None:
+    from pipeline.documents.template_sheet import write_template_sheet
+
+    if per_template < 1:
+        raise TrilightError(f"--by-template is {per_template}; expected at least 1.")
+    write_template_sheet(opened, per_template=per_template, out=folder)
 
 
 def _as_json(opened: Dataset, statistics: Statistics, found: "Distributions") -> dict[str, object]:

@@ -14,9 +14,9 @@ from storage.statistics import Statistics
 
 _TILE_PX = 192
 _MARGIN_PX = 8
-_CAPTION_PX = 34
+_CAPTION_PX = 50
 _TITLE_PX = 64
-_SCENES_PER_ROW = 2
+_TILES_PER_ROW = 8
 _BACKGROUND, _INK, _FAINT = (24, 24, 26), (235, 235, 235), (160, 160, 165)
 
 
@@ -45,14 +45,15 @@ def write_contact_sheet(
     if not chosen:
         return
     views = dataset.manifest.num_views
-    row_width = _SCENES_PER_ROW * (views * _TILE_PX + 2 * _MARGIN_PX)
-    rows = -(-len(chosen) // _SCENES_PER_ROW)
+    per_row = min(max(1, _TILES_PER_ROW // views), len(chosen))
+    row_width = per_row * (views * _TILE_PX + 2 * _MARGIN_PX)
+    rows = -(-len(chosen) // per_row)
     row_height = _TILE_PX + _CAPTION_PX + _MARGIN_PX
     sheet = Image.new("RGB", (row_width, _TITLE_PX + rows * row_height), _BACKGROUND)
     _draw_title(sheet, dataset, statistics)
     for number, (entry, sample) in enumerate(read_chosen(dataset, chosen)):
-        row, column = divmod(number, _SCENES_PER_ROW)
-        left = column * (row_width // _SCENES_PER_ROW) + _MARGIN_PX
+        row, column = divmod(number, per_row)
+        left = column * (row_width // per_row) + _MARGIN_PX
         _draw_cell(sheet, sample, entry.split, left, _TITLE_PX + row * row_height)
     stream = io.BytesIO()
     sheet.save(stream, "PNG")
@@ -78,20 +79,23 @@ def _draw_title(sheet: Image.Image, dataset: Dataset, statistics: Statistics) ->
 
 def _draw_cell(sheet: Image.Image, sample: Sample, split: str, left: int, top: int) -> None:
     draw = ImageDraw.Draw(sheet)
-    template = sample.scene.provenance["template"]
-    draw.text(
-        (left, top),
-        f"{sample.key}  {split}  {template}  {sample.scene.num_triangles} triangles",
-        fill=_INK,
-        font=ImageFont.load_default(13),
+    origin = sample.scene.provenance
+    excursion = origin.get("excursion")
+    beyond = f"  {excursion['axis']} {excursion['value']:g}" if excursion else ""
+    lines = (
+        f"{sample.key}  {split}{beyond}",
+        f"{origin['template']}  {sample.scene.num_triangles} triangles",
     )
+    for number, line in enumerate(lines):
+        at = (left, top + 16 * number)
+        draw.text(at, line, fill=_INK, font=ImageFont.load_default(13))
     for view, (picture, record) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
         tile = Image.fromarray(preview_srgb8(picture)).resize((_TILE_PX, _TILE_PX))
         x = left + view * _TILE_PX
         sheet.paste(tile, (x, top + _CAPTION_PX))
         mark = " (cap)" if record.at_cap else ""
         draw.text(
-            (x, top + 17),
+            (x, top + 33),
             f"{record.noise_floor_db:.1f} dB, {record.spp} spp{mark}",
             fill=_FAINT,
             font=ImageFont.load_default(11),

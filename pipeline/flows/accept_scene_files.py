@@ -15,7 +15,7 @@ from pipeline.objects.licences import StatedLicence, stated_licence
 from storage.errors import TrilightError
 from storage.progress import announce_objects, count_object
 from storage.records import LockedObject
-from storage.splits import LISTED_SPLIT
+from storage.splits import JUDGED_SPLIT
 
 
 def settings_for_files(
@@ -35,7 +35,9 @@ def settings_for_files(
     return dataclasses.replace(
         settings,
         scenes=dataclasses.replace(settings.scenes, num_views=folder.views(views)),
-        splits=dataclasses.replace(settings.splits, listed_scenes=len(folder.descriptions)),
+        splits=dataclasses.replace(
+            settings.splits, one_split=True, listed_scenes=len(folder.descriptions)
+        ),
     )
 
 
@@ -111,7 +113,7 @@ def _locked(uid: str, sha256: str, stated: StatedLicence) -> LockedObject:
     return LockedObject(
         uid=uid,
         asset_sha256=sha256,
-        split=LISTED_SPLIT,
+        split=JUDGED_SPLIT,
         licence=stated.licence,
         licence_source=stated.licence_source,
         title=uid,

@@ -1,59 +1,20 @@
 """The named builds: each a function that returns the full settings of a dataset."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import Any
 
-from pipeline.assets.settings import AssetSettings
-from pipeline.flows.settings import BuildSettings
-from pipeline.objects.licences import DEFAULT_ALLOWED
-from pipeline.renders.settings import RenderSettings
-from scene_templates.settings import SceneSettings
+from pipeline.flows.judging_builds import JUDGING_BUILDS
+from pipeline.flows.renderformer_builds import RENDERFORMER_BUILDS
+from pipeline.flows.settings import BuildSettings, NamedBuild
+from pipeline.flows.training_builds import TRAINING_BUILDS
+from pipeline.objects.generated import PREFIX as BUILTIN
+from storage.changes import changed
 from storage.errors import TrilightError
-from storage.splits import SplitSettings
+from storage.statistics import Statistics
 
-
-def smoke() -> BuildSettings:
-    """Minutes on a laptop: small shards, 256 pixels, pictures to 40 dB or 256 samples."""
-    return BuildSettings(
-        build="smoke",
-        seed=0,
-        allowed_licences=DEFAULT_ALLOWED,
-        assets=AssetSettings(budgets=(1400, 1000, 700, 500, 340, 240)),
-        scenes=SceneSettings(max_triangles=1536, num_views=4),
-        renders=RenderSettings(resolution=256, noise_floor_db=40.0, min_spp=128, max_spp=256),
-        splits=SplitSettings(scenes_per_shard=4),
-    )
-
-
-def pretrain_256() -> BuildSettings:
-    """The first training stage: 256 pixels, up to 1536 triangles, pictures to 46 dB."""
-    build = smoke()
-    return dataclasses.replace(
-        build,
-        build="pretrain-256",
-        renders=dataclasses.replace(build.renders, noise_floor_db=46.0, max_spp=4096),
-        splits=SplitSettings(scenes_per_shard=256, shards_per_cycle=64, held_out_objects=0.02),
-    )
-
-
-def finetune_512() -> BuildSettings:
-    """The second training stage: 512 pixels, up to 4096 triangles, pictures to 46 dB."""
-    build = pretrain_256()
-    return dataclasses.replace(
-        build,
-        build="finetune-512",
-        assets=dataclasses.replace(build.assets, budgets=(3900, 2600, 1700, 1100, 700, 400)),
-        scenes=dataclasses.replace(build.scenes, max_triangles=4096),
-        renders=dataclasses.replace(build.renders, resolution=512),
-        splits=dataclasses.replace(build.splits, scenes_per_shard=64),
-    )
-
-
-BUILDS: Mapping[str, Callable[[], BuildSettings]] = {
-    "smoke": smoke,
-    "pretrain-256": pretrain_256,
-    "finetune-512": finetune_512,
-}
+BUILDS: Mapping[str, NamedBuild] = {**TRAINING_BUILDS, **RENDERFORMER_BUILDS, **JUDGING_BUILDS}
+"""By the name that the command line takes."""
 
 
 def named_build(
@@ -63,6 +24,7 @@ def named_build(
     resolution: int | None = None,
     noise_floor_db: float | None = None,
     allow_licences: tuple[str, ...] = (),
+    changes: Mapping[str, Any] | None = None,
 ) -> BuildSettings:
     """Return the settings of a build with what the caller wants otherwise.
 
@@ -70,22 +32,49 @@ def named_build(
         name: one of BUILDS.
         seed, resolution, noise_floor_db: replace the build's value where not None.
         allow_licences: allowed in addition to the build's.
+        changes: any other settings by dotted name, such as `scenes.lights.coloured_share`.
 
     Raises:
         TrilightError: an unknown name, or values that contradict each other.
     """
     if name not in BUILDS:
         raise TrilightError(f"build {name!r} is unknown; expected one of {', '.join(BUILDS)}.")
-    build = BUILDS[name]()
-    renders = build.renders
-    if resolution is not None:
-        renders = dataclasses.replace(renders, resolution=resolution)
-    if noise_floor_db is not None:
-        renders = dataclasses.replace(renders, noise_floor_db=noise_floor_db)
+    build = BUILDS[name].settings()
+    named = {
+        "seed": seed,
+        "renders.resolution": resolution,
+        "renders.noise_floor_db": noise_floor_db,
+    }
+    build = changed(build, {key: value for key, value in named.items() if value is not None})
     licences = tuple(sorted({*build.allowed_licences, *allow_licences}))
-    return dataclasses.replace(
-        build,
-        seed=build.seed if seed is None else seed,
-        renders=renders,
-        allowed_licences=licences,
+    return changed(dataclasses.replace(build, allowed_licences=licences), changes or {})
+
+
+def object_source(settings: BuildSettings, objects: str | None) -> str:
+    """Return where objects come from.
+
+    Raises:
+        TrilightError: the build is frozen with another source than the one given.
+    """
+    if settings.source is None:
+        return objects or BUILTIN
+    if objects not in (None, settings.source):
+        raise TrilightError(
+            f"--objects is {objects!r}; expected {settings.source!r}, which {settings.build} is "
+            "frozen with: leave --objects away, or choose another build."
+        )
+    return settings.source
+
+
+def frozen_note(build: str, statistics: Statistics) -> tuple[str, ...]:
+    """Return a note on whether the scenes of a frozen set are the published ones."""
+    named = BUILDS[build]
+    if named.scene_digest is None or statistics.num_scenes != named.num_scenes:
+        return ()
+    if statistics.scene_digest == named.scene_digest:
+        return (f"these are the published {named.num_scenes} scenes of {build}",)
+    return (
+        f"the scene digest is {statistics.scene_digest}; the published scenes of {build} have "
+        f"{named.scene_digest}. These are other scenes, so figures cannot be compared: install "
+        "the exact versions with make setup",
     )

@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
@@ -21,7 +21,7 @@ from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.report import write_report
 from pipeline.flows.accept_objects import AcceptedObjects, accept_objects
 from pipeline.flows.accept_scene_files import accept_scene_files, settings_for_files
-from pipeline.flows.builds import named_build
+from pipeline.flows.builds import BUILDS, frozen_note, named_build, object_source
 from pipeline.flows.children import ChildPool
 from pipeline.flows.environment import environment
 from pipeline.flows.make_scene import SceneSource, set_up_child
@@ -59,15 +59,16 @@ class Outcome:
     statistics: Statistics
     """What the dataset holds."""
     notes: tuple[str, ...] = ()
-    """What a person should know of the scene files: unknown fields, cameras not used."""
+    """What a person should know: fields of scene files that are unknown, cameras that were not
+    used, and whether a frozen set is the published one."""
 
 
 @flow(name="generate-scenes", persist_result=False, validate_parameters=True)
 def generate_scenes(
     build: str = "smoke",
-    objects: str = "builtin:",
+    objects: str | None = None,
     out: str = "data/smoke",
-    scenes: int = 24,
+    scenes: int | None = None,
     seed: int | None = None,
     resolution: int | None = None,
     noise_floor_db: float | None = None,
@@ -78,18 +79,19 @@ def generate_scenes(
     accept_environment: bool = False,
     scenes_from: str | None = None,
     views: int | None = None,
+    changes: dict[str, Any] | None = None,
 ) -> Outcome:
     """Make a dataset, or what is missing of it.
 
     With `scenes_from`, scene k is the k-th `*.json` of a folder, with the first of its cameras, and
-    all are of the split `test`; `objects`, `scenes` and the build's limits on scenes do not apply.
+    all are of the split `test`; the build's limits on scenes do not apply.
 
     Args:
         build: name of the settings, such as `smoke`.
         objects: a folder of 3D objects here or on a server, `builtin:` for procedural ones, or
-            `objaverse:`.
+            `objaverse:`; by default what the build demands, or else `builtin:`.
         out: folder of the dataset.
-        scenes: how many scenes; rounded up to whole shards.
+        scenes: how many scenes, rounded up to whole shards; by default the build's number.
         seed: replaces the build's seed.
         resolution: replaces the build's picture width in pixels.
         noise_floor_db: replaces the build's target (psnr_log_db).
@@ -100,6 +102,7 @@ def generate_scenes(
         accept_environment: go on with a dataset that was begun with other library versions.
         scenes_from: folder of scene files (RenderFormer JSON) to render instead of new scenes.
         views: cameras of each scene file; by default as many as every file has.
+        changes: other settings of the build by dotted name, such as `scenes.lights.count`.
 
     Raises:
         TrilightError: what the user can mend; what is finished is safe.
@@ -110,10 +113,18 @@ def generate_scenes(
         resolution=resolution,
         noise_floor_db=noise_floor_db,
         allow_licences=tuple(allow_licences or ()),
+        changes=changes,
     )
     if workers < 1:
         raise TrilightError(f"workers is {workers}; expected at least 1.")
     listed = None if scenes_from is None else find_scene_files(scenes_from)
+    if listed and (objects or scenes):
+        raise TrilightError(
+            f"--scenes-from {scenes_from} was given with --objects or --scenes; expected neither: "
+            "the files say both."
+        )
+    source = object_source(settings, objects)
+    num_scenes = BUILDS[build].num_scenes if scenes is None else scenes
     settings = settings_for_files(settings, listed, views)
     folder = DatasetFolder(Path(out).resolve())
     with folder.locked():
@@ -123,14 +134,14 @@ def generate_scenes(
             folder,
             settings,
             environment(variant),
-            scenes,
+            num_scenes,
             accept_environment=accept_environment,
         )
         accepted = (
             read_scenes_task(_whole(listed), licence, _whole(settings), _whole(publication))
             if listed
             else prepare_assets_task(
-                objects, licence, _whole(settings), _whole(publication), workers
+                source, licence, _whole(settings), _whole(publication), workers
             )
         )
         _make_shards(settings, variant, publication, accepted, workers, failure_budget)
@@ -141,7 +152,7 @@ def generate_scenes(
         num_objects_used=len(accepted.objects),
         num_scenes_given_up=publication.num_given_up(),
         statistics=statistics,
-        notes=listed.notes(settings.scenes.num_views) if listed else (),
+        notes=listed.notes(settings.scenes.num_views) if listed else frozen_note(build, statistics),
     )
 
 

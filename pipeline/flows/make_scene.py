@@ -90,14 +90,15 @@ def _scene(split: str, scene_index: int, attempt: int) -> Scene:
         return source.files.scene(scene_index, source.settings)
     return compose_scene(
         source.settings.scenes,
-        _assets_of(split),
+        assets_of(split),
         seed=source.settings.seed,
         scene_index=scene_index,
         attempt=attempt,
     )
 
 
-def _assets_of(split: str) -> Sequence[PooledAsset]:
+def assets_of(split: str) -> Sequence[PooledAsset]:
+    """Return the objects of a split, sorted by uid; read at the first call in a child."""
     if split not in _state.pool:
         source = _state.source
         _state.pool[split] = [
@@ -134,7 +135,7 @@ def _render_sample(
                 scene = next_camera(scene, settings.scenes, view=view)
         pictures.append(rendered.radiance_rgb)
         camera = (scene.c2w[view], float(scene.fov_deg[view]))
-        facts = sight.facts(*camera, settings.scenes.coverage_grid)
+        facts = sight.facts(*camera, settings.scenes.views.coverage_grid)
         records.append(_record(rendered, facts, seed, camera_attempt))
     scene.check()
     return Sample(

@@ -3,7 +3,7 @@
 import dataclasses
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,8 @@ class BuildSettings:
     """Name of the build that they come from."""
     seed: int
     """Seed of every draw; any integer from 0."""
+    source: str | None = None
+    """Where objects must come from; by default the user says."""
     allowed_licences: tuple[str, ...]
     """Licences of objects that may be used."""
     assets: AssetSettings
@@ -49,6 +51,18 @@ class BuildSettings:
     def digest(self) -> str:
         """sha256 of the settings."""
         return sha256_hex(canonical_json(self.as_json()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedBuild:
+    """What a name on the command line stands for."""
+
+    settings: Callable[[], BuildSettings]
+    """Returns the settings."""
+    num_scenes: int
+    """How many scenes are made where the user does not say."""
+    scene_digest: str | None = None
+    """What the scenes of a frozen set must add up to (storage.statistics), if there are so many."""
 
 
 def differences(

@@ -1,5 +1,8 @@
 """`builtin:`: procedural objects as files, so that a new user needs no download.
 
+`builtin:benchmark-v1` is a set of its own, of which no other source has an object: networks may
+learn from all others and be judged on these.
+
 The files are made anew on every run (milliseconds each) and written only where they differ, so the
 stages after this one read files and nothing else, and a damaged file is mended.
 """
@@ -14,12 +17,16 @@ from storage.records import ObjectRecord
 from storage.seeds import rng_for
 
 PREFIX = "builtin:"
+BENCHMARK = "builtin:benchmark-v1"
+BENCHMARK_COUNT = 100
 DEFAULT_COUNT = 64
 MAX_COUNT = 100_000
 
 
 def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
-    """Write the objects of `builtin:` or `builtin:N` below `work_dir`; return their records.
+    """Write the objects of a source below `work_dir`; return their records.
+
+    Sources are `builtin:`, `builtin:N` and `builtin:benchmark-v1`.
 
     Object i does not depend on N, so a larger N keeps the smaller set.
 
@@ -27,16 +34,17 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
         TrilightError: N is no number from 1 to MAX_COUNT, or `work_dir` cannot be written.
     """
     names = list(FAMILIES)
+    group = "builtin" if source != BENCHMARK else "builtin-benchmark-v1"
     records = []
     for index in range(_count(source)):
         family, number = names[index % len(names)], index // len(names)
-        path = work_dir / "builtin" / f"{family}-{number:05d}.ply"
-        data = encode_ply(*FAMILIES[family](rng_for(0, f"builtin/{family}", number)))
+        path = work_dir / group / f"{family}-{number:05d}.ply"
+        data = encode_ply(*FAMILIES[family](rng_for(0, f"{group}/{family}", number)))
         if not path.is_file() or path.read_bytes() != data:
             write_atomically(path, data)
         records.append(
             ObjectRecord(
-                uid=f"builtin/{path.stem}",
+                uid=f"{group}/{path.stem}",
                 path=str(path.resolve()),
                 title=f"{family.replace('_', ' ')} {number}",
                 licence="CC0-1.0",
@@ -49,6 +57,8 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
 
 
 def _count(source: str) -> int:
+    if source == BENCHMARK:
+        return BENCHMARK_COUNT
     text = source.removeprefix(PREFIX)
     if not text:
         return DEFAULT_COUNT
@@ -56,6 +66,6 @@ def _count(source: str) -> int:
     if not 1 <= count <= MAX_COUNT:
         raise TrilightError(
             f"objects is {source!r}; expected builtin:N with N from 1 to {MAX_COUNT}, such as "
-            f"{PREFIX}{DEFAULT_COUNT}."
+            f"{PREFIX}{DEFAULT_COUNT}, or {BENCHMARK}."
         )
     return count

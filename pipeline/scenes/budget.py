@@ -1,48 +1,104 @@
-"""The triangle budget: one limit per scene, shared among its objects.
+"""The triangle budget: one limit per scene, and detail where it is needed.
 
 A limit per object would either waste most of a scene's triangles or overflow it (the published
-recipes do both). Objects that need few triangles come first, and what they leave goes to the rest.
+recipes do both). Here objects are drawn among those that still fit; each begins with its coarsest
+level, and triangles go, level by level, to the object that is farthest from its source, until all
+are near enough or nothing finer fits.
 """
 
 from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
 
 from storage.asset import Asset, Level
 from storage.errors import Rejected
 
+Entry = TypeVar("Entry")
 
-def levels_within(assets: Sequence[Asset], num_triangles: int) -> tuple[Level, ...]:
-    """Choose one level per asset, together at most `num_triangles`.
+
+def drawn_within(
+    rng: np.random.Generator,
+    entries: Sequence[Entry],
+    least: Sequence[int],
+    count: int,
+    num_triangles: int,
+) -> list[Entry]:
+    """Draw entries with replacement, evenly among those that fit beside the ones before.
+
+    Where all fit, this is an even draw. Otherwise simple objects are drawn more often as
+    companions of demanding ones, as they would be if whole scenes were drawn until one fits.
+
+    Args:
+        rng: where the numbers come from.
+        entries: what to draw from.
+        least: triangles of the coarsest level of each entry.
+        count: how many.
+        num_triangles: for all together.
 
     Raises:
-        Rejected: "over_budget" where an object has no level small enough for its share.
+        Rejected: "over_budget" where not even the simplest fit.
     """
-    chosen: dict[int, Level] = {}
+    sizes = np.array(least)
     left = num_triangles
-    for row in sorted(range(len(assets)), key=lambda row: _finest(assets[row])):
-        share = left // (len(assets) - len(chosen))
-        level = assets[row].finest_within(share)
-        if level is None:
-            smallest = min(len(level.faces) for level in assets[row].levels)
+    drawn: list[Entry] = []
+    for following in range(count - 1, -1, -1):
+        room = left - following * int(sizes.min())
+        fitting = np.flatnonzero(sizes <= room)
+        if len(fitting) == 0:
             raise Rejected(
                 "over_budget",
-                f"an object of at least {smallest} triangles has a share of {share} of the scene's "
-                f"{num_triangles} for objects",
+                f"{count} objects of at least {sizes.min()} triangles each do not fit into the "
+                f"{num_triangles} that the scene has for them",
             )
-        chosen[row] = level
-        left -= len(level.faces)
-    return _refined(assets, tuple(chosen[row] for row in range(len(assets))), left)
+        row = int(fitting[rng.integers(len(fitting))])
+        drawn.append(entries[row])
+        left -= int(sizes[row])
+    return drawn
 
 
-def _finest(asset: Asset) -> int:
-    return max(len(level.faces) for level in asset.levels)
+def levels_within(
+    assets: Sequence[Asset], num_triangles: int, enough_error: float
+) -> tuple[Level, ...]:
+    """Choose one level per asset, together at most `num_triangles`.
+
+    Args:
+        assets: whose coarsest levels fit together (`drawn_within`).
+        num_triangles: for all together.
+        enough_error: two-way distance to the source (99th percentile, share of the diagonal) from
+            which an asset gets no finer.
+
+    Raises:
+        Rejected: "over_budget" where the coarsest levels do not fit.
+    """
+    ladders = [sorted(asset.levels, key=_size) for asset in assets]
+    rungs = [0] * len(assets)
+    left = num_triangles - sum(_size(ladder[0]) for ladder in ladders)
+    if left < 0:
+        raise Rejected(
+            "over_budget",
+            f"{len(assets)} objects need {num_triangles - left} triangles at least, and the scene "
+            f"has {num_triangles} for them",
+        )
+    while True:
+        finer = [
+            (ladder[rung].record.quality.error_p99, -row)
+            for row, (ladder, rung) in enumerate(zip(ladders, rungs, strict=True))
+            if rung + 1 < len(ladder)
+            and ladder[rung].record.quality.error_p99 > enough_error
+            and _size(ladder[rung + 1]) - _size(ladder[rung]) <= left
+        ]
+        if not finer:
+            return tuple(ladder[rung] for ladder, rung in zip(ladders, rungs, strict=True))
+        row = -max(finer)[1]  # the first of equals
+        left -= _size(ladders[row][rungs[row] + 1]) - _size(ladders[row][rungs[row]])
+        rungs[row] += 1
 
 
-def _refined(assets: Sequence[Asset], levels: tuple[Level, ...], left: int) -> tuple[Level, ...]:
-    """Spend what is left over on finer levels, for the object with the most detail first."""
-    refined = list(levels)
-    for row in sorted(range(len(assets)), key=lambda row: -_finest(assets[row])):
-        finer = assets[row].finest_within(len(refined[row].faces) + left)
-        if finer is not None:
-            left -= len(finer.faces) - len(refined[row].faces)
-            refined[row] = finer
-    return tuple(refined)
+def least_triangles(asset: Asset) -> int:
+    """Return the triangles of the coarsest level."""
+    return min(_size(level) for level in asset.levels)
+
+
+def _size(level: Level) -> int:
+    return len(level.faces)

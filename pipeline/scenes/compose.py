@@ -1,22 +1,26 @@
-"""Composes scenes: a layout, real meshes within the triangle budget, and cameras that see them.
+"""Composes scenes: real meshes within the triangle budget, in a layout, with cameras that see them.
 
-Scene k is a pure function of (settings, pool, seed, k, attempt). Which template it uses and how
-many objects it holds depend on k alone, never on the attempt: scenes that are hard to compose are
-replaced by scenes of the same kind, so that rejection does not distort their shares.
+Scene k is a pure function of (settings, pool, seed, k, attempt).
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from pipeline.scenes.budget import levels_within
+from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
+from pipeline.scenes.laws import require_laws
 from pipeline.scenes.pieces import Piece, emitter_piece, joined, object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.posing import posed
+from pipeline.scenes.shapes import MeshShape
+from pipeline.scenes.subdivision import filled
 from pipeline.scenes.views import next_camera, with_first_cameras
 from scene_templates.layout import Layout
-from scene_templates.registry import TEMPLATES
+from scene_templates.layout_rand import layout_rand
+from scene_templates.plans import ScenePlan, scene_plan
 from scene_templates.settings import SceneSettings
-from storage.errors import Rejected, TrilightError
+from storage.errors import TrilightError
 from storage.scene import Scene, SceneObject
 from storage.seeds import rng_for
 
@@ -41,63 +45,96 @@ def compose_scene(
         attempt: how many times this scene was rejected before.
 
     Returns:
-        A checked scene with `settings.num_views` cameras. Its provenance holds template,
-        scene_index, attempt, seed and camera_attempts (per view, the proposal that passed).
+        A checked scene with `settings.num_views` cameras. Its provenance holds template, family,
+        scene_index, attempt, seed and camera_attempts (per view, the proposal that passed), and
+        where the scene is an excursion its axis and value.
 
     Raises:
-        Rejected: no_room, over_budget, no_faces, no_camera or law_broken; equal arguments always
-            give the same answer.
+        Rejected: no_room, over_budget, no_faces, no_camera, emitter_inside or law_broken; equal
+            arguments always give the same answer.
         TrilightError: where the pool is empty.
     """
     if not pool:
         raise TrilightError("scenes: the pool holds 0 objects; expected at least 1: add objects.")
-    name, count = _family(settings, seed, scene_index)
+    plan = scene_plan(settings, seed=seed, scene_index=scene_index)
+    provenance = _provenance(settings, plan, seed, scene_index, attempt)
+    settings = settings.of_scene(scene_index)
     rng = rng_for(seed, "scene", scene_index, attempt)
-    layout = TEMPLATES[name].layout_rand(rng, settings, count)
-    chosen = [pool[row] for row in rng.integers(len(pool), size=count)]
-    pieces = _pieces(layout, chosen, settings, rng)
+    chosen = _objects_rand(rng, settings, plan, pool)
+    budget = _object_budget(settings, plan)
+    levels = levels_within([entry.asset for entry in chosen], budget, settings.enough_error)
+    shapes = [MeshShape(level, settings.centring) for level in levels]
+    layout = layout_rand(rng, settings, plan, shapes)
+    pieces = scene_pieces(layout, chosen, shapes, settings, rng)
     scene = Scene(
         **joined(pieces),
         c2w=np.zeros((0, 4, 4), np.float32),
         fov_deg=np.zeros(0, np.float32),
         objects=tuple(piece.entry for piece in pieces),
-        provenance={
-            "template": name,
-            "scene_index": scene_index,
-            "attempt": attempt,
-            "seed": seed,
-            "camera_attempts": [],
-        },
+        provenance=provenance,
     )
-    return _checked(with_first_cameras(scene, settings))
+    scene = with_first_cameras(scene, settings)
+    require_laws(scene, settings)
+    return scene
 
 
-def _family(settings: SceneSettings, seed: int, scene_index: int) -> tuple[str, int]:
-    """Return the template and the number of objects of a scene, whatever the attempt."""
-    rng = rng_for(seed, "scene-family", scene_index)
-    name = settings.templates[int(rng.integers(len(settings.templates)))]
-    low, high = settings.num_objects
-    return name, int(rng.integers(low, high + 1))
+def _provenance(
+    settings: SceneSettings, plan: ScenePlan, seed: int, scene_index: int, attempt: int
+) -> dict[str, Any]:
+    origin = {
+        "template": plan.family.template,
+        "family": plan.family.name,
+        "scene_index": scene_index,
+        "attempt": attempt,
+        "seed": seed,
+        "camera_attempts": [],
+    }
+    excursion = settings.excursion_of(scene_index)
+    if excursion is not None:
+        origin["excursion"] = {"axis": excursion.axis, "value": excursion.value}
+    return origin
 
 
-def _pieces(
+def _objects_rand(
+    rng: np.random.Generator,
+    settings: SceneSettings,
+    plan: ScenePlan,
+    pool: Sequence[PooledAsset],
+) -> list[PooledAsset]:
+    least = [least_triangles(entry.asset) for entry in pool]
+    return drawn_within(rng, pool, least, plan.num_objects, _object_budget(settings, plan))
+
+
+def _object_budget(settings: SceneSettings, plan: ScenePlan) -> int:
+    return settings.max_triangles - plan.family.shell_triangles - plan.num_lights
+
+
+def scene_pieces(
     layout: Layout,
     chosen: Sequence[PooledAsset],
+    shapes: Sequence[MeshShape],
     settings: SceneSettings,
     rng: np.random.Generator,
 ) -> list[Piece]:
-    angle_deg = settings.smooth_angle_deg
+    """Return floor and walls, objects and emitters of a layout, the objects as `shapes`.
+
+    Raises:
+        Rejected: "no_faces" where no triangle of an object has an area.
+    """
+    angle_deg = settings.materials.smooth_angle_deg
     shell = [shell_piece(part, rng, angle_deg) for part in layout.shell]
     emitters = [emitter_piece(emitter, row) for row, emitter in enumerate(layout.emitters)]
-    used = sum(len(piece.mesh.faces) for piece in [*shell, *emitters])
-    levels = levels_within([entry.asset for entry in chosen], settings.max_triangles - used)
     taken = [piece.entry.name for piece in [*shell, *emitters]]
     objects = []
-    for pooled, level, placement in zip(chosen, levels, layout.objects, strict=True):
+    for pooled, shape, placement in zip(chosen, shapes, layout.objects, strict=True):
         entry = _entry(pooled, taken)
         taken.append(entry.name)
-        objects.append(object_piece(entry, level, placement, layout.floor, rng, angle_deg))
-    return [*shell, *objects, *emitters]
+        positions = posed(shape.points, placement.pose)
+        objects.append(
+            object_piece(entry, positions, shape.faces, placement.surface, rng, angle_deg)
+        )
+    pieces = [*shell, *objects, *emitters]
+    return pieces if settings.fill_to is None else filled(pieces, settings.fill_to)
 
 
 def _entry(pooled: PooledAsset, taken: Sequence[str]) -> SceneObject:
@@ -113,11 +150,3 @@ def _entry(pooled: PooledAsset, taken: Sequence[str]) -> SceneObject:
         attribution=locked.attribution,
         source_url=locked.source_url,
     )
-
-
-def _checked(scene: Scene) -> Scene:
-    try:
-        scene.check()
-    except TrilightError as error:
-        raise Rejected("law_broken", str(error)) from error
-    return scene

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.posing import posed, without_slivers
+from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
-from scene_templates.layout import Emitter, Floor, ObjectPlacement, ShellPart, Surface
-from storage.asset import Level
+from scene_templates.layout import Emitter, ShellPart, Surface
 from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, ROUGHNESS, SPECULAR
 from storage.errors import Rejected
 from storage.scene import SceneObject
@@ -33,34 +32,26 @@ def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: flo
     """Return a floor or wall; where it has many colours, one per triangle drawn from `rng`."""
     positions = part.positions.astype(np.float32)
     mesh = _shaded(positions, part.faces, part.surface, smooth_angle_deg)
-    return _surfaced(
-        SceneObject(name=part.name, kind="shell"),
-        mesh,
-        part.surface,
-        np.arange(len(mesh.faces)),
-        rng,
-    )
+    return _surfaced(SceneObject(name=part.name, kind="shell"), mesh, part.surface, rng)
 
 
 def object_piece(
     entry: SceneObject,
-    level: Level,
-    placement: ObjectPlacement,
-    floor: Floor,
+    positions: NDArray[np.float32],
+    faces: NDArray[np.uint32],
+    surface: Surface,
     rng: np.random.Generator,
     smooth_angle_deg: float,
 ) -> Piece:
-    """Return an object in its place; where it has many colours, one per shading group.
+    """Return an object in its place: vertices [V, 3] in world space, and faces [F, 3].
 
     Raises:
         Rejected: "no_faces" where no triangle is left.
     """
-    positions = posed(level.positions, placement, floor)
-    faces = without_slivers(positions, level.faces)
+    faces = without_slivers(positions, faces)
     if len(faces) == 0:
         raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
-    mesh = _shaded(positions, faces, placement.surface, smooth_angle_deg)
-    return _surfaced(entry, mesh, placement.surface, mesh.groups, rng)
+    return _surfaced(entry, _shaded(positions, faces, surface, smooth_angle_deg), surface, rng)
 
 
 def emitter_piece(emitter: Emitter, row: int) -> Piece:
@@ -68,7 +59,7 @@ def emitter_piece(emitter: Emitter, row: int) -> Piece:
     mesh = flat_shaded(emitter.triangle.astype(np.float32), np.array([[0, 1, 2]], np.uint32))
     materials = np.zeros((1, MATERIAL_WIDTH), np.float32)
     materials[:, ROUGHNESS] = 1.0
-    materials[:, EMISSION] = emitter.radiance
+    materials[:, EMISSION] = emitter.radiance_rgb
     entry = SceneObject(name=f"emitter{row}", kind="emitter")
     return Piece(entry=entry, mesh=mesh, materials=materials, material_index=np.zeros(1, np.int64))
 
@@ -85,22 +76,20 @@ def _shaded(
 
 
 def _surfaced(
-    entry: SceneObject,
-    mesh: ShadedMesh,
-    surface: Surface,
-    colour_groups: NDArray[np.int64],
-    rng: np.random.Generator,
+    entry: SceneObject, mesh: ShadedMesh, surface: Surface, rng: np.random.Generator
 ) -> Piece:
-    """Give a mesh its materials: one row, or one per colour group."""
-    if surface.coloured:
-        rows = colour_groups
+    """Give a mesh its materials: one row, or one per shading group or triangle."""
+    rows = {
+        "one": np.zeros(len(mesh.faces), np.int64),
+        "groups": mesh.groups,
+        "triangles": np.arange(len(mesh.faces)),
+    }[surface.colours]
+    diffuse = np.array([surface.diffuse_rgb])
+    if surface.colours != "one":
         diffuse = surface.diffuse_scale * rng.random((int(rows.max()) + 1, 3))
-    else:
-        rows = np.zeros(len(mesh.faces), np.int64)
-        diffuse = np.array([surface.diffuse_rgb])
     materials = np.zeros((len(diffuse), MATERIAL_WIDTH), np.float32)
     materials[:, DIFFUSE] = diffuse
-    materials[:, SPECULAR] = surface.specular
+    materials[:, SPECULAR] = surface.specular_rgb
     materials[:, ROUGHNESS] = surface.roughness
     return Piece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
 

@@ -1,32 +1,36 @@
-"""Brings an asset's mesh to its place in the room: normalise, scale, turn, move, set down."""
+"""Brings an asset's mesh to its place in the room: centre, scale, turn, move."""
+
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.layout import Floor, ObjectPlacement
+from scene_templates.layout import Pose
 from scene_templates.rotations import rotated
 
 SMALLEST_DOUBLE_AREA = 1e-12
 """A triangle of a square micrometre: no ray meets it, and its normal is rounding."""
 
 
-def posed(
-    positions: NDArray[np.float32], placement: ObjectPlacement, floor: Floor
-) -> NDArray[np.float32]:
-    """Return the vertices [V, 3] of a mesh in world space.
+def in_unit_sphere(
+    positions: NDArray[np.float32], centring: Literal["vertex_mean", "box"]
+) -> NDArray[np.float64]:
+    """Return the vertices [V, 3] of a level scaled so that the farthest lies on the unit sphere.
 
-    As published, the mean of the vertices becomes the centre and the farthest vertex touches the
-    sphere of the placement. The mean depends on the tessellation, so that two levels of one asset
-    differ a little in size and place. A resting object is lowered along the floor's normal until
-    its lowest vertex touches; it need not be in balance.
+    Args:
+        positions: [V, 3] in the unit box of the asset, whose middle is that of its source.
+        centring: what becomes the centre: that middle, which is the same for all levels of an
+            asset, or as published the mean of the vertices, which moves with the tessellation.
     """
-    centred = positions.astype(np.float64)
-    centred -= centred.mean(axis=0)
-    reach = np.sqrt(np.sum(np.square(centred), axis=1).max())
-    world = rotated(centred * (placement.radius / reach), placement.rotation) + placement.centre
-    if placement.rests:
-        world -= floor.height(world).min() * floor.normal
-    return world.astype(np.float32)
+    points = positions.astype(np.float64)
+    if centring == "vertex_mean":
+        points -= points.mean(axis=0)
+    return points / np.sqrt(np.sum(np.square(points), axis=1).max())
+
+
+def posed(points: NDArray[np.float64], pose: Pose) -> NDArray[np.float32]:
+    """Return points [V, 3] of the unit sphere in world space."""
+    return (pose.radius * rotated(points, pose.rotation) + pose.centre).astype(np.float32)
 
 
 def without_slivers(

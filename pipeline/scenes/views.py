@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.sight import Sight, ViewFacts
 from scene_templates.registry import TEMPLATES
-from scene_templates.settings import SceneSettings
+from scene_templates.settings import SceneSettings, ViewLaws
 from storage.errors import Rejected
 from storage.scene import Scene
 from storage.seeds import rng_for
@@ -43,6 +43,7 @@ def next_camera(scene: Scene, settings: SceneSettings, *, view: int) -> Scene:
     Raises:
         Rejected: "no_camera" when the sixteen proposals of the view are used up.
     """
+    settings = settings.of_scene(scene.provenance["scene_index"])
     attempts = list(scene.provenance["camera_attempts"])
     camera, attempt = _first_camera(scene, Sight(scene), settings, view, attempts[view] + 1)
     cameras: list[Camera] = list(zip(scene.c2w, scene.fov_deg, strict=True))
@@ -50,11 +51,11 @@ def next_camera(scene: Scene, settings: SceneSettings, *, view: int) -> Scene:
     return _with_cameras(scene, cameras, attempts)
 
 
-def complaint(facts: ViewFacts, settings: SceneSettings) -> str | None:
+def complaint(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
     """Return what is wrong with a view, or None."""
     if facts.depth < settings.min_depth:
         return "too near"
-    if facts.coverage < settings.min_coverage:
+    if has_objects and facts.coverage < settings.min_coverage:
         return "sees too little of the objects"
     if facts.shell_back > settings.max_shell_back:
         return "sees the back of the shell"
@@ -66,11 +67,12 @@ def complaint(facts: ViewFacts, settings: SceneSettings) -> str | None:
 def _first_camera(
     scene: Scene, sight: Sight, settings: SceneSettings, view: int, first: int
 ) -> tuple[Camera, int]:
+    has_objects = any(entry.kind == "object" for entry in scene.objects)
     complaints: list[str] = []
     for attempt in range(first, CAMERA_ATTEMPTS):
         c2w, fov_deg = _proposal(scene, settings, view, attempt)
-        facts = sight.facts(c2w, float(fov_deg), settings.coverage_grid)
-        found = complaint(facts, settings)
+        facts = sight.facts(c2w, float(fov_deg), settings.views.coverage_grid)
+        found = complaint(facts, settings.views, has_objects=has_objects)
         if found is None:
             return (c2w, fov_deg), attempt
         complaints.append(found)
@@ -83,7 +85,7 @@ def _first_camera(
 def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> Camera:
     origin = scene.provenance
     rng = rng_for(origin["seed"], "camera", origin["scene_index"], origin["attempt"], view, attempt)
-    pose = TEMPLATES[origin["template"]].camera_rand(rng, settings)
+    pose = TEMPLATES[origin["template"]].camera_rand(rng, settings.cameras)
     return pose.c2w.astype(np.float32), np.float32(pose.fov_deg)
 
 

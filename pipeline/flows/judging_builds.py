@@ -1,0 +1,55 @@
+"""The builds that networks are judged on, and never trained: all of their scenes are of `test`."""
+
+import dataclasses
+
+from pipeline.flows.settings import BuildSettings, NamedBuild
+from pipeline.flows.training_builds import finetune_512, pretrain_256
+from pipeline.objects.generated import BENCHMARK
+from scene_templates.default_families import ONE_FAMILY_EACH
+from scene_templates.out_of_range import out_of_range_settings
+from storage.splits import SplitSettings
+
+
+def out_of_range() -> BuildSettings:
+    """One axis at a time beyond the trained range: 37 values of nine axes in four layouts."""
+    build = finetune_512()
+    scenes = out_of_range_settings(max_triangles=4096)
+    return dataclasses.replace(
+        build,
+        build="out-of-range",
+        scenes=dataclasses.replace(scenes, num_views=1),
+        # Lights of a hundredth of the area: a view is black where it is a thousand times darker.
+        renders=dataclasses.replace(
+            build.renders, resolution=256, max_spp=2048, min_mean_radiance=1e-5
+        ),
+        splits=SplitSettings(scenes_per_shard=37, one_split=True),
+    )
+
+
+def benchmark_v1() -> BuildSettings:
+    """200 frozen scenes, 50 of each layout, one view each, to 48 dB or 2048 samples.
+
+    The settings, the seed and the built-in objects are frozen: whoever runs it gets the same
+    scenes (their digest is in `README.md`). For the second resolution use `--resolution 512`.
+    """
+    build = pretrain_256()
+    return dataclasses.replace(
+        build,
+        build="benchmark-v1",
+        seed=20261121,
+        source=BENCHMARK,
+        scenes=dataclasses.replace(
+            build.scenes, families=ONE_FAMILY_EACH, families_in_turn=True, num_views=1
+        ),
+        renders=dataclasses.replace(build.renders, noise_floor_db=48.0, max_spp=2048),
+        splits=SplitSettings(scenes_per_shard=20, one_split=True),
+    )
+
+
+JUDGING_BUILDS = {
+    "out-of-range": NamedBuild(settings=out_of_range, num_scenes=148),
+    "benchmark-v1": NamedBuild(settings=benchmark_v1, num_scenes=200),
+    "benchmark-v1-mini": NamedBuild(settings=benchmark_v1, num_scenes=20),
+}
+"""`out-of-range` counts 37 values times four layouts; the mini is the beginning of the other, and
+grows into it with more `--scenes`."""

@@ -1,0 +1,45 @@
+"""Laws of a composed scene; one that breaks them is rejected, and its next attempt tried.
+
+Cameras have been judged before, each by itself (`views`).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_templates.settings import SceneSettings
+from storage.errors import Rejected, TrilightError
+from storage.scene import Scene
+
+
+def require_laws(scene: Scene, settings: SceneSettings) -> None:
+    """Raise Rejected where a scene breaks the laws of the record, of its budget, or of its lights.
+
+    Raises:
+        Rejected: "law_broken" with what `Scene.check` says, "over_budget", or "emitter_inside"
+            where an emitter reaches into the bounding box of an object.
+    """
+    try:
+        scene.check()
+    except TrilightError as error:
+        raise Rejected("law_broken", str(error)) from error
+    if scene.num_triangles > settings.max_triangles:
+        found = f"{scene.num_triangles} triangles; at most {settings.max_triangles} were allowed"
+        raise Rejected("over_budget", found)
+    _require_emitters_outside(scene, settings.lights.num_inside)
+
+
+def _require_emitters_outside(scene: Scene, num_inside: int) -> None:
+    kinds = [entry.kind for entry in scene.objects]
+    boxes = [_box(scene, row) for row, kind in enumerate(kinds) if kind == "object"]
+    emitters = [row for row, kind in enumerate(kinds) if kind == "emitter"]
+    for row in emitters[num_inside:]:
+        low, high = _box(scene, row)
+        for other_low, other_high in boxes:
+            if (low < other_high).all() and (other_low < high).all():
+                name = scene.objects[row].name
+                raise Rejected("emitter_inside", f"{name} reaches into the box of an object")
+
+
+def _box(scene: Scene, row: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    points = scene.vertex_positions[scene.faces[scene.object_index == row].ravel()]
+    return points.min(axis=0), points.max(axis=0)

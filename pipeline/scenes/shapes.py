@@ -1,0 +1,58 @@
+"""`MeshShape`: an object's mesh as the templates ask for it, with collisions by FCL.
+
+FCL (Pan, Chitta, Manocha 2012) tests triangle against triangle in float64 over bounding volume
+trees; two objects far apart are told by their spheres alone. A mesh inside another without touching
+it is met as well where one's box lies in the other's: a ball in a bowl is refused with it.
+"""
+
+from typing import Any, Literal
+
+import fcl
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.scenes.posing import in_unit_sphere
+from scene_templates.layout import Pose
+from scene_templates.rotations import rotated
+from storage.asset import Level
+
+
+class MeshShape:
+    """One level of an asset in the unit sphere; see scene_templates.placement.Shape."""
+
+    def __init__(self, level: Level, centring: Literal["vertex_mean", "box"]) -> None:
+        self.points = in_unit_sphere(level.positions, centring)
+        self.faces = level.faces
+        self._tree: tuple[float, Any] | None = None
+
+    def meets(self, pose: Pose, other: "MeshShape", its_pose: Pose) -> bool:
+        """Return whether two meshes in their places share a point, or one's box holds the other."""
+        apart = pose.centre - its_pose.centre
+        if np.sum(np.square(apart)) > (pose.radius + its_pose.radius) ** 2:
+            return False
+        low, high = self._box(pose)
+        its_low, its_high = other._box(its_pose)
+        if (low > its_high).any() or (its_low > high).any():
+            return False
+        inside = (low >= its_low).all() and (high <= its_high).all()
+        outside = (low <= its_low).all() and (high >= its_high).all()
+        return bool(inside or outside) or self._touches(pose, other, its_pose)
+
+    def _touches(self, pose: Pose, other: "MeshShape", its_pose: Pose) -> bool:
+        result = fcl.CollisionResult()
+        fcl.collide(self._body(pose), other._body(its_pose), fcl.CollisionRequest(), result)
+        return bool(result.is_collision)
+
+    def _body(self, pose: Pose) -> Any:
+        """Return FCL's object; its tree is kept, since places change more often than sizes."""
+        if self._tree is None or self._tree[0] != pose.radius:
+            tree = fcl.BVHModel()
+            tree.beginModel(len(self.points), len(self.faces))
+            tree.addSubModel(pose.radius * self.points, self.faces.astype(np.int32))
+            tree.endModel()
+            self._tree = (pose.radius, tree)
+        return fcl.CollisionObject(self._tree[1], fcl.Transform(pose.rotation, pose.centre))
+
+    def _box(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        points = pose.radius * rotated(self.points, pose.rotation) + pose.centre
+        return points.min(axis=0), points.max(axis=0)

@@ -1,0 +1,121 @@
+"""More triangles of the same surface: the longest edges are halved until there are enough.
+
+A test set can so ask what the number of triangles does by itself. Triangles are flat, so positions
+stay on the surface to the rounding of float32; each part keeps the material of the whole, and new
+vertices get the mean of their neighbours' normals.
+"""
+
+import dataclasses
+import heapq
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from pipeline.scenes.pieces import Piece
+from pipeline.scenes.shading import ShadedMesh
+
+Edge = tuple[int, int]
+
+
+def filled(pieces: Sequence[Piece], fill_to: int) -> list[Piece]:
+    """Return the pieces with the objects subdivided until all have `fill_to` triangles together.
+
+    Each object gets its share by what it has. The sum falls short of `fill_to` by a few, and never
+    exceeds it.
+    """
+    counts = [len(piece.mesh.faces) for piece in pieces]
+    is_object = [piece.entry.kind == "object" for piece in pieces]
+    of_objects = sum(count for count, yes in zip(counts, is_object, strict=True) if yes)
+    left = fill_to - (sum(counts) - of_objects)
+    return [
+        subdivided(piece, left * count // of_objects) if yes else piece
+        for piece, count, yes in zip(pieces, counts, is_object, strict=True)
+    ]
+
+
+def subdivided(piece: Piece, num_faces: int) -> Piece:
+    """Return a piece with at most `num_faces` faces, short of it by less than one edge's faces.
+
+    The longest edge is halved in every face that has it, so that no gap opens. A piece that has as
+    many faces already is returned as it is.
+    """
+    work = _Work(piece.mesh)
+    while work.halve_longest(num_faces):
+        pass
+    return dataclasses.replace(
+        piece, mesh=work.mesh(), material_index=piece.material_index[np.array(work.origin)]
+    )
+
+
+class _Work:
+    """A mesh in the making. Edges are told by position, since flat faces share no vertices."""
+
+    def __init__(self, mesh: ShadedMesh) -> None:
+        self._points = list(mesh.positions.astype(np.float64))
+        self._normals = list(mesh.normals.astype(np.float64))
+        _, places = np.unique(mesh.positions, axis=0, return_inverse=True)
+        self._place: list[int] = places.ravel().tolist()
+        self._num_places = 1 + max(self._place)
+        self._groups = mesh.groups
+        self._faces: list[list[int]] = mesh.faces.tolist()
+        self.origin = list(range(len(self._faces)))
+        self._rows: dict[Edge, set[int]] = {}
+        self._longest: list[tuple[float, Edge]] = []
+        for row in range(len(self._faces)):
+            self._enter(row)
+
+    def mesh(self) -> ShadedMesh:
+        normals = np.array(self._normals)
+        normals /= np.sqrt(np.sum(np.square(normals), axis=1, keepdims=True))
+        return ShadedMesh(
+            positions=np.array(self._points, np.float32),
+            normals=normals.astype(np.float32),
+            faces=np.array(self._faces, np.uint32),
+            groups=self._groups[np.array(self.origin)],
+        )
+
+    def halve_longest(self, num_faces: int) -> bool:
+        """Halve the longest edge, if its faces leave the mesh within `num_faces`."""
+        while not self._rows[self._longest[0][1]]:
+            del self._rows[heapq.heappop(self._longest)[1]]
+        edge = self._longest[0][1]
+        if len(self._faces) + len(self._rows[edge]) > num_faces:
+            return False
+        heapq.heappop(self._longest)
+        middle, self._num_places = self._num_places, self._num_places + 1
+        made: dict[Edge, int] = {}
+        for row in sorted(self._rows.pop(edge)):
+            self._halve(row, edge, middle, made)
+        return True
+
+    def _halve(self, row: int, edge: Edge, place: int, made: dict[Edge, int]) -> None:
+        face = self._faces[row]
+        first, second = sorted(v for v in face if self._place[v] in edge)
+        if (first, second) not in made:
+            made[first, second] = len(self._points)
+            self._points.append((self._points[first] + self._points[second]) / 2)
+            self._normals.append((self._normals[first] + self._normals[second]) / 2)
+            self._place.append(place)
+        middle = made[first, second]
+        for _, other in self._edges(row):
+            if other != edge:
+                self._rows[other].discard(row)
+        self._faces[row] = [middle if v == first else v for v in face]
+        self._faces.append([middle if v == second else v for v in face])
+        self.origin.append(self.origin[row])
+        self._enter(row)
+        self._enter(len(self._faces) - 1)
+
+    def _enter(self, row: int) -> None:
+        for length_sq, edge in self._edges(row):
+            if edge not in self._rows:
+                self._rows[edge] = set()
+                heapq.heappush(self._longest, (-length_sq, edge))
+            self._rows[edge].add(row)
+
+    def _edges(self, row: int) -> Iterator[tuple[float, Edge]]:
+        face = self._faces[row]
+        for a, b in zip(face, (*face[1:], face[0]), strict=True):
+            apart = self._points[a] - self._points[b]
+            pair = self._place[a], self._place[b]
+            yield float(np.sum(apart * apart)), (min(pair), max(pair))

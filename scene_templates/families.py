@@ -1,0 +1,42 @@
+"""A family: one layout with how many objects of which size it holds, and how often it is drawn."""
+
+from dataclasses import dataclass
+
+from scene_templates.checks import Counts, Range, check_numbers, require
+from scene_templates.registry import TEMPLATES
+from scene_templates.rooms import SharedRoom
+from scene_templates.separate_sides import SeparateSides
+
+
+@dataclass(frozen=True, kw_only=True)
+class Family:
+    """One row of the table that scenes are drawn from."""
+
+    name: str
+    """Unique, such as `corner-multi`."""
+    template: str
+    """The layout: a name of scene_templates.registry."""
+    weight: float = 1.0
+    """How often it is drawn, relative to the others."""
+    shell: SharedRoom | SeparateSides
+    """How floor and walls are placed."""
+    num_objects: Counts
+    """Fewest and most objects, each count equally likely."""
+    object_scale: Range
+    """Diameter of an object's bounding sphere, before halving. Where no free place is found, the
+    sizes of all objects are drawn again."""
+    smooth_share: float = 0.5
+    """Share of objects and shell parts with interpolated normals; the others are flat."""
+
+    def __post_init__(self) -> None:
+        known = ", ".join(TEMPLATES)
+        require(self.template in TEMPLATES, "template", self.template, f"one of {known}")
+        check_numbers(self, shares=("smooth_share",))
+        require(self.weight > 0, "weight", self.weight, "a number above 0")
+        scale = self.object_scale
+        require(scale[0] > 0, "object_scale", scale, "numbers above 0")
+
+    @property
+    def shell_triangles(self) -> int:
+        """Triangles of floor and walls: 128 each."""
+        return TEMPLATES[self.template].shell_triangles

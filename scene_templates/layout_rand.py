@@ -1,0 +1,77 @@
+"""Draws a whole layout: the room, then the objects in it, then what shines on them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from scene_templates.layout import Layout, ObjectPlacement
+from scene_templates.lights import emitters_rand
+from scene_templates.materials import surface_rand
+from scene_templates.patches import SIDES, patch
+from scene_templates.placement import ObjectSpace, Shape, poses_rand
+from scene_templates.plans import ScenePlan
+from scene_templates.registry import TEMPLATES
+from scene_templates.rooms import plane_of
+from scene_templates.separate_sides import SeparateSides
+from scene_templates.settings import SceneSettings
+from scene_templates.template import LayoutParams
+
+
+def layout_rand(
+    rng: np.random.Generator,
+    settings: SceneSettings,
+    plan: ScenePlan,
+    shapes: Sequence[Shape],
+) -> Layout:
+    """Draw a layout of the planned kind.
+
+    Args:
+        rng: where the numbers come from.
+        settings: the ranges; its families are not looked at, the plan has one.
+        plan: the family and the counts.
+        shapes: what the `plan.num_objects` objects look like.
+
+    Raises:
+        Rejected: "no_room" if the objects do not fit.
+    """
+    family = plan.family
+    template = TEMPLATES[family.template]
+    room = family.shell.room_rand(rng, template.parts)
+    placed = zip(template.parts, room.patches, strict=True)
+    space = ObjectSpace(
+        room=room,
+        parts=template.parts,
+        planes=tuple(plane_of(patch(SIDES[name], placement)) for name, placement in placed),
+    )
+    poses = poses_rand(
+        rng,
+        settings.placement,
+        space,
+        shapes,
+        object_scale=family.object_scale,
+        overlaps=plan.overlaps,
+    )
+    materials, smooth_share = settings.materials, family.smooth_share
+    surfaces = tuple(
+        surface_rand(rng, materials, smooth_share=smooth_share, kind="shell")
+        for _ in template.parts
+    )
+    objects = tuple(
+        ObjectPlacement(
+            pose=pose,
+            surface=surface_rand(rng, materials, smooth_share=smooth_share, kind="object"),
+        )
+        for pose in poses
+    )
+    centres = [pose.centre for pose in poses]
+    emitters = emitters_rand(rng, settings.lights, template.lights, plan.num_lights, centres)
+    shell = family.shell
+    return template.layout(
+        LayoutParams(
+            patches=room.patches,
+            surfaces=surfaces,
+            objects=objects,
+            emitters=emitters,
+            wall2_faces_out=isinstance(shell, SeparateSides) and shell.wall2_faces_out,
+        )
+    )
