@@ -48,15 +48,13 @@ class Statistics:
         """Return (name, value) rows for people."""
         if not self.num_views:
             return [("scenes", "0")]
+        excursions = _counts(self.scenes_by_excursion)
+        beyond = [("beyond the range", excursions)] if excursions else []
         median, low = np.percentile(self.noise_floor_db, [50, 5])
         return [
             ("scenes", f"{self.num_scenes} ({_counts(self.scenes_by_split)})"),
             ("templates", _counts(self.scenes_by_template)),
-            *(
-                [("beyond the range", beyond)]
-                if (beyond := _counts(self.scenes_by_excursion))
-                else []
-            ),
+            *beyond,
             ("views", f"{self.num_views}"),
             ("noise floor", f"median {median:.1f} dB, 5th percentile {low:.1f} dB (psnr_log_db)"),
             ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),
