@@ -78,7 +78,7 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     templates: Counter[str] = Counter()
     excursions: Counter[str] = Counter()
     views: list[Any] = []
-    scene_digests: list[str] = []
+    scene_members: dict[str, str] = {}
     for shard in dataset.manifest.shards:
         with dataset.folder.shard(shard.name).open("rb") as stream:
             for name, offset, num_bytes in shard.members:
@@ -87,7 +87,7 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
                 stream.seek(offset)
                 member = stream.read(num_bytes)
                 if name.endswith(SCENE_SUFFIX):
-                    scene_digests.append(f"{name} {sha256_hex(member)}")
+                    scene_members[name] = sha256_hex(member)
                     continue
                 record = json.loads(member)
                 splits[shard.split] += 1
@@ -100,12 +100,18 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
         scenes_by_split=splits,
         scenes_by_template=templates,
         scenes_by_excursion=excursions,
-        scene_digest=sha256_hex("\n".join(sorted(scene_digests)).encode()),
+        scene_digest=digest_of_scenes(scene_members),
         num_bytes=dataset.manifest.num_bytes,
         spp=np.array([view["spp"] for view in views], np.int64),
         noise_floor_db=np.array([view["noise_floor_db"] for view in views], np.float64),
         at_cap=np.array([view["at_cap"] for view in views], np.bool_),
     )
+
+
+def digest_of_scenes(members: Mapping[str, str]) -> str:
+    """Return the digest of a set of scenes from the sha256 of each `KEY.scene.safetensors`."""
+    lines = (f"{name} {digest}" for name, digest in sorted(members.items()))
+    return sha256_hex("\n".join(lines).encode())
 
 
 def _counts(counts: Mapping[str, int]) -> str:

@@ -1,0 +1,182 @@
+"""Settings by dotted names: the right value changes, nothing else, and mistakes are one line."""
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from storage.changes import changed
+from storage.errors import TrilightError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leaf:
+    size: float = 1.5
+    count: int = 3
+    name: str = "leaf"
+    flag: bool = False
+    pair: tuple[float, float] = (0.5, 1.0)
+    whole: tuple[int, ...] = (4, 2, 1)
+    words: tuple[str, ...] = ("a", "b")
+    maybe: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.size < 0:
+            raise TrilightError(f"size is {self.size}; expected numbers from 0.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Branch:
+    leaf: Leaf = field(default_factory=Leaf)
+    leaves: tuple[Leaf, ...] = (Leaf(), Leaf(count=5), Leaf(name="last"))
+    height: float = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tree:
+    branch: Branch = field(default_factory=Branch)
+    branches: tuple[Branch, ...] = (Branch(), Branch(height=7.0))
+    age: int = 100
+
+
+TREE = Tree()
+
+
+def _flat(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Every single setting by its path, with the rows of lists of groups."""
+    found: dict[str, Any] = {}
+    for entry in dataclasses.fields(settings):
+        value, name = getattr(settings, entry.name), f"{prefix}{entry.name}"
+        if dataclasses.is_dataclass(value):
+            found |= _flat(value, f"{name}.")
+        elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+            for row, group in enumerate(value):
+                found |= _flat(group, f"{name}[{row}].")
+        else:
+            found[name] = value
+    return found
+
+
+def _without_rows(path: str) -> str:
+    for row in range(3):
+        path = path.replace(f"[{row}]", "")
+    return path
+
+
+finite = st.floats(0, 1e300)
+VALUES: dict[str, st.SearchStrategy[Any]] = {
+    "size": finite | st.integers(0, 2**60),
+    "count": st.integers(),
+    "name": st.text(),
+    "flag": st.booleans(),
+    "pair": st.tuples(finite, finite).map(list),
+    "whole": st.lists(st.integers(), min_size=1, max_size=5),
+    "words": st.lists(st.text(), max_size=5),
+}
+
+
+@given(
+    st.sampled_from(["branch.leaf", "branch.leaves", "branches.leaf", "branches.leaves"]),
+    st.sampled_from(sorted(VALUES)),
+    st.data(),
+)
+def test_the_named_settings_change_and_no_others(
+    place: str, name: str, data: st.DataObject
+) -> None:
+    value = data.draw(VALUES[name])
+    before, after = _flat(TREE), _flat(changed(TREE, {f"{place}.{name}": value}))
+    assert list(before) == list(after)
+    expected = tuple(value) if isinstance(value, list) else value
+    hit = 0
+    for path, old in before.items():
+        if _without_rows(path) == f"{place}.{name}":
+            hit += 1
+            assert after[path] == expected
+            assert type(after[path]) is type(old)
+        else:
+            assert after[path] == old
+    assert (
+        hit
+        == {"branch.leaf": 1, "branch.leaves": 3, "branches.leaf": 2, "branches.leaves": 6}[place]
+    )
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["age", "branch.leaf.count", "branches.height"]), st.integers(0, 99)
+    )
+)
+def test_several_changes_are_one_after_the_other(changes: dict[str, int]) -> None:
+    step = TREE
+    for name, value in changes.items():
+        step = changed(step, {name: value})
+    assert changed(TREE, changes) == step
+    assert changed(step, changes) == step
+    assert Tree() == TREE
+
+
+def test_values_come_as_json_has_them() -> None:
+    """A whole number for a float becomes one, so that the manifest says 2.0 whoever writes it."""
+    text = '{"branch.height": 2, "branch.leaf.pair": [0, 1], "branch.leaf.whole": [9]}'
+    after = changed(TREE, json.loads(text))
+    assert repr(after.branch.height) == "2.0"
+    assert repr(after.branch.leaf.pair) == "(0.0, 1.0)"
+    assert after.branch.leaf.whole == (9,)
+    assert changed(TREE, {"branch.leaf.maybe": 7}).branch.leaf.maybe == 7
+
+
+WRONG: list[tuple[str, Any, str]] = [
+    ("", 1, "does not exist"),
+    ("ages", 1, "does not exist; expected one of branch, branches, age"),
+    ("branch.leaf.colour", 1, "'colour'"),
+    ("branches.leaves.colour", 1, "'colour'"),
+    ("branch.", 1, "does not exist"),
+    (".age", 1, "does not exist"),
+    ("branch", {"height": 1.0}, "is a group"),
+    ("branch", 1, "is a group"),
+    ("branches", [], "is a group"),
+    ("branches.0.height", 1, "'0'"),
+    ("age.days", 1, "is a single setting"),
+    ("branch.leaf.pair.low", 1, "is a single setting"),
+    ("age", 1.5, "something like 100"),
+    ("age", "100", "something like 100"),
+    ("age", True, "something like 100"),
+    ("age", None, "something like 100"),
+    ("age", [1], "something like 100"),
+    ("branch.height", "2", "something like 2.0"),
+    ("branch.height", True, "something like 2.0"),
+    ("branch.leaf.flag", 1, "something like False"),
+    ("branch.leaf.flag", "true", "something like False"),
+    ("branch.leaf.name", 5, "something like 'leaf'"),
+    ("branch.leaf.pair", 0.5, "something like"),
+    ("branch.leaf.pair", "ab", "something like"),
+    ("branch.leaf.pair", ["a", "b"], "something like"),
+    ("branch.leaf.pair", [None, 1.0], "something like"),
+    ("branch.leaf.words", [1, 2], "something like"),
+    ("branch.leaf.words", "ab", "something like"),
+    ("branch.leaf.size", -1.0, "size is -1.0; expected numbers from 0"),
+    ("branches.leaves.size", -1, "size is -1.0; expected numbers from 0"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "message"), WRONG, ids=lambda part: str(part)[:30])
+def test_a_mistake_is_one_line_that_says_what_to_do(name: str, value: Any, message: str) -> None:
+    with pytest.raises(TrilightError) as caught:
+        changed(TREE, {name: value})
+    text = str(caught.value)
+    assert message in text
+    assert "\n" not in text
+    if not message.startswith("size"):
+        assert repr(name) in text
+
+
+@given(st.text(st.characters(codec="ascii"), max_size=12), st.integers() | st.text() | st.none())
+def test_any_name_and_value_give_settings_or_a_clear_refusal(name: str, value: Any) -> None:
+    try:
+        assert isinstance(changed(TREE, {name: value}), Tree)
+    except TrilightError as error:
+        assert "\n" not in str(error)
