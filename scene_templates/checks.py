@@ -1,7 +1,6 @@
 """Checks that every group of settings makes of its numbers; a complaint names the field."""
 
 import dataclasses
-import math
 from typing import Any
 
 from storage.errors import TrilightError
@@ -22,12 +21,12 @@ def require(law: bool, name: str, value: object, expected: str) -> None:
 def check_numbers(
     settings: Any, *, shares: tuple[str, ...] = (), signed: tuple[str, ...] = ()
 ) -> None:
-    """Check every number and pair of numbers of a settings dataclass.
+    """Check every number and pair of numbers of a settings dataclass by the type of its field.
 
-    Numbers must be finite and from 0, pairs in order as well, and pairs of whole numbers stay so.
+    Numbers must be of their kind, from 0, and below 1e100; pairs in order as well.
 
     Args:
-        settings: the dataclass; other fields are passed over.
+        settings: the dataclass; fields of other types are passed over.
         shares: fields that are shares of something, and so at most 1.
         signed: fields that may be below 0.
 
@@ -35,21 +34,33 @@ def check_numbers(
         TrilightError: the first field that breaks a law.
     """
     for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if isinstance(value, bool) or not _is_numeric(value):
+        if field.type not in _EXPECTED:
             continue
+        value = getattr(settings, field.name)
+        require(_fits(value, field.type), field.name, value, _EXPECTED[field.type])
         low, high = value if isinstance(value, tuple) else (value, value)
-        finite = math.isfinite(low) and math.isfinite(high)
-        require(finite, field.name, value, "finite numbers")
+        finite = -_LARGEST < low < _LARGEST and -_LARGEST < high < _LARGEST
+        require(finite, field.name, value, "finite numbers below 1e100")
         require(low <= high, field.name, value, "the lower number first")
         require(low >= 0 or field.name in signed, field.name, value, "numbers from 0")
         require(high <= 1 or field.name not in shares, field.name, value, "at most 1")
-        if field.type in (int, Counts):
-            whole = isinstance(low, int) and isinstance(high, int)
-            require(whole, field.name, value, "whole numbers")
 
 
-def _is_numeric(value: object) -> bool:
-    if isinstance(value, tuple):
-        return len(value) == 2 and all(isinstance(part, int | float) for part in value)
-    return isinstance(value, int | float)
+_LARGEST = 1e100
+"""Beyond any use; its square is still a float."""
+
+_EXPECTED: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    Range: "two numbers",
+    Counts: "two whole numbers",
+}
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    if kind in (Range, Counts):
+        single = float if kind == Range else int
+        pair = isinstance(value, tuple) and len(value) == 2
+        return pair and all(_fits(part, single) for part in value)
+    allowed = int if kind is int else (int, float)
+    return isinstance(value, allowed) and not isinstance(value, bool)

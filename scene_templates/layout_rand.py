@@ -1,10 +1,12 @@
 """Draws a whole layout: the room, then the objects in it, then what shines on them."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
-from scene_templates.layout import Layout, ObjectPlacement
+from scene_templates.families import Family
+from scene_templates.layout import Layout, ObjectPlacement, Surface
 from scene_templates.lights import emitters_rand
 from scene_templates.materials import surface_rand
 from scene_templates.patches import SIDES, patch
@@ -51,16 +53,9 @@ def layout_rand(
         object_scale=family.object_scale,
         overlaps=plan.overlaps,
     )
-    materials, smooth_share = settings.materials, family.smooth_share
-    surfaces = tuple(
-        surface_rand(rng, materials, smooth_share=smooth_share, kind="shell")
-        for _ in template.parts
-    )
+    surfaces = tuple(_surface_rand(rng, settings, family, "shell") for _ in template.parts)
     objects = tuple(
-        ObjectPlacement(
-            pose=pose,
-            surface=surface_rand(rng, materials, smooth_share=smooth_share, kind="object"),
-        )
+        ObjectPlacement(pose=pose, surface=_surface_rand(rng, settings, family, "object"))
         for pose in poses
     )
     centres = [pose.centre for pose in poses]
@@ -75,3 +70,12 @@ def layout_rand(
             wall2_faces_out=isinstance(shell, SeparateSides) and shell.wall2_faces_out,
         )
     )
+
+
+def _surface_rand(
+    rng: np.random.Generator,
+    settings: SceneSettings,
+    family: Family,
+    kind: Literal["shell", "object"],
+) -> Surface:
+    return surface_rand(rng, settings.materials, smooth_share=family.smooth_share, kind=kind)

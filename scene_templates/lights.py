@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from scene_templates.checks import Counts, Range, check_numbers, require
 from scene_templates.layout import Emitter
-from scene_templates.rotations import Orientation, rotated, rotation_rand
+from scene_templates.rotations import ORIENTATIONS, Orientation, rotated, rotation_rand
 from scene_templates.sectors import Sector
 
 TRIANGLE = 0.025 * np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
@@ -51,6 +51,8 @@ class LightSettings:
 
     def __post_init__(self) -> None:
         check_numbers(self, shares=("coloured_share",))
+        known = self.orientation in ORIENTATIONS
+        require(known, "orientation", self.orientation, " or ".join(ORIENTATIONS))
         require(self.count[0] >= 1, "count", self.count, "at least 1 emitter")
         for name in ("total_emission", "scale", "distance"):
             bounds = getattr(self, name)

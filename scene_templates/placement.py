@@ -17,7 +17,7 @@ from scene_templates.checks import Range, check_numbers, require
 from scene_templates.layout import Plane, Pose
 from scene_templates.patches import SIDES
 from scene_templates.rooms import Room
-from scene_templates.rotations import Orientation, rotated, rotation_rand
+from scene_templates.rotations import ORIENTATIONS, Orientation, rotated, rotation_rand
 from storage.errors import Rejected
 
 ARRANGEMENT_TRIES = 100
@@ -47,8 +47,8 @@ class PlacementSettings:
 
     def __post_init__(self) -> None:
         check_numbers(self, shares=("resting_share", "overlap_share"))
-        known = self.orientation in ("uniform", "euler")
-        require(known, "orientation", self.orientation, "uniform or euler")
+        known = self.orientation in ORIENTATIONS
+        require(known, "orientation", self.orientation, " or ".join(ORIENTATIONS))
 
 
 class Shape(Protocol):

@@ -10,6 +10,8 @@ has and their ranges, object counts, and most object sizes. Not known, and chose
 - which objects the `special` families hold. They are published as six bundled primitives; the same
   six shapes in every split would let geometry cross the splits, so they draw from the pool as the
   others do, and keep their smooth share of 0.25;
+- on which side the walls of the original policy stood: the repair turned some one-sided shifts
+  (-0.25 to -0.15) into the +-0.25 that both policies have here;
 - `thin` objects: published as a list of their own; here from the pool.
 
 The two background policies are those of `separate_sides`; both public stages use `de-biased`.

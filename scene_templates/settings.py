@@ -18,6 +18,9 @@ from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from storage.changes import changed
 
+MAX_TRIANGLES = 65_535
+"""Materials and objects are counted in 16 bits (storage.scene)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ViewLaws:
@@ -57,7 +60,8 @@ class SceneSettings:
     """What becomes the centre of an object: the middle of its source's bounding box, or as
     published the mean of its vertices, which moves with the tessellation."""
     fill_to: int | None = None
-    """Split the triangles of objects until the scene has so many, with the surface unchanged."""
+    """Split the triangles of objects until the scene has so many, with the surface unchanged; a
+    scene that has more already stays as it is."""
     num_views: int = 4
     """Cameras of every scene."""
     placement: PlacementSettings = field(default_factory=PlacementSettings)
@@ -99,6 +103,8 @@ class SceneSettings:
         return changed(plain, dict(excursion.changes))
 
     def _check_budget(self) -> None:
+        most, limit = self.max_triangles, f"at most {MAX_TRIANGLES}: a triangle may be a material"
+        require(most <= MAX_TRIANGLES, "max_triangles", most, limit)
         for family in self.families:
             lights, objects = self.lights.count[1], family.num_objects[1]
             least = family.shell_triangles + lights + 4 * objects
@@ -110,5 +116,5 @@ class SceneSettings:
                 f"{lights} emitters, and four triangles for each of {objects} objects",
             )
         fill_to = self.max_triangles if self.fill_to is None else self.fill_to
-        fits = 0 < fill_to <= self.max_triangles
-        require(fits, "fill_to", self.fill_to, "a number of at most max_triangles")
+        fits = type(fill_to) is int and 0 < fill_to <= self.max_triangles
+        require(fits, "fill_to", self.fill_to, "a whole number of at most max_triangles")

@@ -63,8 +63,14 @@ def _same_kind(old: Any, value: Any) -> bool:
     if isinstance(old, tuple):
         if not isinstance(value, tuple):
             return False
-        of_numbers = all(isinstance(part, int | float) for part in old)
-        return all(isinstance(part, int | float) == of_numbers for part in value)
+        if not old:
+            return not value
+        of_numbers = all(_is_number(part) for part in old)
+        return all(_is_number(part) == of_numbers for part in value)
     if isinstance(old, float):
         return isinstance(value, int | float)
     return old is None or isinstance(value, type(old))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

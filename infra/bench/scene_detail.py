@@ -62,7 +62,10 @@ def _scene(
     chosen = drawn_within(rng, pool, least, plan.num_objects, _NO_LIMIT)
     assets = [entry.asset for entry in chosen]
     finest, wanted = (
-        [MeshShape(level, settings.centring) for level in levels_within(assets, _NO_LIMIT, enough)]
+        [
+            MeshShape(entry.locked.uid, level, settings.centring)
+            for entry, level in zip(chosen, levels_within(assets, _NO_LIMIT, enough), strict=True)
+        ]
         for enough in (0.0, error)
     )
     layout = layout_rand(rng, settings, plan, finest)

@@ -117,25 +117,16 @@ def generate_scenes(
     )
     if workers < 1:
         raise TrilightError(f"workers is {workers}; expected at least 1.")
-    listed = None if scenes_from is None else find_scene_files(scenes_from)
-    if listed and (objects or scenes):
-        raise TrilightError(
-            f"--scenes-from {scenes_from} was given with --objects or --scenes; expected neither: "
-            "the files say both."
-        )
+    listed = _listed(scenes_from, objects, scenes)
     source = object_source(settings, objects)
-    num_scenes = BUILDS[build].num_scenes if scenes is None else scenes
     settings = settings_for_files(settings, listed, views)
     folder = DatasetFolder(Path(out).resolve())
     with folder.locked():
         remove_leftovers(folder.root)
         variant = choose_variant()
+        count = BUILDS[build].num_scenes if scenes is None else scenes
         publication = begin(
-            folder,
-            settings,
-            environment(variant),
-            num_scenes,
-            accept_environment=accept_environment,
+            folder, settings, environment(variant), count, accept_environment=accept_environment
         )
         accepted = (
             read_scenes_task(_whole(listed), licence, _whole(settings), _whole(publication))
@@ -154,6 +145,18 @@ def generate_scenes(
         statistics=statistics,
         notes=listed.notes(settings.scenes.num_views) if listed else frozen_note(build, statistics),
     )
+
+
+def _listed(scenes_from: str | None, objects: str | None, scenes: int | None) -> SceneFolder | None:
+    """Return the scene files that were asked for."""
+    if scenes_from is None:
+        return None
+    if objects is not None or scenes is not None:
+        raise TrilightError(
+            f"--scenes-from {scenes_from} was given with --objects or --scenes; expected neither: "
+            "the files say both."
+        )
+    return find_scene_files(scenes_from)
 
 
 @task(name="prepare-assets", cache_policy=NO_CACHE)

@@ -37,6 +37,8 @@ class BuildSettings:
     """How objects and scenes are divided into splits and shards."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.source, str | None):
+            raise TrilightError(f"source is {self.source!r}; expected a source of objects.")
         if self.seed < 0:
             raise TrilightError(f"seed is {self.seed}; expected an integer from 0.")
         if not self.allowed_licences:

@@ -63,7 +63,10 @@ def compose_scene(
     chosen = _objects_rand(rng, settings, plan, pool)
     budget = _object_budget(settings, plan)
     levels = levels_within([entry.asset for entry in chosen], budget, settings.enough_error)
-    shapes = [MeshShape(level, settings.centring) for level in levels]
+    shapes = [
+        MeshShape(entry.locked.uid, level, settings.centring)
+        for entry, level in zip(chosen, levels, strict=True)
+    ]
     layout = layout_rand(rng, settings, plan, shapes)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng)
     scene = Scene(

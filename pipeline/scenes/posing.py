@@ -21,11 +21,15 @@ def in_unit_sphere(
         positions: [V, 3] in the unit box of the asset, whose middle is that of its source.
         centring: what becomes the centre: that middle, which is the same for all levels of an
             asset, or as published the mean of the vertices, which moves with the tessellation.
+
+    Returns:
+        float64; not finite where the positions are not, or are all the same point.
     """
     points = positions.astype(np.float64)
-    if centring == "vertex_mean":
-        points -= points.mean(axis=0)
-    return points / np.sqrt(np.sum(np.square(points), axis=1).max())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if centring == "vertex_mean":
+            points -= points.mean(axis=0)
+        return points / np.sqrt(np.sum(np.square(points), axis=1).max())
 
 
 def posed(points: NDArray[np.float64], pose: Pose) -> NDArray[np.float32]:

@@ -15,13 +15,21 @@ from pipeline.scenes.posing import in_unit_sphere
 from scene_templates.layout import Pose
 from scene_templates.rotations import rotated
 from storage.asset import Level
+from storage.errors import Rejected
 
 
 class MeshShape:
     """One level of an asset in the unit sphere; see scene_templates.placement.Shape."""
 
-    def __init__(self, level: Level, centring: Literal["vertex_mean", "box"]) -> None:
+    def __init__(self, uid: str, level: Level, centring: Literal["vertex_mean", "box"]) -> None:
+        """Bring a level of the object `uid` into the unit sphere.
+
+        Raises:
+            Rejected: "no_faces" where it is a single point or not finite.
+        """
         self.points = in_unit_sphere(level.positions, centring)
+        if not np.isfinite(self.points).all():
+            raise Rejected("no_faces", f"{uid}: the level has no extent, or is not finite")
         self.faces = level.faces
         self._tree: tuple[float, Any] | None = None
 

@@ -20,8 +20,8 @@ Edge = tuple[int, int]
 def filled(pieces: Sequence[Piece], fill_to: int) -> list[Piece]:
     """Return the pieces with the objects subdivided until all have `fill_to` triangles together.
 
-    Each object gets its share by what it has. The sum falls short of `fill_to` by a few, and never
-    exceeds it.
+    Each object gets its share by what it has. The sum falls short of `fill_to` by a few; pieces
+    that have more already stay as they are.
     """
     counts = [len(piece.mesh.faces) for piece in pieces]
     is_object = [piece.entry.kind == "object" for piece in pieces]

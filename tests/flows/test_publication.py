@@ -182,7 +182,7 @@ def test_shards_without_a_manifest_are_not_touched(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", BUILDS)
 def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
     build = named_build(name)
-    assert build.build == name
+    assert build.build == name.removesuffix("-mini")  # the mini is the other's beginning
     assert build.digest == named_build(name).digest
     assert list(differences(build.as_json(), named_build(name, seed=5).as_json())) == [
         ("seed", build.seed, 5)

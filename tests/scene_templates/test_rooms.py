@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from scene_templates.layout import ShellPart
 from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
 from scene_templates.registry import TEMPLATES
-from scene_templates.rooms import floor_plane, room_rand
-from scene_templates.settings import SceneSettings
+from scene_templates.rooms import Room, SharedRoom, plane_of
+from tests.scene_templates.balls import drawn, template_settings
 
 ROUNDING = 1e-12
 """Coordinates about 1 after ten float64 operations are good to 1e-15; a thousand times that."""
 
-SQUARE = SceneSettings(square_share=1.0)
-LOOSE = SceneSettings(square_share=0.0)
+SQUARE = SharedRoom(square_share=1.0)
+LOOSE = SharedRoom(square_share=0.0)
 
 
 def _corner_normals(positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -24,26 +24,33 @@ def _corner_normals(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def _shells(settings: SceneSettings, name: str, count: int) -> list[tuple[ShellPart, ...]]:
-    template = TEMPLATES[name]
-    return [
-        template.layout_rand(np.random.default_rng(seed), settings, 1).shell
-        for seed in range(count)
-    ]
+def _room(ranges: SharedRoom, name: str, seed: int) -> tuple[Room, list[NDArray[np.float64]]]:
+    """Draw a room, and return it with the vertices of its parts."""
+    parts = TEMPLATES[name].parts
+    room = ranges.room_rand(np.random.default_rng(seed), parts)
+    return room, [patch(SIDES[part], at) for part, at in zip(parts, room.patches, strict=True)]
 
 
-@pytest.mark.parametrize("settings", [SQUARE, LOOSE], ids=["square", "loose"])
+def _shells(ranges: SharedRoom, name: str, count: int) -> list[tuple[ShellPart, ...]]:
+    """Draw whole layouts without objects."""
+    settings = template_settings(name, {"families.num_objects": [0, 0]})
+    family = dataclasses.replace(settings.families[0], shell=ranges)
+    settings = dataclasses.replace(settings, families=(family,))
+    return [one.layout.shell for one in drawn(settings, count)]
+
+
+@pytest.mark.parametrize("ranges", [SQUARE, LOOSE], ids=["square", "loose"])
 @pytest.mark.parametrize("name", list(TEMPLATES))
 def test_parts_are_flat_patches_of_128_faces_that_face_the_room(
-    settings: SceneSettings, name: str
+    ranges: SharedRoom, name: str
 ) -> None:
-    for shell in _shells(settings, name, 20):
+    for shell in _shells(ranges, name, 20):
         assert [part.name for part in shell] == list(TEMPLATES[name].parts)
         for part in shell:
             assert part.positions.shape == (81, 3)
             assert part.faces.shape == (128, 3)
             normals = _corner_normals(part.positions)
-            plane = floor_plane(part.positions)
+            plane = plane_of(part.positions)
             assert np.abs(plane.height(part.positions)).max() < ROUNDING
             assert (np.einsum("ti,i->t", normals, plane.normal) > 0).all()
             # The room's middle is at most 0.125 from the origin, its sides at least 0.375.
@@ -93,17 +100,13 @@ def test_in_square_rooms_walls_stand_exactly_on_the_floors_edge(name: str) -> No
             assert gaps.max() < ROUNDING
 
 
-@pytest.mark.parametrize("settings", [SQUARE, LOOSE], ids=["square", "loose"])
+@pytest.mark.parametrize("ranges", [SQUARE, LOOSE], ids=["square", "loose"])
 @pytest.mark.parametrize("name", ["wall", "corner", "open_box"])
-def test_nothing_shines_through_the_seams(settings: SceneSettings, name: str) -> None:
+def test_nothing_shines_through_the_seams(ranges: SharedRoom, name: str) -> None:
     """From the middle of the room, a look at any point near a seam meets a floor or wall."""
     for seed in range(60):
-        rng = np.random.default_rng(seed)
-        room = room_rand(rng, settings, TEMPLATES[name].parts)
-        patches = [
-            patch(SIDES[part], placement)
-            for part, placement in zip(TEMPLATES[name].parts, room.patches, strict=True)
-        ]
+        room, patches = _room(ranges, name, seed)
+        rng = np.random.default_rng([seed, 1])
         middle = (room.low + room.high) / 2
         for part in TEMPLATES[name].parts[1:]:
             points = _near_seam(rng, room.low, room.high, part)

@@ -7,63 +7,169 @@ from typing import Any
 
 import pytest
 
+from scene_templates.cameras import CameraSettings
+from scene_templates.default_families import ONE_FAMILY_EACH
+from scene_templates.excursions import Excursion
+from scene_templates.families import Family
+from scene_templates.lights import LightSettings
+from scene_templates.materials import MaterialSettings
+from scene_templates.placement import PlacementSettings
 from scene_templates.registry import TEMPLATES
-from scene_templates.settings import SHELL_TRIANGLES, SceneSettings
+from scene_templates.rooms import SharedRoom
+from scene_templates.separate_sides import SideRanges
+from scene_templates.settings import SceneSettings, ViewLaws
+from storage.changes import changed
 from storage.errors import TrilightError
+from tests.scene_templates.balls import DEFAULTS, template_settings
 
-CONTRADICTIONS: list[tuple[str, Any]] = [
-    ("templates", ()),
-    ("templates", ("plane", "cave")),
-    ("max_triangles", 522),  # the open box 512, 8 emitters, 3 objects: 523
-    ("max_triangles", -1),
-    ("num_views", 0),
-    ("num_views", 1.5),
-    ("num_objects", (3, 1)),
-    ("num_objects", (1.0, 3.0)),
-    ("num_lights", (0, 8)),
-    ("object_scale", (0.0, 1.0)),
-    ("object_scale", (1.0, math.inf)),
-    ("total_emission", (5000.0, 2500.0)),
-    ("square_share", 1.01),
-    ("smooth_share", math.nan),
-    ("min_coverage", -0.1),
-    ("min_depth", math.inf),
-    ("albedo_sum", (0.9, 1.1)),
-    ("roughness_clip", (0.01, 1.5)),
-    ("roughness_bias", 0.07),
-    ("shell_tilt_deg", 45.0),
-    ("fov_deg", (30.0, 180.0)),
-    ("room_raise", (0.1, -0.1)),
+GROUPS: dict[type, Any] = {
+    CameraSettings: CameraSettings(),
+    Family: ONE_FAMILY_EACH[0],
+    LightSettings: LightSettings(),
+    MaterialSettings: MaterialSettings(),
+    PlacementSettings: PlacementSettings(),
+    SceneSettings: DEFAULTS,
+    SharedRoom: SharedRoom(),
+    SideRanges: SideRanges(),
+    ViewLaws: ViewLaws(),
+}
+"""An admissible value of every group."""
+
+CONTRADICTIONS: list[tuple[type, str, Any]] = [
+    (SceneSettings, "families", ()),
+    (SceneSettings, "families", (ONE_FAMILY_EACH[0], ONE_FAMILY_EACH[0])),
+    (SceneSettings, "max_triangles", 531),  # the open box 512, 8 emitters, 3 objects of 4: 532
+    (SceneSettings, "max_triangles", -1),
+    (SceneSettings, "num_views", 0),
+    (SceneSettings, "num_views", 1.5),
+    (SceneSettings, "enough_error", -0.1),
+    (SceneSettings, "enough_error", math.nan),
+    (SceneSettings, "centring", "middle"),
+    (SceneSettings, "fill_to", 0),
+    (SceneSettings, "fill_to", 1537),
+    (Family, "template", "cave"),
+    (Family, "weight", 0.0),
+    (Family, "weight", math.inf),
+    (Family, "num_objects", (3, 1)),
+    (Family, "num_objects", (-1, 1)),
+    (Family, "num_objects", (1.0, 3.0)),
+    (Family, "object_scale", (0.0, 1.0)),
+    (Family, "object_scale", (1.0, math.inf)),
+    (Family, "smooth_share", math.nan),
+    (PlacementSettings, "orientation", "quaternion"),
+    (PlacementSettings, "resting_share", 1.01),
+    (PlacementSettings, "overlap_share", -0.01),
+    (LightSettings, "count", (0, 8)),
+    (LightSettings, "count", (1, 8.5)),
+    (LightSettings, "total_emission", (5000.0, 2500.0)),
+    (LightSettings, "scale", (0.0, 1.0)),
+    (LightSettings, "distance", (math.nan, 1.0)),
+    (LightSettings, "spacing", -1.0),
+    (LightSettings, "num_inside", 0.5),
+    (LightSettings, "coloured_share", 2.0),
+    (LightSettings, "orientation", "quaternion"),
+    (MaterialSettings, "albedo_sum", (0.9, 1.1)),
+    (MaterialSettings, "specular_ratio", (0.5, 1.5)),
+    (MaterialSettings, "roughness_clip", (0.01, 1.5)),
+    (MaterialSettings, "roughness_bias", 0.07),
+    (MaterialSettings, "roughness_log", (0.0, 1.0)),
+    (CameraSettings, "fov_deg", (30.0, 180.0)),
+    (CameraSettings, "fov_deg", (0.0, 30.0)),
+    (CameraSettings, "distance", (0.0, 1.0)),
+    (ViewLaws, "min_coverage", -0.1),
+    (ViewLaws, "max_shell_back", 1.1),
+    (ViewLaws, "min_depth", math.inf),
+    (ViewLaws, "coverage_grid", 0),
+    (SharedRoom, "square_share", 1.01),
+    (SharedRoom, "tilt_deg", 45.0),
+    (SharedRoom, "scale", (0.0, 1.0)),
+    (SharedRoom, "raise_z", (0.1, -0.1)),
+    (SideRanges, "scale", (0.0, 1.0)),
+    (SideRanges, "shift_x", (0.25, -0.25)),
+    (SideRanges, "tilt_deg", -1.0),
 ]
 
 
-@pytest.mark.parametrize(("name", "value"), CONTRADICTIONS)
-def test_a_contradiction_is_one_line_that_names_its_field(name: str, value: Any) -> None:
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    CONTRADICTIONS,
+    ids=lambda part: getattr(part, "__name__", None) or str(part)[:20],
+)
+def test_a_contradiction_is_one_line_that_names_its_field(
+    group: type, name: str, value: Any
+) -> None:
     with pytest.raises(TrilightError) as caught:
-        SceneSettings(**{name: value})
+        dataclasses.replace(GROUPS[group], **{name: value})
     message = str(caught.value)
     assert name in message
     assert "\n" not in message
 
 
-def test_the_least_triangle_limit_depends_on_the_templates_in_use() -> None:
-    SceneSettings(templates=("open_box",), max_triangles=523)
-    SceneSettings(templates=("plane",), max_triangles=139)
-    with pytest.raises(TrilightError, match="at least 139"):
-        SceneSettings(templates=("plane",), max_triangles=138)
+RANGES = [
+    f"{group.name}.{field.name}"
+    for group in dataclasses.fields(DEFAULTS)
+    if dataclasses.is_dataclass(settings := getattr(DEFAULTS, group.name))
+    for field in dataclasses.fields(settings)
+    if isinstance(getattr(settings, field.name), tuple)
+]
+
+
+@pytest.mark.parametrize("wrong", [[], [0.5], [1, 2, 3], [True, True], ["a", "b"]], ids=str)
+def test_a_range_that_is_named_is_two_numbers(wrong: list[Any]) -> None:
+    """A single number would silently take the other end from a default further down."""
+    assert len(RANGES) == 10
+    for name in RANGES:
+        with pytest.raises(TrilightError, match=name.split(".")[1]):
+            changed(DEFAULTS, {name: wrong})
+
+
+@pytest.mark.parametrize("value", ["many", 1000.5], ids=str)
+def test_fill_to_is_a_whole_number(value: Any) -> None:
+    with pytest.raises(TrilightError, match="fill_to"):
+        dataclasses.replace(DEFAULTS, fill_to=value)
+
+
+def test_the_least_triangle_limit_depends_on_the_layouts_in_use() -> None:
+    """Shell, eight emitters, and four triangles - a tetrahedron - for each of three objects."""
+    for name, template in TEMPLATES.items():
+        least = 128 * len(template.parts) + 8 + 3 * 4
+        template_settings(name, {"max_triangles": least})
+        with pytest.raises(TrilightError, match=f"at least {least} for {name}"):
+            template_settings(name, {"max_triangles": least - 1})
 
 
 def test_settings_are_plain_values_for_a_manifest() -> None:
-    text = json.dumps(dataclasses.asdict(SceneSettings()))
-    values: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in json.loads(text).items()
-    }
-    assert SceneSettings(**values) == SceneSettings()
+    """Through JSON and back, every number is the same, and the settings are as they were."""
+    stored = json.loads(json.dumps(dataclasses.asdict(DEFAULTS)))
+    assert _rebuilt(DEFAULTS, stored) == DEFAULTS
+    stored["lights"]["count"] = [2, 2]
+    assert _rebuilt(DEFAULTS, stored) != DEFAULTS
 
 
-def test_registry_and_settings_know_the_same_templates() -> None:
-    assert list(TEMPLATES) == list(SHELL_TRIANGLES)
+def _rebuilt(like: Any, stored: Any) -> Any:
+    """Settings of the kind of `like` from JSON values."""
+    if dataclasses.is_dataclass(like) and not isinstance(like, type):
+        names = [field.name for field in dataclasses.fields(like)]
+        return dataclasses.replace(
+            like, **{name: _rebuilt(getattr(like, name), stored[name]) for name in names}
+        )
+    if isinstance(like, tuple):
+        return tuple(_rebuilt(old, new) for old, new in zip(like, stored, strict=True))
+    return stored
+
+
+def test_an_excursion_that_contradicts_the_settings_is_refused_at_once() -> None:
+    """Not at the scene that it would make, which may be the last of many."""
+    wrong = Excursion(axis="lights", value=0, changes=(("lights.count", (0, 0)),))
+    with pytest.raises(TrilightError, match="count"):
+        dataclasses.replace(DEFAULTS, excursions=(wrong,))
+    unknown = Excursion(axis="lights", value=0, changes=(("lights.number", 1),))
+    with pytest.raises(TrilightError, match="number"):
+        dataclasses.replace(DEFAULTS, excursions=(unknown,))
+
+
+def test_the_registry_knows_every_layout() -> None:
     for name, template in TEMPLATES.items():
         assert template.name == name
-        assert SHELL_TRIANGLES[name] == 128 * len(template.parts)
+        assert template.shell_triangles == 128 * len(template.parts)
+        assert template.parts[0] == "floor"

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from pipeline.scenes.pool import PooledAsset
+from scene_templates.default_families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.scene import Scene
 from tests.scenes.small_pool import first_scene, pooled, small_pool
@@ -20,7 +21,7 @@ def pool() -> list[PooledAsset]:
 @pytest.fixture(scope="session")
 def scenes(pool: list[PooledAsset]) -> list[Scene]:
     """Two hundred scenes under the default settings."""
-    settings = SceneSettings()
+    settings = SceneSettings(families=DEFAULT_FAMILIES)
     return [first_scene(settings, pool, seed=3, scene_index=index) for index in range(200)]
 
 

@@ -1,5 +1,6 @@
 """A pool of small objects at several levels, made without the asset stage."""
 
+import dataclasses
 import hashlib
 from collections.abc import Iterable, Sequence
 
@@ -40,12 +41,22 @@ SOURCE = SourceFacts(
 """Of a closed object that needed no repair."""
 
 
-def level(mesh: trimesh.Trimesh) -> Level:
-    """Return a mesh in the unit box as a level."""
+STEP_ERROR = 0.02
+"""Error of each level beyond that of the next finer one: far above what any build calls enough, so
+that finer levels are wanted wherever they fit."""
+
+
+def with_error(quality: LevelQuality, error: float) -> LevelQuality:
+    """Return a quality at another distance to the source."""
+    return dataclasses.replace(quality, error_mean=error / 2, error_p99=error, error_max=2 * error)
+
+
+def level(mesh: trimesh.Trimesh, error: float = 0.0) -> Level:
+    """Return a mesh in the unit box as a level with a stated distance to its source."""
     centred = mesh.vertices - mesh.bounds.mean(axis=0)
     count = len(mesh.faces)
     return Level(
-        record=LevelRecord(budget=count, method="source", quality=QUALITY),
+        record=LevelRecord(budget=count, method="source", quality=with_error(QUALITY, error)),
         positions=(centred / mesh.extents.max()).astype(np.float32),
         faces=mesh.faces.astype(np.uint32),
     )
@@ -70,7 +81,7 @@ def pooled(uid: str, meshes: Iterable[trimesh.Trimesh]) -> PooledAsset:
             source_sha256=digest,
             recipe="trimesh creation",
             source=SOURCE,
-            levels=tuple(level(mesh) for mesh in meshes),
+            levels=tuple(level(mesh, rung * STEP_ERROR) for rung, mesh in enumerate(meshes)),
         ),
     )
 

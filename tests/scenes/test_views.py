@@ -11,14 +11,15 @@ from pipeline.scenes.compose import compose_scene, next_camera
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.sight import Sight
 from pipeline.scenes.views import CAMERA_ATTEMPTS, complaint
-from scene_templates.settings import SceneSettings
+from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.settings import SceneSettings, ViewLaws
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import Rejected
 from storage.scene import ARRAY_FIELDS, Scene
 from tests.scenes.slow_rays import first_hits
 from tests.scenes_by_hand import tiny_scene
 
-SETTINGS = SceneSettings()
+SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 
 
 def _slow_view(scene: Scene, view: int, grid: int) -> tuple[float, float, float]:
@@ -52,9 +53,9 @@ def test_accepted_views_hold_on_a_finer_grid_that_shares_no_ray(scenes: list[Sce
             coverage, shell_back, depth = _slow_view(scene, view, 45)
             # The outline of an object crosses about 4 sqrt(coverage) of the 32 cells of a side,
             # and each crossing errs by a third of a cell or so, independently: under 0.01.
-            assert coverage > SETTINGS.min_coverage - 0.01
-            assert shell_back < SETTINGS.max_shell_back + 0.01
-            assert depth > SETTINGS.min_depth
+            assert coverage > SETTINGS.views.min_coverage - 0.01
+            assert shell_back < SETTINGS.views.max_shell_back + 0.01
+            assert depth > SETTINGS.views.min_depth
 
 
 def test_cameras_keep_their_ranges(scenes: list[Scene]) -> None:
@@ -88,7 +89,11 @@ def test_light_is_seen_only_on_the_side_that_the_camera_sees() -> None:
     above, below = (sight.facts(_camera([0, 0, z]), 30.0, 16) for z in (1.0, -1.0))
     assert (above.lit, above.shell_back, above.coverage) == (1.0, 0.0, 0.0)
     assert (below.lit, below.shell_back, below.coverage) == (0.0, 1.0, 0.0)
-    assert complaint(below, dataclasses.replace(SETTINGS, min_coverage=0.0)) is not None
+    # A scene without objects need not show any, and one with objects must.
+    assert complaint(above, ViewLaws(), has_objects=False) is None
+    assert complaint(above, ViewLaws(), has_objects=True) == "sees too little of the objects"
+    assert complaint(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
+    assert complaint(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
 
 
 def test_a_roof_takes_the_light_away() -> None:
@@ -145,7 +150,7 @@ def test_next_camera_needs_nothing_but_the_stored_scene(scenes: list[Scene]) -> 
 
 
 def test_views_that_nobody_can_find_are_rejected(pool: list[PooledAsset]) -> None:
-    settings = SceneSettings(min_coverage=1.0)
+    settings = dataclasses.replace(SETTINGS, views=ViewLaws(min_coverage=1.0))
     with pytest.raises(Rejected) as caught:
         compose_scene(settings, pool, seed=0, scene_index=0, attempt=0)
     assert caught.value.reason == "no_camera"

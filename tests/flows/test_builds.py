@@ -1,0 +1,164 @@
+"""Every named build is complete, is stored as it is, and keeps the published numbers it claims."""
+
+import dataclasses
+import json
+from typing import Any
+
+import pytest
+
+from pipeline.flows.builds import BUILDS, named_build
+from pipeline.flows.settings import BuildSettings, differences
+from storage.errors import TrilightError
+from storage.splits import split_of_object, split_of_shard
+from tests.scene_templates.published import STAGE_1, STAGE_2
+
+RENDERFORMER = [name for name in BUILDS if name.startswith("renderformer-v1")]
+JUDGED = ["out-of-range", "benchmark-v1", "benchmark-v1-mini"]
+
+
+@pytest.mark.parametrize("name", BUILDS)
+def test_settings_survive_the_manifest(name: str) -> None:
+    build = named_build(name)
+    stored = json.loads(json.dumps(build.as_json()))
+    assert stored == build.as_json()
+    assert list(differences(build.as_json(), stored)) == []
+    assert named_build(name).digest == build.digest
+    assert _rebuilt(build, stored) == build
+    assert build.build == ("benchmark-v1" if name == "benchmark-v1-mini" else name)
+
+
+def _rebuilt(like: Any, stored: Any) -> Any:
+    """Settings of the kind of `like` from JSON values; nothing may be lost on the way."""
+    if dataclasses.is_dataclass(like) and not isinstance(like, type):
+        names = [field.name for field in dataclasses.fields(like)]
+        assert set(stored) == set(names)
+        values = {name: _rebuilt(getattr(like, name), stored[name]) for name in names}
+        return dataclasses.replace(like, **values)
+    if isinstance(like, tuple):
+        return tuple(_rebuilt(old, new) for old, new in zip(like, stored, strict=True))
+    return stored
+
+
+def test_builds_differ_from_each_other() -> None:
+    digests = {name: named_build(name).digest for name in BUILDS if name != "benchmark-v1-mini"}
+    assert len(set(digests.values())) == len(digests)
+
+
+@pytest.mark.parametrize("name", BUILDS)
+def test_what_is_named_changes_and_nothing_else(name: str) -> None:
+    before = named_build(name)
+    after = named_build(
+        name, seed=7, resolution=64, noise_floor_db=33.0, changes={"scenes.num_views": 3}
+    )
+    found = {path: value for path, _, value in differences(before.as_json(), after.as_json())}
+    expected: dict[str, Any] = {"seed": 7, "renders.resolution": 64}
+    expected |= {"renders.noise_floor_db": 33.0, "scenes.num_views": 3}
+    assert found == expected
+    assert after.digest != before.digest
+
+
+def test_licences_are_added_and_sorted() -> None:
+    plain = named_build("smoke").allowed_licences
+    more = named_build("smoke", allow_licences=("ZZ-1.0", "AA-1.0", plain[0])).allowed_licences
+    assert more == tuple(sorted({*plain, "ZZ-1.0", "AA-1.0"}))
+
+
+def test_mistakes_are_named() -> None:
+    with pytest.raises(TrilightError, match="'smok' is unknown; expected one of smoke"):
+        named_build("smok")
+    with pytest.raises(TrilightError, match=r"scenes\.lights\.number"):
+        named_build("smoke", changes={"scenes.lights.number": 3})
+    with pytest.raises(TrilightError, match="seed is -1"):
+        named_build("smoke", seed=-1)
+
+
+@pytest.mark.parametrize("name", RENDERFORMER)
+def test_renderformer_builds_keep_the_published_numbers(name: str) -> None:
+    """Section by section of the published recipes: A.1, A.4 to A.8."""
+    build = named_build(name)
+    first = "256" in name
+    scenes = build.scenes
+    rows = STAGE_1 if first else STAGE_2
+    assert [(f.name, f.weight) for f in scenes.families] == [(r[0], r[1]) for r in rows]
+    assert sum(family.weight for family in scenes.families) == (46 if first else 42)
+    assert len(scenes.families) == (21 if first else 14)
+    assert not scenes.families_in_turn
+    assert scenes.max_triangles == (1572 if first else 4192)
+    assert max(build.assets.budgets) == (1188 if first else 3968)
+    assert build.renders.resolution == (256 if first else 512)
+    assert build.renders.max_spp == 4096
+    assert scenes.num_views == 4
+    assert (scenes.centring, scenes.enough_error, scenes.fill_to) == ("vertex_mean", 0.0, None)
+    _require_published_ranges(build)
+
+
+def _require_published_ranges(build: BuildSettings) -> None:
+    materials, lights, cameras = (
+        build.scenes.materials,
+        build.scenes.lights,
+        build.scenes.cameras,
+    )
+    placement, views = build.scenes.placement, build.scenes.views
+    assert (materials.albedo_sum, materials.specular_ratio) == ((0.9, 1.0), (0.0, 1.0))
+    assert (materials.roughness_log, materials.roughness_bias) == ((0.06, 1.055), 0.05)
+    assert (materials.roughness_clip, materials.smooth_angle_deg) == ((0.01, 1.0), 30.0)
+    assert (materials.coloured_share, materials.triangle_colours_share) == (0.5, 0.0)
+    assert materials.coloured_specular_share == 0.0
+    assert (lights.count, lights.total_emission) == ((1, 8), (2500.0, 5000.0))
+    assert (lights.scale, lights.distance) == ((2.0, 2.5), (2.1, 2.7))
+    assert (lights.target_jitter, lights.spacing) == (0.2, 0.3)
+    assert (lights.orientation, lights.coloured_share, lights.num_inside) == ("euler", 0.0, 0)
+    assert (cameras.distance, cameras.fov_deg) == ((1.5, 2.0), (30.0, 60.0))
+    assert (cameras.target_jitter, cameras.up_jitter) == (0.2, 0.1)
+    assert (placement.orientation, placement.inside) == ("euler", False)
+    assert (placement.resting_share, placement.overlap_share) == (0.0, 1.0)
+    assert (views.min_coverage, views.min_lit, views.max_shell_back) == (0.0, 0.0, 1.0)
+    assert views.min_depth == 0.01
+
+
+def test_the_original_policy_differs_in_the_background_alone() -> None:
+    for size in ("256", "512"):
+        new = named_build(f"renderformer-v1-{size}")
+        old = named_build(f"renderformer-v1-{size}-original")
+        assert new.build != old.build
+        families = tuple(
+            dataclasses.replace(was, shell=now.shell)
+            for was, now in zip(old.scenes.families, new.scenes.families, strict=True)
+        )
+        scenes = dataclasses.replace(old.scenes, families=families)
+        assert dataclasses.replace(old, build=new.build, scenes=scenes) == new
+        assert old.scenes != new.scenes
+
+
+@pytest.mark.parametrize("name", JUDGED)
+def test_all_that_is_judged_is_of_the_test_split(name: str) -> None:
+    splits = named_build(name).splits
+    assert {split_of_shard(shard, splits) for shard in range(50)} == {"test"}
+    assert {split_of_object(f"{number:064x}", splits) for number in range(50)} == {"test"}
+    assert {split_of_object("f" * 64, splits)} == {"test"}
+    # Whole shards: no scene is made beyond those that are promised.
+    assert BUILDS[name].num_scenes % splits.scenes_per_shard == 0
+
+
+def test_a_turn_of_the_test_sets_is_whole() -> None:
+    """Every excursion meets every layout once, and every layout has its share of the benchmark."""
+    strange = named_build("out-of-range").scenes
+    assert len(strange.excursions) == 37
+    assert len({(one.axis, one.value) for one in strange.excursions}) == 37
+    assert len({one.axis for one in strange.excursions}) == 9
+    assert BUILDS["out-of-range"].num_scenes == 37 * len(strange.families)
+    bench = named_build("benchmark-v1").scenes
+    assert bench.families_in_turn
+    assert BUILDS["benchmark-v1"].num_scenes == 50 * len(bench.families)
+    assert len({family.template for family in bench.families}) == 4
+    assert named_build("benchmark-v1-mini") == named_build("benchmark-v1")
+
+
+@pytest.mark.parametrize("name", BUILDS)
+def test_the_simplest_objects_always_fit(name: str) -> None:
+    """The coarsest budget of the asset stage, as often as a family has objects, fits its scene."""
+    build = named_build(name)
+    for family in build.scenes.families:
+        objects = family.num_objects[1]
+        left = build.scenes.max_triangles - family.shell_triangles - build.scenes.lights.count[1]
+        assert objects * min(build.assets.budgets) <= left, family.name
