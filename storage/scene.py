@@ -80,7 +80,7 @@ class Scene:
 
     @property
     def triangle_emits(self) -> NDArray[np.bool_]:
-        """[T] whether the triangle emits light; emitters reflect nothing."""
+        """[T] whether the triangle emits light; its albedos say what it reflects."""
         material_emits: NDArray[np.bool_] = np.any(self.materials[:, EMISSION] > 0, axis=1)
         return material_emits[self.material_index]
 

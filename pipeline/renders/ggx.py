@@ -1,17 +1,23 @@
-"""The BRDF inside a kernel: Lambert plus GGX without Fresnel, single scattering.
+"""The BRDF inside a kernel: Lambert plus GGX without Fresnel, compensated for multiple scattering.
 
-    f = diffuse / pi + specular * D * G1(wi) * G1(wo) / (4 cos_i cos_o)
+    f = diffuse / pi + scale * specular * D * G2 / (4 cos_i cos_o)
 
-D and G1 are those of GGX (Walter et al. 2007) with the separable G of Mitsuba's `roughconductor`,
-so that both tracers mean the same material. Single scattering loses light at high roughness (62 %
-in a white furnace at roughness 1). Directions are in the shading frame, the normal is +z.
+D is that of GGX and G2 the height-correlated Smith term (Heitz 2014), alpha = roughness^2; the
+scale gives back what single scattering loses (pipeline.renders.multiscatter). This is the material
+of Cycles with its "Multiscatter GGX" and a constant colour. The diffuse lobe is reciprocal, the
+specular one is not, because its scale depends on the viewer's side alone: paths must start at the
+camera. Directions are in the shading frame, the normal is +z.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+from pipeline.renders.device_memory import own_floats
+from pipeline.renders.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
 
 _INV_PI = 0.3183098861837907
 
@@ -23,24 +29,71 @@ class KernelLobes:
     diffuse: Any
     """Color3f."""
     specular: Any
-    """Color3f."""
+    """Color3f: with the scale of `seen_from`, after which it may exceed 1."""
     alpha: Any
     """Float: GGX width."""
     weight: Any
     """Float: share of the specular lobe."""
+    again: Any
+    """Color3f: Fms of pipeline.renders.multiscatter."""
 
 
-def evaluate(lobes: KernelLobes, wi: Any, wo: Any) -> tuple[Any, Any]:
+class AlbedoLookup:
+    """The table of pipeline.renders.multiscatter, for kernels.
+
+    An entry holds its three upper neighbours too, so that a lane loads all four at once.
+    """
+
+    def __init__(self) -> None:
+        table = albedo_table("correlated")
+        padded = np.pad(table, ((0, 1), (0, 1)), mode="edge")
+        corners = [padded[:-1, :-1], padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]]
+        self._rows = own_floats(np.stack(corners, axis=-1))
+
+    def __call__(self, cos_in: Any, alpha: Any, active: Any) -> Any:
+        """Return E (Float) of the direction whose cosine is `cos_in`; from below, that at 0."""
+        cosine = dr.maximum(cos_in, 0)
+        u = dr.sqrt(cosine / _stretch(cosine, alpha)) * (X_STEPS - 1)
+        v = dr.sqrt(alpha) * (ROUGHNESS_STEPS - 1)
+        column, row = mi.UInt32(u), mi.UInt32(v)
+        u, v = u - mi.Float(column), v - mi.Float(row)
+        near = dr.gather(mi.Vector4f, self._rows, row * X_STEPS + column, active)
+        return dr.lerp(dr.lerp(near.x, near.y, u), dr.lerp(near.z, near.w, u), v)
+
+
+def seen_from(lobes: KernelLobes, wi: Any, albedo: Any) -> KernelLobes:
+    """Return the lobes scaled for a viewer in direction `wi`, whose directional albedo is `albedo`.
+
+    A shading normal may turn away from a viewer who sees the triangle's front: then the specular
+    lobe is gone, as in Cycles.
+    """
+    scaled = lobes.specular * (1 + lobes.again * ((1 - albedo) / albedo))
+    return replace(lobes, specular=scaled, weight=dr.select(wi.z > 0, lobes.weight, 0))
+
+
+def evaluate(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple[Any, Any]:
     """Return f * cos_o (Color3f) and the density with which `sample` draws wo (Float).
 
-    Both are 0 unless both directions are above the surface.
+    Args:
+        lobes: from `seen_from`.
+        wi: Vector3f to the viewer.
+        wo: Vector3f to the light; below the surface both results are 0.
+        geometric: Vector3f, the triangle's own normal on the viewer's side. The specular lobe
+            reflects nothing to below it, as in Cycles, whatever the shading normal says; `sample`
+            still goes there, and the density counts it.
     """
-    above = (wi.z > 0) & (wo.z > 0)
-    distribution = _distribution(dr.normalize(wi + wo), lobes.alpha)
-    visible = distribution * _shadowing(wi, lobes.alpha) / (4 * wi.z)
+    facets = _distribution(dr.normalize(wi + wo), lobes.alpha) / (2 * wi.z)
+    # 1 + 2 Lambda of Smith's term, so that G1 = 2 / (1 + m) and G2 = 2 / (m_i + m_o).
+    masked_in = _stretch(wi.z, lobes.alpha) / wi.z
+    masked_out = _stretch(wo.z, lobes.alpha) / wo.z
+    mirrored = lobes.specular * (facets / (masked_in + masked_out))
     cosine = _INV_PI * wo.z
-    reflected = lobes.diffuse * cosine + lobes.specular * (visible * _shadowing(wo, lobes.alpha))
-    density = (1 - lobes.weight) * cosine + lobes.weight * visible
+    density = (1 - lobes.weight) * cosine + lobes.weight * facets / (1 + masked_in)
+    reflected = lobes.diffuse * cosine + dr.select(dr.dot(wo, geometric) > 0, mirrored, 0)
+    # A viewer below has no specular lobe: its terms are 0 times what may be infinite.
+    faces, above = wi.z > 0, wo.z > 0
+    reflected = dr.select(faces, reflected, lobes.diffuse * cosine)
+    density = dr.select(faces, density, cosine)
     return dr.select(above, reflected, 0), dr.select(above, density, 0)
 
 
@@ -58,9 +111,10 @@ def _distribution(half: Any, alpha: Any) -> Any:
     return _INV_PI * dr.square(alpha / spread)
 
 
-def _shadowing(direction: Any, alpha: Any) -> Any:
-    tangent_sq = (dr.square(direction.x) + dr.square(direction.y)) / dr.square(direction.z)
-    return 2 / (1 + dr.sqrt(1 + dr.square(alpha) * tangent_sq))
+def _stretch(cosine: Any, alpha: Any) -> Any:
+    """Return the length of (alpha sin, cos): what a direction measures on stretched facets."""
+    cos_sq = dr.square(cosine)
+    return dr.sqrt(cos_sq + dr.square(alpha) * (1 - cos_sq))
 
 
 def _visible_normal(wi: Any, alpha: Any, u: Any) -> Any:

@@ -1,9 +1,9 @@
 """A `Scene` as stock Mitsuba plugins, for either variant.
 
-One mesh holds all surfaces, with the material as attributes of its faces. Emitters are one shape
-per material row and side: Mitsuba's `area` emitter has one side, so each triangle has a turned
-twin, and both are moved apart, or rays would meet either of two coincident faces at random and
-half of the emission would be lost.
+One mesh holds all surfaces, with the material as attributes of its faces; emitters reflect by the
+same material. They are one shape per material row and side: Mitsuba's `area` emitter has one side,
+so each triangle has a turned twin, and both are moved apart, or rays would meet either of two
+coincident faces at random and half of the emission would be lost.
 """
 
 from typing import Any
@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.blend import lobes_of, scaled_albedos
+from pipeline.renders.compensated_texture import PLUGIN, register_plugin
+from pipeline.renders.multiscatter import scattered_again
 from pipeline.renders.tracer import split_triangles
 from storage.conventions import EMISSION
 from storage.errors import Rejected
@@ -22,8 +24,33 @@ _TWIN_OFFSET = 1e-4
 """World units between a twin and the emitter itself: ten times what shadow rays stop short."""
 
 
+def _face(name: str) -> dict[str, str]:
+    return {"type": "mesh_attribute", "name": f"face_{name}"}
+
+
+_MATERIAL = {
+    "type": "blendbsdf",
+    "weight": _face("weight"),
+    "first": {"type": "diffuse", "reflectance": _face("diffuse")},
+    "second": {
+        "type": "roughconductor",
+        "material": "none",
+        "distribution": "ggx",
+        "alpha": _face("alpha"),
+        "specular_reflectance": {
+            "type": PLUGIN,
+            "specular": _face("specular"),
+            "again": _face("again"),
+            "alpha": _face("alpha"),
+        },
+    },
+}
+"""Diffuse and specular lobe as the blend of pipeline.renders.blend, read from the face."""
+
+
 def plugin_scene(scene: Scene) -> Any:
     """Return the mi.Scene of everything."""
+    register_plugin()
     surfaces, emitters = split_triangles(scene)
     shapes = {"surfaces": _surfaces(scene, surfaces)} if len(surfaces) else {}
     for row in np.unique(scene.material_index[emitters]):
@@ -43,26 +70,20 @@ def plugin_feature_scene(scene: Scene) -> Any:
 
 
 def _surfaces(scene: Scene, triangles: NDArray[np.intp]) -> Any:
+    mesh = _mesh(scene, triangles, _two_sided(_MATERIAL))
+    _add_material(mesh, scene, triangles)
+    return mesh
+
+
+def _add_material(mesh: Any, scene: Scene, triangles: NDArray[np.intp]) -> None:
+    """Give the faces of a mesh what _MATERIAL reads."""
     lobes = lobes_of(scene.materials[scene.material_index[triangles]])
     diffuse, specular = scaled_albedos(lobes)
-    material = {
-        "type": "blendbsdf",
-        "weight": _face("weight"),
-        "first": {"type": "diffuse", "reflectance": _face("diffuse")},
-        "second": {
-            "type": "roughconductor",
-            "material": "none",
-            "distribution": "ggx",
-            "alpha": _face("alpha"),
-            "specular_reflectance": _face("specular"),
-        },
-    }
-    mesh = _mesh(scene, triangles, _two_sided(material))
     _add_attribute(mesh, "weight", lobes.weight[:, None])
     _add_attribute(mesh, "alpha", lobes.alpha[:, None])
     _add_attribute(mesh, "diffuse", diffuse)
     _add_attribute(mesh, "specular", specular)
-    return mesh
+    _add_attribute(mesh, "again", scattered_again(lobes.specular, lobes.alpha, "separable"))
 
 
 def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int) -> Any:
@@ -76,9 +97,10 @@ def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int) -> Any:
     if not power > 0:
         raise Rejected("unlit_scene", f"{len(triangles)} emitting triangles have no area")
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": _colour([0.0] * 3)})
+    properties["bsdf"] = _two_sided(_MATERIAL)
+    colour = {"type": "rgb", "value": radiance.tolist()}
     properties["emitter"] = mi.load_dict(
-        {"type": "area", "radiance": _colour(radiance.tolist()), "sampling_weight": power}
+        {"type": "area", "radiance": colour, "sampling_weight": power}
     )
     mesh = mi.Mesh(f"emitter{side}", 3 * len(triangles), len(triangles), props=properties)
     twin = corners[:, ::side] + side * _TWIN_OFFSET * normal[:, None]
@@ -86,6 +108,7 @@ def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int) -> Any:
     parameters["vertex_positions"] = twin.astype(np.float32).ravel()
     parameters["faces"] = np.arange(3 * len(triangles), dtype=np.uint32)
     parameters.update()
+    _add_material(mesh, scene, triangles)
     return mesh
 
 
@@ -109,14 +132,6 @@ def _mesh(scene: Scene, triangles: NDArray[np.intp], material: Any) -> Any:
 
 def _two_sided(material: dict[str, Any]) -> Any:
     return mi.load_dict({"type": "twosided", "material": material})
-
-
-def _colour(values: list[float]) -> dict[str, Any]:
-    return {"type": "rgb", "value": values}
-
-
-def _face(name: str) -> dict[str, str]:
-    return {"type": "mesh_attribute", "name": f"face_{name}"}
 
 
 def _add_attribute(mesh: Any, name: str, values: NDArray[np.float64]) -> None:

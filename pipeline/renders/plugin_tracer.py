@@ -1,8 +1,11 @@
-"""`PluginTracer`: Mitsuba's own `path` integrator over stock plugins.
+"""`PluginTracer`: Mitsuba's own `path` integrator over stock plugins and one texture of our own.
 
-It runs where no LLVM is found (`scalar_rgb`), four to five times slower per sample and with up to
-twice the variance, and it is what `VectorTracer` is compared with. A Python emitter in `scalar_rgb`
-was tried and takes another 5.5 times as long, hence the twins of `plugin_scene`.
+It runs where no LLVM is found (`scalar_rgb`), 35 times slower per sample and with up to twice the
+variance, and `VectorTracer` is compared with it. Six of the 35 are the texture, the only way that
+was found to multiple scattering there (compensated_texture). A Python emitter takes another 5.5
+times as long, hence the twins of `plugin_scene`. Two things differ from `VectorTracer`, neither
+beyond noise in smooth or mostly diffuse scenes: the Smith term of rough lobes, and silhouettes of
+smooth low-poly mirrors, where Mitsuba turns a shading normal over that faces away.
 """
 
 from typing import Any

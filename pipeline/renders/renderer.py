@@ -159,6 +159,8 @@ class _Halves:
 def set_threads(count: int) -> None:
     """Let Mitsuba and the denoiser of this process use `count` threads; call after `activate`."""
     import drjit
+    import mitsuba
 
-    drjit.set_thread_count(count)
+    # In scalar_rgb reflections call Python (compensated_texture): threads would queue for its lock.
+    drjit.set_thread_count(1 if mitsuba.variant() == "scalar_rgb" else count)
     set_denoiser_threads(count)

@@ -1,6 +1,6 @@
 """All triangles as one table that kernels gather from: geometry, shading normals, material.
 
-A row is 28 floats padded to 32, so that a lane loads it as aligned groups of four (5 % faster than
+A row is 29 floats padded to 32, so that a lane loads it as aligned groups of four (5 % faster than
 component by component). Nothing about a scene is a literal in the kernel: one kernel serves all.
 """
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.renders.blend import lobes_of
 from pipeline.renders.device_memory import own_floats
 from pipeline.renders.ggx import KernelLobes
+from pipeline.renders.multiscatter import scattered_again
 from storage.scene import Scene
 
 _GROUPS = 8
@@ -50,6 +51,7 @@ class SurfaceTable:
                 lobes.specular,
                 lobes.alpha[:, None],
                 lobes.weight[:, None],
+                scattered_again(lobes.specular, lobes.alpha, "correlated"),
             ],
             axis=1,
         )
@@ -70,7 +72,7 @@ class SurfaceTable:
 
     def shading(self, triangle: Any, barycentric: Any, active: Any) -> tuple[Any, KernelLobes]:
         """Return the interpolated unit normal (Vector3f, not yet turned) and the material."""
-        groups = [self._group(triangle, row, active) for row in range(7)]
+        groups = [self._group(triangle, row, active) for row in range(_GROUPS)]
         normal0 = mi.Vector3f(groups[0].w, groups[1].w, groups[2].w)
         normal1 = mi.Vector3f(groups[3].x, groups[3].y, groups[3].z)
         normal2 = mi.Vector3f(groups[3].w, groups[4].x, groups[4].y)
@@ -81,6 +83,7 @@ class SurfaceTable:
             specular=mi.Color3f(groups[5].y, groups[5].z, groups[5].w),
             alpha=groups[6].x,
             weight=groups[6].y,
+            again=mi.Color3f(groups[6].z, groups[6].w, groups[7].x),
         )
         # Opposite normals may cancel: a zero normal reflects nothing, where 0 / 0 would spread.
         length_sq = dr.maximum(dr.squared_norm(normal), _TINY)

@@ -52,7 +52,7 @@ def choose_variant() -> Variant:
     return Variant(
         name="scalar_rgb",
         libllvm="",
-        note=f"{found}, so rendering takes about five times as long",
+        note=f"{found}, so rendering takes about 35 times as long",
     )
 
 

@@ -6,9 +6,10 @@ world's X, then Y, then Z, scaled along the world's axes, and moved: the order o
 converter. Vertices are not joined first, so that smooth shading stops where the mesh file splits
 its vertices. Template files, whose scales and translations are meant to be halved, are not known.
 
-An emitter's triangles become emitters each, which reflect nothing, whatever albedo the file gives
-them. Any other surface whose albedos add up to more than 1 is refused and not made darker: it would
-give off more light than it gets, and a picture of some other material would be no help.
+An emitter's triangles become emitters each. They reflect by the albedos that the file gives them,
+since the published renderer's emitters have a white surface, as its files say. What has albedos
+that add up to more than 1 is refused and not made darker: it would give off more light than it
+gets, and a picture of some other material would be no help.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.described_colours import colour_groups, random_diffuse
-from pipeline.scenes.description import DescribedCamera, DescribedObject, SceneDescription
+from pipeline.scenes.description import (
+    DescribedCamera,
+    DescribedMaterial,
+    DescribedObject,
+    SceneDescription,
+)
 from pipeline.scenes.pieces import Piece, joined
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
@@ -148,6 +154,14 @@ def _surface(described: DescribedObject, mesh: LoadedMesh, shaded: ShadedMesh) -
         rows = colour_groups(shaded, material)
         count = int(rows.max()) + 1
         diffuse = random_diffuse(material.rand_tri_diffuse_seed, material.random_diffuse_max, count)
+    materials = _reflecting(diffuse, material)
+    kind: ObjectKind = "shell" if mesh.uid.startswith(SHELL_FOLDER) else "object"
+    entry = _entry(described.name, kind, mesh)
+    return Piece(entry=entry, mesh=shaded, materials=materials, material_index=rows)
+
+
+def _reflecting(diffuse: NDArray[np.float64], material: DescribedMaterial) -> NDArray[np.float32]:
+    """Return material rows [M, 10] that do not emit, for diffuse albedos [M, 3]."""
     largest = float((diffuse + np.array(material.specular)).max())
     if largest > 1 + ALBEDO_SUM_TOLERANCE:
         raise TrilightError(
@@ -157,9 +171,7 @@ def _surface(described: DescribedObject, mesh: LoadedMesh, shaded: ShadedMesh) -
     materials[:, DIFFUSE] = diffuse
     materials[:, SPECULAR] = material.specular
     materials[:, ROUGHNESS] = material.roughness
-    kind: ObjectKind = "shell" if mesh.uid.startswith(SHELL_FOLDER) else "object"
-    entry = _entry(described.name, kind, mesh)
-    return Piece(entry=entry, mesh=shaded, materials=materials, material_index=rows)
+    return materials
 
 
 def _emitters(
@@ -170,8 +182,7 @@ def _emitters(
 ) -> list[Piece]:
     if len(faces) > MAX_EMITTERS:
         _too_many("emitting triangles", len(faces), MAX_EMITTERS)
-    materials = np.zeros((1, MATERIAL_WIDTH), np.float32)
-    materials[:, ROUGHNESS] = 1.0
+    materials = _reflecting(np.array([described.material.diffuse]), described.material)
     materials[:, EMISSION] = described.material.emissive
     single = len(faces) == 1
     return [

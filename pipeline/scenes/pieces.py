@@ -55,7 +55,7 @@ def object_piece(
 
 
 def emitter_piece(emitter: Emitter, row: int) -> Piece:
-    """Return an emitter. It reflects nothing, and its material says so."""
+    """Return an emitter; its material is black, so that it reflects nothing."""
     mesh = flat_shaded(emitter.triangle.astype(np.float32), np.array([[0, 1, 2]], np.uint32))
     materials = np.zeros((1, MATERIAL_WIDTH), np.float32)
     materials[:, ROUGHNESS] = 1.0

@@ -24,8 +24,8 @@ def _floor(surface: NDArray[np.float64] | None = None, scale: float = 1.0) -> Pa
     return quad(np.array(FLOOR) * scale, row)
 
 
-def _lamp(radiance: float = 100.0, scale: float = 1.0) -> Part:
-    return light(np.array(LAMP) * scale, radiance)
+def _lamp(radiance: float = 100.0, scale: float = 1.0, diffuse: float = 0.0) -> Part:
+    return light(np.array(LAMP) * scale, radiance, diffuse)
 
 
 def _render(scene: Scene) -> RenderedView:
@@ -58,6 +58,7 @@ SHAPES = {
         light(np.add(LAMP, [0, 0, 1]), 1.0),
     ],
     "faint light": [_floor(), _lamp(1e-3)],
+    "white lights face to face": [_floor(), _lamp(diffuse=1.0), _lamp(scale=1.001, diffuse=1.0)],
     "64 lights": [_floor(), *[_lamp(1.0 + i, 1 + 0.01 * i) for i in range(64)]],
     "light of a millimetre": [_floor(), light(np.array(LAMP) * [1e-3, 1e-3, 1], 1e6)],
 }  # fmt: skip
@@ -69,6 +70,22 @@ def test_extreme_materials(surface: NDArray[np.float64]) -> None:
     picture = _render(join([ball, _floor(surface), _lamp()])).radiance_rgb
     assert np.isfinite(picture).all()
     assert (picture >= 0).all()
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.01, 1.0])
+@pytest.mark.parametrize("specular", [[1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.5, 0.0]])
+@pytest.mark.parametrize("height", [1e-3, 1e-2])
+def test_extreme_materials_at_grazing_angles(
+    roughness: float, specular: list[float], height: float
+) -> None:
+    """The scale for multiple scattering is 0 / 0 along the surface, and largest at roughness 1."""
+    surface = material(specular=specular, roughness=roughness)
+    low = light(np.array(LAMP) * [1, 1, 0] + [0, 0.9, 1e-3], 100.0)
+    scene = join([_floor(surface), low, _lamp()], eye=(0, -0.9, height), target=(0, 0.5, 0))
+    picture = _render(scene).radiance_rgb
+    assert np.isfinite(picture).all()
+    assert (picture >= 0).all()
+    assert (picture.max() > 0) == (max(specular) > 0)
 
 
 @pytest.mark.parametrize("parts", SHAPES.values(), ids=SHAPES.keys())

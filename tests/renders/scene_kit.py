@@ -52,9 +52,9 @@ def quad(corners: ArrayLike, material_row: NDArray, kind: ObjectKind = "shell") 
     return flat(ring[np.array([[0, 1, 2], [0, 2, 3]])], material_row, kind)
 
 
-def light(triangle: ArrayLike, radiance: ArrayLike) -> Part:
-    """Return one emitting triangle [3, 3], whose white albedo must not matter."""
-    return flat(np.asarray(triangle), material(diffuse=1.0, emission=radiance), "emitter")
+def light(triangle: ArrayLike, radiance: ArrayLike, diffuse: ArrayLike = 0.0) -> Part:
+    """Return one emitting triangle [3, 3], black unless said otherwise."""
+    return flat(np.asarray(triangle), material(diffuse=diffuse, emission=radiance), "emitter")
 
 
 def sphere(centre: ArrayLike, radius: float, material_row: NDArray, rings: int = 12) -> Part:
@@ -95,7 +95,7 @@ def box(
 
 def furnace(radiance: float = 1.0) -> Part:
     """Return a box around everything that emits the same radiance from everywhere."""
-    return box([0, 0, 0], 40.0, material(diffuse=1.0, emission=radiance), kind="emitter")
+    return box([0, 0, 0], 40.0, material(emission=radiance), kind="emitter")
 
 
 def join(

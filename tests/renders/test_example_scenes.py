@@ -1,7 +1,8 @@
 """RenderFormer's example scenes beside pictures that Blender's Cycles made of the same files.
 
 Both are box-filtered, so that the mean of a block of 8 x 8 pixels holds little noise and one
-misplaced edge shows. The reference is half-float.
+misplaced edge shows. The reference is half-float, 1024 samples. Its emitters are black, ours white
+as the files say: no picture here tells one from the other (0.02 dB in cbox, nothing elsewhere).
 """
 
 from pathlib import Path
@@ -13,55 +14,74 @@ from numpy.typing import NDArray
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from storage.exr import decode_exr
+from storage.metrics import psnr_linear_db
 from tests.scenes.example_scenes import example_scene
 
 BLOCK = 8
 
 
 def _blocks(picture: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Clamped to [0, 1] first: the glint of a light, of radiance 50, is mostly noise."""
     rows = len(picture) // BLOCK
-    cut = picture.reshape(rows, BLOCK, rows, BLOCK, 3).astype(np.float64)
+    cut = np.clip(picture, 0, 1).reshape(rows, BLOCK, rows, BLOCK, 3).astype(np.float64)
     return cut.mean(axis=(1, 3))
 
 
-def _psnr(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Linear radiance clamped to [0, 1], as the README of the references measures."""
-    return float(-10 * np.log10(np.mean(np.square(np.clip(a, 0, 1) - np.clip(b, 0, 1)))))
-
-
-def _render(shared: Path, name: str, settings: RenderSettings) -> NDArray[np.float64]:
+def _render(shared: Path, name: str, settings: RenderSettings) -> NDArray[np.float32]:
     scene = example_scene(shared, name)
     renderer = SceneRenderer(scene, settings)
-    return _blocks(renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), 1).radiance_rgb)
+    return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), 1).radiance_rgb
 
 
-def _reference(shared: Path, file: str) -> NDArray[np.float64]:
-    return _blocks(decode_exr((shared / "cycles_reference" / file).read_bytes()))
+def _reference(shared: Path, file: str) -> NDArray[np.float32]:
+    return decode_exr((shared / "cycles_reference" / file).read_bytes())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cbox", "cbox-bunny"])
-def test_direct_light_lies_where_cycles_has_it(shared: Path, llvm: None, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "least_db"), [("cbox", 76), ("cbox-bunny", 74), ("crystals", 71), ("tree", 65)]
+)
+def test_direct_light_is_that_of_cycles(
+    shared: Path, llvm: None, name: str, least_db: float
+) -> None:
+    """Geometry, materials, camera, light and pixels, with nothing but noise between.
+
+    Measured: 79.7, 76.4, 75.4 and 68.0. With single scattering 57.6, 57.6, 59.1 and 21.9; vertices
+    joined before normalising the bunny give 53.3.
+    """
     settings = RenderSettings(
-        resolution=256, noise_floor_db=99, min_spp=256, max_spp=256, max_depth=2, denoiser="off"
+        resolution=256, noise_floor_db=99, min_spp=512, max_spp=512, max_depth=2, denoiser="off"
     )
-    ours, theirs = _render(shared, name, settings), _reference(shared, f"{name}.direct_raw.exr")
-    # Measured: 57.6 dB in both scenes. Vertices joined before normalising the
-    # bunny give 53.3 dB.
-    assert _psnr(ours, theirs) > 55
-    # Half of the blocks agree to the rounding of half floats (5e-4) and what noise is left: what is
-    # lit, from where and how brightly is right to that. The other walls' one percent of specular
-    # light differs, because Cycles compensates multiple scattering.
+    ours = _blocks(_render(shared, name, settings))
+    theirs = _blocks(_reference(shared, f"{name}.direct_raw.exr"))
+    assert psnr_linear_db(ours, theirs) > least_db
+    # Half of the blocks agree to the rounding of half floats (5e-4) and what noise is left.
     lit = theirs > 0.02
-    assert np.median(abs(ours - theirs)[lit] / theirs[lit]) < 0.002
+    assert np.median(abs(ours - theirs)[lit] / theirs[lit]) < 0.001
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "least_db"), [("cbox", 48.0), ("cbox-bunny", 31.0)])
-def test_all_light_agrees_with_cycles(shared: Path, llvm: None, name: str, least_db: float) -> None:
-    settings = RenderSettings(resolution=256, noise_floor_db=99, min_spp=256, max_spp=256)
+@pytest.mark.parametrize(
+    ("name", "spp", "least_db", "least_block_db"),
+    [
+        ("cbox", 512, 45.0, 55.0),
+        ("cbox-bunny", 1024, 30.0, 33.0),
+        ("crystals", 1024, 29.5, 34.0),
+        ("tree", 1024, 27.0, 31.0),
+    ],
+)
+def test_all_light_agrees_with_cycles(
+    shared: Path, llvm: None, name: str, spp: int, least_db: float, least_block_db: float
+) -> None:
+    """Denoised on both sides. Cycles with another seed agrees with its own picture to 50 dB in
+    cbox, 33 in cbox-bunny, 32 in crystals and 29 in tree, whose light comes by mirrors.
+
+    Measured: 46.5, 30.8, 30.4 and 28.1 by pixels; 57.1, 36.8, 36.9 and 33.7 by blocks. With single
+    scattering tree has 17.5.
+    """
+    settings = RenderSettings(resolution=256, noise_floor_db=99, min_spp=spp, max_spp=spp)
     ours, theirs = _render(shared, name, settings), _reference(shared, f"{name}.exr")
-    # Measured: 51.0 and 33.4 dB. Cycles with another seed agrees with its own picture to 50 dB in
-    # cbox and 33 in cbox-bunny, whose floor is lit through the mirror of the bunny.
-    assert _psnr(ours, theirs) > least_db
-    assert abs(ours.mean() / theirs.mean() - 1) < 0.03
+    assert psnr_linear_db(ours, theirs) > least_db
+    assert psnr_linear_db(_blocks(ours), _blocks(theirs)) > least_block_db
+    # What pixels can show; beyond 1, single pixels decide.
+    assert abs(np.clip(ours, 0, 1).mean() / np.clip(theirs, 0, 1).mean() - 1) < 0.02

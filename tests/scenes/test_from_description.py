@@ -111,7 +111,12 @@ def test_examples_have_the_materials_and_kinds_of_their_files(
         assert entry.licence == "LicenseRef-user-provided"
         if max(material["emissive"]) > 0:
             assert entry.kind == "emitter"
-            expected = [*[0] * 6, 1, *material["emissive"]]
+            expected = [
+                *material["diffuse"],
+                *material["specular"],
+                material["roughness"],
+                *material["emissive"],
+            ]
             np.testing.assert_allclose(scene.materials[rows], [expected], rtol=1e-6)
             continue
         assert entry.kind == ("shell" if "backgrounds" in stated["mesh_path"] else "object")
@@ -154,9 +159,10 @@ def test_every_triangle_of_an_emitter_is_an_emitter() -> None:
     emitters = [entry for entry in scene.objects if entry.kind == "emitter"]
     assert [entry.name for entry in emitters] == [f"light.{row}" for row in range(12)]
     assert scene.triangle_emits.sum() == 12
-    assert (
-        scene.materials[scene.material_index[scene.triangle_emits], EMISSION] == (10, 5, 0)
-    ).all()
+    rows = scene.materials[scene.material_index[scene.triangle_emits]]
+    # It reflects what its file says, too.
+    expected = [0.5, 0.4, 0.3, 0.1, 0.1, 0.1, 0.3, 10, 5, 0]
+    np.testing.assert_allclose(rows, np.broadcast_to(expected, rows.shape), rtol=1e-6)
     np.testing.assert_array_equal(np.bincount(scene.object_index), [12, *[1] * 12])
 
 
@@ -189,6 +195,11 @@ REFUSED: list[tuple[tuple[str | int, ...], dict[str, Any], str]] = [
         MATERIAL,
         {"rand_tri_diffuse_seed": 1, "random_diffuse_max": 1.0, "specular": [0.5] * 3},
         "objects.box: diffuse + specular is 1.5",
+    ),
+    (
+        MATERIAL,
+        {"specular": [0.8] * 3, "emissive": [1.0] * 3},
+        "objects.box: diffuse + specular is 1.3",
     ),
     (TRANSFORM, {"scale": [0, 1, 0]}, "objects.box: no triangle of box.obj has an area"),
     (CAMERA, {"look_at": [0, -2, 0]}, "cameras[0] looks from (0.0, -2.0, 0.0) at"),

@@ -1,0 +1,90 @@
+"""The kernel's BRDF as a Mitsuba plugin: with it, Mitsuba's own `path` integrator must make the
+same pictures as our kernel, up to noise, whatever the material.
+
+`PluginTracer` itself cannot serve for that: its `roughconductor` has another Smith term.
+"""
+
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from pipeline.renders import ggx, multiscatter, plugin_scene
+from pipeline.renders.ggx import AlbedoLookup, KernelLobes
+from pipeline.renders.plugin_tracer import PluginTracer
+from storage.scene import Scene
+
+_PLUGIN = "kernel_bsdf"
+_COLOURS, _NUMBERS = ("diffuse", "specular", "again"), ("alpha", "weight")
+
+
+def exact_twin(scene: Scene, monkeypatch: pytest.MonkeyPatch, **depths: int) -> PluginTracer:
+    """Return Mitsuba's integrator, emitters and geometry around the kernel's BRDF (LLVM only)."""
+    _register()
+    children = {name: plugin_scene._face(name) for name in (*_COLOURS, *_NUMBERS)}
+    monkeypatch.setattr(plugin_scene, "_MATERIAL", {"type": _PLUGIN, **children})
+    monkeypatch.setattr(plugin_scene, "_two_sided", mi.load_dict)
+    monkeypatch.setattr(
+        plugin_scene,
+        "scattered_again",
+        lambda specular, alpha, _: multiscatter.scattered_again(specular, alpha, "correlated"),
+    )
+    return PluginTracer(scene, **depths)
+
+
+@cache
+def _register() -> None:
+    class KernelBsdf(mi.BSDF):
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            names = (*_COLOURS, *_NUMBERS)
+            self._textures = {name: properties.get_texture(name) for name in names}
+            self._lookup = AlbedoLookup()
+            sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+            self.m_components = [mi.BSDFFlags.GlossyReflection | sides]
+            self.m_flags = self.m_components[0]
+
+        def sample(self, ctx: Any, si: Any, u: Any, u2: Any, active: Any = True) -> Any:
+            lobes, wi, geometric, side = self._seen(si, active)
+            wo = ggx.sample(lobes, wi, u, u2)
+            reflected, density = ggx.evaluate(lobes, wi, wo, geometric)
+            drawn: Any = mi.BSDFSample3f(_mirrored(wo, side))
+            drawn.pdf, drawn.eta = density, 1.0
+            drawn.sampled_type = +mi.BSDFFlags.GlossyReflection
+            drawn.sampled_component = 0
+            return drawn, dr.select(density > 0, reflected / density, 0)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            lobes, wi, geometric, side = self._seen(si, active)
+            return ggx.evaluate(lobes, wi, _mirrored(wo, side), geometric)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def _seen(self, si: Any, active: Any) -> tuple[KernelLobes, Any, Any, Any]:
+            colours = {name: self._textures[name].eval(si, active) for name in _COLOURS}
+            numbers = {name: self._textures[name].eval_1(si, active) for name in _NUMBERS}
+            weight = numbers["weight"]
+            lobes = KernelLobes(
+                diffuse=colours["diffuse"] * (1 - weight),
+                specular=colours["specular"] * weight,
+                again=colours["again"],
+                **numbers,
+            )
+            geometric = si.to_local(si.n)
+            geometric = dr.mulsign(geometric, geometric.z)
+            side = dr.sign(dr.dot(geometric, si.wi))
+            wi = _mirrored(si.wi, side)
+            albedo = self._lookup(wi.z, lobes.alpha, active)
+            return ggx.seen_from(lobes, wi, albedo), wi, _mirrored(geometric, side) * side, side
+
+    mi.register_bsdf(_PLUGIN, KernelBsdf)
+
+
+def _mirrored(direction: Any, side: Any) -> Any:
+    return mi.Vector3f(direction.x, direction.y, direction.z * side)
