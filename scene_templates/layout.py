@@ -76,6 +76,8 @@ class Emitter:
     """[3, 3] corners in world units."""
     radiance_rgb: RGB
     """Emitted radiance."""
+    reflectance: float
+    """Diffuse albedo, the same in every channel."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -46,11 +46,14 @@ class LightSettings:
     coloured_share: float = 0.0
     """Share of emitters that are coloured at the same mean radiance. An option: published lights
     are white, and a network trained on white ones alone has never seen another."""
+    reflectance: float = 0.0
+    """Diffuse albedo of an emitter. What shines at 300 need not reflect; the published ones do,
+    with an albedo of 1."""
     num_inside: int = 0
     """How many of the emitters hang in the middle of objects instead, for tests out of range."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, shares=("coloured_share",))
+        check_numbers(self, shares=("coloured_share", "reflectance"))
         known = self.orientation in ORIENTATIONS
         require(known, "orientation", self.orientation, " or ".join(ORIENTATIONS))
         require(self.count[0] >= 1, "count", self.count, "at least 1 emitter")
@@ -108,7 +111,9 @@ def _emitter_rand(
     triangle = turned * rng.uniform(*settings.scale, size=3) + centre
     radiance = rng.uniform(*settings.total_emission) / count
     red, green, blue = radiance * _tint_rand(rng, settings.coloured_share)
-    return Emitter(triangle=triangle, radiance_rgb=(red, green, blue))
+    return Emitter(
+        triangle=triangle, radiance_rgb=(red, green, blue), reflectance=settings.reflectance
+    )
 
 
 def _tint_rand(rng: np.random.Generator, coloured_share: float) -> NDArray[np.float64]:

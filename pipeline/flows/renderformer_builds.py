@@ -14,8 +14,6 @@ be meant, with what is done here:
   recoverable. Here they are cleaned and decimated by our own stage, which keeps open surfaces open.
 - **Light and camera shells.** The corner's light shell and the azimuths of most cameras are known;
   the light shells of the other layouts are not: ours (`scene_templates.wall` and the others).
-- **Emitters** carry the published token (diffuse 1) only in exported files; a `Scene` says what the
-  renderer does with them.
 - **Colours** pass through 8-bit vertex colours there, truncated, and are decoded as sRGB by one of
   two readers; here they are linear floats everywhere.
 - **Seeds**, lists of objects, and the number of scenes are lost.
@@ -73,7 +71,7 @@ def _published(families: tuple[Family, ...], *, max_triangles: int) -> SceneSett
             orientation="euler", resting_share=0.0, overlap_share=1.0, inside=False
         ),
         materials=MaterialSettings(triangle_colours_share=0.0),
-        lights=LightSettings(orientation="euler"),
+        lights=LightSettings(orientation="euler", reflectance=1.0),
         views=ViewLaws(min_coverage=0.0, min_lit=0.0, max_shell_back=1.0),
     )
 

@@ -17,7 +17,7 @@ published scenes have defects (reference: renderformer.md, G):
 - one budget for each scene, spent by error, instead of one for each object, which overflows;
 - colours are linear floats, where one number means one albedo; a colour for each triangle or for
   each shading group is equally likely, as the paper says and the code does not do;
-- emitters reflect nothing.
+- emitters reflect nothing: what shines at 300 need not.
 """
 
 import dataclasses

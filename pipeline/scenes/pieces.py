@@ -55,9 +55,10 @@ def object_piece(
 
 
 def emitter_piece(emitter: Emitter, row: int) -> Piece:
-    """Return an emitter; its material is black, so that it reflects nothing."""
+    """Return an emitter: one triangle with a material row of its own."""
     mesh = flat_shaded(emitter.triangle.astype(np.float32), np.array([[0, 1, 2]], np.uint32))
     materials = np.zeros((1, MATERIAL_WIDTH), np.float32)
+    materials[:, DIFFUSE] = emitter.reflectance
     materials[:, ROUGHNESS] = 1.0
     materials[:, EMISSION] = emitter.radiance_rgb
     entry = SceneObject(name=f"emitter{row}", kind="emitter")

@@ -194,7 +194,9 @@ def _shell() -> Piece:
 
 def _light() -> Piece:
     triangle = np.array([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2.0]])
-    return emitter_piece(Emitter(triangle=triangle, radiance_rgb=(9.0, 9.0, 9.0)), 0)
+    return emitter_piece(
+        Emitter(triangle=triangle, radiance_rgb=(9.0, 9.0, 9.0), reflectance=0.0), 0
+    )
 
 
 @pytest.mark.parametrize("fill_to", [1000, 2048])
