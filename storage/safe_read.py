@@ -1,6 +1,7 @@
 """Reading safetensors bytes from outside: the header is bounded before any memory is taken."""
 
 import json
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,23 +14,41 @@ MAX_HEADER_BYTES = 1 << 20
 """A scene's header takes about 1 KiB."""
 
 
-def read_safetensors(data: bytes) -> tuple[dict[str, NDArray], dict[str, str]]:
+def read_safetensors(
+    data: bytes, max_header_bytes: int = MAX_HEADER_BYTES
+) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return arrays and metadata of a safetensors file held in memory.
 
     Raises:
-        TrilightError: the bytes are truncated, the header is larger than MAX_HEADER_BYTES, or the
-            library refuses them (it checks every offset against the length of `data`).
+        TrilightError: as `safetensors_header`, or the library refuses the bytes (it checks every
+            offset against the length of `data`).
+    """
+    header = safetensors_header(data, max_header_bytes)
+    try:
+        arrays = load(data)
+    except (SafetensorError, ValueError) as error:
+        raise TrilightError(f"safetensors: unreadable ({error}).") from error
+    metadata = header.get("__metadata__", {})
+    return {name: np.asarray(array) for name, array in arrays.items()}, metadata
+
+
+def safetensors_header(data: bytes, max_header_bytes: int = MAX_HEADER_BYTES) -> dict[str, Any]:
+    """Return the header of a safetensors file held in memory, as it stands there.
+
+    Raises:
+        TrilightError: the bytes are truncated, the header is larger than `max_header_bytes`, or it
+            is no JSON object.
     """
     length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or length > min(MAX_HEADER_BYTES, len(data) - 8):
+    if len(data) < 8 or length > min(max_header_bytes, len(data) - 8):
         raise TrilightError(
             f"safetensors: the header claims {length} bytes of a file of {len(data)}; expected at "
-            f"most {MAX_HEADER_BYTES}. The file is damaged: run `trilight verify` on its dataset."
+            f"most {max_header_bytes}. The file is damaged."
         )
     try:
         header = json.loads(data[8 : 8 + length])
-        arrays = load(data)
-    except (SafetensorError, ValueError) as error:
-        raise TrilightError(f"safetensors: unreadable ({error}); run `trilight verify`.") from error
-    metadata = header.get("__metadata__", {})
-    return {name: np.asarray(array) for name, array in arrays.items()}, metadata
+    except (ValueError, RecursionError) as error:
+        raise TrilightError(f"safetensors: unreadable ({error}).") from error
+    if not isinstance(header, dict):
+        raise TrilightError("safetensors: the header is no JSON object.")
+    return header

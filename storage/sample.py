@@ -3,6 +3,7 @@
     000000123.scene.safetensors   the arrays of the scene
     000000123.json                schema version, objects, provenance, one record per view
     000000123.0.exr ...           linear radiance of each view, half-float RGB
+    000000123.0.lights.exr ...    optional: each emitter's part of that radiance (storage.lights)
 
 The key is everything before the first dot, as WebDataset reads names.
 """
@@ -15,14 +16,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors.numpy import save
 
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.exr import decode_exr, encode_exr
+from storage.lights import decode_lights_exr, encode_lights_exr, num_lights
 from storage.safe_read import read_safetensors
-from storage.scene import ARRAY_FIELDS, Scene, SceneObject
+from storage.scene import ARRAY_FIELDS, Scene
+from storage.scene_file import encode_arrays, scene_objects, scene_provenance, scene_record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +32,7 @@ class ViewRecord:
     """How one picture was made, and how far to trust it."""
 
     spp: int
-    """Samples per pixel that were spent."""
+    """Samples per pixel that were spent; on each light where they are apart."""
     noise_floor_db: float
     """Measured error of the picture as psnr_log_db (storage.metrics)."""
     noise_floor_linear_db: float
@@ -71,6 +73,9 @@ class Sample:
     """[C, R, R, 3] linear radiance, one picture per camera of the scene."""
     views: tuple[ViewRecord, ...]
     """One record per camera."""
+    lights_rgb: NDArray[np.float32] | None = None
+    """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`; their
+    sum is the picture (storage.lights). None where the build keeps lights together."""
 
 
 def sample_key(scene_index: int) -> str:
@@ -80,17 +85,17 @@ def sample_key(scene_index: int) -> str:
 
 def encode_sample(sample: Sample) -> dict[str, bytes]:
     """Return the members of a sample by suffix; equal samples give equal bytes."""
-    scene = sample.scene
-    arrays = {name: np.ascontiguousarray(getattr(scene, name)) for name in ARRAY_FIELDS}
     record = {
         "schema_version": SCHEMA_VERSION,
-        "objects": [dataclasses.asdict(entry) for entry in scene.objects],
-        "provenance": dict(scene.provenance),
+        **scene_record(sample.scene),
         "views": [dataclasses.asdict(view) for view in sample.views],
     }
-    members = {"scene.safetensors": save(arrays), "json": canonical_json(record)}
+    members = {"scene.safetensors": encode_arrays(sample.scene), "json": canonical_json(record)}
     for view, picture in enumerate(sample.radiance_rgb):
         members[f"{view}.exr"] = encode_exr(picture)
+    if sample.lights_rgb is not None:
+        for view, lights in enumerate(sample.lights_rgb):
+            members[f"{view}.lights.exr"] = encode_lights_exr(lights)
     return members
 
 
@@ -105,11 +110,30 @@ def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
     try:
         pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(record.views))]
         radiance_rgb = np.stack(pictures)
+        lights_rgb = _decode_lights(record.scene, radiance_rgb, members)
     except KeyError as error:
         raise TrilightError(f"sample {key}: {error} is missing.") from error
     except ValueError as error:
         raise TrilightError(f"sample {key}: {error}") from error
-    return Sample(key=key, scene=record.scene, radiance_rgb=radiance_rgb, views=record.views)
+    return Sample(
+        key=key,
+        scene=record.scene,
+        radiance_rgb=radiance_rgb,
+        views=record.views,
+        lights_rgb=lights_rgb,
+    )
+
+
+def _decode_lights(
+    scene: Scene, radiance_rgb: NDArray[np.float32], members: Mapping[str, bytes]
+) -> NDArray[np.float32] | None:
+    if not any(suffix.endswith(".lights.exr") for suffix in members):
+        return None
+    views, height, width, _ = radiance_rgb.shape
+    shape = (num_lights(scene), height, width)
+    return np.stack(
+        [decode_lights_exr(members[f"{view}.lights.exr"], shape) for view in range(views)]
+    )
 
 
 def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
@@ -124,10 +148,11 @@ def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
     record = _decode_record(key, members["json"])
     try:
         views = tuple(ViewRecord(**view) for view in record["views"])
-        objects = tuple(SceneObject(**entry) for entry in record["objects"])
+        objects = scene_objects(record["objects"])
         arrays, _ = read_safetensors(members["scene.safetensors"])
         fields = {name: arrays[name] for name in ARRAY_FIELDS}
-        scene = Scene(objects=objects, provenance=record["provenance"], **fields)
+        provenance = scene_provenance(record["provenance"])
+        scene = Scene(objects=objects, provenance=provenance, **fields)
     except KeyError as error:
         raise TrilightError(f"sample {key}: {error} is missing.") from error
     except (TypeError, ValueError) as error:

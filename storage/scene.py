@@ -16,6 +16,7 @@ from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, SPECULAR
 from storage.errors import TrilightError
 
 ObjectKind = Literal["object", "shell", "emitter"]
+OBJECT_KINDS: tuple[ObjectKind, ...] = ("object", "shell", "emitter")
 
 ALBEDO_SUM_TOLERANCE = 1e-5
 """Two float32 albedos that are meant to add up to 1 may exceed it by their rounding."""

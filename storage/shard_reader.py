@@ -2,7 +2,7 @@
 
 import re
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from storage.errors import TrilightError
@@ -59,6 +59,36 @@ def iterate_samples(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
         members[suffix] = data
     if current is not None:
         yield current, members
+
+
+def read_members(path: Path, key: str, suffixes: Collection[str]) -> dict[str, bytes]:
+    """Return some members of one sample of a shard by suffix, reading no other.
+
+    Raises:
+        TrilightError: as `iterate_members`, there is no such sample, or a member occurs twice.
+    """
+    members: dict[str, bytes] = {}
+    keys: list[str] = []
+    try:
+        with tarfile.open(path, mode="r:") as archive:
+            for member in archive:
+                found, suffix = _checked_name(path, member)
+                if found not in keys[-1:]:
+                    keys.append(found)
+                if found != key or suffix not in suffixes:
+                    continue
+                if suffix in members:
+                    raise TrilightError(f"{path.name}: member {key}.{suffix} occurs twice.")
+                stream = archive.extractfile(member)
+                members[suffix] = stream.read() if stream else b""
+    except (tarfile.TarError, OSError) as error:
+        raise TrilightError(f"{path.name}: not a readable shard ({error}).") from error
+    if key not in keys:
+        held = f"{keys[0]} to {keys[-1]}" if keys else "none"
+        raise TrilightError(
+            f"{path.name}: no sample {key}; expected one of its {len(keys)}: {held}."
+        )
+    return members
 
 
 def _checked_name(path: Path, member: tarfile.TarInfo) -> tuple[str, str]:

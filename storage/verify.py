@@ -10,6 +10,7 @@ import numpy as np
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
+from storage.lights import sum_of_lights
 from storage.manifest import Manifest, ShardEntry, index_shard, read_manifest
 from storage.objects_lock import read_objects_lock
 from storage.records import LockedObject
@@ -124,6 +125,7 @@ def check_sample(
         yield f"sample {sample.key}: pictures {sample.radiance_rgb.shape}; expected {expected}"
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
         yield f"sample {sample.key}: a picture holds a value that is not finite or negative"
+    yield from _check_lights(sample, apart=bool(manifest.settings["renders"].get("per_light")))
     for entry in sample.scene.objects:
         if entry.kind != "object":
             continue
@@ -132,6 +134,23 @@ def check_sample(
             yield f"sample {sample.key}: object {entry.uid!r} is not in objects.lock.jsonl"
         elif lock.split != split:
             yield f"sample {sample.key}: object {entry.uid!r} belongs to split {lock.split}"
+
+
+def _check_lights(sample: Sample, *, apart: bool) -> Iterator[str]:
+    """Yield the faults of the pictures of single lights; older manifests know no such setting."""
+    if (sample.lights_rgb is not None) != apart:
+        found = "lacks" if apart else "has"
+        yield f"sample {sample.key}: {found} pictures by light; renders.per_light is {apart}"
+    if sample.lights_rgb is None:
+        return
+    for view, lights in enumerate(sample.lights_rgb):
+        differs = (sum_of_lights(lights) != sample.radiance_rgb[view]).any(axis=-1)
+        if differs.any():
+            row, column = (int(index) for index in np.argwhere(differs)[0])
+            yield (
+                f"sample {sample.key}: view {view} is not the sum of its lights in "
+                f"{int(differs.sum())} pixels, first in ({row}, {column})"
+            )
 
 
 def _setting(manifest: Manifest, group: str, name: str) -> Any:

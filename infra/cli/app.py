@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import typer
 
-from infra.cli import assets, bench, doctor, generate, inspect, train, verify
+from infra.cli import assets, bench, doctor, generate, inspect, render, train, verify
 from storage.errors import TrilightError
 
 app = typer.Typer(
@@ -21,6 +21,7 @@ app = typer.Typer(
 app.command("doctor")(doctor.doctor)
 app.command("assets")(assets.assets)
 app.command("generate")(generate.generate)
+app.command("render")(render.render)
 app.command("verify")(verify.verify)
 app.command("inspect")(inspect.inspect)
 app.command("train")(train.train)

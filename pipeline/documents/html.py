@@ -6,13 +6,13 @@ the documents themselves make.
 
 import base64
 import html
-import io
 from collections.abc import Iterable, Sequence
 from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+
+from pipeline.documents.png import encode_png
 
 Cell = str | int | float
 
@@ -109,9 +109,7 @@ def outside_link(url: str) -> Markup:
 
 def png_uri(pixels: NDArray[np.uint8]) -> str:
     """Return a picture, [H, W] grey or [H, W, 3] RGB, as a data URI."""
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG")
-    return data_uri(stream.getvalue())
+    return data_uri(encode_png(pixels))
 
 
 def data_uri(png: bytes) -> str:

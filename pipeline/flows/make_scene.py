@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.flows.scene_files import SceneFiles
 from pipeline.flows.settings import BuildSettings
@@ -121,6 +122,7 @@ def _render_sample(
     """
     renderer, sight = SceneRenderer(scene, settings.renders), Sight(scene)
     pictures, records = [], []
+    lights: list[NDArray[np.float32]] = []
     for view in range(scene.num_views):
         while True:
             camera_attempt = int(scene.provenance["camera_attempts"][view])
@@ -134,6 +136,8 @@ def _render_sample(
                 failures.append(_failure("renders", f"{key}.{view}", rejection, camera_attempt))
                 scene = next_camera(scene, settings.scenes, view=view)
         pictures.append(rendered.radiance_rgb)
+        if rendered.lights_rgb is not None:
+            lights.append(rendered.lights_rgb)
         camera = (scene.c2w[view], float(scene.fov_deg[view]))
         facts = sight.facts(*camera, settings.scenes.views.coverage_grid)
         records.append(_record(rendered, facts, seed, camera_attempt))
@@ -143,6 +147,7 @@ def _render_sample(
         scene=_with_digest(scene, settings),
         radiance_rgb=np.stack(pictures),
         views=tuple(records),
+        lights_rgb=np.stack(lights) if lights else None,
     )
 
 

@@ -126,8 +126,12 @@ def find_scene_files(folder: str) -> SceneFolder:
             raise TrilightError(
                 f"--scenes-from {folder}: rename {name!r}; expected printable text."
             )
-    described = tuple(read_description(_read_scene_file(root, name), name) for name in names)
-    return SceneFolder(root=root, descriptions=described)
+    return SceneFolder(root=root, descriptions=tuple(described_by(root, name) for name in names))
+
+
+def described_by(root: Path, name: str) -> SceneDescription:
+    """Return what a scene file in the folder `root` describes; raises TrilightError."""
+    return read_description(_read_scene_file(root, name), name)
 
 
 def build_scene(
@@ -136,7 +140,7 @@ def build_scene(
     settings: AssetSettings,
     *,
     licence: str,
-    num_views: int,
+    num_views: int | None,
     scene_index: int,
     seed: int,
 ) -> tuple[Scene, Mapping[str, str]]:
@@ -147,7 +151,7 @@ def build_scene(
         name: of the scene file in it.
         settings: limits on meshes.
         licence: of the objects.
-        num_views: cameras to take from the file.
+        num_views: cameras to take from the file, or None for all.
         scene_index: which scene of the dataset this is; stands in its provenance.
         seed: of the dataset; stands in the provenance, and decides nothing here.
 
@@ -159,6 +163,7 @@ def build_scene(
     """
     data = _read_scene_file(root, name)
     description = read_description(data, name)
+    num_views = len(description.cameras) if num_views is None else num_views
     digests = {name: sha256_hex(data)}
     meshes: dict[tuple[str, int | None], LoadedMesh] = {}
     for described in description.objects:

@@ -39,19 +39,29 @@ class EmitterPoint:
 class EmitterTable:
     """The emitting triangles `order` of a scene, in that order."""
 
-    def __init__(self, scene: Scene, order: NDArray[np.intp]) -> None:
+    def __init__(
+        self, scene: Scene, order: NDArray[np.intp], lit: NDArray[np.bool_] | None = None
+    ) -> None:
         """Build the table.
 
+        Args:
+            scene: the scene.
+            order: rows of its emitting triangles.
+            lit: which of `order` are switched on; all by default. The others stay black bodies.
+
         Raises:
-            Rejected: "unlit_scene" where no emitter has both area and radiance.
+            Rejected: "unlit_scene" where no emitter that is on has both area and radiance.
         """
         corners = scene.vertex_positions[scene.faces[order]].astype(np.float64)
         radiance = scene.materials[scene.material_index[order]][:, EMISSION].astype(np.float64)
+        if lit is not None:
+            radiance *= lit[:, None]
         edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         area = 0.5 * np.linalg.norm(np.cross(edge1, edge2), axis=1)
         power = area * radiance.mean(axis=1)
         if not power.sum() > 0:
-            raise Rejected("unlit_scene", f"{len(order)} emitting triangles have no area")
+            count = len(order) if lit is None else int(lit.sum())
+            raise Rejected("unlit_scene", f"{count} emitting triangles have no area")
         share = power / power.sum()
         density = np.divide(share, area, out=np.zeros_like(area), where=area > 0)
         keep, alias = alias_table(share)

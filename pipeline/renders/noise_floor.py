@@ -53,7 +53,7 @@ def measure_floor(
 
 
 def next_spp(spp: int, *, gap_db: float, step: int, max_spp: int) -> int:
-    """Return how many samples to go on to, given how far the floor is below its target.
+    """Return how many samples to go on to before the floor is measured again.
 
     Args:
         spp: samples per pixel so far, a multiple of `step` below `max_spp`.
@@ -61,6 +61,12 @@ def next_spp(spp: int, *, gap_db: float, step: int, max_spp: int) -> int:
         step: samples of one pass of both halves.
         max_spp: the cap, a multiple of `step`.
     """
-    growth = min(_MAX_GROWTH, 2 ** (gap_db / _DB_PER_DOUBLING))
-    wanted = step * math.ceil(spp * growth / step)
+    expected = expected_spp(spp, gap_db=gap_db, step=step, max_spp=max_spp)
+    return min(expected, max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step))
+
+
+def expected_spp(spp: int, *, gap_db: float, step: int, max_spp: int) -> int:
+    """Return at how many samples the floor should reach its target, or the cap; as `next_spp`."""
+    doublings = min(gap_db / _DB_PER_DOUBLING, math.log2(max_spp / spp) + 1)
+    wanted = step * math.ceil(spp * 2**doublings / step)
     return min(max_spp, max(wanted, spp + step))

@@ -134,7 +134,8 @@ def _seen_emission(
     area_density, emitted = scene.emitters.density_and_radiance(row, emits)
     cosine = dr.abs(dr.dot(point.geometric_normal, direction))
     emitter_density = area_density * dr.square(distance) / cosine
-    return dr.select(emits, emitted * (density / (density + emitter_density)), 0)
+    shines = emits & (dr.max(emitted) > 0)  # one that is off has no density: 0/0 at grazing angles
+    return dr.select(shines, emitted * (density / (density + emitter_density)), 0)
 
 
 def _vertex(

@@ -48,15 +48,22 @@ _MATERIAL = {
 """Diffuse and specular lobe as the blend of pipeline.renders.blend, read from the face."""
 
 
-def plugin_scene(scene: Scene) -> Any:
-    """Return the mi.Scene of everything."""
+def plugin_scene(scene: Scene, *, only_light: int | None = None) -> Any:
+    """Return the mi.Scene of everything, with one emitter object switched on or all of them."""
     register_plugin()
     surfaces, emitters = split_triangles(scene)
     shapes = {"surfaces": _surfaces(scene, surfaces)} if len(surfaces) else {}
-    for row in np.unique(scene.material_index[emitters]):
-        triangles = emitters[scene.material_index[emitters] == row]
-        for side in (1, -1):
-            shapes[f"emitter_{row}_{side}"] = _emitter(scene, triangles, side)
+    is_on = np.ones(len(emitters), bool)
+    if only_light is not None:
+        is_on = scene.object_index[emitters] == only_light
+    if not is_on.any():
+        raise Rejected("unlit_scene", "0 emitting triangles have no area")
+    for on in (True, False):
+        kept = emitters[is_on == on]
+        for row in np.unique(scene.material_index[kept]):
+            triangles = kept[scene.material_index[kept] == row]
+            for side in (1, -1):
+                shapes[f"emitter_{on}_{row}_{side}"] = _emitter(scene, triangles, side, on=on)
     return mi.load_dict({"type": "scene", **shapes})
 
 
@@ -86,15 +93,20 @@ def _add_material(mesh: Any, scene: Scene, triangles: NDArray[np.intp]) -> None:
     _add_attribute(mesh, "again", scattered_again(lobes.specular, lobes.alpha, "separable"))
 
 
-def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int) -> Any:
-    """Return the shape of emitting triangles of one material row, lit on one side."""
+def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int, *, on: bool) -> Any:
+    """Return the shape of emitting triangles of one material row, lit on one side.
+
+    One that is off stays an emitter, of no radiance: only emitters are hidden from the camera.
+    """
     corners = scene.vertex_positions[scene.faces[triangles]].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled_area = np.linalg.norm(cross, axis=1, keepdims=True)
     normal = np.divide(cross, doubled_area, out=np.zeros_like(cross), where=doubled_area > 0)
     radiance = scene.materials[scene.material_index[triangles[0]], EMISSION].astype(np.float64)
     power = 0.5 * float(doubled_area.sum()) * float(radiance.mean())
-    if not power > 0:
+    if not on:
+        radiance, power = np.zeros(3), 0.0
+    elif not power > 0:
         raise Rejected("unlit_scene", f"{len(triangles)} emitting triangles have no area")
     properties = mi.Properties()
     properties["bsdf"] = _two_sided(_MATERIAL)

@@ -8,6 +8,7 @@ beyond noise in smooth or mostly diffuse scenes: the Smith term of rough lobes, 
 smooth low-poly mirrors, where Mitsuba turns a shading normal over that faces away.
 """
 
+import copy
 from typing import Any
 
 import mitsuba as mi
@@ -30,6 +31,7 @@ class PluginTracer:
     """A scene on any backend; see `Tracer` for the meaning of its methods."""
 
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
+        self._record = scene
         self._scene = plugin_scene(scene)
         self._feature_scene = plugin_feature_scene(scene)
         self._path = _integrator(
@@ -37,6 +39,11 @@ class PluginTracer:
         )
         self._features = _integrator(type="aov", aovs="albedo:albedo,normal:sh_normal")
         self._depth = _integrator(type="aov", aovs="depth:depth")
+
+    def only_light(self, row: int) -> "PluginTracer":
+        tracer = copy.copy(self)
+        tracer._scene = plugin_scene(self._record, only_light=row)
+        return tracer
 
     def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
         return _render(self._scene, self._path, camera, seed=seed, spp=spp)

@@ -13,13 +13,16 @@ A pass of 64 is stratified finer than four of 16: 0.1 to 0.3 dB less error on sa
 to 2 dB in the median pixel of the easy ones (LOG.md). The small ones are for quick previews.
 """
 
+MAX_RESOLUTION = 2048
+"""Largest picture: one pass of 64 samples takes 3.3 GB there, and that grows with the area."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
     """The target, the budget and the estimator of every picture of a build."""
 
     resolution: int
-    """Width and height in pixels, a multiple of 8."""
+    """Width and height in pixels, a multiple of 8 up to MAX_RESOLUTION."""
     noise_floor_db: float
     """Sampling stops when the measured floor (psnr_log_db) reaches this."""
     min_spp: int
@@ -38,11 +41,15 @@ class RenderSettings:
     """Quality of Open Image Denoise; `fast` costs 1 to 2 dB and saves 0.3 core-seconds."""
     min_mean_radiance: float = 0.01
     """A view whose first samples are darker than this on average is rejected as black_view."""
+    per_light: bool = False
+    """Render each emitter alone as well, and make the picture their sum (storage.lights). It takes
+    about as many times as long as there are emitters."""
 
     def __post_init__(self) -> None:
         _require(
-            self.resolution > 0 and self.resolution % 8 == 0,
-            f"resolution is {self.resolution}; expected a positive multiple of 8",
+            0 < self.resolution <= MAX_RESOLUTION and self.resolution % 8 == 0,
+            f"resolution is {self.resolution}; expected a positive multiple of 8 up to "
+            f"{MAX_RESOLUTION}",
         )
         _require(
             0 < self.noise_floor_db < MAX_DB,

@@ -28,6 +28,16 @@ class Features:
 class Tracer(Protocol):
     """One loaded scene. Emitters are hidden from camera rays in everything that it returns."""
 
+    def only_light(self, row: int) -> "Tracer":
+        """Return the same loaded scene in which only the emitter `objects[row]` is switched on.
+
+        The others stay where they are, black. Equal seeds give equal camera rays in both.
+
+        Raises:
+            Rejected: "unlit_scene" where it has no area.
+        """
+        ...
+
     def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
         """Return the mean of one pass of samples, linear radiance [R, R, 3].
 

@@ -4,6 +4,7 @@ The sum over a pixel's samples is a reduction of our own, in a fixed order: pict
 on the number of threads. A pass is explicit, so that raw samples are at hand before denoising.
 """
 
+import copy
 from typing import Any
 
 import drjit as dr
@@ -27,6 +28,7 @@ class VectorTracer:
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
         surfaces, emitters = split_triangles(scene)
         order = np.concatenate([surfaces, emitters])
+        self._record, self._emitters = scene, emitters
         self._scene = KernelScene(
             surfaces=_load(scene, surfaces),
             everything=_load(scene, order),
@@ -36,6 +38,13 @@ class VectorTracer:
             max_depth=max_depth,
             rr_depth=rr_depth,
         )
+
+    def only_light(self, row: int) -> "VectorTracer":
+        lit = self._record.object_index[self._emitters] == row
+        tracer = copy.copy(self)
+        tracer._scene = copy.copy(self._scene)
+        tracer._scene.emitters = EmitterTable(self._record, self._emitters, lit)
+        return tracer
 
     def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
         sampler = _sampler(camera, seed, spp)

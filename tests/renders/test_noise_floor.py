@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.renders.noise_floor import measure_floor, next_spp
+from pipeline.renders.noise_floor import expected_spp, measure_floor, next_spp
 from storage.metrics import MAX_DB, psnr_log_db
 
 
@@ -26,6 +26,13 @@ def test_a_gap_of_one_slope_doubles_the_samples() -> None:
     assert next_spp(128, gap_db=2.4, step=128, max_spp=4096) == 512
     assert next_spp(128, gap_db=99.0, step=128, max_spp=4096) == 512
     assert next_spp(512, gap_db=99.0, step=128, max_spp=640) == 640
+
+
+def test_the_expected_number_of_samples_looks_past_the_next_step() -> None:
+    assert expected_spp(128, gap_db=1.2, step=128, max_spp=4096) == 256
+    assert expected_spp(128, gap_db=4.8, step=128, max_spp=4096) == 2048
+    assert next_spp(128, gap_db=4.8, step=128, max_spp=4096) == 512
+    assert expected_spp(128, gap_db=1e9, step=128, max_spp=4096) == 4096
 
 
 def test_the_floor_is_one_decibel_below_the_halves_agreement() -> None:

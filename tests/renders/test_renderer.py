@@ -101,6 +101,23 @@ def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
     assert 32 < wanted.spp < 4096 and wanted.spp % 32 == 0
 
 
+def test_a_view_says_how_far_it_is() -> None:
+    scene = simple_scene()
+    settings = dataclasses.replace(CHEAP, noise_floor_db=95.0, max_spp=256)
+    steps = SceneRenderer(scene, settings).view_steps(scene.c2w[0], float(scene.fov_deg[0]), 0)
+    seen = []
+    while True:
+        try:
+            seen.append(next(steps))
+        except StopIteration as end:
+            view = end.value
+            break
+    assert [step.spp for step in seen] == list(range(16, 257, 16))
+    assert all(step.spp <= step.expected_spp <= 256 for step in seen)
+    assert [step.noise_floor_db is None for step in seen] == [True] * 2 + [False] * 14
+    assert digest(view) == digest(_render(scene, settings))
+
+
 def test_the_measured_floor_is_below_the_true_agreement_here() -> None:
     """An honest floor: the picture is at least as close to a converged one as it claims.
 

@@ -17,6 +17,7 @@ GOOD: dict[str, Any] = {
     [
         ("resolution", 0),
         ("resolution", 60),
+        ("resolution", 2056),
         ("min_spp", 0),
         ("min_spp", 640),
         ("min_spp", 100),

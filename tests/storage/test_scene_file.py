@@ -1,0 +1,188 @@
+"""A scene comes back from its file exactly; what is no scene is refused before it takes memory."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.sample import encode_sample
+from storage.scene import ARRAY_FIELDS, Scene, SceneObject
+from storage.scene_file import (
+    MAX_FILE_BYTES,
+    decode_scene_file,
+    encode_scene,
+    read_scene_file,
+    scene_digest,
+)
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+KEY = "trilight_scene"
+
+
+def _remade(
+    arrays: Callable[[dict[str, Any]], None] = lambda arrays: None,
+    record: Callable[[dict[str, Any]], None] = lambda record: None,
+) -> bytes:
+    """Return the file of the tiny scene with arrays or metadata changed in place."""
+    scene = tiny_scene()
+    plain = {name: getattr(scene, name) for name in ARRAY_FIELDS}
+    data = encode_scene(scene)
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    metadata = json.loads(header["__metadata__"][KEY])
+    arrays(plain)
+    record(metadata)
+    return save(plain, {KEY: json.dumps(metadata)})
+
+
+def test_round_trip_is_exact() -> None:
+    odd = SceneObject(
+        name='floor "ü" \n', kind="shell", licence="MIT", attribution="Ö", source_url="x"
+    )
+    scene = tiny_scene(objects=(odd, SceneObject(name="light", kind="emitter")))
+    back = decode_scene_file(encode_scene(scene), "a")
+    for name, (dtype, _) in ARRAY_FIELDS.items():
+        assert getattr(back, name).dtype == dtype
+        assert np.array_equal(getattr(back, name), getattr(scene, name))
+    assert back.objects == scene.objects
+    assert back.provenance == scene.provenance
+    assert encode_scene(back) == encode_scene(scene)
+
+
+def test_the_digest_is_that_of_the_member_in_a_shard() -> None:
+    sample = tiny_sample()
+    member = encode_sample(sample)["scene.safetensors"]
+    assert scene_digest(sample.scene) == sha256_hex(member)
+    moved = tiny_scene(fov_deg=np.array([45, 41], np.float32))
+    assert scene_digest(moved) != scene_digest(tiny_scene())
+    assert scene_digest(tiny_scene(provenance={})) == scene_digest(tiny_scene())
+
+
+def test_a_scene_that_breaks_a_law_is_not_written() -> None:
+    with pytest.raises(TrilightError, match="fov_deg"):
+        encode_scene(tiny_scene(fov_deg=np.array([45, 181], np.float32)))
+
+
+def _drop(arrays: dict[str, Any]) -> None:
+    del arrays["faces"]
+
+
+def _add(arrays: dict[str, Any]) -> None:
+    arrays["extra"] = np.zeros(3, np.float32)
+
+
+def _retype(arrays: dict[str, Any]) -> None:
+    arrays["faces"] = arrays["faces"].astype(np.int64)
+
+
+def _reshape(arrays: dict[str, Any]) -> None:
+    arrays["materials"] = arrays["materials"][:, :9].copy()
+
+
+def _lawless(arrays: dict[str, Any]) -> None:
+    arrays["faces"] = arrays["faces"] + np.uint32(7)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_drop, "missing or not expected: 'faces'"),
+        (_add, "missing or not expected: 'extra'"),
+        (_retype, r"faces is \['I64', \[3, 3\]\]; expected U32"),
+        (_reshape, r"materials is \['F32', \[2, 9\]\]; expected F32"),
+        (_lawless, r"faces\[0, 0\] is 7; expected vertex rows below 7"),
+    ],
+)
+def test_arrays_are_exactly_those_of_a_scene(
+    change: Callable[[dict[str, Any]], None], message: str
+) -> None:
+    with pytest.raises(TrilightError, match=f"^a.safetensors: .*{message}"):
+        decode_scene_file(_remade(arrays=change), "a.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"schema_version": 99}, "schema version 99"),
+        ({"schema_version": None}, "schema version None"),
+        ({"objects": {}}, "objects is {}"),
+        ({"objects": [1, 2]}, r"objects\[0\] is 1"),
+        ({"objects": [{"name": "x", "kind": "shell"}]}, "exactly the fields attribution"),
+        ({"provenance": []}, r"provenance is \[\]"),
+        ({"provenance": {"x": float("nan")}}, "NaN is no JSON number"),
+    ],
+)
+def test_metadata_are_exactly_those_of_a_scene(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(TrilightError, match=message) as caught:
+        decode_scene_file(_remade(record=lambda record: record.update(change)), "a")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("field", "value"), [("kind", "lamp"), ("name", 3), ("uid", ["x"])])
+def test_fields_of_objects_are_checked(field: str, value: Any) -> None:
+    with pytest.raises(TrilightError, match=rf"objects\[1\].{field} is "):
+        decode_scene_file(
+            _remade(record=lambda record: record["objects"][1].update({field: value})), "a"
+        )
+
+
+def test_a_file_without_our_metadata_is_no_scene() -> None:
+    scene = tiny_scene()
+    data = save({name: getattr(scene, name) for name in ARRAY_FIELDS})
+    with pytest.raises(TrilightError, match=f"metadata {KEY} are missing"):
+        decode_scene_file(data, "a")
+
+
+def test_deep_metadata_are_refused() -> None:
+    scene = tiny_scene()
+    arrays = {name: getattr(scene, name) for name in ARRAY_FIELDS}
+    with pytest.raises(TrilightError, match="not JSON"):
+        decode_scene_file(save(arrays, {KEY: "[" * 100_000}), "a")
+
+
+def test_a_shape_that_claims_too_much_is_refused_before_any_array_is_made() -> None:
+    data = encode_scene(tiny_scene())
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    header["fov_deg"]["shape"] = [1 << 40]
+    bomb = json.dumps(header).encode()
+    with pytest.raises(TrilightError, match="fov_deg is"):
+        decode_scene_file(len(bomb).to_bytes(8, "little") + bomb + data[8 + length :], "a")
+
+
+@pytest.mark.parametrize("kept", [0, 7, 8, 100, -1])
+def test_a_cut_file_is_refused(kept: int) -> None:
+    with pytest.raises(TrilightError, match="^a: "):
+        decode_scene_file(encode_scene(tiny_scene())[:kept], "a")
+
+
+def test_every_flipped_byte_is_a_scene_or_one_clear_line() -> None:
+    """No damage ends in anything but a lawful scene or a TrilightError."""
+    data, rng = encode_scene(tiny_scene()), np.random.default_rng(0)
+    refused = 0
+    for at in rng.integers(0, len(data), 400):
+        damaged = bytearray(data)
+        damaged[at] ^= int(rng.integers(1, 256))
+        try:
+            scene: Scene = decode_scene_file(bytes(damaged), "a")
+            scene.check()
+        except TrilightError:
+            refused += 1
+    assert refused > 100
+
+
+def test_a_large_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "large.safetensors"
+    with path.open("wb") as stream:
+        stream.truncate(MAX_FILE_BYTES + 1)  # a hole: it takes no room
+    with pytest.raises(TrilightError, match="large.safetensors: expected a regular file"):
+        read_scene_file(path)
+    with pytest.raises(TrilightError, match="cannot be read"):
+        read_scene_file(tmp_path / "absent.safetensors")
+    path.write_bytes(encode_scene(tiny_scene()))
+    assert read_scene_file(path).objects == tiny_scene().objects
