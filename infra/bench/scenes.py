@@ -48,8 +48,8 @@ _LEVELS = ("finest", *(f"{error:.2%}" for error in ERRORS))
 
 
 def run(options: Options, round_done: Callable[[], None]) -> Comparison:
-    """Measure; quickly 40 scenes a build and 2 pictures, otherwise 200 and 16."""
-    count, pictures, repeats = (40, 2, 1) if options.quick else (200, 16, 2)
+    """Measure; quickly 40 scenes a build and 2 pictures, otherwise 200 and 8."""
+    count, pictures, repeats = (40, 2, 1) if options.quick else (200, 8, 2)
     with tempfile.TemporaryDirectory() as folder:
         child = _child(DatasetFolder(Path(folder)), options)
         sides: dict[str, Callable[[], Mapping[str, float]]] = {
