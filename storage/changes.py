@@ -21,7 +21,12 @@ def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
             settings themselves refuse.
     """
     for name, value in changes.items():
-        settings = _changed(settings, name.split("."), value, name)
+        try:
+            settings = _changed(settings, name.split("."), value, name)
+        except TrilightError as error:
+            if name in str(error):
+                raise
+            raise TrilightError(f"setting {name!r}: {error}") from error
     return settings
 
 
