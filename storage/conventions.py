@@ -10,8 +10,13 @@ Pictures: row 0 is the top, pixel (i, j) covers the square around its centre (j 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-SCHEMA_VERSION = 2
+from storage.errors import TrilightError
+
+SCHEMA_VERSION = 3
 """Version of everything that Trilight stores; a change of meaning needs a new one."""
+
+READABLE_VERSIONS = (2, 3)
+"""What this code reads. Version 2 is version 3 with the profile `lossless` alone."""
 
 SPLITS = ("train", "validation", "test")
 
@@ -24,6 +29,16 @@ EMISSION = slice(7, 10)
 
 HALF_FLOAT_MAX = 65504.0
 """The largest finite value of a stored picture."""
+
+
+def require_readable(version: object, where: str) -> None:
+    """Raise TrilightError unless `version` is among READABLE_VERSIONS; `where` names the file."""
+    if version not in READABLE_VERSIONS:
+        readable = " and ".join(str(known) for known in READABLE_VERSIONS)
+        raise TrilightError(
+            f"{where}: schema version {version}; this Trilight reads {readable}. Use the release "
+            "that made it, or make it again with `trilight generate`."
+        )
 
 
 def alpha_ggx(roughness: ArrayLike) -> NDArray:

@@ -1,11 +1,12 @@
 """Half-float RGB OpenEXR in memory: what a stored picture is.
 
-ZIP is lossless on the half floats and every reader knows it; which codec is the best trade is
-measured with the shards. Equal pictures give equal bytes: the header holds nothing of the clock.
+The file itself says how it is packed, so a reader need not be told. Which codecs are used is
+`storage.profiles`. Equal pictures give equal bytes: the header holds nothing of the clock.
 """
 
 import io
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,29 @@ MAX_RESOLUTION = 8192
 """A larger window in a file from outside is refused before any memory is taken."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ExrCodec:
+    """How an OpenEXR file is packed."""
+
+    compression: str
+    """OpenEXR's name, such as ZIP or DWAB; of what the library offers, this is all that can be
+    chosen but for DWA's level: deflate, zstd and lossy JPEG 2000 have their default levels."""
+    dwa_level: float | None = None
+    """Of DWAA and DWAB: greater is coarser; None is the library's 45."""
+
+
+ZIP = ExrCodec(compression="ZIP")
+"""Exact on half floats, and known to every reader of OpenEXR."""
+
+_LOSSY = frozenset(
+    getattr(OpenEXR, f"{name}_COMPRESSION") for name in ("B44", "B44A", "DWAA", "DWAB", "LJ2K")
+)
+
+_HALF = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
+_NOT_NEGATIVE = np.where(_HALF < 0, np.float32(0), _HALF)
+"""Every half float by its bits: looking them up takes half of the time of numpy's conversion."""
+
+
 Attributes = Mapping[str, str | int | float]
 """Entries of a header beyond what every file has."""
 
@@ -26,17 +50,24 @@ Header = Mapping[str, Any]
 """The header of a file as the library gives it."""
 
 
-def encode_exr(radiance_rgb: NDArray[np.float32], attributes: Attributes | None = None) -> bytes:
-    """Return the OpenEXR file of a picture, rounded to half floats.
+def encode_exr(
+    radiance_rgb: NDArray[np.float32],
+    codec: ExrCodec = ZIP,
+    *,
+    attributes: Attributes | None = None,
+) -> bytes:
+    """Return the OpenEXR file of a picture, rounded to half floats; one thread.
 
     Args:
         radiance_rgb: [R, R, 3] linear radiance, finite, in [0, 65504].
+        codec: how to pack it. A lossy one may leave values below 0, or infinite ones where the
+            brightest rounds up: callers look at what comes back.
         attributes: more entries of the header, by name.
 
     Raises:
         TrilightError: a value is not finite, negative, or too large for a half float.
     """
-    return encode_channels({"RGB": to_half(radiance_rgb)}, attributes)
+    return encode_channels({"RGB": to_half(radiance_rgb)}, codec, attributes=attributes)
 
 
 def to_half(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
@@ -52,10 +83,18 @@ def to_half(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
 
 
 def encode_channels(
-    channels: Mapping[str, NDArray[np.float16]], attributes: Attributes | None = None
+    channels: Mapping[str, NDArray[np.float16]],
+    codec: ExrCodec = ZIP,
+    *,
+    attributes: Attributes | None = None,
 ) -> bytes:
     """Return the OpenEXR file of named channels, [H, W] each or [H, W, 3] under the name RGB."""
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header: dict[str, object] = {
+        "compression": getattr(OpenEXR, f"{codec.compression}_COMPRESSION"),
+        "type": OpenEXR.scanlineimage,
+    }
+    if codec.dwa_level is not None:
+        header["dwaCompressionLevel"] = float(codec.dwa_level)  # an int would be another type
     stream = io.BytesIO()
     OpenEXR.File({**header, **(attributes or {})}, dict(channels), num_threads=0).write(stream)
     return stream.getvalue()
@@ -64,13 +103,26 @@ def encode_channels(
 def decode_exr(data: bytes) -> NDArray[np.float32]:
     """Return the picture of an OpenEXR file as float32 [H, W, 3].
 
+    Where the file is packed with losses, what they took below 0 is 0 again.
+
     Raises:
         TrilightError: not an EXR file, truncated, larger than MAX_RESOLUTION, or without RGB.
     """
-    channels = decode_channels(data, _check_window)
+    header: dict[str, Any] = {}
+
+    def check(found: Header) -> None:
+        _check_window(found)
+        header.update(found)
+
+    channels = decode_channels(data, check)
     if "RGB" not in channels:
         raise TrilightError(f"picture: channels are {sorted(channels)}; expected R, G and B.")
-    return np.asarray(channels["RGB"], np.float32)
+    pixels, lossy = channels["RGB"], header["compression"] in _LOSSY
+    if pixels.dtype != np.float16:  # other tools write float32
+        return np.asarray(np.maximum(pixels, 0) if lossy else pixels, np.float32)
+    table = _NOT_NEGATIVE if lossy else _HALF
+    picture: NDArray[np.float32] = np.take(table, pixels.view(np.uint16))
+    return picture
 
 
 def decode_channels(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from storage.atomic import write_atomically
-from storage.conventions import SCHEMA_VERSION, SPLITS
+from storage.conventions import SCHEMA_VERSION, SPLITS, require_readable
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.shard_reader import MAX_MEMBER_BYTES, MEMBER_NAME, iterate_members
@@ -130,11 +130,7 @@ def read_manifest(path: Path) -> Manifest:
         ) from error
     except (OSError, ValueError, KeyError, AttributeError) as error:
         raise TrilightError(f"{path}: not a readable manifest ({error}).") from error
-    if version != SCHEMA_VERSION:
-        raise TrilightError(
-            f"{path}: schema version {version}; this Trilight reads {SCHEMA_VERSION}. Use the "
-            "release that made it, or make it again with `trilight generate`."
-        )
+    require_readable(version, str(path))
     try:
         return _decode(record)
     except (KeyError, TypeError, ValueError) as error:

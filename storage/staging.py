@@ -10,6 +10,7 @@ from pathlib import Path
 
 from storage.atomic import write_atomically
 from storage.failures import decode_failures, encode_failures
+from storage.profiles import Profile
 from storage.records import Failure
 from storage.sample import Sample, encode_sample, sample_key
 from storage.shard_reader import iterate_samples
@@ -29,10 +30,14 @@ class StagedScene:
 
 
 def stage_scene(
-    folder: Path, scene_index: int, sample: Sample | None, failures: list[Failure]
+    folder: Path,
+    scene_index: int,
+    sample: Sample | None,
+    failures: list[Failure],
+    profile: Profile,
 ) -> None:
-    """Write what became of a scene into the staging folder of its shard."""
-    members = encode_sample(sample) if sample else {}
+    """Write what became of a scene into the staging folder of its shard, packed as it will stay."""
+    members = encode_sample(sample, profile) if sample else {}
     stream = io.BytesIO()
     write_tar(
         stream, [(sample_key(scene_index), {**members, _FAILURES: encode_failures(failures)})]

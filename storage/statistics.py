@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from storage.dataset import Dataset
 from storage.digests import sha256_hex
-
-SCENE_SUFFIX = ".scene.safetensors"
-"""Of the member that holds a scene's arrays (storage.sample)."""
+from storage.profiles import PACKED, PLAIN, unpack_arrays
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,7 +28,7 @@ class Statistics:
     """Scenes per axis along which they leave the usual range; empty where none does."""
     scene_digest: str
     """sha256 over the keys and arrays of all scenes, without pictures: equal for equal scenes,
-    whatever they were rendered with."""
+    whatever they were rendered and packed with."""
     num_bytes: int
     """Bytes of all shards."""
     spp: NDArray[np.int64]
@@ -82,12 +80,14 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     for shard in dataset.manifest.shards:
         with dataset.folder.shard(shard.name).open("rb") as stream:
             for name, offset, num_bytes in shard.members:
-                if not name.endswith((".json", SCENE_SUFFIX)):
+                key, _, suffix = name.partition(".")
+                if suffix not in ("json", PLAIN, PACKED):
                     continue
                 stream.seek(offset)
                 member = stream.read(num_bytes)
-                if name.endswith(SCENE_SUFFIX):
-                    scene_members[name] = sha256_hex(member)
+                if suffix != "json":
+                    arrays = unpack_arrays({suffix: member})
+                    scene_members[f"{key}.{PLAIN}"] = sha256_hex(arrays)
                     continue
                 record = json.loads(member)
                 splits[shard.split] += 1
@@ -109,7 +109,7 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
 
 
 def digest_of_scenes(members: Mapping[str, str]) -> str:
-    """Return the digest of a set of scenes from the sha256 of each `KEY.scene.safetensors`."""
+    """Return the digest of scenes from the sha256 of each unpacked `KEY.scene.safetensors`."""
     lines = (f"{name} {digest}" for name, digest in sorted(members.items()))
     return sha256_hex("\n".join(lines).encode())
 

@@ -31,6 +31,8 @@ _LIBRARIES = (
     "pymeshlab",
     "meshoptimizer",
     "libigl",
+    "OpenEXR",
+    "h5py",
 )
 
 

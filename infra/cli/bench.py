@@ -14,7 +14,7 @@ from storage.errors import TrilightError
 if TYPE_CHECKING:
     from infra.bench.harness import Comparison, Options
 
-_NAMES = ("assets", "render", "scenes")
+_NAMES = ("assets", "render", "scenes", "shards")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,5 +77,14 @@ def _named(name: str) -> _Benchmark:
 
         return _Benchmark(
             num_rounds=scenes.num_rounds, run=scenes.run, rows=scenes.rows, plot=scenes.plot
+        )
+    if name == "shards":
+        from infra.bench import shards, shards_report
+
+        return _Benchmark(
+            num_rounds=shards.num_rounds,
+            run=shards.run,
+            rows=shards_report.rows,
+            plot=shards_report.plot,
         )
     raise TrilightError(f"benchmark {name!r} is unknown; expected one of {', '.join(_NAMES)}.")

@@ -1,13 +1,25 @@
 """What the bytes of a dataset depend on beside its settings: processor, variant, libraries."""
 
 import platform
+import zlib
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from pipeline.renders.variant import Variant
 
-_LIBRARIES = ("trilight", "mitsuba", "drjit", "pyoidn", "numpy", "scipy", "trimesh", "pymeshlab")
+_LIBRARIES = (
+    "trilight",
+    "mitsuba",
+    "drjit",
+    "pyoidn",
+    "numpy",
+    "scipy",
+    "trimesh",
+    "pymeshlab",
+    "OpenEXR",
+    "safetensors",
+)
 _VECTOR_EXTENSIONS = ("avx512f", "avx2", "sse4_2", "asimd")
 
 
@@ -17,7 +29,10 @@ def environment(variant: Variant) -> dict[str, Any]:
         "mitsuba_variant": variant.name,
         "llvm": Path(variant.libllvm).name,
         "processor": f"{platform.machine()} {vector_extension()}".strip(),
-        "libraries": {name: _version(name) for name in _LIBRARIES},
+        "libraries": {
+            **{name: _version(name) for name in _LIBRARIES},
+            "zlib": zlib.ZLIB_RUNTIME_VERSION,  # Python's own, which packs the arrays of scenes
+        },
     }
 
 

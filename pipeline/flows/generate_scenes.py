@@ -186,7 +186,8 @@ def read_scenes_task(
 def make_shard_task(shard_index: int, job: "_ShardJob") -> ShardEntry:
     """Make one shard with a borrowed render child."""
     with job.pool.borrow() as child:
-        return make_shard(job.folder, job.settings.splits, shard_index, child)
+        settings = job.settings
+        return make_shard(job.folder, settings.splits, settings.storage.profile, shard_index, child)
 
 
 @task(name="write-documents", cache_policy=NO_CACHE)

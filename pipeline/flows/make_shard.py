@@ -12,6 +12,7 @@ from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.shards.pack import pack_shard
 from storage.layout import DatasetFolder
 from storage.manifest import ShardEntry
+from storage.profiles import Profile
 from storage.records import Failure
 from storage.sample import Sample, sample_key
 from storage.splits import SplitSettings, scenes_of_shard, shard_name, split_of_shard
@@ -19,7 +20,11 @@ from storage.staging import is_staged, stage_scene
 
 
 def make_shard(
-    folder: DatasetFolder, splits: SplitSettings, shard_index: int, child: IsolatedChild
+    folder: DatasetFolder,
+    splits: SplitSettings,
+    profile: Profile,
+    shard_index: int,
+    child: IsolatedChild,
 ) -> ShardEntry:
     """Make what is missing of a shard and pack it.
 
@@ -35,7 +40,7 @@ def make_shard(
         started = time.monotonic()
         split, attempts = split_of_shard(shard_index, splits), _attempts(splits)
         sample, failures = _make_scene(split, scene_index, attempts, child)
-        stage_scene(staged, scene_index, sample, failures)
+        stage_scene(staged, scene_index, sample, failures, profile)
         _log(folder.logs / f"{name}.jsonl", scene_index, time.monotonic() - started, failures)
     return pack_shard(folder, name, scenes_of_shard(shard_index, splits))
 

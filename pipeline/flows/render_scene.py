@@ -130,7 +130,7 @@ def render_scene(
     finally:
         child.close()
     header = _header(source, facts, settings, step, view=view, seed=seed, variant=variant)
-    write_atomically(files.exr, encode_exr(step.radiance_rgb, header))
+    write_atomically(files.exr, encode_exr(step.radiance_rgb, attributes=header))
     write_atomically(files.png, encode_png(preview_srgb8(step.radiance_rgb)))
     return Picture(view=step, facts=facts, files=files)
 

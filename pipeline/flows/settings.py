@@ -12,6 +12,7 @@ from pipeline.renders.settings import RenderSettings
 from scene_templates.settings import SceneSettings
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.profiles import StorageSettings
 from storage.splits import SplitSettings
 
 
@@ -35,6 +36,8 @@ class BuildSettings:
     """How scenes become pictures."""
     splits: SplitSettings
     """How objects and scenes are divided into splits and shards."""
+    storage: StorageSettings = dataclasses.field(default_factory=StorageSettings)
+    """How arrays and pictures are packed."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.source, str | None):

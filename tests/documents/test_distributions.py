@@ -134,7 +134,8 @@ def _unlawful() -> Sample:
 
 def _without_cameras() -> Sample:
     plain = sample(7, furnished([]))
-    return dataclasses.replace(plain, views=plain.views[:1])
+    one = plain.radiance_rgb[:1]
+    return dataclasses.replace(plain, views=plain.views[:1], radiance_rgb=one)
 
 
 @pytest.mark.parametrize("make", [_without_template, _of_words, _unlawful, _without_cameras])

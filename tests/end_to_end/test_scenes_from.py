@@ -12,7 +12,10 @@ from storage.layout import DatasetFolder
 from storage.staging import stage_scene
 from tests.end_to_end.conftest import Trilight
 
-SMALL = ("--resolution", "64", "--noise-floor", "20", "--json")
+SMALL = (
+    *("--resolution", "64", "--noise-floor", "20", "--json"),
+    *("--set", 'storage.profile="lossless"'),  # so that a sample that was read is staged as it was
+)
 
 
 @pytest.fixture
@@ -52,7 +55,7 @@ def test_existing_scenes_become_a_dataset(trilight: Trilight, scenes: Path, tmp_
 
     # as a kill leaves it: no shard, and one of its two scenes finished
     (tmp_path / "set" / shard.name).unlink()
-    stage_scene(dataset.folder.staged_shard(shard.name), 0, samples[0], [])
+    stage_scene(dataset.folder.staged_shard(shard.name), 0, samples[0], [], "lossless")
     log = dataset.folder.logs / f"{shard.name}.jsonl"
     before = len(log.read_text().splitlines())
     assert generate("set")["dataset_digest"] == outcome["dataset_digest"]

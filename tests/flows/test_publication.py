@@ -56,7 +56,8 @@ def _make_shard(publication: Publication, build: BuildSettings, index: int) -> N
     folder, name = publication.folder, shard_name(index, build.splits)
     for scene in scenes_of_shard(index, build.splits):
         failure = Failure(stage="scenes", item=sample_key(scene), reason="no_camera", message="x")
-        stage_scene(folder.staged_shard(name), scene, _sample(scene), [failure])
+        profile = build.storage.profile
+        stage_scene(folder.staged_shard(name), scene, _sample(scene), [failure], profile)
     publication.add_shard(pack_shard(folder, name, scenes_of_shard(index, build.splits)))
 
 
@@ -159,7 +160,8 @@ def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
     name = publication.manifest.shards[0].name
     folder = publication.folder.staged_shard(name)
     for index in range(4):
-        stage_scene(folder, index, dataclasses.replace(sample, key=sample_key(index)), [])
+        again = dataclasses.replace(sample, key=sample_key(index))
+        stage_scene(folder, index, again, [], "lossless")
     publication.add_shard(pack_shard(publication.folder, name, range(4)))
     assert "belongs to split test" in verify_dataset(tmp_path).problems[0]
 
@@ -196,8 +198,28 @@ def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
         ({"name": "smoke", "seed": -1}, "seed is -1"),
         ({"name": "smoke", "resolution": 100}, "resolution"),
         ({"name": "smoke", "noise_floor_db": -3.0}, "noise_floor_db"),
+        ({"name": "smoke", "changes": {"storage.profile": "tiny"}}, "profile is 'tiny'; expected"),
     ],
 )
 def test_wrong_settings_are_named(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
         named_build(**arguments)
+
+
+def test_the_profile_is_a_setting_and_stands_in_the_manifest(tmp_path: Path) -> None:
+    """Builds to learn from are compact, those to judge by exact; `--set` changes it."""
+    assert {name: named_build(name).storage.profile for name in ("smoke", "benchmark-v1")} == {
+        "smoke": "compact",
+        "benchmark-v1": "lossless",
+    }
+    build = named_build("smoke", changes={"storage.profile": "lossless"})
+    publication = _begin(tmp_path, build, 4)
+    assert publication.manifest.settings["storage"] == {"profile": "lossless"}
+    with pytest.raises(TrilightError, match=r"storage\.profile was 'lossless', now 'compact'"):
+        _begin(tmp_path, named_build("smoke"), 4)
+
+
+def test_a_shard_is_packed_as_the_settings_say(tmp_path: Path) -> None:
+    assert _build().storage.profile == "compact"
+    (shard, *_) = _dataset(tmp_path, 4).manifest.shards
+    assert set(shard.index["000000000"]) == {"scene.safetensors.gz", "json", "0.exr", "1.exr"}

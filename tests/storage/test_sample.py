@@ -1,8 +1,10 @@
 """A sample comes back from its members exactly, and damaged members are named."""
 
+import io
 import json
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from storage.conventions import SCHEMA_VERSION
@@ -38,14 +40,24 @@ def test_a_missing_member_is_named(suffix: str) -> None:
         decode_sample("000000000", members)
 
 
-def test_another_schema_version_is_refused() -> None:
+@pytest.mark.parametrize("version", [None, 1, 99, "2", [2]])
+def test_another_schema_version_is_refused(version: object) -> None:
     members = encode_sample(tiny_sample())
     record = json.loads(members["json"])
-    members["json"] = json.dumps({**record, "schema_version": 99}).encode()
-    with pytest.raises(
-        TrilightError, match=f"version 99; this Trilight reads {SCHEMA_VERSION}.*generate"
-    ):
+    members["json"] = json.dumps({**record, "schema_version": version}).encode()
+    with pytest.raises(TrilightError, match=r"version .*; this Trilight reads 2 and 3.*generate"):
         decode_sample("000000000", members)
+
+
+def test_version_2_is_read() -> None:
+    """Its members are those of the profile `lossless`."""
+    sample = tiny_sample()
+    members = encode_sample(sample, "lossless")
+    record = json.loads(members["json"])
+    assert record["schema_version"] == SCHEMA_VERSION == 3
+    members["json"] = json.dumps({**record, "schema_version": 2}).encode()
+    back = decode_sample(sample.key, members)
+    assert np.array_equal(back.radiance_rgb, sample.radiance_rgb)
 
 
 def test_safetensors_header_bomb_is_refused() -> None:
@@ -61,6 +73,23 @@ def test_half_floats_keep_eleven_bits() -> None:
     back = decode_exr(encode_exr(picture))
     # a half float has 11 significant bits, so rounding is at most 2^-11 of the value
     assert (abs(back - picture) <= picture * 2**-11).all()
+
+
+@pytest.mark.parametrize("compression", ["ZIP", "DWAB"])
+def test_float32_pictures_of_other_tools_are_read(compression: str) -> None:
+    """Exact values that half floats do not hold; below 0 only where the codec put them there."""
+    picture = np.full((16, 16, 3), 1.00001, np.float32)
+    picture[8, 8] = -1.0
+    codec = getattr(OpenEXR, f"{compression}_COMPRESSION")
+    stream = io.BytesIO()
+    header = {"compression": codec, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"RGB": picture}, num_threads=0).write(stream)
+    back = decode_exr(stream.getvalue())
+    assert back.dtype == np.float32
+    if compression == "ZIP":
+        assert np.array_equal(back, picture)
+    else:
+        assert (back >= 0).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e-6, 65505.0])

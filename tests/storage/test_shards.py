@@ -5,12 +5,14 @@ import tarfile
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.manifest import index_shard
+from storage.profiles import PROFILES, Profile, keeps_law
 from storage.sample import encode_sample
 from storage.shard_reader import iterate_samples
 from storage.shard_writer import write_shard
@@ -49,14 +51,25 @@ def test_bytes_are_pinned(tmp_path: Path) -> None:
 PINNED = "34fe3b8b9ef7e13f706ad65041b050257f8fafe56d80fb5364e220a7f4e3a41c"
 
 
-def test_stock_webdataset_reads_a_shard(tmp_path: Path) -> None:
+@pytest.mark.parametrize("profile", PROFILES)
+def test_stock_webdataset_reads_a_shard(tmp_path: Path, profile: Profile) -> None:
+    """In three lines, which stand in the README of `storage`; it undoes `.gz` by itself."""
+    import OpenEXR
     import webdataset
+    from safetensors.numpy import load
 
     sample = tiny_sample()
-    write_shard(tmp_path / "train-000000.tar", [(sample.key, encode_sample(sample))])
-    (read,) = webdataset.WebDataset(str(tmp_path / "train-000000.tar"), shardshuffle=False)
-    assert read["__key__"] == sample.key
-    assert {"json", "scene.safetensors", "0.exr", "1.exr"} <= set(read)
+    url = str(tmp_path / "train-000000.tar")
+    write_shard(tmp_path / "train-000000.tar", [(sample.key, encode_sample(sample, profile))])
+
+    for read in webdataset.WebDataset(url, shardshuffle=False).decode():
+        arrays = load(read["scene.safetensors.gz" if profile == "compact" else "scene.safetensors"])
+        picture = OpenEXR.File(io.BytesIO(read["0.exr"])).channels()["RGB"].pixels
+
+        assert read["__key__"] == sample.key
+        assert read["json"]["objects"][0]["name"] == "floor"
+        assert np.array_equal(arrays["vertex_positions"], sample.scene.vertex_positions)
+        assert keeps_law(sample.radiance_rgb[0], picture.astype(np.float32), 41.5)
 
 
 def test_the_index_finds_every_member(tmp_path: Path) -> None:

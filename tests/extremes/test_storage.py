@@ -1,0 +1,122 @@
+"""Pictures and scenes at the ends of what they may hold come back, or are refused by name."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from storage.conventions import EMISSION, HALF_FLOAT_MAX
+from storage.errors import TrilightError
+from storage.exr import decode_exr, encode_exr
+from storage.profiles import PROFILES, Profile, keeps_law, pack_picture
+from storage.renderformer_h5 import write_renderformer_h5
+from storage.renderformer_h5_read import read_renderformer_h5
+from storage.sample import decode_sample, encode_sample
+from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
+
+FINITE = np.arange(0x7C00, dtype=np.uint16).view(np.float16)
+"""Every half float from 0 to 65504."""
+SMALLEST = float(FINITE[1])
+
+
+def _spike(resolution: int) -> NDArray[np.float32]:
+    picture = np.zeros((resolution, resolution, 3), np.float32)
+    picture[resolution // 2, resolution // 2] = HALF_FLOAT_MAX
+    return picture
+
+
+def _any_halfs(resolution: int) -> NDArray[np.float32]:
+    rng = np.random.default_rng(0)
+    return rng.choice(FINITE, (resolution, resolution, 3)).astype(np.float32)
+
+
+def _denormals(resolution: int) -> NDArray[np.float32]:
+    rng = np.random.default_rng(0)
+    return rng.choice(FINITE[:1024], (resolution, resolution, 3)).astype(np.float32)
+
+
+PICTURES: dict[str, Callable[[int], NDArray[np.float32]]] = {
+    "zeros": lambda resolution: np.zeros((resolution, resolution, 3), np.float32),
+    "brightest": lambda r: np.full((r, r, 3), HALF_FLOAT_MAX, np.float32),
+    "one brightest pixel": _spike,
+    "all half floats": _any_halfs,
+    "denormals": _denormals,
+    "smallest": lambda resolution: np.full((resolution, resolution, 3), SMALLEST, np.float32),
+}
+
+
+@pytest.mark.parametrize("resolution", [1, 8, 9, 33, 512])
+@pytest.mark.parametrize("make", PICTURES.values(), ids=PICTURES.keys())
+def test_without_loss_every_half_float_comes_back(
+    make: Callable[[int], NDArray[np.float32]], resolution: int
+) -> None:
+    picture = make(resolution)
+    assert np.array_equal(decode_exr(pack_picture(picture, 40.0, "lossless")), picture)
+
+
+@pytest.mark.parametrize("floor_db", [10.0, 45.0, 80.0, 90.0])
+@pytest.mark.parametrize("resolution", [1, 8, 9, 33, 512])
+@pytest.mark.parametrize("make", PICTURES.values(), ids=PICTURES.keys())
+def test_compact_keeps_the_law_or_loses_nothing(
+    make: Callable[[int], NDArray[np.float32]], resolution: int, floor_db: float
+) -> None:
+    """DWA turns the brightest half floats into infinity and zeros below 0: neither gets out."""
+    picture = make(resolution)
+    back = decode_exr(pack_picture(picture, floor_db, "compact"))
+    assert np.isfinite(back).all()
+    assert (back >= 0).all()
+    assert np.array_equal(back, picture) or keeps_law(picture, back, floor_db)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -SMALLEST, 65520.0])
+def test_what_no_picture_may_hold_is_refused(profile: Profile, value: float) -> None:
+    picture = np.ones((8, 8, 3), np.float32)
+    picture[7, 0, 2] = value
+    with pytest.raises(TrilightError, match=r"radiance\[7, 0, 2\]"):
+        pack_picture(picture, 40.0, profile)
+
+
+def test_rounding_to_half_floats_is_the_only_loss() -> None:
+    """Values between two half floats go to the nearer: 2^-11 of the value, or half of 6e-8."""
+    exponents = np.random.default_rng(0).uniform(-9, 4.8, (64, 64, 3))
+    picture = (10.0**exponents).astype(np.float32)
+    back = decode_exr(encode_exr(picture))
+    assert (np.abs(back - picture) <= np.maximum(picture * 2.0**-11, SMALLEST / 2)).all()
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_scene_of_extreme_numbers_is_packed_exactly(profile: Profile) -> None:
+    scene = tiny_scene()
+    ends = np.finfo(np.float32)
+    scene.vertex_positions[0] = np.array([ends.max, ends.tiny, -0.0], np.float32)
+    scene.materials[LIGHT, EMISSION] = [1e38, 1e-45, 0]
+    sample = dataclasses.replace(tiny_sample(), scene=scene)
+    back = decode_sample("0", encode_sample(sample, profile)).scene
+    assert back.vertex_positions.tobytes() == scene.vertex_positions.tobytes()
+    assert back.materials.tobytes() == scene.materials.tobytes()
+
+
+@pytest.mark.parametrize("emission", [65504.0, SMALLEST])
+def test_the_ends_of_half_floats_go_through_hdf5(tmp_path: Path, emission: float) -> None:
+    scene = tiny_scene()
+    scene.materials[LIGHT, EMISSION] = emission
+    pictures = np.stack([_spike(8), _any_halfs(8)])
+    write_renderformer_h5(tmp_path / "a.h5", scene, pictures, texture_type="float16")
+    read = read_renderformer_h5(tmp_path / "a.h5")
+    assert read.radiance_rgb is not None
+    assert np.array_equal(read.radiance_rgb, pictures)
+    lit = read.scene.materials[read.scene.material_index[read.scene.triangle_emits]]
+    assert (lit[:, EMISSION] == emission).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 65520.0, -1.0])
+def test_hdf5_refuses_what_no_picture_may_hold(tmp_path: Path, value: float) -> None:
+    pictures = np.ones((2, 8, 8, 3), np.float32)
+    pictures[1, 0, 0, 0] = value
+    with pytest.raises(TrilightError, match="expected values in"):
+        write_renderformer_h5(tmp_path / "a.h5", tiny_scene(), pictures)
+    assert not list(tmp_path.iterdir())

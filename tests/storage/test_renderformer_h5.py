@@ -1,0 +1,232 @@
+"""The published HDF5 layout: what is written, what comes back, and that it comes back for good."""
+
+import dataclasses
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from storage.conventions import EMISSION
+from storage.errors import TrilightError
+from storage.renderformer_h5 import FAR, NEAR, TextureType, write_renderformer_h5
+from storage.renderformer_h5_read import read_renderformer_h5
+from storage.scene import Scene
+from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
+
+TYPES: tuple[TextureType, ...] = ("float16", "float32")
+
+
+def arrays_of(path: Path) -> dict[str, np.ndarray]:
+    with h5py.File(path) as file:
+        return {name: file[name][()] for name in file}
+
+
+def awkward_scene() -> Scene:
+    """Two equal lights, albedos that add up to 1, and colours that half floats do not hold."""
+    scene = tiny_scene()
+    materials = np.concatenate([scene.materials, scene.materials[LIGHT:]])
+    materials[0, :6] = [0.6001, 1 / 3, 0.7, 0.3999, 2 / 3, 0.3]
+    objects = (*scene.objects, dataclasses.replace(scene.objects[LIGHT], name="light2"))
+    return dataclasses.replace(
+        scene,
+        faces=np.concatenate([scene.faces, scene.faces[2:] - np.uint32(4)]),
+        materials=materials,
+        material_index=np.array([0, 0, 1, 2], np.uint16),
+        object_index=np.array([0, 0, 1, 2], np.uint16),
+        objects=objects,
+    )
+
+
+@pytest.mark.parametrize("texture_type", TYPES)
+def test_the_layout_and_its_quirks(tmp_path: Path, texture_type: TextureType) -> None:
+    sample = tiny_sample()
+    write_renderformer_h5(
+        tmp_path / "a.h5", sample.scene, sample.radiance_rgb, texture_type=texture_type
+    )
+    arrays = arrays_of(tmp_path / "a.h5")
+    assert {name: (array.dtype.name, array.shape) for name, array in arrays.items()} == {
+        "triangles": ("float32", (3, 3, 3)),
+        "vn": ("float32", (3, 3, 3)),
+        "texture": (texture_type, (3, 13, 32, 32)),
+        "c2w": ("float32", (2, 4, 4)),
+        "fov": ("float32", (2,)),
+        "img": ("float16", (2, 16, 16, 4)),
+        "mvp": ("float32", (2, 4, 4)),
+    }
+    filled = arrays["texture"][2, 0] != 0
+    assert filled.sum() == 559
+    assert [row.sum() for row in filled] == [32, *range(32, 1, -1)]
+    floor, light = arrays["texture"][0, :, 0, 0], arrays["texture"][2, :, 0, 0]
+    expected = [0.5, 0.4, 0.3, 0.2, 0.2, 0.2, 0.5, 0.5, 0.5, 1, 0, 0, 0]
+    assert floor == pytest.approx(expected, abs=2**-11)  # half floats keep 11 bits
+    assert light.tolist() == [1, 1, 1, 0, 0, 0, 1, 0.5, 0.5, 1, 100, 100, 100]
+    assert (arrays["img"][..., 3] == 1).all()
+    assert np.array_equal(arrays["img"][..., :3], sample.radiance_rgb)
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert {file[name].compression_opts for name in file} == {9}
+
+
+def test_mvp_projects_what_the_camera_looks_at(tmp_path: Path) -> None:
+    sample = tiny_sample()
+    write_renderformer_h5(tmp_path / "a.h5", sample.scene, sample.radiance_rgb)
+    mvp = arrays_of(tmp_path / "a.h5")["mvp"].astype(np.float64)
+    for view, pose in enumerate(sample.scene.c2w.astype(np.float64)):
+        half = np.tan(np.radians(float(sample.scene.fov_deg[view])) / 2)
+        for distance, depth in ((NEAR, -1.0), (FAR, 1.0)):
+            corner = pose @ [half * distance, half * distance, -distance, 1]
+            clip = mvp[view] @ corner
+            # float32 entries of about 10 divided by 0.05
+            assert clip[:3] / clip[3] == pytest.approx([1, 1, depth], abs=1e-4)
+
+
+@pytest.mark.parametrize("texture_type", TYPES)
+@pytest.mark.parametrize("scene", [tiny_scene(), awkward_scene()], ids=["tiny", "awkward"])
+def test_scene_to_file_to_scene_to_file(
+    tmp_path: Path, scene: Scene, texture_type: TextureType
+) -> None:
+    first, again = tmp_path / "first.h5", tmp_path / "again.h5"
+    pictures = tiny_sample().radiance_rgb
+    write_renderformer_h5(first, scene, pictures, texture_type=texture_type)
+    read = read_renderformer_h5(first)
+    assert read.lost == ()
+    assert read.radiance_rgb is not None and np.array_equal(read.radiance_rgb, pictures)
+    write_renderformer_h5(again, read.scene, read.radiance_rgb, texture_type=texture_type)
+    assert again.read_bytes() == first.read_bytes()
+
+    back = read.scene
+    assert np.array_equal(back.vertex_positions[back.faces], scene.vertex_positions[scene.faces])
+    assert np.array_equal(back.vertex_normals[back.faces], scene.vertex_normals[scene.faces])
+    assert np.array_equal(back.c2w, scene.c2w)
+    before, after = (s.materials[s.material_index] for s in (scene, back))
+    assert np.array_equal(after[:, EMISSION], before[:, EMISSION])
+    if texture_type == "float32":
+        assert np.array_equal(after, before)
+    assert after == pytest.approx(before, abs=2**-11)  # one step of a half float below 1
+    assert [entry.kind for entry in back.objects].count("emitter") == scene.triangle_emits.sum()
+    assert len(back.vertex_positions) == len(scene.vertex_positions)
+    for index in (back.object_index, back.material_index):  # each light stays one
+        assert len(set(index[back.triangle_emits])) == scene.triangle_emits.sum()
+
+
+def test_half_floats_never_make_a_surface_brighter_than_white(tmp_path: Path) -> None:
+    """A thousand pairs that add up to 1: the file's sums stay within the law of `Scene`."""
+    scene = tiny_scene()
+    diffuse = np.random.default_rng(0).random((1000, 3)).astype(np.float32)
+    materials = np.zeros((1001, 10), np.float32)
+    materials[:1000, :3], materials[:1000, 3:6] = diffuse, 1 - diffuse
+    materials[1000] = scene.materials[LIGHT]
+    index = np.concatenate([np.arange(1000), [1000]]).astype(np.uint16)
+    many = dataclasses.replace(
+        scene,
+        faces=np.concatenate([scene.faces[:1]] * 1000 + [scene.faces[2:]]),
+        materials=materials,
+        material_index=index,
+        object_index=np.array([0] * 1000 + [1], np.uint16),
+    )
+    write_renderformer_h5(tmp_path / "a.h5", many, texture_type="float16")
+    read = read_renderformer_h5(tmp_path / "a.h5")  # checks the laws
+    assert read.lost == ()
+    assert read.radiance_rgb is None
+
+
+@pytest.mark.parametrize("radiance", [1e5, 1e-8])
+def test_lights_beyond_half_floats_are_refused(tmp_path: Path, radiance: float) -> None:
+    scene = tiny_scene()
+    scene.materials[LIGHT, EMISSION] = radiance
+    with pytest.raises(TrilightError, match=r"emission.*Write float32"):
+        write_renderformer_h5(tmp_path / "a.h5", scene, texture_type="float16")
+    write_renderformer_h5(tmp_path / "a.h5", scene, texture_type="float32")
+    back = read_renderformer_h5(tmp_path / "a.h5").scene
+    (row,) = back.material_index[back.triangle_emits]
+    assert np.array_equal(back.materials[row], scene.materials[LIGHT])
+
+
+def test_what_other_tools_write_is_carried_over_or_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    write_renderformer_h5(path, tiny_scene(), tiny_sample().radiance_rgb)
+    with h5py.File(path, "r+") as file:
+        file.attrs["export_metadata"] = "{}"
+        file["depth"] = np.zeros(3)
+        file["texture"][0, 0, 0, 0] = 0.5 + 559 * 0.001
+        file["texture"][1, 8] = 0.25
+        file["texture"][2, 1] = 0.5
+        file["vn"][0] = [[0, 0, 2], [0, 0, 0.5], [0, 0, 0]]
+        file["img"][0, 0, 0, 3] = 0.5
+        del file["mvp"]
+    read = read_renderformer_h5(path)
+    assert read.lost == (
+        "array or group 'depth'",
+        "attribute 'export_metadata'",
+        "textures that vary, of 1 triangles: their mean was taken",
+        "normal textures of 1 triangles",
+        "alpha of pictures: they stand before black",
+        "lengths of 3 normals that were not 1",
+        "what emitters reflect: ours reflect nothing",
+    )
+    scene = read.scene
+    assert scene.materials[scene.material_index[0], 0] == pytest.approx(0.501, abs=1e-6)
+    assert np.array_equal(scene.vertex_normals[scene.faces[0]], [[0, 0, 1]] * 3)
+    (light,) = scene.material_index[scene.triangle_emits]
+    assert scene.materials[light].tolist() == [0, 0, 0, 0, 0, 0, 1, 100, 100, 100]
+    assert {entry.licence for entry in scene.objects} == {"LicenseRef-unknown"}
+
+
+def test_albedos_that_rounding_took_over_one_are_mended(tmp_path: Path) -> None:
+    """0.6001 and 0.3999, each rounded up by another tool; a sum that is meant is refused."""
+    path = tmp_path / "a.h5"
+    write_renderformer_h5(path, tiny_scene())
+    with h5py.File(path, "r+") as file:
+        file["texture"][0, :3], file["texture"][0, 3:6] = 0.6004, 0.4001
+    read = read_renderformer_h5(path)
+    assert "lowered" in read.lost[-1]
+    row = read.scene.materials[read.scene.material_index[0]]
+    assert row[:6] == pytest.approx([0.6004] * 3 + [0.3996] * 3, abs=1e-6)  # float32
+    with h5py.File(path, "r+") as file:
+        file["texture"][0, 3:6] = 0.402
+    with pytest.raises(TrilightError, match=r"a\.h5: .*specular at most 1"):
+        read_renderformer_h5(path)
+
+
+def test_flat_and_smooth_shading_stay(tmp_path: Path) -> None:
+    """The two triangles of the floor share vertices; turned normals part them."""
+    path = tmp_path / "a.h5"
+    write_renderformer_h5(path, tiny_scene())
+    assert len(read_renderformer_h5(path).scene.vertex_positions) == 7
+    with h5py.File(path, "r+") as file:
+        file["vn"][1] = np.array([[0, 0.6, 0.8]] * 3)
+    scene = read_renderformer_h5(path).scene
+    assert len(scene.vertex_positions) == 9
+    assert np.allclose(scene.vertex_normals[scene.faces[1]], [0, 0.6, 0.8])
+
+
+@pytest.mark.parametrize("packing", [{}, {"compression": "gzip", "shuffle": True, "chunks": True}])
+def test_other_packings_are_read(tmp_path: Path, packing: dict[str, object]) -> None:
+    plain, other = tmp_path / "a.h5", tmp_path / "b.h5"
+    sample = tiny_sample()
+    write_renderformer_h5(plain, sample.scene, sample.radiance_rgb)
+    with h5py.File(other, "w") as file:
+        for name, array in arrays_of(plain).items():
+            wide = array.astype(np.float64) if name in ("c2w", "triangles") else array
+            file.create_dataset(name, data=wide, **packing)
+    write_renderformer_h5(tmp_path / "c.h5", read_renderformer_h5(other).scene, sample.radiance_rgb)
+    assert (tmp_path / "c.h5").read_bytes() == plain.read_bytes()
+
+
+def test_the_example_scenes_go_through_it(shared: Path, tmp_path: Path) -> None:
+    """Real meshes, smooth shading and colours per triangle."""
+    from pipeline.assets.settings import AssetSettings
+    from pipeline.flows.scene_files import build_scene
+
+    for name in ("cbox-bunny.json", "tree.json"):
+        scene, _ = build_scene(
+            (shared / "renderformer_scenes").resolve(), name, AssetSettings(budgets=(4096,)),
+            licence="LicenseRef-unknown", num_views=1, scene_index=0, seed=0,
+        )  # fmt: skip
+        first, again = tmp_path / f"{name}.h5", tmp_path / "again.h5"
+        write_renderformer_h5(first, scene, texture_type="float16")
+        read = read_renderformer_h5(first)
+        write_renderformer_h5(again, read.scene, texture_type="float16")
+        assert again.read_bytes() == first.read_bytes()
+        assert read.lost == ()
+        assert read.scene.num_triangles == scene.num_triangles
