@@ -86,7 +86,9 @@ def _scene(
 
 
 def _picture(scene: Scene, *, seed: int) -> NDArray[np.float32]:
-    renders = dataclasses.replace(smoke().renders, min_spp=_SPP, max_spp=_SPP)
+    renders = dataclasses.replace(
+        smoke().renders, min_spp=_SPP, max_spp=_SPP, min_mean_radiance=0.0
+    )
     view = SceneRenderer(scene, renders).render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
     return view.radiance_rgb
 
