@@ -172,9 +172,9 @@ def plot(result: Comparison, path: Path) -> None:
     axes.plot(triangles, [side["median_db"].median for side in sides], "o-", label="median")
     axes.plot(triangles, [side["p5_db"].median for side in sides], "o--", label="5th percentile")
     axes.axhline(itself["median_db"].median, color="grey", label="the same scene, other samples")
-    for name, x, side in zip(_LEVELS[1:], triangles, sides, strict=True):
+    for row, (name, x, side) in enumerate(zip(_LEVELS[1:], triangles, sides, strict=True)):
         at = (x, side["median_db"].median)
-        axes.annotate(name, at, textcoords="offset points", xytext=(4, 6))
+        axes.annotate(name, at, textcoords="offset points", xytext=(4, -14 if row % 2 else 6))
     axes.set_xlabel("triangles of all objects of a scene, mean")
     axes.set_ylabel("difference to the finest meshes, dB (psnr_log_db)")
     axes.set_title(f"Detail of objects, 256 x 256, {result.date}")
