@@ -8,6 +8,7 @@ from pipeline.flows.judging_builds import JUDGING_BUILDS
 from pipeline.flows.renderformer_builds import RENDERFORMER_BUILDS
 from pipeline.flows.settings import BuildSettings, NamedBuild
 from pipeline.flows.training_builds import TRAINING_BUILDS
+from pipeline.objects.generated import BENCHMARK
 from pipeline.objects.generated import PREFIX as BUILTIN
 from storage.changes import changed
 from storage.errors import TrilightError
@@ -57,7 +58,8 @@ def object_source(settings: BuildSettings, objects: str | None) -> str:
         TrilightError: the build is frozen with another source than the one given.
     """
     if settings.source is None:
-        return objects or BUILTIN
+        # Who is judged may have learnt from the built-in objects of everybody.
+        return objects or (BENCHMARK if settings.splits.one_split else BUILTIN)
     if objects not in (None, settings.source):
         raise TrilightError(
             f"--objects is {objects!r}; expected {settings.source!r}, which {settings.build} is "

@@ -4,12 +4,14 @@ import dataclasses
 import json
 from typing import Any
 
+import numpy as np
 import pytest
 
-from pipeline.flows.builds import BUILDS, named_build
+from pipeline.flows.builds import BUILDS, frozen_note, named_build, object_source
 from pipeline.flows.settings import BuildSettings, differences
 from storage.errors import TrilightError
 from storage.splits import split_of_object, split_of_shard
+from storage.statistics import Statistics
 from tests.scene_templates.published import STAGE_1, STAGE_2
 
 RENDERFORMER = [name for name in BUILDS if name.startswith("renderformer-v1")]
@@ -162,3 +164,37 @@ def test_the_simplest_objects_always_fit(name: str) -> None:
         objects = family.num_objects[1]
         left = build.scenes.max_triangles - family.shell_triangles - build.scenes.lights.count[1]
         assert objects * min(build.assets.budgets) <= left, family.name
+
+
+def test_sets_to_be_judged_by_have_objects_of_their_own() -> None:
+    assert object_source(named_build("smoke"), None) == "builtin:"
+    assert object_source(named_build("smoke"), "folder") == "folder"
+    assert object_source(named_build("out-of-range"), "folder") == "folder"
+    for name in JUDGED:
+        assert object_source(named_build(name), None) == "builtin:benchmark-v1"
+    with pytest.raises(TrilightError, match="leave --objects away"):
+        object_source(named_build("benchmark-v1"), "builtin:")
+
+
+def test_a_frozen_set_says_whether_it_is_the_published_one() -> None:
+    named = BUILDS["benchmark-v1-mini"]
+    published = _statistics(num_scenes=20, scene_digest=str(named.scene_digest))
+    other = _statistics(num_scenes=20, scene_digest="0" * 64)
+    grown = _statistics(num_scenes=40, scene_digest="0" * 64)
+    assert "published 20 scenes" in frozen_note("benchmark-v1-mini", published)[0]
+    assert "cannot be compared" in frozen_note("benchmark-v1-mini", other)[0]
+    assert frozen_note("benchmark-v1-mini", grown) == frozen_note("smoke", other) == ()
+
+
+def _statistics(*, num_scenes: int, scene_digest: str) -> Statistics:
+    return Statistics(
+        num_scenes=num_scenes,
+        scenes_by_split={},
+        scenes_by_template={},
+        scenes_by_excursion={},
+        scene_digest=scene_digest,
+        num_bytes=0,
+        spp=np.zeros(0, np.int64),
+        noise_floor_db=np.zeros(0),
+        at_cap=np.zeros(0, np.bool_),
+    )
