@@ -9,13 +9,13 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
-from scene_templates.cameras import CameraSettings
 from scene_templates.checks import check_numbers, require
-from scene_templates.excursions import Excursion
-from scene_templates.families import Family
-from scene_templates.lights import LightSettings
-from scene_templates.materials import MaterialSettings
-from scene_templates.placement import PlacementSettings
+from scene_templates.contents.cameras import CameraSettings
+from scene_templates.contents.lights import LightSettings
+from scene_templates.contents.materials import MaterialSettings
+from scene_templates.contents.placement import PlacementSettings
+from scene_templates.families.excursions import Excursion
+from scene_templates.families.family import Family
 from storage.changes import changed
 
 MAX_TRIANGLES = 65_535

@@ -8,8 +8,8 @@ import dataclasses
 from pipeline.flows.settings import BuildSettings, NamedBuild
 from pipeline.flows.training_builds import finetune_512, pretrain_256
 from pipeline.objects.generated import BENCHMARK
-from scene_templates.default_families import ONE_FAMILY_EACH
-from scene_templates.out_of_range import out_of_range_settings
+from scene_templates.families.default_families import ONE_FAMILY_EACH
+from scene_templates.families.out_of_range import out_of_range_settings
 from storage.profiles import StorageSettings
 from storage.splits import SplitSettings
 

@@ -5,7 +5,7 @@ renderformer.md, A.1 to A.9), and so in the manifest of every dataset. What is n
 be meant, with what is done here:
 
 - **Templates.** That 21 and 14 families map to four layouts, and their weights, is known; a few
-  object sizes, counts and lists are not (`scene_templates.renderformer_v1` names each).
+  object sizes, counts and lists are not (`scene_templates.families.renderformer_v1` names each).
 - **Triangles.** The recipes cap each object at 1188 and 3968 faces, while the loader pads scenes to
   1572 and 4192: three objects do not fit, and the public loader fails on them. Here the whole scene
   keeps within the padding; objects are drawn among those that fit, and take the finest levels that
@@ -13,7 +13,7 @@ be meant, with what is done here:
 - **Meshes.** Published objects were voxelised to be watertight and decimated by tools that are not
   recoverable. Here they are cleaned and decimated by our own stage, which keeps open surfaces open.
 - **Light and camera shells.** The corner's light shell and the azimuths of most cameras are known;
-  the light shells of the other layouts are not: ours (`scene_templates.wall` and the others).
+  the light shells of the other layouts are not: ours (`scene_templates.templates`).
 - **Colours** pass through 8-bit vertex colours there, truncated, and are decoded as sRGB by one of
   two readers; here they are linear floats everywhere.
 - **Seeds**, lists of objects, and the number of scenes are lost.
@@ -30,11 +30,11 @@ import functools
 from pipeline.assets.settings import AssetSettings
 from pipeline.flows.settings import BuildSettings, NamedBuild
 from pipeline.flows.training_builds import finetune_512, pretrain_256
-from scene_templates.families import Family
-from scene_templates.lights import LightSettings
-from scene_templates.materials import MaterialSettings
-from scene_templates.placement import PlacementSettings
-from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
+from scene_templates.contents.lights import LightSettings
+from scene_templates.contents.materials import MaterialSettings
+from scene_templates.contents.placement import PlacementSettings
+from scene_templates.families.family import Family
+from scene_templates.families.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.settings import SceneSettings, ViewLaws
 
 

@@ -26,7 +26,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.flows.settings import BuildSettings, NamedBuild
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.renders.settings import RenderSettings
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families.default_families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.splits import SplitSettings
 

@@ -16,10 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise, set_denoiser_threads
+from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import NoiseFloor, expected_spp, measure_floor, next_spp
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import Features, Tracer, load_tracer
+from pipeline.renders.tracer import Features, Tracer
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected
 from storage.lights import MAX_LIGHTS, light_rows, rounded_to_half, sum_of_lights

@@ -59,19 +59,6 @@ class Tracer(Protocol):
         ...
 
 
-def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> Tracer:
-    """Return the fastest tracer of the variant that `activate` has set, with the scene loaded."""
-    import mitsuba  # not before `activate`, which says where compiled kernels are kept
-
-    if mitsuba.variant() == "llvm_ad_rgb":
-        from pipeline.renders.vector_tracer import VectorTracer
-
-        return VectorTracer(scene, max_depth=max_depth, rr_depth=rr_depth)
-    from pipeline.renders.plugin_tracer import PluginTracer
-
-    return PluginTracer(scene, max_depth=max_depth, rr_depth=rr_depth)
-
-
 def split_triangles(scene: Scene) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the triangle rows of surfaces and those of emitters."""
     emits = scene.triangle_emits

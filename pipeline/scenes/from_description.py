@@ -29,7 +29,7 @@ from pipeline.scenes.description import (
 from pipeline.scenes.pieces import Piece, joined
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
-from scene_templates.rotations import rotated, rotation_xyz
+from scene_templates.contents.rotations import rotated, rotation_xyz
 from storage.conventions import (
     DIFFUSE,
     EMISSION,

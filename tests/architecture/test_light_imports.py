@@ -24,7 +24,7 @@ def _loaded_by(statement: str) -> set[str]:
     [
         "import storage",
         "import storage.dataset, storage.verify, storage.staging, storage.shard_writer",
-        "import scene_templates.registry, scene_templates.settings",
+        "import scene_templates.templates.registry, scene_templates.settings",
     ],
 )
 def test_the_waist_and_the_templates_are_light(statement: str) -> None:

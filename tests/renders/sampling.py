@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
-from pipeline.renders.tracer import Tracer, load_tracer
+from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.tracer import Tracer
 from storage.scene import Scene
 
 SIGMAS = 5.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from infra.bench.cycles.cycles_picture import Request, cycles_picture
 from infra.bench.cycles.environment import installed_python
 from pipeline.renders.camera import Camera
-from pipeline.renders.tracer import load_tracer
+from pipeline.renders.load_tracer import load_tracer
 from storage.exr import decode_exr
 from storage.scene import Scene
 from tests.renders.scene_kit import box, furnace, join, light, material, quad, sphere

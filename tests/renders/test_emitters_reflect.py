@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.plugin_tracer import PluginTracer
-from pipeline.renders.tracer import load_tracer
 from storage.conventions import camera_rays
 from storage.scene import Scene
 from tests.renders.closed_forms import lambert_irradiance

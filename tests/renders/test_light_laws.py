@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.plugin_tracer import PluginTracer
-from pipeline.renders.tracer import load_tracer
 from storage.conventions import camera_rays
 from storage.scene import Scene
 from tests.renders.closed_forms import lambert_irradiance

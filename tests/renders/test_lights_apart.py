@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from pipeline.flows.builds import named_build
 from pipeline.flows.make_scene import _render_sample
 from pipeline.renders.denoiser import denoise
+from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import load_tracer
 from storage.errors import Rejected
 from storage.exr import decode_exr, encode_exr
 from storage.lights import MAX_LIGHTS, light_rows, rounded_to_half, sum_of_lights

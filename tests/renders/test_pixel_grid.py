@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.tracer import load_tracer
+from pipeline.renders.load_tracer import load_tracer
 from storage.conventions import camera_rays
 from storage.scene import Scene
 from tests.renders.sampling import camera_of

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.plugin_tracer import PluginTracer
-from pipeline.renders.tracer import load_tracer
 from storage.scene import Scene
 from tests.conftest import ROOT
 from tests.renders.kernel_bsdf import exact_twin
@@ -109,7 +109,7 @@ from pipeline.renders.variant import Variant, activate
 activate(Variant(name="scalar_rgb", libllvm="", note=""))
 import drjit
 from pipeline.renders.renderer import set_threads
-from pipeline.renders.tracer import load_tracer
+from pipeline.renders.load_tracer import load_tracer
 from tests.renders.sampling import camera_of
 from tests.renders.test_twin_tracers import _room
 scene = _room(5)

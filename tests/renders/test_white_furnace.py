@@ -11,8 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import plugin_scene, surface_table
+from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.plugin_tracer import PluginTracer
-from pipeline.renders.tracer import Tracer, load_tracer
+from pipeline.renders.tracer import Tracer
 from storage.scene import Scene
 from tests.conftest import ROOT
 from tests.renders.sampling import camera_of
@@ -64,7 +65,7 @@ import json
 from pipeline.renders.variant import Variant, activate
 activate(Variant(name="scalar_rgb", libllvm="", note=""))
 from pipeline.renders.renderer import set_threads
-from pipeline.renders.tracer import load_tracer
+from pipeline.renders.load_tracer import load_tracer
 from tests.renders.test_white_furnace import COSINES, ROUGHNESS, mean_radiance, plate
 set_threads(1)
 means = {}

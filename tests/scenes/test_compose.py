@@ -9,10 +9,10 @@ import pytest
 from pipeline.flows.builds import BUILDS, named_build
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families.default_families import DEFAULT_FAMILIES
 from scene_templates.plans import scene_plan
-from scene_templates.registry import TEMPLATES
 from scene_templates.settings import SceneSettings
+from scene_templates.templates.registry import TEMPLATES
 from storage.changes import changed
 from storage.errors import Rejected, TrilightError
 from storage.scene import Scene

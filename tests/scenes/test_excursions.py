@@ -12,7 +12,7 @@ from scipy.spatial.distance import pdist
 from pipeline.flows.builds import named_build
 from pipeline.flows.settings import differences
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.out_of_range import median_settings
+from scene_templates.families.out_of_range import median_settings
 from scene_templates.plans import scene_plan
 from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.scene import Scene

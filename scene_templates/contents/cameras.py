@@ -6,7 +6,7 @@ import numpy as np
 
 from scene_templates.checks import Range, check_numbers, require
 from scene_templates.layout import CameraPose
-from scene_templates.sectors import Sector
+from scene_templates.templates.sectors import Sector
 from storage.conventions import look_at_c2w
 
 

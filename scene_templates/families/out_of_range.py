@@ -9,16 +9,16 @@ import dataclasses
 import math
 from typing import Any
 
-from scene_templates.cameras import CameraSettings
 from scene_templates.checks import Range
-from scene_templates.default_families import ONE_FAMILY_EACH
-from scene_templates.excursions import Excursion
-from scene_templates.families import Family
-from scene_templates.lights import LightSettings
-from scene_templates.materials import MaterialSettings
-from scene_templates.placement import PlacementSettings
-from scene_templates.rooms import SharedRoom
+from scene_templates.contents.cameras import CameraSettings
+from scene_templates.contents.lights import LightSettings
+from scene_templates.contents.materials import MaterialSettings
+from scene_templates.contents.placement import PlacementSettings
+from scene_templates.families.default_families import ONE_FAMILY_EACH
+from scene_templates.families.excursions import Excursion
+from scene_templates.families.family import Family
 from scene_templates.settings import SceneSettings
+from scene_templates.shell.rooms import SharedRoom
 
 _MEDIAN_EMISSION, _MEDIAN_SIZE = 3750.0, 2.25
 

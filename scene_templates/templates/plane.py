@@ -1,7 +1,7 @@
 """Objects over a floor, seen and lit from all around."""
 
-from scene_templates.sectors import Sector
-from scene_templates.template import Template
+from scene_templates.templates.sectors import Sector
+from scene_templates.templates.template import Template
 
 PLANE = Template(
     name="plane",

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scene_templates.cameras import CameraSettings, camera_rand
+from scene_templates.contents.cameras import CameraSettings, camera_rand
 from scene_templates.layout import (
     CameraPose,
     Emitter,
@@ -19,8 +19,8 @@ from scene_templates.layout import (
     ShellPart,
     Surface,
 )
-from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
-from scene_templates.sectors import Sector
+from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.templates.sectors import Sector
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,7 +46,7 @@ class Template:
     name: str
     """As in `Family.template`."""
     parts: tuple[str, ...]
-    """Names of its shell parts (scene_templates.patches.SIDES), the floor first."""
+    """Names of its shell parts (scene_templates.shell.patches.SIDES), the floor first."""
     cameras: Sector
     """From where it is seen."""
     lights: Sector

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import Counts, Range, check_numbers, require
+from scene_templates.contents.rotations import ORIENTATIONS, Orientation, rotated, rotation_rand
 from scene_templates.layout import Emitter
-from scene_templates.rotations import ORIENTATIONS, Orientation, rotated, rotation_rand
-from scene_templates.sectors import Sector
+from scene_templates.templates.sectors import Sector
 
 TRIANGLE = 0.025 * np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
 """The published emitter before scaling: equilateral, edge 0.0707."""

@@ -1,7 +1,7 @@
 """A floor and one wall at +X, seen and lit from the -X half."""
 
-from scene_templates.sectors import Sector
-from scene_templates.template import Template
+from scene_templates.templates.sectors import Sector
+from scene_templates.templates.template import Template
 
 WALL = Template(
     name="wall",

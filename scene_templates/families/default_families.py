@@ -1,8 +1,8 @@
 """Trilight's own families: every layout equally often, with 1, 2 or 3 objects equally often."""
 
-from scene_templates.families import Family
-from scene_templates.registry import TEMPLATES
-from scene_templates.rooms import SharedRoom
+from scene_templates.families.family import Family
+from scene_templates.shell.rooms import SharedRoom
+from scene_templates.templates.registry import TEMPLATES
 
 DEFAULT_FAMILIES = tuple(
     family

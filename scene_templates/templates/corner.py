@@ -1,7 +1,7 @@
 """A floor and two walls at +X and +Y, seen from the quarter opposite them."""
 
-from scene_templates.sectors import Sector
-from scene_templates.template import Template
+from scene_templates.templates.sectors import Sector
+from scene_templates.templates.template import Template
 
 CORNER = Template(
     name="corner",

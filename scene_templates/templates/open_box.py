@@ -1,7 +1,7 @@
 """A floor and three walls without a ceiling, seen and lit through the open front (-Y) and top."""
 
-from scene_templates.sectors import Sector
-from scene_templates.template import Template
+from scene_templates.templates.sectors import Sector
+from scene_templates.templates.template import Template
 
 OPEN_BOX = Template(
     name="open_box",

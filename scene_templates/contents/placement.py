@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import Range, check_numbers, require
+from scene_templates.contents.rotations import ORIENTATIONS, Orientation, rotated, rotation_rand
 from scene_templates.layout import Plane, Pose
-from scene_templates.patches import SIDES
-from scene_templates.rooms import Room
-from scene_templates.rotations import ORIENTATIONS, Orientation, rotated, rotation_rand
+from scene_templates.shell.patches import SIDES
+from scene_templates.shell.rooms import Room
 from storage.errors import Rejected
 
 ARRANGEMENT_TRIES = 100

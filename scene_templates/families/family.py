@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 from scene_templates.checks import Counts, Range, check_numbers, require
-from scene_templates.registry import TEMPLATES
-from scene_templates.rooms import SharedRoom
-from scene_templates.separate_sides import SeparateSides
+from scene_templates.shell.rooms import SharedRoom
+from scene_templates.shell.separate_sides import SeparateSides
+from scene_templates.templates.registry import TEMPLATES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,7 +15,7 @@ class Family:
     name: str
     """Unique, such as `corner-multi`."""
     template: str
-    """The layout: a name of scene_templates.registry."""
+    """The layout: a name of scene_templates.templates.registry."""
     weight: float = 1.0
     """How often it is drawn, relative to the others."""
     shell: SharedRoom | SeparateSides

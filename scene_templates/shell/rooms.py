@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from scene_templates.checks import Range, check_numbers, require
 from scene_templates.layout import Plane
-from scene_templates.patches import SIDES, PatchPlacement
+from scene_templates.shell.patches import SIDES, PatchPlacement
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from scene_templates.checks import Range, check_numbers, require
-from scene_templates.patches import SIDES, PatchPlacement
-from scene_templates.rooms import Room
+from scene_templates.shell.patches import SIDES, PatchPlacement
+from scene_templates.shell.rooms import Room
 
 
 @dataclass(frozen=True, kw_only=True)

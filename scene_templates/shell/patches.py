@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.rotations import rotated, rotation_xyz
+from scene_templates.contents.rotations import rotated, rotation_xyz
 
 QUADS = 8
 """Quads per side of a patch: 8 x 8 x 2 = 128 triangles."""

@@ -1,0 +1,1 @@
+"""What is in a room and around it: objects, surfaces, lights, cameras."""

@@ -1,0 +1,1 @@
+"""Which kinds of scenes a build draws from."""

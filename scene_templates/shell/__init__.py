@@ -1,0 +1,1 @@
+"""Floor and walls: where they stand."""

@@ -1,0 +1,1 @@
+"""The four templates, and what they have in common."""
