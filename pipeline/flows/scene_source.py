@@ -15,6 +15,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.flows.scene_files import build_scene, described_by
 from pipeline.objects.licences import USER_PROVIDED
 from storage.errors import TrilightError
+from storage.profiles import PACKED, PLAIN
 from storage.safe_url import safe_url
 from storage.sample import decode_scene
 from storage.scene import Scene
@@ -26,7 +27,7 @@ SEPARATOR = "::"
 
 _KEY = re.compile(r"[0-9A-Za-z_\-]+")
 _EXPECTED = "expected a scene .json or .safetensors, or SHARD.tar::KEY"
-_MEMBERS = ("json", "scene.safetensors")
+_MEMBERS = ("json", PLAIN, PACKED)
 
 
 @dataclass(frozen=True, kw_only=True)

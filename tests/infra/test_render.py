@@ -20,6 +20,7 @@ from pipeline.flows.scene_source import load_source, scene_source
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
 from storage.exr import decode_exr
+from storage.profiles import Profile
 from storage.sample import Sample, encode_sample
 from storage.scene import Scene
 from storage.scene_file import encode_scene, scene_digest
@@ -86,11 +87,11 @@ def mistake(*arguments: str | Path) -> str:
     return str(result.exception)
 
 
-def _shard(path: Path, scene: Scene) -> Path:
+def _shard(path: Path, scene: Scene, profile: Profile = "lossless") -> Path:
     made = tiny_sample(key="000000012")
     sample = Sample(key=made.key, scene=scene, radiance_rgb=made.radiance_rgb, views=made.views)
     other = tiny_sample(key="000000011")
-    write_shard(path, [(each.key, encode_sample(each)) for each in (other, sample)])
+    write_shard(path, [(each.key, encode_sample(each, profile)) for each in (other, sample)])
     return path
 
 
@@ -100,8 +101,14 @@ def test_one_scene_gives_one_picture_whatever_it_is_read_from(
     scene = load_source(scene_source(str(described))).scene
     (tmp_path / "two.safetensors").write_bytes(encode_scene(scene))
     shard = _shard(tmp_path / "train-000000.tar", scene)
-    sources: list[str | Path] = [described, tmp_path / "two.safetensors", f"{shard}::000000012"]
-    outs = [tmp_path / f"new/{row}.exr" for row in range(3)]
+    packed = _shard(tmp_path / "train-000001.tar", scene, "compact")
+    sources: list[str | Path] = [
+        described,
+        tmp_path / "two.safetensors",
+        f"{shard}::000000012",
+        f"{packed}::000000012",
+    ]
+    outs = [tmp_path / f"new/{row}.exr" for row in range(len(sources))]
     found = [
         render(source, "--view", "1", "--out", out)
         for source, out in zip(sources, outs, strict=True)
