@@ -25,7 +25,8 @@ def render(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="SRC", help="RenderFormer scene .json, .safetensors scene, or SHARD.tar::KEY"
+            metavar="SRC",
+            help="scene .json or .h5 of RenderFormer, .safetensors scene, or SHARD.tar::KEY",
         ),
     ],
     out: Annotated[Path, typer.Option(help="the picture, X.exr; X.png is written beside it")],

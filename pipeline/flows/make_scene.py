@@ -11,9 +11,10 @@ from pipeline.flows.scene_files import SceneFiles
 from pipeline.flows.settings import BuildSettings
 from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.renders.variant import Variant, activate
-from pipeline.scenes.compose import compose_scene, next_camera
+from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.sight import Sight, ViewFacts
+from pipeline.scenes.views import next_camera
 from storage.asset import decode_asset
 from storage.errors import Rejected
 from storage.records import Failure, LockedObject

@@ -2,6 +2,7 @@
 
     scene.json                 RenderFormer scene; its meshes lie in the folder of the file
     scene.safetensors          storage.scene_file
+    scene.h5                   the published layout (storage.renderformer_h5)
     train-000000.tar::KEY      the sample KEY of a shard
 
 The last form is taken apart here and nowhere else: no library that knows URLs ever sees it.
@@ -16,6 +17,7 @@ from pipeline.flows.scene_files import build_scene, described_by
 from pipeline.objects.licences import USER_PROVIDED
 from storage.errors import TrilightError
 from storage.profiles import PACKED, PLAIN
+from storage.renderformer_h5_read import read_renderformer_h5
 from storage.safe_url import safe_url
 from storage.sample import decode_scene
 from storage.scene import Scene
@@ -26,7 +28,7 @@ SEPARATOR = "::"
 """Between a shard and the key of a sample."""
 
 _KEY = re.compile(r"[0-9A-Za-z_\-]+")
-_EXPECTED = "expected a scene .json or .safetensors, or SHARD.tar::KEY"
+_EXPECTED = "expected a scene .json, .safetensors or .h5, or SHARD.tar::KEY"
 _MEMBERS = ("json", PLAIN, PACKED)
 
 
@@ -52,7 +54,7 @@ class LoadedScene:
     scene: Scene
     """It passes `Scene.check`."""
     notes: tuple[str, ...]
-    """What a person should know: fields of a scene file that mean nothing."""
+    """What a person should know: what of a file means nothing, or could not be carried over."""
 
 
 def scene_source(text: str) -> SceneSource:
@@ -74,7 +76,7 @@ def scene_source(text: str) -> SceneSource:
         raise TrilightError(f"{text}: no such file; {_EXPECTED}.")
     if not separator and suffix == ".tar":
         raise TrilightError(f"{text}: a shard holds many scenes; expected {text}{SEPARATOR}KEY.")
-    if not separator and suffix not in (".json", ".safetensors"):
+    if not separator and suffix not in (".json", ".safetensors", ".h5"):
         raise TrilightError(f"{text}: cannot be read as a scene; {_EXPECTED}.")
     return SceneSource(path=path, key=key if separator else None)
 
@@ -96,6 +98,9 @@ def load_source(source: SceneSource) -> LoadedScene:
     if source.path.suffix.lower() == ".safetensors":
         return LoadedScene(scene=read_scene_file(source.path), notes=())
     root, name = source.path.parent.resolve(), source.path.name
+    if source.path.suffix.lower() == ".h5":
+        found = read_renderformer_h5(source.path)
+        return LoadedScene(scene=found.scene, notes=tuple(f"{name}: {text}" for text in found.lost))
     unknown = described_by(root, name).unknown_fields
     scene, _ = build_scene(
         root,

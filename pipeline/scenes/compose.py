@@ -15,7 +15,7 @@ from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.posing import posed
 from pipeline.scenes.shapes import MeshShape
 from pipeline.scenes.subdivision import filled
-from pipeline.scenes.views import next_camera, with_first_cameras
+from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
 from scene_templates.layout_rand import layout_rand
 from scene_templates.plans import ScenePlan, scene_plan
@@ -23,8 +23,6 @@ from scene_templates.settings import SceneSettings
 from storage.errors import TrilightError
 from storage.scene import Scene, SceneObject
 from storage.seeds import rng_for
-
-__all__ = ["compose_scene", "next_camera"]
 
 
 def compose_scene(

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.scenes.compose import compose_scene, next_camera
+from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.sight import Sight
-from pipeline.scenes.views import CAMERA_ATTEMPTS, complaint
+from pipeline.scenes.views import CAMERA_ATTEMPTS, complaint, next_camera
 from scene_templates.families.default_families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings, ViewLaws
 from storage.conventions import camera_rays, look_at_c2w
