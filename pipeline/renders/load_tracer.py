@@ -8,7 +8,7 @@ def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> Tracer:
     """Return the fastest tracer of the variant that `activate` has set, with the scene loaded."""
     import mitsuba  # not before `activate`, which says where compiled kernels are kept
 
-    if mitsuba.variant() == "llvm_ad_rgb":
+    if mitsuba.variant() != "scalar_rgb":
         from pipeline.renders.vector_tracer import VectorTracer
 
         return VectorTracer(scene, max_depth=max_depth, rr_depth=rr_depth)

@@ -4,6 +4,9 @@ LLVM is loaded at run time, and a library that loads may still abort the whole p
 compiles (LLVM 15 does, "Cannot select: fminimum"). So each candidate renders a tiny picture in a
 process of its own, without any kernel that another library compiled. The answer is remembered.
 
+A graphics card is used only where the user asks for it (TRILIGHT_VARIANT=cuda_ad_rgb), and only
+after the same probe: no figure of this project was measured on one.
+
 Nothing here imports mitsuba, except `activate`.
 """
 
@@ -16,7 +19,7 @@ import tempfile
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from pipeline.renders.llvm_libraries import llvm_libraries
 from storage.atomic import write_atomically
@@ -29,20 +32,56 @@ _PROBE_S = 180
 _REMEMBERED_TRIES = 32
 
 
+VariantName = Literal["llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"]
+
+_ASK = "TRILIGHT_VARIANT"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Variant:
     """What Mitsuba runs on."""
 
-    name: Literal["llvm_ad_rgb", "scalar_rgb"]
+    name: VariantName
     """Mitsuba's name for it."""
     libllvm: str
-    """The LLVM library that it compiles with; empty for scalar_rgb."""
+    """The LLVM library that it compiles with; empty for the others."""
     note: str
     """One sentence for the user where this is the slow fallback, else empty."""
 
 
 def choose_variant() -> Variant:
-    """Return the fastest variant that works here; later calls read the remembered probes."""
+    """Return the fastest variant for processors that works here, or the one that the user names.
+
+    Later calls read the remembered probes.
+
+    Raises:
+        TrilightError: TRILIGHT_VARIANT names none, or one that cannot render here.
+    """
+    asked = os.environ.get(_ASK, "")
+    if asked not in ("", *get_args(VariantName)):
+        names = ", ".join(get_args(VariantName))
+        raise TrilightError(f"{_ASK} is {asked!r}; expected one of {names}, or nothing.")
+    if asked == "scalar_rgb":
+        return Variant(name="scalar_rgb", libllvm="", note="rendering takes about 35 times as long")
+    if asked == "cuda_ad_rgb":
+        return _on_graphics_card()
+    found = _on_processor()
+    if asked and found.name != asked:
+        raise TrilightError(f"{_ASK} is {asked!r}, but {found.note}; see: trilight doctor")
+    return found
+
+
+def _on_graphics_card() -> Variant:
+    chosen = Variant(name="cuda_ad_rgb", libllvm="", note="")
+    if not _probe(chosen):
+        raise TrilightError(
+            f"{_ASK} is {chosen.name!r}, but no picture could be rendered with it here; "
+            "unset it to render on the processor."
+        )
+    return chosen
+
+
+def _on_processor() -> Variant:
     tried = []
     for library in llvm_libraries():
         if _works(library):
@@ -85,7 +124,7 @@ def _works(library: Path) -> bool:
     known = _remembered(memory)
     if identity in known:
         return True
-    if not _probe(library):
+    if not _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note="")):
         return False
     with contextlib.suppress(TrilightError):  # remembered next time, or probed again
         recent = [*known, identity][-_REMEMBERED_TRIES:]
@@ -108,17 +147,15 @@ def _identity(library: Path) -> str:
     return sha256_hex(canonical_json([str(library), status.st_mtime_ns, status.st_size, *versions]))
 
 
-def _probe(library: Path) -> bool:
+def _probe(variant: Variant) -> bool:
     """Render a tiny picture in a child; an abort, a hang or a wrong picture is a no."""
     with tempfile.TemporaryDirectory() as kernels:
-        environment = {
-            **os.environ,
-            "DRJIT_LIBLLVM_PATH": str(library),
-            "DRJIT_CACHE_DIR": kernels,
-        }
+        environment = {**os.environ, "DRJIT_CACHE_DIR": kernels}
+        if variant.libllvm:
+            environment["DRJIT_LIBLLVM_PATH"] = variant.libllvm
         try:
             result = subprocess.run(
-                [sys.executable, "-m", "pipeline.renders.variant_probe"],
+                [sys.executable, "-m", "pipeline.renders.variant_probe", variant.name],
                 cwd=_ROOT,
                 env=environment,
                 capture_output=True,

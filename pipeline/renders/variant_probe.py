@@ -1,10 +1,11 @@
-"""Run as a process of its own: renders a tiny picture with the LLVM library of the environment.
+"""Run as a process of its own: renders a tiny picture with the variant that its argument names.
 
-Ends with status 0 only when the picture is as bright as it must be: a white light above the middle
-of a grey floor, seen from the side.
+LLVM's library is the one of the environment. Ends with status 0 only when the picture is as bright
+as it must be: a white light above the middle of a grey floor, seen from the side.
 """
 
 import resource
+import sys
 
 import mitsuba
 import numpy as np
@@ -15,7 +16,7 @@ from storage.scene import Scene, SceneObject
 
 def main() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # an abort is an answer, not an accident
-    mitsuba.set_variant("llvm_ad_rgb")
+    mitsuba.set_variant(sys.argv[1])
     from pipeline.renders.renderer import SceneRenderer
     from pipeline.renders.settings import RenderSettings
 

@@ -12,6 +12,7 @@ from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts
 from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.variant import Variant, choose_variant
+from storage.errors import TrilightError
 from tests.conftest import ROOT
 
 
@@ -54,18 +55,46 @@ def test_success_is_remembered_and_believed(
     assert choose_variant() == chosen
 
 
-def _must_not_be_asked(library: Path) -> bool:
-    raise AssertionError(f"{library} was probed again")
+def _must_not_be_asked(variant: Variant) -> bool:
+    raise AssertionError(f"{variant} was probed again")
 
 
 def test_where_no_library_works_the_fallback_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(variant_module, "_probe", lambda library: False)
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: False)
     monkeypatch.setattr(variant_module, "_remembered", lambda memory: [])
     fallback = choose_variant()
     assert (fallback.name, fallback.libllvm) == ("scalar_rgb", "")
     assert "none works with Mitsuba" in fallback.note
     monkeypatch.setattr(variant_module, "llvm_libraries", list)
     assert choose_variant().note.startswith("no LLVM library found")
+
+
+def test_the_user_may_name_the_variant(monkeypatch: pytest.MonkeyPatch, variant: Variant) -> None:
+    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")
+    assert choose_variant().name == "scalar_rgb"
+    monkeypatch.setenv("TRILIGHT_VARIANT", variant.name)
+    assert choose_variant().name == variant.name
+    monkeypatch.setenv("TRILIGHT_VARIANT", "metal")
+    with pytest.raises(TrilightError, match="'metal'; expected one of llvm_ad_rgb, scalar_rgb"):
+        choose_variant()
+
+
+def test_a_graphics_card_is_used_only_after_a_probe(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: variant.name == "cuda_ad_rgb")
+    assert choose_variant().name == "cuda_ad_rgb"
+    monkeypatch.undo()
+    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # hides the cards of a machine that has some
+    with pytest.raises(TrilightError, match="no picture could be rendered"):
+        choose_variant()
+
+
+def test_where_llvm_is_asked_for_and_missing_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variant_module, "llvm_libraries", list)
+    monkeypatch.setenv("TRILIGHT_VARIANT", "llvm_ad_rgb")
+    with pytest.raises(TrilightError, match="no LLVM library found"):
+        choose_variant()
 
 
 def test_asking_does_not_import_mitsuba() -> None:

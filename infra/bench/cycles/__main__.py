@@ -18,19 +18,10 @@ from rich.table import Table
 from infra.bench import harness
 from infra.bench.cycles import comparison, environment
 from infra.bench.cycles.comparison import NamedScene, Plan, SceneResult
+from infra.bench.renders.render_child import smoke_child
 from infra.cli.console import console, progress_bars
-from pipeline.flows.accept_objects import accept_objects
-from pipeline.flows.environment import environment as our_environment
-from pipeline.flows.make_scene import SceneSource, set_up_child
-from pipeline.flows.publication import begin
-from pipeline.flows.training_builds import smoke
-from pipeline.isolation import ChildLimits, IsolatedChild
-from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
-
-_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10_000)
 
 
 def main(
@@ -61,7 +52,7 @@ def main(
     results: list[SceneResult] = []
     with tempfile.TemporaryDirectory() as folder, progress_bars() as bars:
         task = bars.add_task("pictures", total=len(chosen) * comparison.num_pictures(plan), note="")
-        child = _render_child(DatasetFolder(Path(folder)), threads)
+        child = smoke_child(Path(folder), threads=threads)
         try:
             for named in chosen:
                 bars.update(task, note=named.name)
@@ -97,14 +88,6 @@ def _numbers(text: str, unit: int) -> tuple[int, ...]:
     if not all(word.isdecimal() and int(word) > 0 and int(word) % unit == 0 for word in words):
         raise TrilightError(f"samples are {text!r}; expected multiples of {unit} between commas.")
     return tuple(int(word) for word in words)
-
-
-def _render_child(folder: DatasetFolder, threads: int) -> IsolatedChild:
-    variant, build = choose_variant(), smoke()
-    publication = begin(folder, build, our_environment(variant), 1, accept_environment=False)
-    accepted = accept_objects("builtin:", None, build, publication, workers=threads)
-    source = SceneSource(settings=build, variant=variant, threads=threads, objects=accepted.objects)
-    return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(source,))
 
 
 def _record(plan: Plan, results: list[SceneResult]) -> dict[str, Any]:

@@ -46,6 +46,8 @@ class NamedScene:
     """What the table calls it."""
     make: Callable[[IsolatedChild], Scene] = field(repr=False)
     """Makes it in a child."""
+    publishable: bool
+    """Whether pictures of it may be published: it holds built-in objects only."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,14 +87,18 @@ class SceneResult:
 def described(root: Path, name: str) -> NamedScene:
     """Return a scene of a folder of RenderFormer files."""
     return NamedScene(
-        name=Path(name).stem, make=lambda child: child.call(described_scene, root, name)
+        name=Path(name).stem,
+        make=lambda child: child.call(described_scene, root, name),
+        publishable=False,
     )
 
 
 def sampled(scene_index: int) -> NamedScene:
     """Return a scene that the build `smoke` would compose of the child's objects."""
     return NamedScene(
-        name=f"sampled {scene_index}", make=lambda child: child.call(sampled_scene, scene_index)
+        name=f"sampled {scene_index}",
+        make=lambda child: child.call(sampled_scene, scene_index),
+        publishable=True,
     )
 
 
