@@ -7,6 +7,7 @@ cases, by at most 1.1 dB; ordinary scenes are understated by about 3 dB. Below 6
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,11 @@ _COMMON_ERROR_DB = 1.0
 """Taken off for what both halves have in common."""
 
 _DB_PER_DOUBLING = 1.2
-"""The true error falls by 0.9 to 2.0 dB per doubling of the samples, not by 3; taken low."""
+"""The true error falls by 0.9 to 2.0 dB per doubling of the samples, not by 3; taken low, until
+the view itself has been measured twice."""
+
+_SLOWEST_DB, _FASTEST_DB = 0.6, 3.0
+"""Bounds of what two floors of a view may say of its next doubling: each has noise of its own."""
 
 _MAX_GROWTH = 4.0
 """The samples grow at most by this between two measurements."""
@@ -52,21 +57,47 @@ def measure_floor(
     )
 
 
-def next_spp(spp: int, *, gap_db: float, step: int, max_spp: int) -> int:
+def slope_db(measured: Sequence[tuple[int, float]]) -> float:
+    """Return what a doubling of the samples buys in this view, in dB, from its last two floors.
+
+    Args:
+        measured: (samples per pixel, floor in dB) of this view so far, in order; one is enough.
+    """
+    if len(measured) < 2:
+        return _DB_PER_DOUBLING
+    (before, lower_db), (now, upper_db) = measured[-2:]
+    return min(max((upper_db - lower_db) / math.log2(now / before), _SLOWEST_DB), _FASTEST_DB)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Goal:
+    """When sampling ends."""
+
+    target_db: float
+    """The floor to reach."""
+    step: int
+    """Samples per pixel of one pass of both halves."""
+    max_spp: int
+    """The cap, a multiple of `step`."""
+
+
+def next_spp(measured: Sequence[tuple[int, float]], goal: Goal) -> int:
     """Return how many samples to go on to before the floor is measured again.
 
     Args:
-        spp: samples per pixel so far, a multiple of `step` below `max_spp`.
-        gap_db: target minus measured floor, above 0.
-        step: samples of one pass of both halves.
-        max_spp: the cap, a multiple of `step`.
+        measured: as for `slope_db`; the last one is below the goal's target, and has a multiple of
+            its step below its cap.
+        goal: when sampling ends.
     """
-    expected = expected_spp(spp, gap_db=gap_db, step=step, max_spp=max_spp)
-    return min(expected, max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step))
+    spp, step = measured[-1][0], goal.step
+    growth = max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step)
+    return min(expected_spp(measured, goal), growth)
 
 
-def expected_spp(spp: int, *, gap_db: float, step: int, max_spp: int) -> int:
+def expected_spp(measured: Sequence[tuple[int, float]], goal: Goal) -> int:
     """Return at how many samples the floor should reach its target, or the cap; as `next_spp`."""
-    doublings = min(gap_db / _DB_PER_DOUBLING, math.log2(max_spp / spp) + 1)
-    wanted = step * math.ceil(spp * 2**doublings / step)
-    return min(max_spp, max(wanted, spp + step))
+    spp, floor_db = measured[-1]
+    gap_db = goal.target_db - floor_db
+    doublings = min(gap_db / slope_db(measured), math.log2(goal.max_spp / spp) + 1)
+    wanted = goal.step * math.ceil(spp * 2**doublings / goal.step)
+    return min(goal.max_spp, max(wanted, spp + goal.step))

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise, set_denoiser_threads
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.noise_floor import NoiseFloor, expected_spp, measure_floor, next_spp
+from pipeline.renders.noise_floor import Goal, NoiseFloor, expected_spp, measure_floor, next_spp
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features, Tracer
@@ -98,7 +98,8 @@ class SceneRenderer:
         Raises:
             Rejected: "black_view" (mean radiance of the first pass of both halves below the
                 bound), "nonfinite_radiance" (found in the raw samples: the denoiser would hide
-                it), "radiance_overflow" (a pixel that half floats cannot hold).
+                it), "radiance_overflow" (a pixel that half floats cannot hold),
+                "floor_not_reached" (at max_spp, with `reject_at_cap`).
         """
         steps = self.view_steps(c2w, fov_deg, seed)
         while True:
@@ -126,6 +127,7 @@ class SceneRenderer:
         features = self._tracer.features(camera, seed=aux_seed, spp=settings.aux_spp)
         hits = self._tracer.hits(camera)
         floor = yield from self._sample_to_target(samples, features, hits)
+        self._refuse_noisy(floor)
         parts = self._denoised(samples.mean(), features)
         lights = rounded_to_half(_representable(parts)) if settings.per_light else None
         picture = parts[0] if lights is None else sum_of_lights(lights)
@@ -146,22 +148,31 @@ class SceneRenderer:
         if mean < bound:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
 
+    def _refuse_noisy(self, floor: NoiseFloor) -> None:
+        target_db = self._settings.noise_floor_db
+        if self._settings.reject_at_cap and floor.log_db < target_db:
+            raise Rejected("floor_not_reached", f"{floor.log_db:.1f} dB; expected {target_db:g}")
+
     def _sample_to_target(
         self, samples: HalfSamples, features: Features, hits: NDArray[np.bool_]
     ) -> Generator[Sampling, None, NoiseFloor]:
-        settings, step = self._settings, 2 * self._settings.pass_spp
+        settings = self._settings
+        goal = Goal(
+            target_db=settings.noise_floor_db,
+            step=2 * settings.pass_spp,
+            max_spp=settings.max_spp,
+        )
+        measured: list[tuple[int, float]] = []
         while True:
             half_a, half_b = (
                 self._denoised(half, features).sum(axis=0) for half in samples.half_means()
             )
             floor = measure_floor(half_a, half_b, hits)
-            gap_db = settings.noise_floor_db - floor.log_db
-            if gap_db <= 0 or samples.spp == settings.max_spp:
+            measured.append((samples.spp, floor.log_db))
+            if floor.log_db >= goal.target_db or samples.spp == goal.max_spp:
                 return floor
-            spp = samples.spp
-            expected = expected_spp(spp, gap_db=gap_db, step=step, max_spp=settings.max_spp)
-            goal = next_spp(spp, gap_db=gap_db, step=step, max_spp=settings.max_spp)
-            for _ in samples.passes_to(goal):
+            expected = expected_spp(measured, goal)
+            for _ in samples.passes_to(next_spp(measured, goal)):
                 yield Sampling(spp=samples.spp, expected_spp=expected, noise_floor_db=floor.log_db)
 
     def _denoised(self, parts_rgb: NDArray[np.float32], features: Features) -> NDArray[np.float32]:

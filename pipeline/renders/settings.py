@@ -30,6 +30,10 @@ class RenderSettings:
     estimate is honest from 128 on (64 a half)."""
     max_spp: int
     """The cap: sampling stops here whatever the floor is."""
+    reject_at_cap: bool = False
+    """Reject a view that misses its floor at the cap (floor_not_reached; its camera is tried
+    again), after all of its samples, instead of keeping it with the floor that it has. A set
+    without its hard views is another distribution: keep them unless every picture must be good."""
     max_depth: int = 10
     """Longest path in edges: 1 sees emitters alone, 2 adds direct light."""
     rr_depth: int = 2

@@ -101,6 +101,15 @@ def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
     assert 32 < wanted.spp < 4096 and wanted.spp % 32 == 0
 
 
+def test_a_build_may_refuse_what_stays_noisy() -> None:
+    strict = dataclasses.replace(CHEAP, noise_floor_db=95.0, max_spp=32, reject_at_cap=True)
+    with pytest.raises(Rejected, match="expected 95") as rejection:
+        _render(simple_scene(), strict)
+    assert rejection.value.reason == "floor_not_reached"
+    easy = dataclasses.replace(strict, noise_floor_db=10.0)
+    assert _render(simple_scene(), easy).noise_floor_db >= 10
+
+
 def test_a_view_says_how_far_it_is() -> None:
     scene = simple_scene()
     settings = dataclasses.replace(CHEAP, noise_floor_db=95.0, max_spp=256)
