@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pipeline.flows.render_scene import Picture
     from pipeline.renders.renderer import Sampling
 
-_HONEST_SPP = 2 * PASS_SPP[0]
+_FIRST_SPP = 2 * PASS_SPP[1]
 """Fewer samples, and the noise floor may flatter (pipeline.renders.noise_floor)."""
 
 
@@ -53,7 +53,7 @@ def render(
     settings = RenderSettings(
         resolution=resolution,
         noise_floor_db=noise_floor,
-        min_spp=min(_HONEST_SPP, max_spp),
+        min_spp=min(_FIRST_SPP, max_spp),
         max_spp=max_spp,
         min_mean_radiance=0.0,  # who asks for a dark picture gets it
     )
@@ -94,8 +94,8 @@ def _notes(picture: "Picture", settings: RenderSettings, variant: Variant) -> li
     notes = list(picture.facts.notes)
     if not picture.view.radiance_rgb.any():
         notes.append("the picture is black: the camera sees nothing that is lit")
-    if picture.view.spp < _HONEST_SPP:
-        notes.append(f"below {_HONEST_SPP} samples the measured noise floor may flatter")
+    if picture.view.spp < _FIRST_SPP:
+        notes.append(f"below {_FIRST_SPP} samples the measured noise floor may flatter")
     if variant.note:
         notes.append(f"{variant.note}; see trilight doctor")
     return notes

@@ -39,7 +39,7 @@ def smoke() -> BuildSettings:
         allowed_licences=DEFAULT_ALLOWED,
         assets=AssetSettings(budgets=(1400, 1000, 700, 500, 340, 240)),
         scenes=SceneSettings(families=DEFAULT_FAMILIES, max_triangles=1536, num_views=4),
-        renders=RenderSettings(resolution=256, noise_floor_db=40.0, min_spp=128, max_spp=256),
+        renders=RenderSettings(resolution=256, noise_floor_db=40.0, min_spp=32, max_spp=256),
         splits=SplitSettings(scenes_per_shard=4),
     )
 

@@ -17,7 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise, set_denoiser_threads
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.noise_floor import Goal, NoiseFloor, expected_spp, measure_floor, next_spp
+from pipeline.renders.noise_floor import (
+    Goal,
+    Half,
+    NoiseFloor,
+    expected_spp,
+    measure_floor,
+    next_spp,
+)
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features, Tracer
@@ -116,8 +123,11 @@ class SceneRenderer:
         settings = self._settings
         pose = np.asarray(c2w, np.float64)
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
-        samples = HalfSamples(self._parts, camera, settings.pass_spp, seed)
-        first_pass_of_both, settled = 2 * settings.pass_spp, settings.min_spp
+        settled = settings.min_spp
+        samples = HalfSamples(
+            self._parts, camera, seed, first_spp=settled, max_spp=settings.max_spp
+        )
+        first_pass_of_both = 2 * samples.pass_spp
         for _ in samples.passes_to(first_pass_of_both):
             yield Sampling(spp=samples.spp, expected_spp=settled, noise_floor_db=None)
         self._refuse_black(samples)
@@ -157,23 +167,25 @@ class SceneRenderer:
         self, samples: HalfSamples, features: Features, hits: NDArray[np.bool_]
     ) -> Generator[Sampling, None, NoiseFloor]:
         settings = self._settings
-        goal = Goal(
-            target_db=settings.noise_floor_db,
-            step=2 * settings.pass_spp,
-            max_spp=settings.max_spp,
-        )
         measured: list[tuple[int, float]] = []
         while True:
-            half_a, half_b = (
-                self._denoised(half, features).sum(axis=0) for half in samples.half_means()
-            )
-            floor = measure_floor(half_a, half_b, hits)
+            half_a, half_b = (self._half(raw, features) for raw in samples.half_means())
+            floor = measure_floor(half_a, half_b, hits, samples.spp)
             measured.append((samples.spp, floor.log_db))
-            if floor.log_db >= goal.target_db or samples.spp == goal.max_spp:
+            if floor.log_db >= settings.noise_floor_db or samples.spp == settings.max_spp:
                 return floor
+            goal = Goal(
+                target_db=settings.noise_floor_db,
+                step=2 * samples.pass_spp,
+                max_spp=settings.max_spp,
+            )
             expected = expected_spp(measured, goal)
             for _ in samples.passes_to(next_spp(measured, goal)):
                 yield Sampling(spp=samples.spp, expected_spp=expected, noise_floor_db=floor.log_db)
+
+    def _half(self, raw_rgb: NDArray[np.float32], features: Features) -> Half:
+        denoised = self._denoised(raw_rgb, features)
+        return Half(raw_rgb=raw_rgb.sum(axis=0), denoised_rgb=denoised.sum(axis=0))
 
     def _denoised(self, parts_rgb: NDArray[np.float32], features: Features) -> NDArray[np.float32]:
         """Return the parts [P, R, R, 3] without noise; raises Rejected("radiance_overflow").

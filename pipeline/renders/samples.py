@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
+from pipeline.renders.settings import PASS_SPP
 from pipeline.renders.tracer import Tracer
 from storage.errors import Rejected
 from storage.seeds import seed_for
@@ -18,42 +19,68 @@ class HalfSamples:
     have the same seeds, hence the same camera rays.
     """
 
-    def __init__(self, parts: Sequence[Tracer], camera: Camera, pass_spp: int, seed: int) -> None:
-        self._parts, self._camera, self._pass_spp, self._seed = parts, camera, pass_spp, seed
+    def __init__(
+        self, parts: Sequence[Tracer], camera: Camera, seed: int, *, first_spp: int, max_spp: int
+    ) -> None:
+        """Begin a view without any sample.
+
+        Args:
+            parts: what is traced.
+            camera: the view.
+            seed: of this view alone.
+            first_spp: samples per pixel of the first measurement, both halves together.
+            max_spp: the most that will be asked for.
+        """
+        self._parts, self._camera, self._seed = parts, camera, seed
+        self._first, self._most = first_spp // 2, max_spp // 2
         shape = (len(parts), camera.resolution, camera.resolution, 3)
         self._sums = [np.zeros(shape), np.zeros(shape)]
-        self._passes = [0, 0]
+        self._half_spp = [0, 0]
+        self._passes = 0
 
     @property
     def spp(self) -> int:
         """Samples per pixel so far, both halves together."""
-        return sum(self._passes) * self._pass_spp
+        return sum(self._half_spp)
+
+    @property
+    def pass_spp(self) -> int:
+        """Samples per pixel of the next pass of one half: the best that leads to round numbers.
+
+        It divides what is there already and what is left, so that a half which has 64 samples goes
+        on in passes of 64, however small its first ones were.
+        """
+        done = self._half_spp[0]
+        left = (self._most if done else self._first) - done
+        return next(size for size in PASS_SPP if done % size == 0 and left % size == 0)
 
     def passes_to(self, spp: int) -> Iterator[None]:
-        """Add passes to both halves until there are `spp` samples, yielding after each.
+        """Add passes to both halves until there are `spp` samples at least, yielding after each.
 
         Raises:
             Rejected: "nonfinite_radiance" where a raw sample is not finite.
         """
         while self.spp < spp:
+            size = self.pass_spp
             for half, total in enumerate(self._sums):
-                seed = seed_for(self._seed, "pass", self._passes[half], half)
+                seed = seed_for(self._seed, "pass", self._passes, half)
                 for part, tracer in enumerate(self._parts):
-                    total[part] += self._one_pass(tracer, seed)
-                self._passes[half] += 1
+                    total[part] += size * self._one_pass(tracer, seed, size)
+                self._half_spp[half] += size
                 yield
+            self._passes += 1
 
     def half_means(self) -> list[NDArray[np.float32]]:
         """Return the mean of each half, [P, R, R, 3]."""
-        pairs = zip(self._sums, self._passes, strict=True)
-        return [(total / passes).astype(np.float32) for total, passes in pairs]
+        pairs = zip(self._sums, self._half_spp, strict=True)
+        return [(total / spp).astype(np.float32) for total, spp in pairs]
 
     def mean(self) -> NDArray[np.float32]:
         """Return the mean of all samples, [P, R, R, 3]."""
-        return ((self._sums[0] + self._sums[1]) / sum(self._passes)).astype(np.float32)
+        return ((self._sums[0] + self._sums[1]) / self.spp).astype(np.float32)
 
-    def _one_pass(self, tracer: Tracer, seed: int) -> NDArray[np.float32]:
-        radiance_rgb = tracer.radiance(self._camera, seed=seed, spp=self._pass_spp)
+    def _one_pass(self, tracer: Tracer, seed: int, spp: int) -> NDArray[np.float32]:
+        radiance_rgb = tracer.radiance(self._camera, seed=seed, spp=spp)
         if not np.isfinite(radiance_rgb).all():
             count = int((~np.isfinite(radiance_rgb)).any(axis=-1).sum())
             raise Rejected("nonfinite_radiance", f"{count} pixels of raw samples")

@@ -7,7 +7,7 @@ from storage.errors import TrilightError
 from storage.metrics import MAX_DB
 
 PASS_SPP = (64, 16, 4)
-"""Samples per pixel of one pass, from best to cheapest: squares, as the sampler needs.
+"""Samples per pixel of one pass of a half, from best to cheapest: squares, as the sampler needs.
 
 A pass of 64 is stratified finer than four of 16: 0.1 to 0.3 dB less error on sampled scenes, and 1
 to 2 dB in the median pixel of the easy ones (LOG.md). The small ones are for quick previews.
@@ -26,8 +26,8 @@ class RenderSettings:
     noise_floor_db: float
     """Sampling stops when the measured floor (psnr_log_db) reaches this."""
     min_spp: int
-    """Samples per pixel, both halves together, before a measured floor may be believed: the
-    estimate is honest from 128 on (64 a half)."""
+    """Samples per pixel, both halves together, before the floor is measured first. From 32 on it is
+    honest in views without rare bright paths, and goes by what it finds in the others."""
     max_spp: int
     """The cap: sampling stops here whatever the floor is."""
     reject_at_cap: bool = False
@@ -67,7 +67,7 @@ class RenderSettings:
         _require(
             self.min_spp % unit == 0 and self.max_spp % unit == 0,
             f"min_spp is {self.min_spp} and max_spp {self.max_spp}; expected multiples of {unit}, "
-            f"and of {2 * PASS_SPP[0]} for the best sampling",
+            f"and a cap of a multiple of {2 * PASS_SPP[0]} for the best sampling",
         )
         _require(self.aux_spp in PASS_SPP, f"aux_spp is {self.aux_spp}; expected one of {PASS_SPP}")
         _require(
@@ -81,15 +81,6 @@ class RenderSettings:
         _require(
             self.min_mean_radiance >= 0,
             f"min_mean_radiance is {self.min_mean_radiance}; expected 0 or more",
-        )
-
-    @property
-    def pass_spp(self) -> int:
-        """Samples per pixel of one pass: the largest of PASS_SPP that divides both halves."""
-        return next(
-            size
-            for size in PASS_SPP
-            if self.min_spp % (2 * size) == 0 and self.max_spp % (2 * size) == 0
         )
 
 

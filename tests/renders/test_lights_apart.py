@@ -90,7 +90,7 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     scene = lit_scene()
     tracer = load_tracer(scene, max_depth=SETTINGS.max_depth, rr_depth=SETTINGS.rr_depth)
     parts = [tracer.only_light(row) for row in light_rows(scene)]
-    samples = HalfSamples(parts, camera_of(scene, 32), SETTINGS.pass_spp, 0)
+    samples = HalfSamples(parts, camera_of(scene, 32), 0, first_spp=32, max_spp=32)
     assert len(list(samples.passes_to(SETTINGS.max_spp))) == 2
     seed = seed_for(0, "features")
     features = tracer.features(camera_of(scene, 32), seed=seed, spp=SETTINGS.aux_spp)

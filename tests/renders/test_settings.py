@@ -33,12 +33,3 @@ def test_bad_settings_name_themselves(name: str, value: Any) -> None:
     with pytest.raises(TrilightError, match=f"{name}.*{value}") as caught:
         RenderSettings(**{**GOOD, name: value})
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("min_spp", "max_spp", "pass_spp"),
-    [(128, 512, 64), (128, 128, 64), (32, 128, 16), (128, 160, 16), (8, 8, 4), (8, 128, 4)],
-)
-def test_passes_are_the_largest_that_fit(min_spp: int, max_spp: int, pass_spp: int) -> None:
-    settings = RenderSettings(**{**GOOD, "min_spp": min_spp, "max_spp": max_spp})
-    assert settings.pass_spp == pass_spp

@@ -1,0 +1,159 @@
+"""`python -m infra.bench.renders.calibration`: how often is a stated noise floor wrong?
+
+Scenes that nothing was tuned on are rendered as a build would, to several targets, and compared
+with converged pictures of other samples. A view whose error is more than 1 dB above its stated floor
+counts as a broken promise: at most one in ten may be.
+"""
+
+import dataclasses
+import json
+import os
+import sys
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from infra.bench import harness
+from infra.bench.cycles.comparison import sampled
+from infra.bench.renders.named_set import NUM_SAMPLED
+from infra.bench.renders.render_child import smoke_child
+from infra.cli.console import console, progress_bars
+from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.settings import RenderSettings
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+from storage.metrics import psnr_linear_db, psnr_log_db
+from storage.scene import Scene
+
+TARGETS_DB = (38.0, 42.0, 46.0, 50.0)
+
+BROKEN_DB = 1.0
+"""A stated floor that is better than the truth by more than this is a broken promise."""
+
+_REFERENCE_SEED = 1_000_003
+
+
+@dataclass(frozen=True, kw_only=True)
+class Promise:
+    """One view: what was stated, and what is true."""
+
+    scene: str
+    """Name of the scene."""
+    target_db: float
+    """The floor that was asked for."""
+    spp: int
+    """Samples per pixel that were spent."""
+    at_cap: bool
+    """Whether it ended at the cap."""
+    stated_db: float
+    """The measured floor, psnr_log_db."""
+    true_db: float
+    """psnr_log_db to the reference."""
+    stated_linear_db: float
+    """The measured floor, psnr_linear_db."""
+    true_linear_db: float
+    """psnr_linear_db to the reference."""
+    reference_db: float
+    """The reference's own floor: a truth near it is soft."""
+
+
+def promises(scene: Scene, name: str, settings: RenderSettings, max_spp: int) -> list[Promise]:
+    """Return one promise for each target; runs in a render child."""
+    pose, fov_deg = scene.c2w[0], float(scene.fov_deg[0])
+    reference = SceneRenderer(
+        scene,
+        dataclasses.replace(
+            settings, noise_floor_db=max(TARGETS_DB) + 8, min_spp=2048, max_spp=max_spp
+        ),
+    ).render_view(pose, fov_deg, _REFERENCE_SEED)
+    made = []
+    for seed, target_db in enumerate(TARGETS_DB):
+        asked = dataclasses.replace(settings, noise_floor_db=target_db)
+        view = SceneRenderer(scene, asked).render_view(pose, fov_deg, seed)
+        made.append(_promise(name, target_db, view, reference))
+    return made
+
+
+def _promise(name: str, target_db: float, view: RenderedView, reference: RenderedView) -> Promise:
+    return Promise(
+        scene=name,
+        target_db=target_db,
+        spp=view.spp,
+        at_cap=view.at_cap,
+        stated_db=view.noise_floor_db,
+        true_db=psnr_log_db(view.radiance_rgb, reference.radiance_rgb),
+        stated_linear_db=view.noise_floor_linear_db,
+        true_linear_db=psnr_linear_db(view.radiance_rgb, reference.radiance_rgb),
+        reference_db=reference.noise_floor_db,
+    )
+
+
+def broken(found: list[Promise]) -> list[Promise]:
+    """Return the views whose stated floor is more than BROKEN_DB better than the truth."""
+    return [one for one in found if one.stated_db - one.true_db > BROKEN_DB]
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="JSON file to write")],
+    scenes: Annotated[int, typer.Option(help="how many, from the first held-out one")] = 40,
+    resolution: Annotated[int, typer.Option(help="pixels each way")] = 96,
+    max_spp: Annotated[int, typer.Option(help="cap of what is judged")] = 1024,
+    reference_spp: Annotated[int, typer.Option(help="cap of the references")] = 8192,
+) -> None:
+    """Render held-out scenes to several targets, and count broken promises."""
+    settings = RenderSettings(
+        resolution=resolution,
+        noise_floor_db=TARGETS_DB[0],
+        min_spp=32,
+        max_spp=max_spp,
+        min_mean_radiance=0.0,
+    )
+    found: list[Promise] = []
+    with tempfile.TemporaryDirectory() as folder, progress_bars() as bars:
+        task = bars.add_task("scenes", total=scenes, note="")
+        child = smoke_child(Path(folder), threads=os.cpu_count() or 1)
+        try:
+            for index in range(NUM_SAMPLED, NUM_SAMPLED + scenes):
+                named = sampled(index)
+                scene = named.make(child)
+                found += child.call(promises, scene, named.name, settings, reference_spp)
+                bars.advance(task)
+                # after every scene: what was measured survives whatever comes next
+                write_atomically(out, _record(found).encode())
+        finally:
+            child.close()
+    console.print(_table(found))
+
+
+def _record(found: list[Promise]) -> str:
+    record = {"machine": harness.machine(), "views": [asdict(one) for one in found]}
+    return json.dumps(record) + "\n"
+
+
+def _table(found: list[Promise]) -> Table:
+    table = Table(box=None)
+    for title in ("target", "views", "broken", "median spp", "at cap", "truth - stated, median"):
+        table.add_column(title, justify="right")
+    for target_db in (*TARGETS_DB, None):
+        chosen = [one for one in found if target_db in (None, one.target_db)]
+        table.add_row(
+            "all" if target_db is None else f"{target_db:g} dB",
+            str(len(chosen)),
+            f"{100 * len(broken(chosen)) / len(chosen):.0f} %",
+            f"{np.median([one.spp for one in chosen]):.0f}",
+            f"{100 * np.mean([one.at_cap for one in chosen]):.0f} %",
+            f"{np.median([one.true_db - one.stated_db for one in chosen]):.1f} dB",
+        )
+    return table
+
+
+if __name__ == "__main__":
+    try:
+        typer.run(main)
+    except TrilightError as mistake:
+        sys.exit(f"infra.bench.renders.calibration: {mistake}")

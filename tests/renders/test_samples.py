@@ -1,0 +1,61 @@
+"""Passes: the largest that lead to round numbers, in two halves that share nothing."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.renders.camera import Camera
+from pipeline.renders.samples import HalfSamples
+
+CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
+
+
+class Recorder:
+    """A tracer that writes down what it is asked, and whose light is the number of samples."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[int, int]] = []
+
+    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        self.asked.append((spp, seed))
+        return np.full((camera.resolution, camera.resolution, 3), spp, np.float32)
+
+
+def _passes(first_spp: int, spp: int, max_spp: int) -> tuple[HalfSamples, list[tuple[int, int]]]:
+    tracer = Recorder()
+    samples = HalfSamples([tracer], CAMERA, 0, first_spp=first_spp, max_spp=max_spp)  # type: ignore[list-item]
+    for _ in samples.passes_to(spp):
+        pass
+    return samples, tracer.asked
+
+
+@pytest.mark.parametrize(
+    ("first_spp", "spp", "max_spp", "of_a_half"),
+    [
+        (128, 128, 512, [64]),
+        (32, 32, 4096, [16]),
+        (32, 256, 4096, [16, 16, 16, 16, 64]),
+        (32, 160, 160, [16, 16, 16, 16, 16]),
+        (8, 32, 64, [4, 4, 4, 4]),
+        (8, 64, 64, [4, 4, 4, 4, 16]),
+    ],
+)
+def test_passes_are_the_largest_that_fit(
+    first_spp: int, spp: int, max_spp: int, of_a_half: list[int]
+) -> None:
+    samples, asked = _passes(first_spp, spp, max_spp)
+    assert samples.spp == spp
+    assert [size for size, _ in asked[::2]] == of_a_half
+    assert [size for size, _ in asked[1::2]] == of_a_half
+
+
+def test_the_mean_weighs_passes_by_their_samples() -> None:
+    samples, _ = _passes(32, 256, 4096)
+    expected = (4 * 16 * 16 + 64 * 64) / 128
+    assert samples.mean().max() == samples.mean().min() == expected
+    assert [float(half.mean()) for half in samples.half_means()] == [expected, expected]
+
+
+def test_no_two_passes_have_the_same_seed() -> None:
+    _, asked = _passes(32, 512, 4096)
+    assert len({seed for _, seed in asked}) == len(asked)
