@@ -1,8 +1,8 @@
 """`python -m infra.bench.renders.calibration`: how often is a stated noise floor wrong?
 
 Scenes that nothing was tuned on are rendered as a build would, to several targets, and compared
-with converged pictures of other samples. A view whose error is more than 1 dB above its stated floor
-counts as a broken promise: at most one in ten may be.
+with converged pictures of other samples. A view that is more than 1 dB worse than its stated floor
+is a broken promise: at most one in ten may be.
 """
 
 import dataclasses
