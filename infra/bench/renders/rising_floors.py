@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from infra.bench.cycles.comparison import sampled
 from infra.bench.harness import RESULTS
 from infra.bench.renders.render_child import smoke_child
+from infra.cli.console import console
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from storage.conventions import preview_srgb8
@@ -76,7 +77,7 @@ def main(
         finally:
             child.close()
     _draw(made[:-1], made[-1].view.radiance_rgb, out)
-    print(f"written: {out}")
+    console.print(f"written: {out}")
 
 
 def _draw(made: list[_Rendered], reference: NDArray[np.float32], out: Path) -> None:
