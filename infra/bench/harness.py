@@ -46,6 +46,14 @@ class Options:
     """Sources of objects."""
     allowed_licences: tuple[str, ...]
     """Of objects that may be measured."""
+    scenes: Path | None = None
+    """Folder of RenderFormer scene files that belong to the named set as well."""
+    cycles_spp: tuple[int, ...] = ()
+    """Samples at which Blender's Cycles takes part; Blender is installed for it."""
+    usd_per_core_hour: float = 0.04
+    """What computing costs."""
+    resume: bool = False
+    """Keep what an interrupted run of the same plan has measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,15 +69,11 @@ class Spread:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """The figures of every side, with what they were measured on."""
+class Result:
+    """What every benchmark says besides its figures."""
 
     name: str
     """Name of the benchmark."""
-    sides: Mapping[str, Mapping[str, Spread]]
-    """Figures by side; `seconds` is always one of them."""
-    repeats: int
-    """Counted rounds, after one that was not counted."""
     machine: Mapping[str, Any] = field(default_factory=lambda: machine())
     """Processor, cores, system, versions, revision."""
     date: str = field(default_factory=lambda: datetime.date.today().isoformat())
@@ -78,6 +82,16 @@ class Comparison:
     def as_json_line(self) -> str:
         """Return the result as one line."""
         return json.dumps(asdict(self), sort_keys=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison(Result):
+    """The figures of every side, with what they were measured on."""
+
+    sides: Mapping[str, Mapping[str, Spread]]
+    """Figures by side; `seconds` is always one of them."""
+    repeats: int
+    """Counted rounds, after one that was not counted."""
 
 
 def compare(
@@ -138,12 +152,12 @@ def machine() -> dict[str, Any]:
     }
 
 
-def save(comparison: Comparison, *, quick: bool) -> Path:
+def save(result: Result, *, quick: bool) -> Path:
     """Write the result as dated JSON under docs/bench and return its path."""
     RESULTS.mkdir(parents=True, exist_ok=True)
     suffix = "-quick" if quick else ""
-    path = RESULTS / f"{comparison.name}{suffix}-{comparison.date}.json"
-    path.write_text(comparison.as_json_line() + "\n")
+    path = RESULTS / f"{result.name}{suffix}-{result.date}.json"
+    path.write_text(result.as_json_line() + "\n")
     return path
 
 

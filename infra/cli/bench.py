@@ -1,9 +1,9 @@
-"""`trilight bench`: one benchmark, its figures, and a dated result."""
+"""`trilight bench`: one benchmark, or its parts in turn: figures, and a dated result of each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 
 import typer
 
@@ -12,17 +12,22 @@ from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
-    from infra.bench.harness import Comparison, Options
+    from infra.bench.harness import Options, Result
 
 _NAMES = ("assets", "render", "scenes", "shards")
 
+_Measured = TypeVar("_Measured", bound="Result")
+
 
 @dataclass(frozen=True, kw_only=True)
-class _Benchmark:
+class _Benchmark(Generic[_Measured]):
+    """A benchmark, or one part of several that it has."""
+
     num_rounds: "Callable[[Options], int]"
-    run: "Callable[[Options, Callable[[], None]], Comparison]"
-    rows: "Callable[[Comparison], list[tuple[str, str]]]"
-    plot: "Callable[[Comparison, Path], None]"
+    run: "Callable[[Options, Callable[[], None]], _Measured]"
+    rows: "Callable[[_Measured], list[tuple[str, str]]]"
+    plot: "Callable[[_Measured, Path], None]"
+    part: str = ""
 
 
 def bench(
@@ -34,57 +39,137 @@ def bench(
     allow_licence: Annotated[
         list[str] | None, typer.Option(help="measure objects under this licence too")
     ] = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option(help="of render: frontier, throughput or cost; may be repeated [all]"),
+    ] = None,
+    scenes: Annotated[
+        Path | None, typer.Option(help="render: folder of RenderFormer scenes to add to the set")
+    ] = None,
+    cycles: Annotated[
+        str, typer.Option(help="render: Cycles at these samples too, as 128,4096; installs Blender")
+    ] = "",
+    price: Annotated[float, typer.Option(help="render: USD per core-hour")] = 0.04,
+    resume: Annotated[
+        bool, typer.Option(help="render: go on with the same run where it was interrupted")
+    ] = False,
 ) -> None:
     """Run a benchmark; writes a dated JSON line and a figure under docs/bench."""
-    benchmark = _named(name)
-    from infra.bench.harness import Options, save
+    benchmarks = _chosen(name, part or [])
+    from infra.bench.harness import Options
 
     options = Options(
         quick=quick,
         objects=tuple(objects or ("builtin:",)),
         allowed_licences=(*DEFAULT_ALLOWED, *(allow_licence or ())),
+        scenes=scenes,
+        cycles_spp=_samples(cycles),
+        usd_per_core_hour=price,
+        resume=resume,
     )
+    for benchmark in benchmarks:
+        _measure(benchmark, options)
+
+
+def _measure(benchmark: _Benchmark[Any], options: "Options") -> None:
+    from infra.bench.harness import save
+
     with progress_bars() as bars:
-        task = bars.add_task("rounds", total=benchmark.num_rounds(options), note="")
+        total = benchmark.num_rounds(options)
+        task = bars.add_task(benchmark.part or "rounds", total=total, note="")
         result = benchmark.run(options, lambda: bars.advance(task))
-    path = save(result, quick=quick)
+    path = save(result, quick=options.quick)
     figure = path.with_suffix(".png")
     benchmark.plot(result, figure)
-    print_rows(f"{name} on {result.machine['processor']}", benchmark.rows(result))
     console.print(result.as_json_line(), soft_wrap=True)
+    print_rows(f"{result.name} on {result.machine['processor']}", benchmark.rows(result))
     console.print(f"\nWritten: {path} and {figure.name}", style="bold")
 
 
-def _named(name: str) -> _Benchmark:
+def _samples(text: str) -> tuple[int, ...]:
+    words = text.split(",") if text else []
+    if not all(word.isdecimal() and int(word) > 0 for word in words):
+        raise TrilightError(f"--cycles {text!r}: expected numbers of samples between commas.")
+    return tuple(sorted({int(word) for word in words}))
+
+
+def _chosen(name: str, parts: list[str]) -> list[_Benchmark[Any]]:
+    """Return a benchmark, or those of its parts that are asked for."""
+    benchmarks = _named(name)
+    known = [benchmark.part for benchmark in benchmarks if benchmark.part]
+    for part in parts:
+        if part not in known:
+            expected = f"expected one of {', '.join(known)}" if known else "it has no parts"
+            raise TrilightError(f"--part {part!r}: unknown in benchmark {name!r}; {expected}.")
+    return [benchmark for benchmark in benchmarks if not parts or benchmark.part in parts]
+
+
+def _named(name: str) -> list[_Benchmark[Any]]:
     """Import only what is asked for: each benchmark needs other libraries."""
     if name == "assets":
         from infra.bench import assets, assets_report
 
-        return _Benchmark(
-            num_rounds=assets.num_rounds,
-            run=assets.run,
-            rows=assets_report.rows,
-            plot=assets_report.plot,
-        )
+        return [
+            _Benchmark(
+                num_rounds=assets.num_rounds,
+                run=assets.run,
+                rows=assets_report.rows,
+                plot=assets_report.plot,
+            )
+        ]
     if name == "render":
-        from infra.bench import render
-
-        return _Benchmark(
-            num_rounds=render.num_rounds, run=render.run, rows=render.rows, plot=render.plot
-        )
+        return _render_parts()
     if name == "scenes":
         from infra.bench import scenes
 
-        return _Benchmark(
-            num_rounds=scenes.num_rounds, run=scenes.run, rows=scenes.rows, plot=scenes.plot
-        )
+        return [
+            _Benchmark(
+                num_rounds=scenes.num_rounds, run=scenes.run, rows=scenes.rows, plot=scenes.plot
+            )
+        ]
     if name == "shards":
         from infra.bench import shards, shards_report
 
-        return _Benchmark(
-            num_rounds=shards.num_rounds,
-            run=shards.run,
-            rows=shards_report.rows,
-            plot=shards_report.plot,
-        )
+        return [
+            _Benchmark(
+                num_rounds=shards.num_rounds,
+                run=shards.run,
+                rows=shards_report.rows,
+                plot=shards_report.plot,
+            )
+        ]
     raise TrilightError(f"benchmark {name!r} is unknown; expected one of {', '.join(_NAMES)}.")
+
+
+def _render_parts() -> list[_Benchmark[Any]]:
+    from infra.bench.renders import (
+        cost,
+        frontier,
+        frontier_report,
+        throughput,
+        throughput_report,
+    )
+
+    return [
+        _Benchmark(
+            part="frontier",
+            num_rounds=frontier.num_rounds,
+            run=frontier.run,
+            rows=frontier_report.rows,
+            plot=frontier_report.plot,
+        ),
+        _Benchmark(
+            part="throughput",
+            num_rounds=throughput.num_rounds,
+            run=throughput.run,
+            rows=throughput_report.rows,
+            plot=throughput_report.plot,
+        ),
+        _Benchmark(
+            part="cost",
+            num_rounds=cost.num_rounds,
+            run=cost.run,
+            rows=cost.rows,
+            plot=cost.plot,
+        ),
+    ]

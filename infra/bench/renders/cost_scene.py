@@ -1,0 +1,116 @@
+"""A scene of which one quantity at a time can be changed, with all the others fixed.
+
+Two built-in objects, a mirror and a rough body, in an open room of three quads under small lights.
+The objects are drawn again with more or fewer triangles from the same formula; of the lights on a
+ring the first few are there, and share one power. So surfaces, materials and camera always agree.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
+from pipeline.scenes.pieces import Piece, emitter_piece, joined, object_piece, shell_piece
+from scene_templates.layout import Emitter, ShellPart, Surface
+from storage.conventions import look_at_c2w
+from storage.scene import Scene, SceneObject
+from storage.seeds import rng_for
+
+MAX_LIGHTS = 32
+_TOTAL_EMISSION = 3750.0
+"""Radiance summed over the lights: the middle of what builds draw."""
+
+_SMOOTH_ANGLE_DEG = 60.0
+_ROOM: dict[str, ArrayLike] = {
+    "floor": [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]],
+    "wall0": [[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.5], [-1.0, 1.0, 1.5]],
+    "wall1": [[-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, 1.0, 1.5], [-1.0, -1.0, 1.5]],
+}
+
+
+def cost_scene(num_triangles: int, num_lights: int) -> Scene:
+    """Return the scene with one camera.
+
+    Args:
+        num_triangles: about how many in all; the objects' grids come within a tenth from 100 on.
+        num_lights: 1 to MAX_LIGHTS emitting triangles.
+    """
+    rng = rng_for(0, "cost scene")
+    shell = [
+        shell_piece(_wall(name, corners), rng, _SMOOTH_ANGLE_DEG) for name, corners in _ROOM.items()
+    ]
+    for_objects = num_triangles - 2 * len(_ROOM) - num_lights
+    objects = [
+        _object("box", 0.3, for_objects // 2, (0.35, 0.1, 0.36), _surface(0.05, 0.9, 0.05), rng),
+        _object("egg", 1.0, for_objects // 2, (-0.4, 0.0, 0.36), _surface(0.6, 0.3, 0.6), rng),
+    ]
+    emitters = [emitter_piece(_light(row, num_lights), row) for row in range(num_lights)]
+    pieces = [*shell, *objects, *emitters]
+    pose = look_at_c2w(eye=(1.4, -2.2, 1.3), target=(0, 0, 0.35), up=(0, 0, 1))
+    scene = Scene(
+        **joined(pieces),
+        c2w=pose[None].astype(np.float32),
+        fov_deg=np.array([40.0], np.float32),
+        objects=tuple(piece.entry for piece in pieces),
+        provenance={"template": "cost", "scene_index": 0, "attempt": 0, "seed": 0},
+    )
+    scene.check()
+    return scene
+
+
+def _surface(diffuse: float, specular: float, roughness: float) -> Surface:
+    return Surface(
+        diffuse_scale=diffuse,
+        diffuse_rgb=(diffuse, diffuse, diffuse),
+        specular_rgb=(specular, specular, specular),
+        roughness=roughness,
+        smooth=True,
+        colours="one",
+    )
+
+
+def _wall(name: str, corners: ArrayLike) -> ShellPart:
+    return ShellPart(
+        name=name,
+        positions=np.asarray(corners, np.float64),
+        faces=np.array([[0, 1, 2], [0, 2, 3]], np.uint32),
+        surface=_surface(0.5, 0.3, 0.5),
+    )
+
+
+def _object(
+    name: str,
+    exponent: float,
+    num_triangles: int,
+    centre: tuple[float, float, float],
+    surface: Surface,
+    rng: np.random.Generator,
+) -> Piece:
+    """Return a superquadric of 2 rings columns triangles, near `num_triangles`."""
+    rings = max(2, round(math.sqrt(num_triangles / 4)))
+    columns = max(3, round(num_triangles / (2 * rings)))
+    params = SuperquadricParams(
+        exponent_profile=exponent,
+        exponent_plan=exponent,
+        half_sizes=(0.3, 0.3, 0.35),
+        taper=0.0,
+        twist_rad=0.0,
+        rings=rings,
+        columns=columns,
+    )
+    positions, faces = superquadric(params)
+    placed: NDArray[np.float32] = (positions + np.array(centre)).astype(np.float32)
+    entry = SceneObject(name=name, kind="object")
+    return object_piece(entry, placed, faces.astype(np.uint32), surface, rng, _SMOOTH_ANGLE_DEG)
+
+
+def _light(row: int, num_lights: int) -> Emitter:
+    """Return one of MAX_LIGHTS places on a ring, spread so that the first few are far apart."""
+    angle = 2 * math.pi * ((row * 0.6180339887) % 1.0)
+    centre = np.array([0.8 * math.cos(angle), 0.8 * math.sin(angle) - 0.6, 2.2])
+    corners = 0.08 * np.array([[1.0, 0.0, 0.0], [-0.5, -0.866, 0.0], [-0.5, 0.866, 0.0]])
+    radiance = _TOTAL_EMISSION / num_lights
+    return Emitter(
+        triangle=centre + corners, radiance_rgb=(radiance, radiance, radiance), reflectance=0.0
+    )
