@@ -5,8 +5,8 @@
 D is that of GGX and G2 the height-correlated Smith term (Heitz 2014), alpha = roughness^2; the
 scale gives back what single scattering loses (pipeline.renders.multiscatter). This is the material
 of Cycles with its "Multiscatter GGX" and a constant colour. The diffuse lobe is reciprocal, the
-specular one is not, because its scale depends on the viewer's side alone: paths must start at the
-camera. Directions are in the shading frame, the normal is +z.
+specular one is not, because its scale depends on the viewer's side alone: a path from a light must
+say which side that is. Directions are in the shading frame, the normal is +z.
 """
 
 from dataclasses import dataclass, replace
@@ -95,6 +95,27 @@ def evaluate(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple[Any,
     reflected = dr.select(faces, reflected, lobes.diffuse * cosine)
     density = dr.select(faces, density, cosine)
     return dr.select(above, reflected, 0), dr.select(above, density, 0)
+
+
+def reverse_density(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
+    """Return the density with which `sample`, for a path that comes from wo, draws wi (Float).
+
+    Such a path sees the surface from the side of wo. Where that is the triangle's other side, the
+    shading normal is turned over, wo is then below it, and only the cosine is left.
+
+    Args:
+        lobes: from `seen_from` wi.
+        wi: Vector3f to the viewer.
+        wo: Vector3f to the light, above the shading normal: `evaluate` is 0 elsewhere, and this
+            means nothing there.
+        geometric: as in `evaluate`.
+    """
+    distribution = _distribution(dr.normalize(wi + wo), lobes.alpha)
+    facets = distribution / (2 * (wo.z + _stretch(wo.z, lobes.alpha)))
+    density = (1 - lobes.weight) * _INV_PI * wi.z + lobes.weight * facets
+    same_side = dr.dot(wo, geometric) > 0
+    above = dr.select(same_side & (wi.z > 0), density, 0)
+    return dr.select(same_side, above, _INV_PI * dr.maximum(-wi.z, 0))
 
 
 def sample(lobes: KernelLobes, wi: Any, u_lobe: Any, u_direction: Any) -> Any:

@@ -5,84 +5,46 @@ roulette), for the one kind of surface and the one kind of emitter that a `Scene
 reflects as any surface does, by its material row, and what is black ends the path. Leaving out
 virtual calls makes it 1.8 times as fast (LOG.md), and one kernel serves every scene, view and
 number of emitters.
+
+Both are weighed against light tracing too (pipeline.renders.light_kernel has the formulas), unless
+there are no light paths.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from pipeline.renders import ggx
-from pipeline.renders.emitter_table import EmitterTable
-from pipeline.renders.ggx import AlbedoLookup, KernelLobes
-from pipeline.renders.surface_table import SurfacePoint, SurfaceTable
-
-_MAX_SURVIVAL = 0.95
-"""A path never survives roulette for sure, so that bright loops end."""
-
-_OFFSET = 1500 * 2.0**-24
-"""Relative distance of a ray's start from its surface, as in Mitsuba: 1500 float32 roundings."""
+from pipeline.renders.film import Film
+from pipeline.renders.kernel_scene import (
+    MOST_ODDS,
+    SMALLEST_COSINE,
+    KernelScene,
+    Vertex,
+    off_surface,
+    roulette,
+    vertex_at,
+)
+from pipeline.renders.surface_table import SurfacePoint
 
 _SHORTENING = 1e-4
 """Relative length that a shadow ray stops short of its emitter, so that it does not hit it."""
 
 
-class KernelScene:
-    """One scene as kernels see it. Triangle numbers of `everything` put surfaces first.
-
-    Not a dataclass: Dr.Jit would take its arrays for variables of the loop.
-    """
-
-    def __init__(
-        self,
-        *,
-        surfaces: Any,
-        everything: Any,
-        table: SurfaceTable,
-        emitters: EmitterTable,
-        num_surfaces: int,
-        max_depth: int,
-        rr_depth: int,
-    ) -> None:
-        """Bring the parts together.
-
-        Args:
-            surfaces: mi.Scene without emitters: what camera rays meet.
-            everything: mi.Scene with emitters: what all other rays meet.
-            table: geometry and materials of all triangles.
-            emitters: the emitting ones.
-            num_surfaces: the first triangle number that emits.
-            max_depth: longest path in edges.
-            rr_depth: edges after which a path goes on by Russian roulette.
-        """
-        self.surfaces = surfaces
-        self.everything = everything
-        self.table = table
-        self.emitters = emitters
-        self.albedo = AlbedoLookup()
-        self.num_surfaces = dr.opaque(mi.UInt32, num_surfaces)
-        self.max_depth = dr.opaque(mi.UInt32, max_depth)
-        self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Vertex:
-    """A vertex of the path, lane by lane."""
-
-    point: SurfacePoint
-    frame: Any
-    """Frame3f: shading frame, turned over with the triangle to face the incoming ray."""
-    geometric: Any
-    """Vector3f: normal of the triangle on the side of the incoming ray, in the frame."""
-    incoming: Any
-    """Vector3f: where the path came from, in the frame."""
-    lobes: KernelLobes
-
-
 @dr.syntax
-def trace(scene: KernelScene, sampler: Any, ray: Any) -> Any:
-    """Return the radiance (Color3f) along camera rays; emitters themselves are not seen."""
+def trace(scene: KernelScene, film: Film, light_paths: Any, sampler: Any, ray: Any) -> Any:
+    """Return the radiance (Color3f) along camera rays; emitters themselves are not seen.
+
+    Args:
+        scene: the scene.
+        film: the camera.
+        light_paths: Float, light paths for each sample of a pixel. What they may find is left out
+            in proportion.
+        sampler: mi.Sampler with a lane for each ray.
+        ray: Ray3f from `film`.
+    """
     hit = scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
     active = mi.Bool(hit.is_valid())
     distance, triangle = mi.Float(hit.t), mi.UInt32(hit.prim_index)
@@ -90,15 +52,19 @@ def trace(scene: KernelScene, sampler: Any, ray: Any) -> Any:
     origin, direction = mi.Point3f(ray.o), mi.Vector3f(ray.d)
     radiance, throughput = mi.Color3f(0), mi.Color3f(1)
     density, depth = mi.Float(0), mi.UInt32(0)
+    odds = light_paths * dr.square(distance) / film.density(direction)
     while active:
         point = scene.table.point(triangle, barycentric, active)
+        odds /= dr.maximum(dr.abs(dr.dot(point.geometric_normal, direction)), SMALLEST_COSINE)
         emits = active & (triangle >= scene.num_surfaces)
-        seen = _seen_emission(scene, point, triangle, direction, distance, density, emits)
+        landing = dr.select(depth > 1, odds, 0)
+        seen = _seen_emission(scene, point, triangle, direction, distance, density, landing, emits)
         radiance += throughput * seen
         depth += 1
         active &= depth < scene.max_depth
-        vertex = _vertex(scene, point, triangle, barycentric, direction, active)
-        lit = _direct_light(scene, vertex, sampler.next_2d(active), active)
+        vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
+        vertex = _viewed(scene, vertex, active)
+        lit = _direct_light(scene, vertex, odds, depth, sampler.next_2d(active), active)
         radiance += throughput * lit
         local = ggx.sample(
             vertex.lobes, vertex.incoming, sampler.next_1d(active), sampler.next_2d(active)
@@ -106,18 +72,20 @@ def trace(scene: KernelScene, sampler: Any, ray: Any) -> Any:
         reflected, density = _reflected(vertex, local)
         active &= density > 0
         throughput = dr.select(active, throughput * reflected / density, throughput)
-        roulette = depth >= scene.rr_depth
-        survival = dr.minimum(dr.max(throughput), _MAX_SURVIVAL)
-        active &= ~roulette | (sampler.next_1d(active) < survival)
-        throughput = dr.select(roulette & active, throughput / survival, throughput)
-        active &= dr.max(throughput) > 0
+        odds = dr.minimum(odds * _turned_back(vertex, local, depth) / density, MOST_ODDS)
+        throughput, active = roulette(scene, throughput, depth, sampler.next_1d(active), active)
         direction = mi.Vector3f(vertex.frame.to_world(local))
-        origin = _off_surface(point, direction)
+        origin = off_surface(point, direction)
         hit = scene.everything.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
         active &= hit.is_valid()
         distance, triangle = mi.Float(hit.t), mi.UInt32(hit.prim_index)
         barycentric = mi.Point2f(hit.prim_uv)
     return radiance
+
+
+def _viewed(scene: KernelScene, vertex: Vertex, active: Any) -> Vertex:
+    albedo = scene.albedo(vertex.incoming.z, vertex.lobes.alpha, active)
+    return replace(vertex, lobes=ggx.seen_from(vertex.lobes, vertex.incoming, albedo))
 
 
 def _seen_emission(
@@ -127,65 +95,49 @@ def _seen_emission(
     direction: Any,
     distance: Any,
     density: Any,
+    landing: Any,
     emits: Any,
 ) -> Any:
-    """Return the emission that a BRDF sample ran into, weighed against emitter sampling."""
+    """Return the emission that a BRDF sample ran into, weighed against the other strategies."""
     row = dr.select(emits, triangle - scene.num_surfaces, 0)
     area_density, emitted = scene.emitters.density_and_radiance(row, emits)
     cosine = dr.abs(dr.dot(point.geometric_normal, direction))
     emitter_density = area_density * dr.square(distance) / cosine
+    leaving = scene.cone.density(point.position, point.geometric_normal, -direction)
+    others = dr.square(emitter_density / density) + dr.square(landing * area_density * leaving)
     shines = emits & (dr.max(emitted) > 0)  # one that is off has no density: 0/0 at grazing angles
-    return dr.select(shines, emitted * (density / (density + emitter_density)), 0)
+    return dr.select(shines, emitted / (1 + others), 0)
 
 
-def _vertex(
-    scene: KernelScene,
-    point: SurfacePoint,
-    triangle: Any,
-    barycentric: Any,
-    direction: Any,
-    active: Any,
-) -> _Vertex:
-    """Return the vertex, seen from the side of the triangle that the ray comes from."""
-    normal, lobes = scene.table.shading(triangle, barycentric, active)
-    geometric = dr.mulsign(point.geometric_normal, dr.dot(point.geometric_normal, normal))
-    behind = dr.dot(geometric, direction) > 0
-    frame = mi.Frame3f(dr.select(behind, -normal, normal))
-    incoming = frame.to_local(-direction)
-    albedo = scene.albedo(incoming.z, lobes.alpha, active)
-    return _Vertex(
-        point=point,
-        frame=frame,
-        geometric=frame.to_local(dr.select(behind, -geometric, geometric)),
-        incoming=incoming,
-        lobes=ggx.seen_from(lobes, incoming, albedo),
-    )
-
-
-def _reflected(vertex: _Vertex, local: Any) -> tuple[Any, Any]:
+def _reflected(vertex: Vertex, local: Any) -> tuple[Any, Any]:
     return ggx.evaluate(vertex.lobes, vertex.incoming, local, vertex.geometric)
 
 
-def _direct_light(scene: KernelScene, vertex: _Vertex, u: Any, active: Any) -> Any:
-    """Return the light of one sampled emitter point, weighed against BRDF sampling."""
+def _turned_back(vertex: Vertex, local: Any, depth: Any) -> Any:
+    """Return C+ r of a light path that comes from `local`; at x1, its end, it draws nothing."""
+    drawn = ggx.reverse_density(vertex.lobes, vertex.incoming, local, vertex.geometric)
+    return dr.abs(dr.dot(vertex.geometric, local)) * dr.select(depth > 1, drawn, 1)
+
+
+def _direct_light(
+    scene: KernelScene, vertex: Vertex, odds: Any, depth: Any, u: Any, active: Any
+) -> Any:
+    """Return the light of one sampled emitter point, weighed against the other strategies."""
     emitter = scene.emitters.sample(u, active)
     to_emitter = emitter.position - vertex.point.position
     distance_sq = dr.squared_norm(to_emitter)
     direction = to_emitter * dr.rsqrt(distance_sq)
     emitter_density = emitter.area_density * distance_sq / dr.abs(dr.dot(emitter.normal, direction))
-    reflected, density = _reflected(vertex, vertex.frame.to_local(direction))
+    local = vertex.frame.to_local(direction)
+    reflected, density = _reflected(vertex, local)
+    leaving = scene.cone.density(emitter.position, emitter.normal, -direction)
+    landing = odds * _turned_back(vertex, local, depth) * leaving / distance_sq
+    others = dr.square(density / emitter_density) + dr.square(dr.select(depth > 1, landing, 0))
     useful = active & (dr.max(reflected) > 0) & dr.isfinite(emitter_density)
-    start = _off_surface(vertex.point, direction)
+    start = off_surface(vertex.point, direction)
     remaining = emitter.position - start
     length = dr.norm(remaining)
     shadow_ray = mi.Ray3f(start, mi.Vector3f(remaining / length))
     shadow_ray.maxt = length * (1 - _SHORTENING)
     lit = useful & ~scene.everything.ray_test(shadow_ray, active=useful)
-    return dr.select(lit, reflected * emitter.radiance / (emitter_density + density), 0)
-
-
-def _off_surface(point: SurfacePoint, direction: Any) -> Any:
-    """Return the start of a ray that leaves the surface on the side of `direction`."""
-    offset = (1 + dr.max(dr.abs(point.position))) * _OFFSET
-    side = dr.mulsign(mi.Float(offset), dr.dot(point.geometric_normal, direction))
-    return mi.Point3f(point.position + point.geometric_normal * side)
+    return dr.select(lit, reflected * emitter.radiance / (emitter_density * (1 + others)), 0)

@@ -1,7 +1,8 @@
-"""`VectorTracer`: all samples of a pass in one compiled kernel (Mitsuba's LLVM variant).
+"""`VectorTracer`: a pass is two compiled kernels (Mitsuba's LLVM variant): camera and light paths.
 
-The sum over a pixel's samples is a reduction of our own, in a fixed order: pictures do not depend
-on the number of threads. A pass is explicit, so that raw samples are at hand before denoising.
+The sum over a pixel's samples is a reduction of our own, in a fixed order, and that of the light
+paths is one of whole numbers: pictures do not depend on the number of threads. A pass is explicit,
+so that raw samples are at hand before denoising.
 """
 
 import copy
@@ -14,12 +15,22 @@ from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.device_memory import own_floats
+from pipeline.renders.emission_cone import EmissionCone
 from pipeline.renders.emitter_table import EmitterTable
-from pipeline.renders.path_kernel import KernelScene, trace
+from pipeline.renders.film import Film
+from pipeline.renders.kernel_scene import KernelScene
+from pipeline.renders.light_kernel import trace_light
+from pipeline.renders.light_starts import even_numbers
+from pipeline.renders.path_kernel import trace
+from pipeline.renders.splats import Splats, splat_unit
 from pipeline.renders.surface_table import SurfaceTable
 from pipeline.renders.tracer import Features, split_triangles
-from storage.conventions import focal_px
 from storage.scene import Scene
+from storage.seeds import seed_for
+
+LIGHT_PATHS = 0.25
+"""Light paths for each camera path: a quarter has most of the gain, and the whole then takes 1.1 to
+1.4 times as long (LOG.md)."""
 
 
 class VectorTracer:
@@ -34,10 +45,13 @@ class VectorTracer:
             everything=_load(scene, order),
             table=SurfaceTable(scene, order),
             emitters=EmitterTable(scene, emitters),
+            cone=EmissionCone(scene),
             num_surfaces=len(surfaces),
             max_depth=max_depth,
             rr_depth=rr_depth,
         )
+
+        self._unit = splat_unit(scene)
 
     def only_light(self, row: int) -> "VectorTracer":
         lit = self._record.object_index[self._emitters] == row
@@ -47,13 +61,35 @@ class VectorTracer:
         return tracer
 
     def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        light_paths = LIGHT_PATHS * camera.resolution**2
+        traced = self._traced(camera, light_paths, seed=seed, spp=spp)
+        return traced + self._landed(camera, light_paths, seed=seed, count=int(light_paths * spp))
+
+    def _traced(
+        self, camera: Camera, light_paths: float, *, seed: int, spp: int
+    ) -> NDArray[np.float32]:
+        """Return what camera paths leave to themselves beside so many light paths per sample."""
         sampler = _sampler(camera, seed, spp)
-        ray = _camera_rays(camera, *_jittered(camera, sampler, spp))
-        return _pixel_means(camera, spp, trace(self._scene, sampler, ray))
+        film, beside = Film(camera), dr.opaque(mi.Float, light_paths)
+        ray = film.rays(*_jittered(camera, sampler, spp))
+        return _pixel_means(camera, spp, trace(self._scene, film, beside, sampler, ray))
+
+    def _landed(
+        self, camera: Camera, light_paths: float, *, seed: int, count: int
+    ) -> NDArray[np.float32]:
+        """Return the rest, from `count` light paths."""
+        splats, beside = Splats(camera.resolution, self._unit), dr.opaque(mi.Float, light_paths)
+        u = even_numbers(count, seed)
+        emitter = self._scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
+        to = mi.Point2f(u[2], u[3])
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed_for(seed, "light paths"), count)
+        trace_light(self._scene, Film(camera), beside, emitter, to, sampler, splats)
+        return (splats.picture() * (light_paths / count)).astype(np.float32)
 
     def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
         sampler = _sampler(camera, seed, spp)
-        ray = _camera_rays(camera, *_jittered(camera, sampler, spp))
+        ray = Film(camera).rays(*_jittered(camera, sampler, spp))
         hit = self._scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
         active = hit.is_valid()
         normal, lobes = self._scene.table.shading(hit.prim_index, hit.prim_uv, active)
@@ -65,7 +101,7 @@ class VectorTracer:
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
         column, row = _pixel_corners(camera, 1)
-        ray = _camera_rays(camera, column + 0.5, row + 0.5)
+        ray = Film(camera).rays(column + 0.5, row + 0.5)
         found = self._scene.surfaces.ray_intersect_preliminary(ray, coherent=True).is_valid()
         return np.array(found).reshape(camera.resolution, camera.resolution)
 
@@ -100,20 +136,6 @@ def _jittered(camera: Camera, sampler: Any, spp: int) -> tuple[Any, Any]:
     column, row = _pixel_corners(camera, spp)
     jitter = sampler.next_2d()
     return column + jitter.x, row + jitter.y
-
-
-def _camera_rays(camera: Camera, x: Any, y: Any) -> Any:
-    """Return rays through points of the picture in pixels: storage.conventions.camera_rays."""
-    half = dr.opaque(mi.Float, 0.5 * camera.resolution)
-    focal = dr.opaque(mi.Float, float(focal_px(camera.fov_deg, camera.resolution)))
-    right, up, backward, origin = (_opaque_vector(camera.c2w[:3, axis]) for axis in range(4))
-    direction = right * (x - half) + up * (half - y) - backward * focal
-    return mi.Ray3f(mi.Point3f(origin), dr.normalize(direction))
-
-
-def _opaque_vector(values: NDArray[np.float64]) -> Any:
-    """Return a Vector3f that the kernel reads as data, so that each view runs the same kernel."""
-    return mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in values))
 
 
 def _pixel_means(camera: Camera, spp: int, samples: Any) -> NDArray[np.float32]:

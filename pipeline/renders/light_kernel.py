@@ -1,0 +1,163 @@
+"""Light tracing inside a kernel: paths from the emitters that are joined to the camera.
+
+It finds what the path tracer meets by luck only: light that a glossy surface throws on another one
+(caustics). A path has vertices x1..xk, of which the camera sees x1 and xk is on an emitter. The
+path tracer *hits* xk with a BRDF sample or *picks* it from the table of emitters; a light path sets
+out from xk and *lands* on x1. Whichever of the three finds a path is weighed by its density among
+those of all three (power heuristic, exponent 2: Veach and Guibas 1995): all light is counted once,
+mostly by the strategy that finds it best. With
+
+    P      pixels per area at x1              L      light paths for each sample of a pixel
+    a, e   densities with which a light path picks xk (per area) and leaves it (per steradian)
+    c_i    density (per steradian) of a BRDF sample of the path tracer at x_i, towards x_(i+1)
+    r_i    that of a light path, towards x_(i-1)
+    C+_i, C-_i   cosines of the triangle's normal at x_i to x_(i+1) and to x_(i-1)
+    d_i    distance from x_i to x_(i+1)
+
+the densities, per area at each vertex, are
+
+    hit  = P * product over i < k of c_i C-_(i+1) / d_i^2
+    pick = hit * a d_(k-1)^2 / (c_(k-1) C-_k)
+    land = L a e * product over i < k of C+_i / d_i^2 * product over 1 < i < k of r_i
+
+The path tracer carries the ratio L / P * product of C+_i r_i / (c_i C-_(i+1)), a light path its
+inverse, once for `hit` and once for `pick`. Roulette is in none of them. Direct light (k = 2) never
+lands: the stratified picks of the path tracer had 4 to 25 times less variance there (LOG.md).
+
+The BRDF is not reciprocal: in a light path the viewer's side is that of the next vertex. Light
+arrives by the cosine of the shading normal but spreads by that of the triangle, hence a factor
+C-/C+ at each vertex (Veach 1996).
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pipeline.renders import ggx
+from pipeline.renders.emitter_table import EmitterPoint
+from pipeline.renders.film import Film
+from pipeline.renders.kernel_scene import (
+    MOST_ODDS,
+    SMALLEST_COSINE,
+    KernelScene,
+    Vertex,
+    off_surface,
+    roulette,
+    vertex_at,
+)
+from pipeline.renders.splats import Splats
+from pipeline.renders.surface_table import SurfacePoint
+
+
+@dr.syntax
+def trace_light(
+    scene: KernelScene,
+    film: Film,
+    light_paths: Any,
+    emitter: EmitterPoint,
+    u_direction: Any,
+    sampler: Any,
+    splats: Splats,
+) -> None:
+    """Add the light that lands to `splats`: radiance times the samples of a pixel.
+
+    Args:
+        scene: the scene.
+        film: the camera.
+        light_paths: Float, light paths for each sample of a pixel, as `trace` was told.
+        emitter: where the path of each lane begins.
+        u_direction: Point2f, uniform, for the directions in which they leave.
+        sampler: mi.Sampler with a lane for each path.
+        splats: the sums.
+    """
+    direction = scene.cone.sample(emitter.position, emitter.normal, u_direction)
+    leaving = scene.cone.density(emitter.position, emitter.normal, direction)
+    cosine = dr.abs(dr.dot(emitter.normal, direction))
+    active = mi.Bool((leaving > 0) & (dr.max(emitter.radiance) > 0))
+    hit_odds = mi.Float(cosine / (emitter.area_density * leaving))
+    strength = dr.max(emitter.radiance) * hit_odds
+    throughput = mi.Color3f(emitter.radiance / dr.max(emitter.radiance))
+    start = SurfacePoint(position=emitter.position, geometric_normal=emitter.normal)
+    ray = mi.Ray3f(off_surface(start, direction), direction)
+    hit = scene.everything.ray_intersect_preliminary(ray, active=active)
+    active &= hit.is_valid()
+    triangle, barycentric = mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
+    pick_odds, depth = mi.Float(dr.square(hit.t) / leaving), mi.UInt32(1)
+    while active:
+        point = scene.table.point(triangle, barycentric, active)
+        vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
+        spread = dr.maximum(dr.dot(vertex.geometric, vertex.incoming), SMALLEST_COSINE)
+        throughput, hit_odds, pick_odds = throughput / spread, hit_odds / spread, pick_odds / spread
+        visible = active & (triangle < scene.num_surfaces)
+        landing = visible & (depth > 1) & (depth < scene.max_depth)
+        odds = dr.minimum(dr.hypot(hit_odds, pick_odds), MOST_ODDS) / light_paths
+        value, pixel, landing = _landed(scene, film, light_paths, vertex, odds, landing)
+        splats.add(throughput * strength * value, pixel, landing)
+        depth += 1
+        active &= depth < scene.max_depth
+        u_lobe, u_local = sampler.next_1d(active), sampler.next_2d(active)
+        local, reflected, forward, ratio = _bounce(scene, vertex, u_lobe, u_local, active)
+        throughput *= reflected * ratio
+        hit_odds = dr.minimum(hit_odds * forward * ratio, MOST_ODDS)
+        onwards = dr.select(depth == 2, 1, forward)  # from x_(k-1) a path is picked, not drawn
+        pick_odds = dr.minimum(pick_odds * onwards * ratio, MOST_ODDS)
+        throughput, active = roulette(scene, throughput, depth, sampler.next_1d(active), active)
+        direction = mi.Vector3f(vertex.frame.to_world(local))
+        ray = mi.Ray3f(off_surface(point, direction), direction)
+        hit = scene.everything.ray_intersect_preliminary(ray, active=active)
+        active &= hit.is_valid()
+        triangle, barycentric = mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
+
+
+def _landed(
+    scene: KernelScene, film: Film, light_paths: Any, vertex: Vertex, odds: Any, active: Any
+) -> tuple[Any, Any, Any]:
+    """Return what the camera sees of light at a vertex (Color3f), in which pixel, and whether.
+
+    Args:
+        odds: Float, the square root of (hit^2 + pick^2) / land^2, without P and c_1.
+    """
+    to_camera = film.origin - vertex.point.position
+    distance_sq = dr.squared_norm(to_camera)
+    direction = to_camera * dr.rsqrt(distance_sq)
+    local = vertex.frame.to_local(direction)
+    reflected, forward, _ = _viewed(scene, vertex, local, active)
+    pixels = film.density(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
+    share = 1 / (1 + dr.square(pixels * odds * forward))
+    pixel, inside = film.pixel(vertex.point.position)
+    active &= inside & (dr.max(reflected) > 0)
+    start = off_surface(vertex.point, to_camera)
+    remaining = film.origin - start
+    ray = mi.Ray3f(start, mi.Vector3f(dr.normalize(remaining)))
+    ray.maxt = dr.norm(remaining)
+    active &= ~scene.surfaces.ray_test(ray, active=active)
+    return reflected * (share * pixels / light_paths), pixel, active
+
+
+def _bounce(
+    scene: KernelScene, vertex: Vertex, u_lobe: Any, u_direction: Any, active: Any
+) -> tuple[Any, Any, Any, Any]:
+    """Return a direction (in the frame), f and c of a viewer there, and C- / r (0: absorbed)."""
+    faced = dr.select(vertex.incoming.z > 0, vertex.lobes.weight, 0)
+    lobes = replace(vertex.lobes, weight=faced)
+    local = ggx.sample(lobes, vertex.incoming, u_lobe, u_direction)
+    reflected, forward, drawn = _viewed(scene, vertex, local, active)
+    across = dr.abs(dr.dot(vertex.geometric, local))
+    return local, reflected, forward, dr.select(active & (drawn > 0), across / drawn, 0)
+
+
+def _viewed(scene: KernelScene, vertex: Vertex, view: Any, active: Any) -> tuple[Any, Any, Any]:
+    """Return f cos (Color3f), c and r for light that comes from `incoming` and goes to `view`.
+
+    The surface is turned to the side of the viewer, as the path tracer has it. The BRDF is the same
+    around the normal, so that mirroring z is enough.
+    """
+    side = dr.mulsign(mi.Float(1), dr.dot(vertex.geometric, view))
+    turn = mi.Vector3f(1, 1, side)
+    wi, wo, geometric = view * turn, vertex.incoming * turn, vertex.geometric * turn * side
+    albedo = scene.albedo(wi.z, vertex.lobes.alpha, active)
+    lobes = ggx.seen_from(vertex.lobes, wi, albedo)
+    reflected, density = ggx.evaluate(lobes, wi, wo, geometric)
+    return reflected, density, ggx.reverse_density(lobes, wi, wo, geometric)

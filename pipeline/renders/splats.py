@@ -1,0 +1,67 @@
+"""Sums over pixels to which any lane adds, equal in every bit whatever the order.
+
+Sums of floats depend on the order, and threads come in any; sums of whole numbers do not. So a
+splat is rounded to a multiple of a unit, a power of two that goes with the scene's brightest
+emitter: pictures scale exactly with the light.
+"""
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.conventions import EMISSION
+from storage.scene import Scene
+
+_STEPS = 34
+"""A unit is the radiance of the brightest emitter over 2^33 to 2^34: what is dimmer is lost."""
+
+_LARGEST = 2.0**54
+"""A splat in units, a million times that radiance: a thousand of them fit into 64 bits."""
+
+_SMALLEST_EXPONENT = -90
+"""Of the brightest emitter: units must stay ordinary float32 numbers."""
+
+
+def splat_unit(scene: Scene) -> float:
+    """Return the radiance of one unit."""
+    brightest = float(scene.materials[scene.material_index[scene.triangle_emits], EMISSION].max())
+    return math.ldexp(0.5, max(math.frexp(brightest)[1], _SMALLEST_EXPONENT) + 1 - _STEPS)
+
+
+class Splats:
+    """Sums of one picture. Not a dataclass: Dr.Jit would take its arrays for variables of loops."""
+
+    def __init__(self, resolution: int, unit: float) -> None:
+        """Begin with nothing.
+
+        Args:
+            resolution: width and height in pixels.
+            unit: from `splat_unit`.
+        """
+        self._resolution, self._unit = resolution, unit
+        self._per_unit = dr.opaque(mi.Float, 1 / unit)
+        self._sums = [dr.zeros(mi.UInt64, resolution**2) for _ in range(3)]
+        self._broken = dr.zeros(mi.UInt32, resolution**2)
+
+    def add(self, value: Any, pixel: Any, active: Any) -> None:
+        """Add colours of at least 0 (Color3f) to pixels (UInt32)."""
+        # Atomic. By default each thread sums small pictures apart, in a kernel of their own.
+        add, direct = dr.ReduceOp.Add, dr.ReduceMode.Direct
+        units = value * self._per_unit
+        fits = dr.max(units) < _LARGEST
+        fits &= dr.all(dr.isfinite(units))  # the largest of numbers and no numbers is a number
+        for channel, total in zip(units, self._sums, strict=True):
+            rounded = mi.UInt64(dr.select(fits, channel, 0) + 0.5)
+            dr.scatter_reduce(add, total, rounded, pixel, active & fits, mode=direct)
+        dr.scatter_reduce(add, self._broken, mi.UInt32(1), pixel, active & ~fits, mode=direct)
+
+    def picture(self) -> NDArray[np.float64]:
+        """Return the sums, [R, R, 3]; NaN where a splat was not finite or far too large."""
+        dr.eval(self._sums, self._broken)
+        sums = np.stack([np.array(total) for total in self._sums], axis=-1) * self._unit
+        sums[np.array(self._broken) > 0] = np.nan
+        return sums.reshape(self._resolution, self._resolution, 3)

@@ -1,0 +1,37 @@
+"""The camera paths and the light paths of `VectorTracer` apart, as tracers of their own."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.renders.camera import Camera
+from pipeline.renders.vector_tracer import VectorTracer
+from storage.scene import Scene
+
+_ALMOST_ALL = 2.0**40
+"""Light paths for each camera path, of which weights leave a millionth to the other strategies."""
+
+
+class CameraPathsOnly(VectorTracer):
+    """The path tracer as it is without light paths."""
+
+    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        return self._traced(camera, 0.0, seed=seed, spp=spp)
+
+
+class CameraPathsLeft(VectorTracer):
+    """What weights leave to camera paths beside light paths without number."""
+
+    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        return self._traced(camera, _ALMOST_ALL, seed=seed, spp=spp)
+
+
+class LightPathsOnly(VectorTracer):
+    """All light but the direct one from light paths alone, with a weight of 1."""
+
+    def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
+        super().__init__(scene, max_depth=max_depth, rr_depth=rr_depth)
+        self._unit /= 2.0**32  # each of so many paths counts for so much less
+
+    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        count = camera.resolution**2 * spp
+        return self._landed(camera, _ALMOST_ALL, seed=seed, count=count)
