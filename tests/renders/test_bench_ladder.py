@@ -12,7 +12,7 @@ from pipeline.renders.renderer import SceneRenderer
 from storage.metrics import psnr_log_db
 from tests.scenes_by_hand import tiny_scene
 
-TARGETS_DB = (40.0, 90.0)
+TARGETS_DB = (40.0, 99.0)
 MAX_SPP = 512
 
 
