@@ -40,8 +40,8 @@ _SEED = 1_000_003
 _SETTINGS = RenderSettings(
     resolution=RESOLUTION,
     noise_floor_db=58.0,  # 6 dB above the best that is judged, 52 dB
-    min_spp=2048,
-    max_spp=8192,
+    min_spp=1024,
+    max_spp=4096,
     min_mean_radiance=0.0,
 )
 
