@@ -23,10 +23,10 @@ _OUTLIER_FACTOR = 4.0
 _HARMLESS_SHARE = 0.005
 """Up to this share of outlying light, PSNR(A, B) was no more than 1 dB too good in any view."""
 
-_DB_PER_DECADE = 2.0
+_DB_PER_DECADE = 3.0
 """Taken off for each factor of 10 of outlying light beyond the harmless share."""
 
-_MOST_DB = 3.0
+_MOST_DB = 4.0
 """Taken off at most, from _MATURE_SPP samples a half on; twice and three times that at a half and a
 quarter of them."""
 

@@ -110,7 +110,8 @@ def with_firm_truth(found: list[Promise]) -> list[Promise]:
 
 def main(
     out: Annotated[Path, typer.Option(help="JSON file to write")],
-    scenes: Annotated[int, typer.Option(help="how many, from the first held-out one")] = 40,
+    first: Annotated[int, typer.Option(help="number of the first scene")] = NUM_SAMPLED,
+    scenes: Annotated[int, typer.Option(help="how many")] = 40,
     resolution: Annotated[int, typer.Option(help="pixels each way")] = 96,
     max_spp: Annotated[int, typer.Option(help="cap of what is judged")] = 1024,
     reference_spp: Annotated[int, typer.Option(help="cap of the references")] = 4096,
@@ -121,7 +122,7 @@ def main(
         task = bars.add_task("scenes", total=scenes, note="")
         child = smoke_child(Path(folder), threads=os.cpu_count() or 1)
         try:
-            for index in range(NUM_SAMPLED, NUM_SAMPLED + scenes):
+            for index in range(first, first + scenes):
                 named = sampled(index)
                 scene = named.make(child)
                 arguments = (scene, named.name, resolution, max_spp, reference_spp)
