@@ -65,9 +65,9 @@ def test_direct_light_is_that_of_cycles(
     ("name", "spp", "least_db", "least_block_db"),
     [
         ("cbox", 512, 45.0, 55.0),
-        ("cbox-bunny", 1024, 30.0, 33.0),
-        ("crystals", 1024, 29.5, 34.0),
-        ("tree", 1024, 27.0, 31.0),
+        ("cbox-bunny", 1024, 30.8, 35.0),
+        ("crystals", 1024, 30.8, 36.0),
+        ("tree", 1024, 27.6, 31.5),
     ],
 )
 def test_all_light_agrees_with_cycles(
@@ -76,8 +76,8 @@ def test_all_light_agrees_with_cycles(
     """Denoised on both sides. Cycles with another seed agrees with its own picture to 50 dB in
     cbox, 33 in cbox-bunny, 32 in crystals and 29 in tree, whose light comes by mirrors.
 
-    Measured: 46.5, 30.8, 30.4 and 28.1 by pixels; 57.1, 36.8, 36.9 and 33.7 by blocks. With single
-    scattering tree has 17.5.
+    Measured: 47.0, 31.2, 31.2 and 28.1 by pixels; 57.5, 36.7, 38.3 and 33.2 by blocks. The bounds
+    leave 0.4 to 2.5 dB to the samples of another processor. With single scattering tree has 17.5.
     """
     settings = RenderSettings(resolution=256, noise_floor_db=99, min_spp=spp, max_spp=spp)
     ours, theirs = _render(shared, name, settings), _reference(shared, f"{name}.exr")
