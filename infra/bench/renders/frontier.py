@@ -146,13 +146,13 @@ def _chosen(options: Options) -> list[NamedScene]:
 
 
 def _plan(options: Options, chosen: Sequence[NamedScene]) -> Plan:
-    most_doublings = 4 if options.quick else 6
+    num_levels = 4 if options.quick else 7
     return Plan(
         scenes=tuple(named.name for named in chosen),
         resolution=RESOLUTION,
         targets_db=(38.0, 42.0, 46.0, 50.0),
-        max_spp=1024 if options.quick else 4096,
-        mitsuba_spp=tuple(64 << doubling for doubling in range(most_doublings)),
+        max_spp=1024,  # a quarter of the references'
+        mitsuba_spp=tuple(64 << doubling for doubling in range(num_levels)),
         cycles_spp=tuple(sorted(options.cycles_spp)),
         threads=os.cpu_count() or 1,
     )
