@@ -2,6 +2,10 @@
 
 What stands beside the shards is the dataset. `.staging` holds what is not finished; it may be
 deleted at any time, and then it is made again.
+
+No folder holds more than 5,000 entries: of files that are numbered, the first 4,096 stand in their
+folder, and each following 4,096 in one of its `part-0001`, `part-0002`, ... Where a file stands
+follows from its number alone, so nothing moves when a dataset grows.
 """
 
 import contextlib
@@ -13,6 +17,15 @@ from pathlib import Path
 
 from storage.atomic import write_error
 from storage.errors import TrilightError
+
+FILES_PER_FOLDER = 4096
+"""Numbered files of one folder; with their sub-folders and what else lies there, below 5,000."""
+
+
+def numbered(number: int, name: str) -> str:
+    """Return the relative path of the file `name`, which is the `number`-th of its folder."""
+    part = number // FILES_PER_FOLDER
+    return f"part-{part:04d}/{name}" if part else name
 
 
 @dataclass(frozen=True)
@@ -37,6 +50,19 @@ class DatasetFolder:
     @property
     def attribution(self) -> Path:
         return self.root / "attribution.csv"
+
+    @property
+    def card(self) -> Path:
+        """The dataset card, which is what hubs and people open first."""
+        return self.root / "README.md"
+
+    @property
+    def licences(self) -> Path:
+        return self.root / "LICENSE.md"
+
+    @property
+    def croissant(self) -> Path:
+        return self.root / "croissant.json"
 
     @property
     def contact_sheet(self) -> Path:
@@ -78,7 +104,12 @@ class DatasetFolder:
         return self.staging / "samples" / name
 
     def shard(self, name: str) -> Path:
+        """Path of a shard; its name is relative to the folder and may begin with a part of it."""
         return self.root / name
+
+    def shard_files(self) -> list[Path]:
+        """Return every file that is called like a shard, listed in the manifest or not."""
+        return sorted([*self.root.glob("*.tar"), *self.root.glob("part-*/*.tar")])
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:

@@ -17,9 +17,10 @@ from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION, SPLITS, require_readable
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
+from storage.layout import numbered
 from storage.shard_reader import MAX_MEMBER_BYTES, MEMBER_NAME, iterate_members
 
-SHARD_NAME = re.compile(rf"({'|'.join(SPLITS)})-(\d{{6}})\.tar")
+SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
 
 
@@ -28,7 +29,7 @@ class ShardEntry:
     """One shard as the manifest describes it."""
 
     name: str
-    """File name beside the manifest."""
+    """File name beside the manifest, or in one of the parts of its folder (storage.layout)."""
     split: str
     """train, validation or test."""
     num_samples: int
@@ -97,7 +98,7 @@ def index_shard(path: Path) -> ShardEntry:
         raise TrilightError(f"{path.name}: not a shard; expected a name like train-000003.tar.")
     members = [(key, suffix, at, len(data)) for key, suffix, at, data in iterate_members(path)]
     return ShardEntry(
-        name=path.name,
+        name=numbered(int(match[2]), path.name),
         split=match[1],
         num_samples=len({key for key, *_ in members}),
         num_bytes=path.stat().st_size,
@@ -132,12 +133,12 @@ def read_manifest(path: Path) -> Manifest:
         raise TrilightError(f"{path}: not a readable manifest ({error}).") from error
     require_readable(version, str(path))
     try:
-        return _decode(record)
+        return _decode(record, version)
     except (KeyError, TypeError, ValueError) as error:
         raise TrilightError(f"{path}: not a readable manifest ({error}).") from error
 
 
-def _decode(record: dict[str, Any]) -> Manifest:
+def _decode(record: dict[str, Any], version: int) -> Manifest:
     del record["totals"], record["dataset_digest"]
     shards = []
     for row in record.pop("shards"):
@@ -148,4 +149,4 @@ def _decode(record: dict[str, Any]) -> Manifest:
             if not (MEMBER_NAME.fullmatch(name) and at >= 0 and 0 <= size <= MAX_MEMBER_BYTES):
                 raise ValueError(f"member {name!r} of {size} bytes at {at}")
         shards.append(ShardEntry(**row))
-    return Manifest(shards=tuple(shards), **record)
+    return Manifest(shards=tuple(shards), schema_version=version, **record)

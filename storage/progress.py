@@ -53,7 +53,7 @@ def read_progress(folder: DatasetFolder) -> Progress:
     except TrilightError:
         scenes_planned = in_shards = 0
     plan = json.loads(_plan(folder).read_bytes()) if _plan(folder).exists() else {"objects": 0}
-    staged = sum(1 for _ in (folder.staging / "samples").glob("*/*.tar"))
+    staged = sum(path.is_file() for path in (folder.staging / "samples").rglob("*.tar"))
     done, total = (
         json.loads(_downloads(folder).read_bytes()) if _downloads(folder).exists() else (0, 0)
     )

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from storage.conventions import SPLITS
 from storage.errors import TrilightError
+from storage.layout import numbered
 
 JUDGED_SPLIT = "test"
 """Split of whole sets that are judged by, never learnt from."""
@@ -71,8 +72,13 @@ def split_of_shard(shard_index: int, settings: SplitSettings) -> str:
 
 
 def shard_name(shard_index: int, settings: SplitSettings) -> str:
-    """Return the file name of a shard, such as `train-000003.tar`."""
-    return f"{split_of_shard(shard_index, settings)}-{shard_index:06d}.tar"
+    """Return the name of a shard, such as `train-000003.tar`, relative to the dataset."""
+    return named_shard(shard_index, split_of_shard(shard_index, settings))
+
+
+def named_shard(shard_index: int, split: str) -> str:
+    """Return the name of a shard of a split, relative to the dataset."""
+    return numbered(shard_index, f"{split}-{shard_index:06d}.tar")
 
 
 def scenes_of_shard(shard_index: int, settings: SplitSettings) -> range:

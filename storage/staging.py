@@ -10,6 +10,7 @@ from pathlib import Path
 
 from storage.atomic import write_atomically
 from storage.failures import decode_failures, encode_failures
+from storage.layout import numbered
 from storage.profiles import Profile
 from storage.records import Failure
 from storage.sample import Sample, encode_sample, sample_key
@@ -58,4 +59,4 @@ def read_staged_scene(folder: Path, scene_index: int) -> StagedScene:
 
 
 def _path(folder: Path, scene_index: int) -> Path:
-    return folder / f"{sample_key(scene_index)}.tar"
+    return folder / numbered(scene_index, f"{sample_key(scene_index)}.tar")

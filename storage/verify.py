@@ -10,6 +10,7 @@ import numpy as np
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
+from storage.licences import mixed_share_alike
 from storage.lights import sum_of_lights
 from storage.manifest import Manifest, ShardEntry, index_shard, read_manifest
 from storage.objects_lock import read_objects_lock
@@ -49,7 +50,9 @@ def verify_dataset(
     locked = _locked_by_uid(folder) if not problems else {}
     listed = {shard.name for shard in manifest.shards}
     problems += [
-        f"{p.name}: not in the manifest" for p in _shard_files(root) if p.name not in listed
+        f"{name}: not in the manifest"
+        for path in folder.shard_files()
+        if (name := path.relative_to(root).as_posix()) not in listed
     ]
     num_samples, keys = 0, set[str]()
     for shard in manifest.shards:
@@ -58,10 +61,6 @@ def verify_dataset(
         num_samples += shard.num_samples
         shard_done(shard.name)
     return Verification(manifest=manifest, problems=problems, num_samples=num_samples)
-
-
-def _shard_files(root: Path) -> list[Path]:
-    return sorted(root.glob("*.tar"))
 
 
 def _locked_by_uid(folder: DatasetFolder) -> dict[str, LockedObject]:
@@ -126,6 +125,8 @@ def check_sample(
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
         yield f"sample {sample.key}: a picture holds a value that is not finite or negative"
     yield from _check_lights(sample, apart=bool(manifest.settings["renders"].get("per_light")))
+    if mixed := mixed_share_alike(entry.licence for entry in sample.scene.objects):
+        yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
     for entry in sample.scene.objects:
         if entry.kind != "object":
             continue

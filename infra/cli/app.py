@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import typer
 
-from infra.cli import assets, bench, doctor, generate, inspect, render, train, verify
+from infra.cli import assets, bench, doctor, generate, inspect, render, shards, train, verify
 from storage.errors import TrilightError
 
 app = typer.Typer(
@@ -26,6 +26,7 @@ app.command("verify")(verify.verify)
 app.command("inspect")(inspect.inspect)
 app.command("train")(train.train)
 app.command("bench")(bench.bench)
+app.add_typer(shards.app, name="shards")
 
 
 def main() -> None:

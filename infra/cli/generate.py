@@ -185,7 +185,7 @@ def _report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_jso
     rows += [
         ("dataset digest", outcome.digest),
         ("wall time", f"{seconds:.0f} s"),
-        ("look at", f"{folder.contact_sheet}, {folder.report}"),
+        ("look at", f"{folder.contact_sheet}, {folder.report}, {folder.card}"),
         ("shards, manifest", str(folder.root)),
         ("why rejected", str(folder.failures)),
     ]

@@ -2,8 +2,10 @@
 
 import csv
 import io
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
+
+from storage.derived import derivation_of
 
 _COLUMNS = ("uid", "title", "licence", "licence_source", "attribution", "source_url", "changes")
 _REMESHED = "cleaned, remeshed and given new materials"
@@ -37,7 +39,20 @@ def encode_attribution(objects: Iterable[HasRights], *, changes: str = _REMESHED
     for entry in sorted(objects, key=lambda row: row.uid):
         rights = (entry.licence, entry.licence_source, entry.attribution, entry.source_url)
         writer.writerow([_inert(cell) for cell in (entry.uid, entry.title, *rights, changes)])
-    return stream.getvalue().encode()
+    # a lone surrogate, which JSON from outside may hold, has no UTF-8
+    return stream.getvalue().encode(errors="replace")
+
+
+def attribution_of(objects: Iterable[HasRights], settings: Mapping[str, Any]) -> bytes:
+    """Return the file of a dataset with these settings, which say what was done to its objects."""
+    return encode_attribution(objects, changes=" or ".join(sorted(_changes(settings))))
+
+
+def _changes(settings: Mapping[str, Any]) -> set[str]:
+    if derivation := derivation_of(settings):
+        return set().union(*(_changes(source["settings"]) for source in derivation.sources))
+    from_files = settings.get("splits", {}).get("listed_scenes") is not None
+    return {AS_IN_FILE if from_files else _REMESHED}
 
 
 def _inert(cell: str) -> str:

@@ -109,11 +109,16 @@ def _settings(dataset: Dataset) -> Markup:
     return joined(
         [
             element("h2", "Settings", id="settings"),
-            element("pre", *_lines(dataset.manifest.settings)),
+            element("pre", *_lines(_own_settings(dataset.manifest.settings))),
             element("h3", "What the bytes depend on besides"),
             element("pre", *_lines(dataset.manifest.environment)),
         ]
     )
+
+
+def _own_settings(settings: Mapping[str, object]) -> Mapping[str, object]:
+    """Return settings without those of the sources, which the manifest holds in full."""
+    return {name: value for name, value in settings.items() if name != "derived"}
 
 
 def _lines(values: Mapping[str, object], prefix: str = "") -> Iterator[str]:

@@ -15,10 +15,7 @@ from prefect.cache_policies import NO_CACHE
 from prefect.futures import PrefectFuture, as_completed
 from prefect.utilities.annotations import quote
 
-from pipeline.documents.attribution import AS_IN_FILE, encode_attribution
-from pipeline.documents.contact_sheet import write_contact_sheet
-from pipeline.documents.distributions import dataset_distributions
-from pipeline.documents.report import write_report
+from pipeline.documents.dataset_documents import write_documents
 from pipeline.flows.accept_objects import AcceptedObjects, accept_objects
 from pipeline.flows.accept_scene_files import accept_scene_files, settings_for_files
 from pipeline.flows.builds import BUILDS, frozen_note, named_build, object_source
@@ -31,12 +28,12 @@ from pipeline.flows.scene_files import SceneFolder, find_scene_files
 from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import Variant, choose_variant
-from storage.atomic import remove_leftovers, write_atomically
+from storage.atomic import remove_leftovers
 from storage.dataset import open_dataset
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
 from storage.manifest import ShardEntry
-from storage.statistics import Statistics, dataset_statistics
+from storage.statistics import Statistics
 
 Argument = TypeVar("Argument")
 
@@ -136,7 +133,7 @@ def generate_scenes(
             )
         )
         _make_shards(settings, variant, publication, accepted, workers, failure_budget)
-        statistics = write_documents_task(_whole(publication), _whole(accepted))
+        statistics = write_documents_task(_whole(publication))
     return Outcome(
         digest=publication.manifest.dataset_digest,
         num_objects_found=accepted.num_found,
@@ -191,16 +188,9 @@ def make_shard_task(shard_index: int, job: "_ShardJob") -> ShardEntry:
 
 
 @task(name="write-documents", cache_policy=NO_CACHE)
-def write_documents_task(publication: Publication, accepted: AcceptedObjects) -> Statistics:
-    """Write what a person looks at."""
-    dataset = open_dataset(str(publication.folder.root))
-    statistics = dataset_statistics(dataset)
-    objects = [locked for locked, _ in accepted.objects]
-    changes = {"changes": AS_IN_FILE} if accepted.files else {}
-    write_atomically(publication.folder.attribution, encode_attribution(objects, **changes))
-    write_contact_sheet(dataset, statistics)
-    write_report(dataset, dataset_distributions(dataset))
-    return statistics
+def write_documents_task(publication: Publication) -> Statistics:
+    """Write what people and hubs look at."""
+    return write_documents(open_dataset(str(publication.folder.root)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -86,7 +86,7 @@ def _log(path: Path, scene_index: int, seconds: float, failures: list[Failure]) 
         "pid": os.getpid(),
         "finished_unix_s": round(time.time(), 1),
     }
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as stream:
         stream.write(json.dumps(row) + "\n")
 

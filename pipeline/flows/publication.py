@@ -6,6 +6,7 @@ from typing import Any
 
 from pipeline.flows.settings import BuildSettings, differences
 from pipeline.shards.pack import rejections_of_shard
+from storage.derived import derivation_of
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.failures import read_failures, write_failures
@@ -61,10 +62,11 @@ class Publication:
         listed = {entry.name for entry in self.manifest.shards}
         missing = []
         for index in range(self.num_shards):
-            path = self.folder.shard(shard_name(index, self._splits))
+            name = shard_name(index, self._splits)
+            path = self.folder.shard(name)
             if not path.exists():
                 missing.append(index)
-            elif path.name not in listed:
+            elif name not in listed:
                 self.add_shard(index_shard(path))
         return missing
 
@@ -104,6 +106,7 @@ def begin(
     whole = planned_scenes(num_scenes, settings.splits)
     if folder.manifest.exists():
         manifest = read_manifest(folder.manifest)
+        _require_generated(folder, manifest)
         _require_same(
             folder, "setting", manifest.settings, settings.as_json(), "choose another --out"
         )
@@ -117,12 +120,8 @@ def begin(
                 "floors with --accept-environment",
             )
         whole = max(whole, manifest.num_scenes)
-    elif any(folder.root.glob("*.tar")):
-        raise TrilightError(
-            f"{folder.root}: there are shards but no manifest.json; expected an empty folder or a "
-            "dataset. Choose another --out."
-        )
     else:
+        _require_free(folder)
         manifest = Manifest(
             build=settings.build,
             settings=settings.as_json(),
@@ -135,6 +134,28 @@ def begin(
     manifest = dataclasses.replace(manifest, num_scenes=whole)
     write_manifest(folder.manifest, manifest)
     return Publication(folder, manifest, settings.splits)
+
+
+def _require_free(folder: DatasetFolder) -> None:
+    if folder.shard_files():
+        raise TrilightError(
+            f"{folder.root}: there are shards but no manifest.json; expected an empty folder or a "
+            "dataset. Choose another --out."
+        )
+    for path in (folder.card, folder.licences):
+        if path.exists():
+            raise TrilightError(
+                f"{folder.root}: {path.name} is there, and the dataset's own would replace it; "
+                "expected an empty folder or a dataset. Choose another --out."
+            )
+
+
+def _require_generated(folder: DatasetFolder, manifest: Manifest) -> None:
+    if derivation := derivation_of(manifest.settings):
+        raise TrilightError(
+            f"{folder.root}: this dataset was made by `trilight shards {derivation.operation}` and "
+            "cannot grow; extend its sources and make it anew, or choose another --out."
+        )
 
 
 def _require_same(

@@ -12,6 +12,7 @@ from pathlib import Path
 from pipeline.objects.builtin.families import FAMILIES
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
+from storage.layout import numbered
 from storage.ply import encode_ply
 from storage.records import ObjectRecord
 from storage.seeds import rng_for
@@ -38,7 +39,7 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
     records = []
     for index in range(_count(source)):
         family, number = names[index % len(names)], index // len(names)
-        path = work_dir / group / f"{family}-{number:05d}.ply"
+        path = work_dir / group / numbered(index, f"{family}-{number:05d}.ply")
         data = encode_ply(*FAMILIES[family](rng_for(0, f"{group}/{family}", number)))
         if not path.is_file() or path.read_bytes() != data:
             write_atomically(path, data)

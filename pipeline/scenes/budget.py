@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from storage.asset import Asset, Level
 from storage.errors import Rejected
@@ -23,11 +24,13 @@ def drawn_within(
     least: Sequence[int],
     count: int,
     num_triangles: int,
+    camps: Sequence[str] = (),
 ) -> list[Entry]:
     """Draw entries with replacement, evenly among those that fit beside the ones before.
 
     Where all fit, this is an even draw. Otherwise simple objects are drawn more often as
     companions of demanding ones, as they would be if whole scenes were drawn until one fits.
+    Entries of two different camps never fit beside each other.
 
     Args:
         rng: where the numbers come from.
@@ -35,16 +38,18 @@ def drawn_within(
         least: triangles of the coarsest level of each entry.
         count: how many.
         num_triangles: for all together.
+        camps: which camp each entry belongs to, "" where to none; nothing where there is none.
 
     Raises:
         Rejected: "over_budget" where not even the simplest fit.
     """
-    sizes = np.array(least)
+    sizes, camps = np.array(least), camps or [""] * len(least)
+    allowed = np.ones(len(sizes), np.bool_)
     left = num_triangles
     drawn: list[Entry] = []
     for following in range(count - 1, -1, -1):
-        room = left - following * int(sizes.min())
-        fitting = np.flatnonzero(sizes <= room)
+        room = left - following * _simplest_beside(sizes, camps, allowed)
+        fitting = np.flatnonzero(allowed & (sizes <= room))
         if len(fitting) == 0:
             raise Rejected(
                 "over_budget",
@@ -54,7 +59,22 @@ def drawn_within(
         row = int(fitting[rng.integers(len(fitting))])
         drawn.append(entries[row])
         left -= int(sizes[row])
+        if camps[row]:
+            allowed &= np.array([camp in ("", camps[row]) for camp in camps])
     return drawn
+
+
+def _simplest_beside(
+    sizes: NDArray[np.int64], camps: Sequence[str], allowed: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Return the triangles [N] of the simplest entry that may still come after each one."""
+    of_camp = {
+        camp: sizes[allowed & np.array([other in ("", camp) for other in camps])]
+        for camp in sorted(set(camps) - {""})
+    }
+    simplest = {camp: int(fitting.min(initial=sizes.max())) for camp, fitting in of_camp.items()}
+    simplest[""] = int(sizes[allowed].min())
+    return np.array([simplest[camp] for camp in camps])
 
 
 def levels_within(

@@ -103,7 +103,8 @@ def _objects_rand(
     pool: Sequence[PooledAsset],
 ) -> list[PooledAsset]:
     least = [least_triangles(entry.asset) for entry in pool]
-    return drawn_within(rng, pool, least, plan.num_objects, _object_budget(settings, plan))
+    camps = [entry.camp for entry in pool]
+    return drawn_within(rng, pool, least, plan.num_objects, _object_budget(settings, plan), camps)
 
 
 def _object_budget(settings: SceneSettings, plan: ScenePlan) -> int:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from storage.asset import Asset
+from storage.licences import share_alike_camp
 from storage.records import LockedObject
 
 
@@ -14,3 +15,8 @@ class PooledAsset:
     """Identity, split and rights."""
     asset: Asset
     """Meshes at falling budgets."""
+
+    @property
+    def camp(self) -> str:
+        """Objects of two camps never meet in a scene: their licences could not both be kept."""
+        return share_alike_camp(self.locked.licence)

@@ -29,6 +29,13 @@ def test_objects_to_shards_to_a_model(trilight: Trilight, tmp_path: Path) -> Non
         assert min(sheet.size) > 400
         assert len(sheet.getcolors(1 << 24) or []) > 1000  # pictures, not an empty sheet
     assert trilight("inspect", "set").returncode == 0
+    assert outcome["dataset_digest"] in (tmp_path / "set" / "README.md").read_text()
+    for name in ("LICENSE.md", "attribution.csv", "croissant.json", "report.html"):
+        assert (tmp_path / "set" / name).stat().st_size > 100
+
+    resharded = trilight("shards", "reshard", "set", "--out", "three", "--scenes-per-shard", "3")
+    assert resharded.returncode == 0, resharded.stderr
+    assert trilight("verify", "three").returncode == 0
 
     trained = trilight("train", "smoke", "--data", "set", "--out", "run", "--steps", "60")
     assert trained.returncode == 1
@@ -66,6 +73,8 @@ BAD_INPUT = [
     (("inspect", "empty"), "no manifest.json"),
     (("train", "smoke", "--data", "empty"), "no manifest.json"),
     (("train", "nonsense", "--data", "empty"), "'nonsense'"),
+    (("shards", "merge", "empty", "empty", "--out", "c"), "no manifest.json"),
+    (("shards", "select", "empty", "--out", "c", "--split", "no"), "--split is 'no'"),
     (("bench", "nonsense"), "benchmark 'nonsense' is unknown"),
 ]
 

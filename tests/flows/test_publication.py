@@ -175,6 +175,38 @@ def test_two_makers_are_kept_apart(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.parametrize("name", ["README.md", "LICENSE.md"])
+def test_documents_of_others_are_not_replaced(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("theirs")
+    with pytest.raises(TrilightError, match=rf"{name} is there.*another --out"):
+        _begin(tmp_path, _build())
+    assert not (tmp_path / "manifest.json").exists()
+
+
+def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None:
+    publication = _dataset(tmp_path, 4)
+    licences = ("CC-BY-SA-4.0", "CC-BY-SA-3.0", "CC-BY-SA-3.0")
+    rows = [dataclasses.replace(_locked(), uid=uid) for uid in "abc"]
+    publication.lock_objects(rows)
+    scene = tiny_scene()
+    floor = scene.objects[0]
+    name = publication.manifest.shards[0].name
+    for index in range(4):
+        used = [
+            dataclasses.replace(floor, name=uid, kind="object", uid=uid, licence=licence)
+            for uid, licence in zip("abc", licences, strict=True)
+        ][index % 2 :]
+        objects = (*scene.objects, *used)
+        sample = dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects))
+        stage_scene(publication.folder.staged_shard(name), index, sample, [], "lossless")
+    publication.add_shard(pack_shard(publication.folder, name, range(4)))
+    problems = [text for text in verify_dataset(tmp_path).problems if "share-alike" in text]
+    assert [problem.split(":")[1] for problem in problems] == [
+        " sample 000000000", " sample 000000002",
+    ]  # fmt: skip
+    assert "CC-BY-SA-3.0 and CC-BY-SA-4.0 meet" in problems[0]
+
+
 def test_shards_without_a_manifest_are_not_touched(tmp_path: Path) -> None:
     (tmp_path / "train-000000.tar").write_bytes(b"")
     with pytest.raises(TrilightError, match=r"shards but no manifest\.json"):

@@ -1,0 +1,168 @@
+"""`croissant.json`: the dataset in the Croissant 1.1 vocabulary of MLCommons, as JSON-LD.
+
+It is written as plain JSON: mlcroissant, which validates it in the tests, would only be a slower
+way to spell the same dictionary, and brings rdflib and pandas along. There is no date of
+publication in it: equal datasets give equal bytes.
+"""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.documents.rights import Rights
+from storage.conventions import SPLITS
+from storage.licences import licence_url
+from storage.manifest import Manifest, ShardEntry
+
+_CONTEXT: Mapping[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "arrayShape": "cr:arrayShape",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "containedIn": "cr:containedIn",
+    "cr": "http://mlcommons.org/croissant/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "description": {"@container": "@language"},
+    "equivalentProperty": "cr:equivalentProperty",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileObject": "cr:fileObject",
+    "fileProperty": "cr:fileProperty",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isArray": "cr:isArray",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "name": {"@container": "@language"},
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "samplingRate": "cr:samplingRate",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+"""The context that the specification prescribes."""
+
+_SPLIT_URLS: Mapping[str, str] = {
+    "train": "http://mlcommons.org/croissant/Training",
+    "validation": "http://mlcommons.org/croissant/Validation",
+    "test": "http://mlcommons.org/croissant/Test",
+}
+_RECORDS = "scene-records"
+
+
+def encode_croissant(manifest: Manifest, rights: Rights) -> bytes:
+    """Return the file of a dataset: every shard with its sha256, and a record for each scene.
+
+    Args:
+        manifest: of the dataset.
+        rights: of its objects; a licence without a known address is given by its name.
+    """
+    digest = manifest.dataset_digest
+    shards = list(manifest.shards)
+    document: dict[str, Any] = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.1",
+        "name": f"trilight-{manifest.build}",
+        "description": (
+            f"{manifest.num_samples} path-traced scenes of triangles with {manifest.num_views} HDR "
+            "views each, every view with its own measured error, as WebDataset shards."
+        ),
+        "version": f"{manifest.schema_version}.0.0+{digest[:12]}",
+        "identifier": f"sha256:{digest}",
+        "keywords": ["neural rendering", "path tracing", "HDR", "WebDataset"],
+        "license": [licence_url(name) or name for name in rights.licences],
+        "distribution": [*map(_shard, shards), *_file_sets(shards)],
+        "recordSet": [_splits(shards), _scenes()] if shards else [],
+    }
+    text = json.dumps(document, indent=1, sort_keys=True, ensure_ascii=True)
+    return text.encode() + b"\n"
+
+
+def _shard(shard: ShardEntry) -> dict[str, Any]:
+    return {
+        "@type": "cr:FileObject",
+        "@id": shard.name,
+        "name": shard.name,
+        "contentUrl": shard.name,
+        "contentSize": f"{shard.num_bytes} B",
+        "encodingFormat": "application/x-tar",
+        "sha256": shard.sha256,
+    }
+
+
+def _file_sets(shards: list[ShardEntry]) -> list[dict[str, Any]]:
+    """Return the kinds of members that all shards hold."""
+    kinds = (
+        (_RECORDS, "objects, provenance and the record of each view", "application/json", "*.json"),
+        (
+            "scene-arrays",
+            "geometry, materials and cameras as safetensors, gzip where the name ends so",
+            "application/octet-stream",
+            "*.scene.safetensors*",
+        ),
+        ("pictures", "linear radiance of each view, half floats", "image/x-exr", "*.exr"),
+    )
+    return [
+        {
+            "@type": "cr:FileSet",
+            "@id": name,
+            "name": name,
+            "description": description,
+            "containedIn": [{"@id": shard.name} for shard in shards],
+            "encodingFormat": encoding,
+            "includes": pattern,
+        }
+        for name, description, encoding, pattern in kinds
+        if shards
+    ]
+
+
+def _splits(shards: list[ShardEntry]) -> dict[str, Any]:
+    used = [split for split in SPLITS if any(shard.split == split for shard in shards)]
+    return {
+        "@type": "cr:RecordSet",
+        "@id": "splits",
+        "name": "splits",
+        "description": "a shard holds one split; its name begins with it",
+        "dataType": "cr:Split",
+        "key": {"@id": "splits/name"},
+        "field": [_field("splits/name", "sc:Text"), _field("splits/url", "sc:URL")],
+        "data": [{"splits/name": split, "splits/url": _SPLIT_URLS[split]} for split in used],
+    }
+
+
+def _scenes() -> dict[str, Any]:
+    """Return the records of scenes: key and whole JSON, all that mlcroissant reads of many tars."""
+    key = {"extract": {"fileProperty": "filename"}, "transform": {"regex": r"^([^.]+)\."}}
+    content = {"extract": {"fileProperty": "content"}}
+    return {
+        "@type": "cr:RecordSet",
+        "@id": "scenes",
+        "name": "scenes",
+        "description": "one record per scene; its arrays and pictures have the same key",
+        "key": {"@id": "scenes/key"},
+        "field": [_field("scenes/key", "sc:Text", key), _field("scenes/json", "sc:Text", content)],
+    }
+
+
+def _field(name: str, data_type: str, source: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    field: dict[str, Any] = {"@type": "cr:Field", "@id": name, "name": name, "dataType": data_type}
+    return field | ({"source": {"fileSet": {"@id": _RECORDS}, **source}} if source else {})

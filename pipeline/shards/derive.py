@@ -1,0 +1,197 @@
+"""Stage "shards", on finished datasets: merge, select and reshard.
+
+Members are copied byte for byte under their new keys, one sample at a time. The result depends on
+the sources, their order and the arguments alone; it is written into a folder of its own.
+"""
+
+import contextlib
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pipeline.shards.finished import FinishedDataset, SampleReader
+from pipeline.shards.plans import (
+    Selection,
+    Taken,
+    even_shards,
+    kept_shards,
+    key_offsets,
+    raised_key,
+    taken_scenes,
+    used_objects,
+)
+from storage.derived import Derivation, common, derived_settings, source_record
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+from storage.failures import read_failures, write_failures
+from storage.layout import DatasetFolder
+from storage.manifest import Manifest, ShardEntry, index_shard, write_manifest
+from storage.objects_lock import encode_objects_lock, write_objects_lock
+from storage.records import Failure, LockedObject
+from storage.shard_writer import write_shard
+from storage.splits import named_shard
+
+Operation = Literal["merge", "select", "reshard"]
+
+_SAME = ("renders.resolution", "renders.per_light")
+"""Settings that all pictures of a dataset share."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Derive:
+    """What to make of finished datasets."""
+
+    operation: Operation
+    """What it is called."""
+    selection: Selection = dataclasses.field(default_factory=Selection)
+    """Which scenes are taken."""
+    scenes_per_shard: int | None = None
+    """Scenes of each new shard; `merge` keeps shards, `select` fills them as its source does."""
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What the user asked for, as the manifest states it."""
+        asked = {**dataclasses.asdict(self.selection), "scenes_per_shard": self.scenes_per_shard}
+        return {name: value for name, value in asked.items() if value is not None}
+
+
+def derive_shards(
+    sources: Sequence[FinishedDataset],
+    derive: Derive,
+    out: DatasetFolder,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Write shards, lock, failures and manifest of the new dataset; the manifest comes last.
+
+    Args:
+        sources: finished datasets; `select` and `reshard` take one.
+        derive: what to make of them.
+        out: an empty folder.
+        progress: called with the shards that are read or written so far, and with their number.
+
+    Raises:
+        TrilightError: the sources do not fit together, one is damaged, nothing is selected, an
+            object would be in two splits, or the disk is full.
+    """
+    _require_alike(sources)
+    total, done = sum(len(source.manifest.shards) for source in sources), itertools.count(1)
+    taken = taken_scenes(sources, derive.selection, shard_done=lambda: progress(next(done), total))
+    objects = sorted(
+        used_objects(sources, taken), key=lambda row: canonical_json(dataclasses.asdict(row))
+    )
+    groups, scenes_per_shard = _grouped(sources, derive, taken)
+    write_objects_lock(out.objects_lock, objects)
+    write_failures(out.failures, _failures(sources, taken))
+    shards = []
+    for number, group in enumerate(groups):
+        name = named_shard(number, group[0].facts.shard.split)
+        write_shard(out.shard(name), _samples(sources, group))
+        shards.append(index_shard(out.shard(name)))
+        progress(next(done), total + len(groups))
+    write_manifest(
+        out.manifest, _manifest(sources, derive, objects, tuple(shards), scenes_per_shard)
+    )
+
+
+def _grouped(
+    sources: Sequence[FinishedDataset], derive: Derive, taken: Sequence[Taken]
+) -> tuple[list[list[Taken]], int | None]:
+    """Return the scenes of each new shard, and their number where it is not the sources'."""
+    if derive.operation == "merge":
+        return kept_shards(taken), None
+    size = derive.scenes_per_shard
+    if size is None:
+        size = max(shard.num_samples for shard in sources[0].manifest.shards)
+    return even_shards(taken, size), size
+
+
+def _samples(
+    sources: Sequence[FinishedDataset], group: Sequence[Taken]
+) -> Iterator[tuple[str, Mapping[str, bytes]]]:
+    with contextlib.ExitStack() as opened:
+        readers = [
+            opened.enter_context(contextlib.closing(SampleReader(source))) for source in sources
+        ]
+        for entry in group:
+            facts = entry.facts
+            yield entry.key, readers[entry.source].members(facts.shard, facts.key)
+
+
+def _manifest(
+    sources: Sequence[FinishedDataset],
+    derive: Derive,
+    objects: Sequence[LockedObject],
+    shards: tuple[ShardEntry, ...],
+    scenes_per_shard: int | None,
+) -> Manifest:
+    manifests = [source.manifest for source in sources]
+    derivation = Derivation(
+        operation=derive.operation,
+        arguments=derive.arguments,
+        sources=[
+            source_record(manifest, key_offset=offset)
+            for manifest, offset in zip(manifests, key_offsets(sources), strict=True)
+        ],
+    )
+    builds = {manifest.build for manifest in manifests}
+    return dataclasses.replace(
+        manifests[0],
+        build=builds.pop() if len(builds) == 1 else "merged",
+        settings=derived_settings(derivation, scenes_per_shard=scenes_per_shard),
+        environment=_environment(manifests),
+        num_scenes=sum(shard.num_samples for shard in shards),
+        objects_lock_sha256=sha256_hex(encode_objects_lock(objects)),
+        shards=shards,
+    )
+
+
+def _environment(manifests: Sequence[Manifest]) -> Mapping[str, Any]:
+    """Return what all sources were made with; where they differ, also what each was made with."""
+    environments = [dict(manifest.environment) for manifest in manifests]
+    if all(environment == environments[0] for environment in environments):
+        return environments[0]
+    return {**common(environments), "of_sources": environments}
+
+
+def _failures(sources: Sequence[FinishedDataset], taken: Sequence[Taken]) -> list[Failure]:
+    """Return the rejections of the scenes that are taken, and of objects.
+
+    A scene that no attempt could save is not among those taken, so `merge` and `reshard`, which
+    take all, say so too where its number is that of no other scene.
+    """
+    keys = {(entry.source, entry.facts.key) for entry in taken}
+    held = sum(source.manifest.num_samples for source in sources)
+    rows = []
+    for row, (source, offset) in enumerate(zip(sources, key_offsets(sources), strict=True)):
+        for failure in read_failures(source.folder.failures):
+            key, dot, view = failure.item.partition(".")
+            if failure.stage not in ("scenes", "renders"):
+                rows.append(failure)
+            elif (row, key) in keys or held == len(taken):
+                item = f"{raised_key(key, offset)}{dot}{view}"
+                rows.append(dataclasses.replace(failure, item=item))
+    return rows
+
+
+def _require_alike(sources: Sequence[FinishedDataset]) -> None:
+    first = sources[0]
+    for other in sources[1:]:
+        pairs = [
+            ("schema version", first.manifest.schema_version, other.manifest.schema_version),
+            ("number of views", first.manifest.num_views, other.manifest.num_views),
+            *((name, _setting(first, name), _setting(other, name)) for name in _SAME),
+        ]
+        for name, before, now in pairs:
+            if before != now:
+                raise TrilightError(
+                    f"{other.folder.root}: its {name} is {now}; expected {before}, as "
+                    f"{first.folder.root} has it. Generate one of them anew."
+                )
+
+
+def _setting(dataset: FinishedDataset, name: str) -> Any:
+    group, _, setting = name.partition(".")
+    return dataset.manifest.settings.get(group, {}).get(setting, False)

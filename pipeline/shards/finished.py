@@ -1,0 +1,158 @@
+"""Finished datasets as sources of others: checked by digest, then read scene by scene."""
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from storage.derived import derivation_of
+from storage.digests import sha256_hex, sha256_of_file
+from storage.errors import TrilightError
+from storage.layout import DatasetFolder
+from storage.manifest import Manifest, ShardEntry, index_shard, read_manifest
+from storage.objects_lock import read_objects_lock
+from storage.profiles import PACKED, PLAIN, unpack_arrays
+from storage.records import LockedObject
+from storage.safe_url import safe_url
+from storage.splits import SplitSettings, shards_for
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FinishedDataset:
+    """A dataset that is whole."""
+
+    folder: DatasetFolder
+    """Where it is."""
+    manifest: Manifest
+    """What it says of itself."""
+    objects: Mapping[str, list[LockedObject]]
+    """Its locked objects by uid; a merged dataset may know several under one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFacts:
+    """What decides whether a scene is taken, and where it goes."""
+
+    shard: ShardEntry
+    """The shard that it is in."""
+    key: str
+    """Its key there."""
+    template: str
+    """Layout of the scene."""
+    noise_floor_db: float
+    """Of its worst view, as psnr_log_db."""
+    uids: tuple[str, ...]
+    """Objects that stand in it."""
+    arrays_sha256: str
+    """Digest of its unpacked arrays: equal for equal scenes."""
+
+
+def open_finished(place: str) -> FinishedDataset:
+    """Open a dataset of this machine.
+
+    Raises:
+        TrilightError: a URL, no readable manifest, shards still to make, or a lock that is not the
+            manifest's.
+    """
+    if "://" in place:
+        raise TrilightError(f"{safe_url(place)}: expected the folder of a dataset on this machine.")
+    folder = DatasetFolder(Path(place))
+    manifest = read_manifest(folder.manifest)
+    planned = _planned_shards(manifest)
+    if len(manifest.shards) < planned:
+        raise TrilightError(
+            f"{place}: {len(manifest.shards)} of {planned} shards are there; expected a finished "
+            "dataset. Run the same `trilight generate` again to finish it."
+        )
+    lock = folder.objects_lock
+    if not lock.exists() or sha256_of_file(lock) != manifest.objects_lock_sha256:
+        raise TrilightError(
+            f"{place}: {lock.name} is missing or not the one of the manifest (sha256 differs); run "
+            "`trilight verify`."
+        )
+    objects: dict[str, list[LockedObject]] = {}
+    for entry in read_objects_lock(lock):
+        objects.setdefault(entry.uid, []).append(entry)
+    return FinishedDataset(folder=folder, manifest=manifest, objects=objects)
+
+
+def read_facts(dataset: FinishedDataset, *, shard_done: Callable[[], None]) -> Iterator[SceneFacts]:
+    """Yield the facts of every scene, after checking the digest of its shard.
+
+    Memory is that of one scene. Pictures are hashed with the shard and not decoded.
+
+    Raises:
+        TrilightError: a shard is missing or its bytes are not those of the manifest, or a scene
+            lacks what is asked of it.
+    """
+    for shard in dataset.manifest.shards:
+        path = dataset.folder.shard(shard.name)
+        if not path.exists() or index_shard(path) != shard:
+            raise TrilightError(
+                f"{path}: missing, or its bytes are not those of the manifest (sha256 differs); "
+                "run `trilight verify`, then make the shard anew."
+            )
+        with contextlib.closing(SampleReader(dataset)) as reader:
+            for key in shard.index:
+                yield _facts(shard, key, reader.members(shard, key, ("json", PLAIN, PACKED)))
+        shard_done()
+
+
+class SampleReader:
+    """Reads members of samples by key; the shard that it read last stays open. To be closed."""
+
+    def __init__(self, dataset: FinishedDataset) -> None:
+        self._folder = dataset.folder
+        self._shard: ShardEntry | None = None
+        self._index: Mapping[str, Mapping[str, tuple[int, int]]] = {}
+        self._stream: BinaryIO | None = None
+
+    def members(
+        self, shard: ShardEntry, key: str, suffixes: tuple[str, ...] | None = None
+    ) -> dict[str, bytes]:
+        """Return members of a sample by suffix, all of them by default; the shard was checked."""
+        if shard is not self._shard or self._stream is None:
+            self.close()
+            self._stream = self._folder.shard(shard.name).open("rb")
+            self._shard, self._index = shard, shard.index
+        members = {}
+        for suffix, (offset, num_bytes) in self._index[key].items():
+            if suffixes is None or suffix in suffixes:
+                self._stream.seek(offset)
+                members[suffix] = self._stream.read(num_bytes)
+        return members
+
+    def close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+
+
+def _facts(shard: ShardEntry, key: str, members: Mapping[str, bytes]) -> SceneFacts:
+    try:
+        record = json.loads(members["json"])
+        return SceneFacts(
+            shard=shard,
+            key=key,
+            template=str(record["provenance"]["template"]),
+            noise_floor_db=min(float(view["noise_floor_db"]) for view in record["views"]),
+            uids=tuple(
+                sorted({str(row["uid"]) for row in record["objects"] if row["kind"] == "object"})
+            ),
+            arrays_sha256=sha256_hex(unpack_arrays(members)),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise TrilightError(
+            f"{shard.name}: sample {key} is not as expected ({error!r}); run `trilight verify`."
+        ) from error
+
+
+def _planned_shards(manifest: Manifest) -> int:
+    """Return how many shards the dataset has when it is finished."""
+    if derivation_of(manifest.settings):
+        return len(manifest.shards)  # it only ever appears whole
+    try:
+        return shards_for(manifest.num_scenes, SplitSettings(**manifest.settings["splits"]))
+    except (KeyError, TypeError) as error:
+        raise TrilightError(f"manifest: settings.splits is not readable ({error!r}).") from error

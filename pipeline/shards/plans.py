@@ -1,0 +1,173 @@
+"""Which scenes of finished datasets go into which shard of a new one, and under which key.
+
+The keys of the first source stay; each following source's are raised by one number, which the
+manifest states: `key_offset`. So every scene can be found in its source, and no two share a key.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from pipeline.shards.finished import FinishedDataset, SceneFacts, read_facts
+from storage.conventions import SPLITS
+from storage.errors import TrilightError
+from storage.records import LockedObject
+from storage.sample import sample_key
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Which scenes are taken; by default all."""
+
+    split: str | None = None
+    """Of this split only."""
+    template: str | None = None
+    """Of this layout only."""
+    min_noise_floor_db: float | None = None
+    """Whose every view has at least this noise floor (psnr_log_db)."""
+
+    def __post_init__(self) -> None:
+        if self.split not in (None, *SPLITS):
+            raise TrilightError(f"--split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
+
+    def takes(self, facts: SceneFacts) -> bool:
+        return (
+            self.split in (None, facts.shard.split)
+            and self.template in (None, facts.template)
+            and (self.min_noise_floor_db is None or facts.noise_floor_db >= self.min_noise_floor_db)
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taken:
+    """One scene of the new dataset."""
+
+    source: int
+    """Which of the sources it is from."""
+    facts: SceneFacts
+    """Where it is there."""
+    key: str
+    """Its new key."""
+
+
+def taken_scenes(
+    sources: Sequence[FinishedDataset],
+    selection: Selection,
+    *,
+    shard_done: Callable[[], None],
+) -> list[Taken]:
+    """Return the scenes to take, in the order of the sources and of their shards.
+
+    Raises:
+        TrilightError: no scene is taken, the same scene is there twice, or a source is damaged.
+    """
+    offsets = key_offsets(sources)
+    taken: list[Taken] = []
+    seen: dict[str, Taken] = {}
+    for row, source in enumerate(sources):
+        for facts in read_facts(source, shard_done=shard_done):
+            if not selection.takes(facts):
+                continue
+            entry = Taken(source=row, facts=facts, key=raised_key(facts.key, offsets[row]))
+            first = seen.setdefault(facts.arrays_sha256, entry)
+            if first.source != row:
+                raise TrilightError(
+                    f"scene {facts.key} of {source.folder.root} is scene {first.facts.key} of "
+                    f"{sources[first.source].folder.root}; expected each scene once. Leave one of "
+                    "the datasets out, or generate it with another --seed."
+                )
+            taken.append(entry)
+    if not taken:
+        found = sum(source.manifest.num_samples for source in sources)
+        raise TrilightError(f"none of the {found} scenes is selected; expected at least one.")
+    return taken
+
+
+def key_offsets(sources: Sequence[FinishedDataset]) -> list[int]:
+    """Return what is added to the keys of each source: 0, then beyond all keys before.
+
+    Scenes that could not be made count too: `failures.jsonl` names them.
+    """
+    offsets, following = [], 0
+    for source in sources:
+        offsets.append(following)
+        keys = [key for shard in source.manifest.shards for key in shard.index]
+        last = max((int(key) for key in keys if key.isdecimal()), default=-1)
+        following += max(last + 1, source.manifest.num_scenes)
+    return offsets
+
+
+def raised_key(key: str, offset: int) -> str:
+    """Return a key raised by a number; raises TrilightError where it is not a number."""
+    if not offset:
+        return key
+    if not (key.isascii() and key.isdecimal()):
+        raise TrilightError(f"sample {key!r}: expected a number as key, to raise it by {offset}.")
+    return sample_key(int(key) + offset)
+
+
+def used_objects(sources: Sequence[FinishedDataset], taken: Sequence[Taken]) -> list[LockedObject]:
+    """Return the locked objects that stand in scenes.
+
+    Raises:
+        TrilightError: an object is in scenes of two splits, known by its uid or by its asset: what
+            is learnt from one would be judged on the other. Or an object is in no lock.
+    """
+    splits: dict[str, tuple[str, Taken]] = {}
+    used: dict[LockedObject, None] = {}
+    for entry in taken:
+        source = sources[entry.source]
+        for uid in entry.facts.uids:
+            if uid not in source.objects:
+                raise TrilightError(
+                    f"{source.folder.root}: object {uid!r} of scene {entry.facts.key} is not in "
+                    "objects.lock.jsonl; run `trilight verify`."
+                )
+            for locked in source.objects[uid]:
+                used[locked] = None
+                for name in (f"uid {uid}", f"asset {locked.asset_sha256}"):
+                    split, first = splits.setdefault(name, (entry.facts.shard.split, entry))
+                    if split != entry.facts.shard.split:
+                        raise TrilightError(_leak(uid, sources, first, entry))
+    return list(used)
+
+
+def _leak(uid: str, sources: Sequence[FinishedDataset], first: Taken, second: Taken) -> str:
+    places = " and in ".join(
+        f"{entry.facts.shard.split} of {sources[entry.source].folder.root} (scene "
+        f"{entry.facts.key})"
+        for entry in (first, second)
+    )
+    return (
+        f"object {uid!r} is in {places}; expected every object in one split only. Generate both "
+        "with the same splits.held_out_objects, or take one split of each with `trilight shards "
+        "select` first."
+    )
+
+
+def kept_shards(taken: Sequence[Taken]) -> list[list[Taken]]:
+    """Return the scenes shard by shard, as the sources have them."""
+    groups: dict[tuple[int, str], list[Taken]] = {}
+    for entry in taken:
+        groups.setdefault((entry.source, entry.facts.shard.name), []).append(entry)
+    return list(groups.values())
+
+
+def even_shards(taken: Sequence[Taken], scenes_per_shard: int) -> list[list[Taken]]:
+    """Return the scenes of each split in shards of a size, all but the last of a split full.
+
+    Shards are ordered by their first scene, so that numbers follow keys.
+
+    Raises:
+        TrilightError: the size is below 1.
+    """
+    if scenes_per_shard < 1:
+        raise TrilightError(f"--scenes-per-shard is {scenes_per_shard}; expected at least 1.")
+    of_split: Mapping[str, list[Taken]] = {
+        split: [entry for entry in taken if entry.facts.shard.split == split] for split in SPLITS
+    }
+    shards = [
+        entries[start : start + scenes_per_shard]
+        for entries in of_split.values()
+        for start in range(0, len(entries), scenes_per_shard)
+    ]
+    return sorted(shards, key=lambda entries: entries[0].key)

@@ -1,0 +1,43 @@
+"""`trilight shards`: what the commands take and print."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from infra.cli.app import app
+from storage.dataset import open_dataset
+from storage.errors import TrilightError
+from tests.flows.derive_kit import finished, scenes
+
+
+def shards(*arguments: str | Path) -> str:
+    result = CliRunner().invoke(app, ["shards", *(str(argument) for argument in arguments)])
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+def test_merge_select_and_reshard(tmp_path: Path) -> None:
+    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
+    printed = shards("merge", a, b, "--out", tmp_path / "ab")
+    assert "12 (4 test, 8 train)" in printed and "trilight verify" in printed
+    chosen = ("--split", "train", "--template", "plane", "--min-noise-floor", "36.5")
+    shards("select", tmp_path / "ab", "--out", tmp_path / "c", *chosen)
+    assert [key for s in open_dataset(str(tmp_path / "c")).manifest.shards for key in s.index] == [
+        "000000003", "000000009",
+    ]  # fmt: skip
+    size = ("--scenes-per-shard", "5", "--json")
+    outcome = json.loads(shards("reshard", tmp_path / "ab", "--out", tmp_path / "d", *size))
+    assert outcome["scenes_by_split"] == {"test": 4, "train": 8}
+    assert outcome["dataset_digest"] == open_dataset(str(tmp_path / "d")).digest
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    a, out = finished(tmp_path / "a", scenes(0)), tmp_path / "c"
+    with pytest.raises(TrilightError, match="1 dataset; expected at least 2"):
+        shards("merge", a, "--out", out)
+    with pytest.raises(TrilightError, match="expected --split, --template or --min-noise-floor"):
+        shards("select", a, "--out", out)
+    assert not out.exists()
