@@ -1,23 +1,37 @@
 """A finished dataset, for whoever reads it: the manifest and the samples of its shards."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import BinaryIO
 
-from storage.digests import sha256_of_file
+from storage.dataset_files import DatasetFiles, RemoteFiles, dataset_files
 from storage.errors import TrilightError
+from storage.failures import decode_failures
 from storage.layout import DatasetFolder
-from storage.manifest import Manifest, ShardEntry, read_manifest
+from storage.manifest import Manifest, ShardEntry, decode_manifest
+from storage.objects_lock import decode_objects_lock
+from storage.records import Failure, LockedObject
 from storage.sample import Sample, SceneRecord, decode_sample, decode_scene
-from storage.shard_reader import iterate_samples
+from storage.shard_reader import samples_of
 
 
 class Dataset:
-    """The shards of one dataset folder, checked by digest as they are read."""
+    """The shards of one dataset, checked by digest as they are read."""
 
-    def __init__(self, folder: DatasetFolder, manifest: Manifest) -> None:
-        self.folder = folder
+    def __init__(self, files: DatasetFiles, manifest: Manifest) -> None:
+        self.files = files
         self.manifest = manifest
+
+    @property
+    def shown(self) -> str:
+        """Where the dataset is, for people: without secrets."""
+        return self.files.shown
+
+    @property
+    def folder(self) -> DatasetFolder:
+        """The dataset's folder; raises TrilightError where it is on a server."""
+        if isinstance(self.files, RemoteFiles):
+            raise TrilightError(f"dataset {self.shown!r} is on a server; expected a local folder.")
+        return DatasetFolder(self.files.root)
 
     @property
     def digest(self) -> str:
@@ -34,18 +48,9 @@ class Dataset:
         Raises:
             TrilightError: the file is missing or its bytes are not those of the manifest.
         """
-        path = self.folder.shard(shard.name)
-        if not path.exists():
-            raise TrilightError(
-                f"{path}: the shard is missing; run `trilight generate` again to make it."
-            )
-        if sha256_of_file(path) != shard.sha256:
-            raise TrilightError(
-                f"{path}: the bytes are not those of the manifest (sha256 differs). Delete the "
-                "file and run `trilight generate` again to make it anew."
-            )
-        for key, members in iterate_samples(path):
-            yield decode_sample(key, members)
+        with self.files.open(shard, checked=True) as stream:
+            for key, members in samples_of(stream, shard.name):
+                yield decode_sample(key, members)
 
     def read_scenes(self, shard: ShardEntry) -> Iterator[SceneRecord]:
         """Yield the samples of a shard without their pictures, through the manifest's index.
@@ -57,7 +62,7 @@ class Dataset:
             TrilightError: the shard is missing or shorter than its index, or a scene in it is
                 unreadable or breaks a law.
         """
-        with self._opened(shard) as stream:
+        with self.files.open(shard, checked=False) as stream:
             for key, members in shard.index.items():
                 scene_members = [suffix for suffix in members if not suffix.endswith("exr")]
                 record = decode_scene(key, _read(stream, shard, members, scene_members))
@@ -67,21 +72,20 @@ class Dataset:
     def read_samples(self, shard: ShardEntry, keys: Iterable[str]) -> Iterator[Sample]:
         """Yield some samples of a shard with their pictures; otherwise as `read_scenes`."""
         index = shard.index
-        with self._opened(shard) as stream:
+        with self.files.open(shard, checked=False) as stream:
             for key in keys:
                 sample = decode_sample(key, _read(stream, shard, index[key], index[key]))
                 _require_lawful(sample)
                 yield sample
 
-    def _opened(self, shard: ShardEntry) -> BinaryIO:
-        path = self.folder.shard(shard.name)
-        try:
-            return path.open("rb")
-        except OSError as error:
-            raise TrilightError(
-                f"{path}: cannot be read ({error.strerror}); run `trilight generate` again to make "
-                "what is missing."
-            ) from error
+    def objects_lock(self) -> list[LockedObject]:
+        """Return the objects that were used; none where the dataset has no lock."""
+        data = self.files.read("objects.lock.jsonl")
+        return [] if data is None else decode_objects_lock(data, "objects.lock.jsonl")
+
+    def failures(self) -> list[Failure]:
+        """Return what was rejected; none where the dataset does not say."""
+        return decode_failures(self.files.read("failures.jsonl") or b"")
 
 
 def _read(
@@ -115,12 +119,17 @@ def _require_lawful(record: SceneRecord | Sample) -> None:
 
 
 def open_dataset(url: str) -> Dataset:
-    """Open the dataset in a local folder.
+    """Open the dataset in a local folder, or below a URL of http, https, s3, gs or hf.
 
     Raises:
-        TrilightError: there is no readable manifest. Remote datasets are not read yet.
+        TrilightError: there is no readable manifest, the URL is refused, or the driver for it is
+            not installed.
     """
-    if "://" in url:
-        raise TrilightError(f"{url}: only local folders can be read; expected a path.")
-    folder = DatasetFolder(Path(url))
-    return Dataset(folder, read_manifest(folder.manifest))
+    files = dataset_files(url)
+    data = files.read("manifest.json")
+    if data is None:
+        raise TrilightError(
+            f"{files.shown}: no manifest.json here; expected a dataset, as `trilight generate ... "
+            "--out` makes it."
+        )
+    return Dataset(files, decode_manifest(data, f"{files.shown}/manifest.json"))

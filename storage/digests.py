@@ -3,7 +3,9 @@
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
+
+_PIECE_BYTES = 1 << 20
 
 
 def sha256_hex(data: bytes) -> str:
@@ -14,7 +16,15 @@ def sha256_hex(data: bytes) -> str:
 def sha256_of_file(path: Path) -> str:
     """Return the sha256 of a file, read in pieces."""
     with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+        return sha256_of_stream(stream)
+
+
+def sha256_of_stream(stream: BinaryIO) -> str:
+    """Return the sha256 of an open file from where it stands to its end, read in pieces."""
+    digest = hashlib.sha256()
+    while piece := stream.read(_PIECE_BYTES):
+        digest.update(piece)
+    return digest.hexdigest()
 
 
 def canonical_json(value: Any) -> bytes:

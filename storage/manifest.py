@@ -10,15 +10,15 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO
 
 from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION, SPLITS, require_readable
-from storage.digests import canonical_json, sha256_hex, sha256_of_file
+from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
 from storage.layout import numbered
-from storage.shard_reader import MAX_MEMBER_BYTES, MEMBER_NAME, iterate_members
+from storage.shard_reader import MAX_MEMBER_BYTES, MEMBER_NAME, scan_samples
 
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
@@ -93,17 +93,29 @@ def index_shard(path: Path) -> ShardEntry:
     Raises:
         TrilightError: the name is not a shard's, or the file is not a whole shard.
     """
-    match = SHARD_NAME.fullmatch(path.name)
+    with path.open("rb") as stream:
+        return index_stream(stream, path.name)
+
+
+def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
+    """Return the manifest entry of an open shard; raises as `index_shard` does."""
+    match = SHARD_NAME.fullmatch(name)
     if match is None:
-        raise TrilightError(f"{path.name}: not a shard; expected a name like train-000003.tar.")
-    members = [(key, suffix, at, len(data)) for key, suffix, at, data in iterate_members(path)]
+        raise TrilightError(f"{name}: not a shard; expected a name like train-000003.tar.")
+    samples = list(scan_samples(stream, name))
+    num_bytes = stream.seek(0, 2)
+    stream.seek(0)
     return ShardEntry(
-        name=numbered(int(match[2]), path.name),
+        name=numbered(int(match[2]), PurePosixPath(name).name),
         split=match[1],
-        num_samples=len({key for key, *_ in members}),
-        num_bytes=path.stat().st_size,
-        sha256=sha256_of_file(path),
-        members=tuple((f"{key}.{suffix}", at, size) for key, suffix, at, size in members),
+        num_samples=len(samples),
+        num_bytes=num_bytes,
+        sha256=sha256_of_stream(stream),
+        members=tuple(
+            (f"{key}.{suffix}", member.offset, member.num_bytes)
+            for key, members in samples
+            for suffix, member in members.items()
+        ),
     )
 
 
@@ -122,20 +134,29 @@ def read_manifest(path: Path) -> Manifest:
         TrilightError: missing, not JSON, another schema version, or a shard name that is none.
     """
     try:
-        record = json.loads(path.read_bytes())
-        version = record.pop("schema_version")
+        data = path.read_bytes()
     except FileNotFoundError as error:
         raise TrilightError(
             f"{path.parent}: no manifest.json here; expected the folder of a dataset, as "
             "`trilight generate ... --out` makes it."
         ) from error
-    except (OSError, ValueError, KeyError, AttributeError) as error:
+    except OSError as error:
         raise TrilightError(f"{path}: not a readable manifest ({error}).") from error
-    require_readable(version, str(path))
+    return decode_manifest(data, str(path))
+
+
+def decode_manifest(data: bytes, place: str) -> Manifest:
+    """Return the manifest of the bytes of a file; raises as `read_manifest`, naming `place`."""
+    try:
+        record = json.loads(data)
+        version = record.pop("schema_version")
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
+        raise TrilightError(f"{place}: not a readable manifest ({error}).") from error
+    require_readable(version, place)
     try:
         return _decode(record, version)
-    except (KeyError, TypeError, ValueError) as error:
-        raise TrilightError(f"{path}: not a readable manifest ({error}).") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise TrilightError(f"{place}: not a readable manifest ({error}).") from error
 
 
 def _decode(record: dict[str, Any], version: int) -> Manifest:

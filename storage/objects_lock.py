@@ -29,13 +29,18 @@ def read_objects_lock(path: Path) -> list[LockedObject]:
         TrilightError: missing, or a line that is not a locked object.
     """
     try:
-        lines = path.read_bytes().splitlines()
+        data = path.read_bytes()
     except OSError as error:
         raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+    return decode_objects_lock(data, str(path))
+
+
+def decode_objects_lock(data: bytes, place: str) -> list[LockedObject]:
+    """Return the objects of the bytes of a lock; raises as `read_objects_lock`, naming `place`."""
     objects = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(data.splitlines(), start=1):
         try:
             objects.append(LockedObject(**json.loads(line)))
         except (TypeError, ValueError) as error:
-            raise TrilightError(f"{path}:{number}: not a locked object ({error}).") from error
+            raise TrilightError(f"{place}:{number}: not a locked object ({error}).") from error
     return objects

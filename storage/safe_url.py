@@ -1,4 +1,4 @@
-"""URLs and messages as they may be shown and stored: without names, passwords, tokens, queries."""
+"""URLs and messages as they may be shown and stored: no names, passwords, tokens, queries."""
 
 import re
 
@@ -40,3 +40,21 @@ def safe_text(text: str) -> str:
     text = _URL_IN_TEXT.sub(lambda match: safe_url(match[0]), text)
     text = _SECRET_FIELD.sub(lambda match: f"{match[1]}{HIDDEN}", text)
     return _SECRET_WORD.sub(HIDDEN, text)
+
+
+def printable(text: str) -> str:
+    r"""Return `text` with everything that is not printable written as an escape.
+
+    File names may hold line breaks, control characters, or bytes that are not UTF-8, which Python
+    keeps as lone surrogates that no encoder accepts: a byte 0xff becomes `\xff`, a line feed `\n`.
+    """
+    return "".join(
+        character if character.isprintable() else _escape(character) for character in text
+    )
+
+
+def _escape(character: str) -> str:
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:
+        return f"\\x{code - 0xDC00:02x}"
+    return character.encode("unicode_escape").decode("ascii")

@@ -1,9 +1,15 @@
-"""Reading tar shards without trusting them: plain members, sane names, whole samples."""
+"""Reading tar shards without trusting them: plain members, sane names, whole samples.
+
+The headers are walked here, 512 bytes at a time: whatever is not a plain file is refused before any
+of it is read, and no number in a header makes anybody take memory.
+"""
 
 import re
 import tarfile
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from storage.errors import TrilightError
 
@@ -14,101 +20,137 @@ MEMBER_NAME = re.compile(r"([0-9A-Za-z_\-]+)\.([0-9A-Za-z_.\-]+)")
 """Key and suffix of a member; neither can leave a folder."""
 
 
-def iterate_members(path: Path) -> Iterator[tuple[str, str, int, bytes]]:
-    """Yield (key, suffix, offset, bytes) of each member of a shard, in the order of the file.
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One file in a shard."""
+
+    key: str
+    """Of its sample."""
+    suffix: str
+    """What it is in the sample."""
+    offset: int
+    """Of its first byte in the shard."""
+    num_bytes: int
+    """Its size."""
+
+
+def scan_members(stream: BinaryIO, name: str) -> Iterator[Member]:
+    """Yield the members of an open shard in the order of the file, reading headers only.
+
+    The position of the stream may be moved between two members.
 
     Raises:
-        TrilightError: the file is no complete tar, or holds a link, a folder, a path, or a member
-            that is larger than MAX_MEMBER_BYTES. Nothing is extracted to disk.
+        TrilightError: the file is no complete tar, or holds a link, a folder, a path, an extended
+            header, or a member that is larger than MAX_MEMBER_BYTES.
     """
-    try:
-        with tarfile.open(path, mode="r:") as archive:
-            for member in archive:
-                key, suffix = _checked_name(path, member)
-                stream = archive.extractfile(member)
-                data = stream.read() if stream else b""
-                if len(data) != member.size:
-                    raise TrilightError(f"{path.name}: member {member.name} is cut short.")
-                yield key, suffix, member.offset_data, data
-            _require_end(path, archive)
-    except (tarfile.TarError, OSError) as error:
-        raise TrilightError(f"{path.name}: not a readable shard ({error}).") from error
+    end, position = stream.seek(0, 2), 0
+    while True:
+        stream.seek(position)
+        block = stream.read(tarfile.BLOCKSIZE)
+        if not any(block):  # a tar ends in two empty blocks; a file that is cut has none
+            if block + stream.read(tarfile.BLOCKSIZE) == bytes(2 * tarfile.BLOCKSIZE):
+                return
+            raise TrilightError(f"{name}: the end of the shard is missing; it is cut short.")
+        try:
+            member = tarfile.TarInfo.frombuf(block, "utf-8", "strict")
+        except (tarfile.TarError, ValueError) as error:
+            raise TrilightError(f"{name}: not a readable shard ({error}).") from error
+        found = _checked(name, member, position + tarfile.BLOCKSIZE)
+        position = found.offset + -(-found.num_bytes // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+        if position > end:
+            raise TrilightError(f"{name}: member {member.name} is cut short.")
+        yield found
+
+
+def scan_samples(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, Member]]]:
+    """Yield (key, members by suffix) of each sample of an open shard, reading headers only.
+
+    Members of one sample must stand together, as WebDataset demands.
+
+    Raises:
+        TrilightError: as `scan_members`, or a member or a key occurs twice.
+    """
+    seen: set[str] = set()
+    current: str | None = None
+    members: dict[str, Member] = {}
+    for member in scan_members(stream, name):
+        if member.key != current:
+            if current is not None:
+                yield current, members
+            if member.key in seen:
+                raise TrilightError(f"{name}: sample {member.key} occurs twice.")
+            seen.add(member.key)
+            current, members = member.key, {}
+        if member.suffix in members:
+            raise TrilightError(f"{name}: member {member.key}.{member.suffix} occurs twice.")
+        members[member.suffix] = member
+    if current is not None:
+        yield current, members
+
+
+def samples_of(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, bytes]]]:
+    """Yield (key, bytes of the members by suffix) of each sample of an open shard.
+
+    Raises:
+        TrilightError: as `scan_samples`.
+    """
+    for key, members in scan_samples(stream, name):
+        yield key, {suffix: _read(stream, member) for suffix, member in members.items()}
 
 
 def iterate_samples(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
     """Yield (key, members by suffix) of each sample of a shard.
 
-    Members of one sample must stand together, as WebDataset demands.
-
     Raises:
-        TrilightError: as `iterate_members`, or a member or a key occurs twice.
+        TrilightError: as `scan_samples`, or the file cannot be read.
     """
-    seen: set[str] = set()
-    current: str | None = None
-    members: dict[str, bytes] = {}
-    for key, suffix, _, data in iterate_members(path):
-        if key != current:
-            if current is not None:
-                yield current, members
-            if key in seen:
-                raise TrilightError(f"{path.name}: sample {key} occurs twice.")
-            seen.add(key)
-            current, members = key, {}
-        if suffix in members:
-            raise TrilightError(f"{path.name}: member {key}.{suffix} occurs twice.")
-        members[suffix] = data
-    if current is not None:
-        yield current, members
+    with _opened(path) as stream:
+        yield from samples_of(stream, path.name)
 
 
 def read_members(path: Path, key: str, suffixes: Collection[str]) -> dict[str, bytes]:
     """Return some members of one sample of a shard by suffix, reading no other.
 
     Raises:
-        TrilightError: as `iterate_members`, there is no such sample, or a member occurs twice.
+        TrilightError: as `scan_samples`, the file cannot be read, or there is no such sample.
     """
-    members: dict[str, bytes] = {}
     keys: list[str] = []
-    try:
-        with tarfile.open(path, mode="r:") as archive:
-            for member in archive:
-                found, suffix = _checked_name(path, member)
-                if found not in keys[-1:]:
-                    keys.append(found)
-                if found != key or suffix not in suffixes:
-                    continue
-                if suffix in members:
-                    raise TrilightError(f"{path.name}: member {key}.{suffix} occurs twice.")
-                stream = archive.extractfile(member)
-                members[suffix] = stream.read() if stream else b""
-    except (tarfile.TarError, OSError) as error:
-        raise TrilightError(f"{path.name}: not a readable shard ({error}).") from error
-    if key not in keys:
+    found: dict[str, bytes] | None = None
+    with _opened(path) as stream:
+        for this, members in scan_samples(stream, path.name):
+            keys.append(this)
+            if this == key:
+                chosen = {suffix: members[suffix] for suffix in suffixes if suffix in members}
+                found = {suffix: _read(stream, member) for suffix, member in chosen.items()}
+    if found is None:
         held = f"{keys[0]} to {keys[-1]}" if keys else "none"
         raise TrilightError(
             f"{path.name}: no sample {key}; expected one of its {len(keys)}: {held}."
         )
-    return members
+    return found
 
 
-def _checked_name(path: Path, member: tarfile.TarInfo) -> tuple[str, str]:
+def _opened(path: Path) -> BinaryIO:
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise TrilightError(f"{path.name}: not a readable shard ({error}).") from error
+
+
+def _read(stream: BinaryIO, member: Member) -> bytes:
+    stream.seek(member.offset)
+    return stream.read(member.num_bytes)
+
+
+def _checked(name: str, member: tarfile.TarInfo, offset: int) -> Member:
     match = MEMBER_NAME.fullmatch(member.name)
-    if not member.isreg() or match is None:
+    if member.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or match is None:
         raise TrilightError(
-            f"{path.name}: member {member.name!r} is refused; expected a plain file named "
-            "KEY.SUFFIX."
+            f"{name}: member {member.name!r} is refused; expected a plain file named KEY.SUFFIX."
         )
-    if member.size > MAX_MEMBER_BYTES:
+    if not 0 <= member.size <= MAX_MEMBER_BYTES:
         raise TrilightError(
-            f"{path.name}: member {member.name} claims {member.size} bytes; expected at most "
+            f"{name}: member {member.name} claims {member.size} bytes; expected at most "
             f"{MAX_MEMBER_BYTES}."
         )
-    return match[1], match[2]
-
-
-def _require_end(path: Path, archive: tarfile.TarFile) -> None:
-    """A tar ends in two empty blocks; a file cut between two members has none."""
-    with path.open("rb") as stream:
-        stream.seek(archive.offset)
-        if stream.read(2 * tarfile.BLOCKSIZE) != bytes(2 * tarfile.BLOCKSIZE):
-            raise TrilightError(f"{path.name}: the end of the shard is missing; it is cut short.")
+    return Member(match[1], match[2], offset, member.size)

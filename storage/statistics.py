@@ -78,7 +78,7 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     views: list[Any] = []
     scene_members: dict[str, str] = {}
     for shard in dataset.manifest.shards:
-        with dataset.folder.shard(shard.name).open("rb") as stream:
+        with dataset.files.open(shard, checked=False) as stream:
             for name, offset, num_bytes in shard.members:
                 key, _, suffix = name.partition(".")
                 if suffix not in ("json", PLAIN, PACKED):

@@ -1,22 +1,29 @@
 """Is a dataset what its manifest says? Every hash, member and law, and a list of what is wrong."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import BinaryIO
 
-import numpy as np
-
+from storage.check_sample import check_sample
+from storage.dataset import Dataset, open_dataset
+from storage.dataset_files import LocalFiles, RemoteFiles
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
-from storage.licences import mixed_share_alike
-from storage.lights import sum_of_lights
-from storage.manifest import Manifest, ShardEntry, index_shard, read_manifest
-from storage.objects_lock import read_objects_lock
+from storage.manifest import Manifest, ShardEntry, index_stream
+from storage.objects_lock import decode_objects_lock
 from storage.records import LockedObject
-from storage.sample import Sample, decode_sample
-from storage.shard_reader import iterate_samples
+from storage.remote.fetch import download
+from storage.remote.tries import TransferFailed
+from storage.sample import decode_sample
+from storage.shard_reader import samples_of, scan_members
+
+REMOTE_THREADS = 8
+"""Shards of a server that are fetched, or asked for, at the same time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,130 +36,163 @@ class Verification:
     """One line per fault, naming shard and sample; empty where the dataset is whole."""
     num_samples: int
     """Samples that were looked at."""
+    bad_shards: Sequence[str]
+    """Names of the shards that are missing or not what they should be."""
+
+
+@dataclass(kw_only=True)
+class _Found:
+    """What was found in one shard."""
+
+    faults: list[str] = field(default_factory=list)
+    keys: list[str] = field(default_factory=list)
 
 
 def verify_dataset(
-    root: Path, *, fast: bool = False, shard_done: Callable[[str], None] = lambda name: None
+    root: str | Path, *, fast: bool = False, shard_done: Callable[[str], None] = lambda name: None
 ) -> Verification:
-    """Check a dataset folder against its manifest.
+    """Check a dataset, in a folder or on a server, against its manifest.
+
+    Several shards are looked at side by side in threads: hashing and unpacking leave Python's lock.
+    Shards of a server are fetched anew, past the cache, and not kept.
 
     Args:
-        root: the dataset.
-        fast: compare only sizes and member counts, reading no picture.
+        root: the dataset, a path or a URL.
+        fast: compare only sizes, and in a folder also the members' names and places; reads no
+            picture. A changed byte is not seen.
         shard_done: called with the name of each shard that was looked at.
 
     Raises:
-        TrilightError: there is no readable manifest, so there is nothing to check against.
+        TrilightError: there is no readable manifest, so there is nothing to check against, or the
+            disk is full.
     """
-    folder = DatasetFolder(root)
-    manifest = read_manifest(folder.manifest)
-    problems = list(_check_lock(folder, manifest))
-    locked = _locked_by_uid(folder) if not problems else {}
-    listed = {shard.name for shard in manifest.shards}
-    problems += [
-        f"{name}: not in the manifest"
-        for path in folder.shard_files()
-        if (name := path.relative_to(root).as_posix()) not in listed
-    ]
-    num_samples, keys = 0, set[str]()
-    for shard in manifest.shards:
-        for fault in _check_shard(folder, shard, manifest, locked, keys, fast=fast):
-            problems.append(f"{shard.name}: {fault}")
-        num_samples += shard.num_samples
-        shard_done(shard.name)
-    return Verification(manifest=manifest, problems=problems, num_samples=num_samples)
+    dataset = open_dataset(str(root))
+    manifest = dataset.manifest
+    lock = dataset.files.read("objects.lock.jsonl")
+    problems = list(_check_lock(lock, manifest))
+    locked = {} if problems or lock is None else _by_uid(lock)
+    problems += [f"{name}: not in the manifest" for name in _strangers(dataset)]
+    where: dict[str, str] = {}
+    bad: list[str] = []
+    threads = os.cpu_count() or 1 if isinstance(dataset.files, LocalFiles) else REMOTE_THREADS
+    with ThreadPoolExecutor(threads) as pool:
+        checks = [
+            pool.submit(_check_shard, dataset, shard, locked, fast=fast)
+            for shard in manifest.shards
+        ]
+        try:
+            for shard, check in zip(manifest.shards, checks, strict=True):
+                found = check.result()
+                faults = [*found.faults, *_twice(found.keys, shard, where)]
+                bad += [shard.name] if faults else []
+                problems += [
+                    f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}" for fault in faults
+                ]
+                shard_done(shard.name)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return Verification(
+        manifest=manifest, problems=problems, num_samples=manifest.num_samples, bad_shards=bad
+    )
 
 
-def _locked_by_uid(folder: DatasetFolder) -> dict[str, LockedObject]:
-    if not folder.objects_lock.exists():
-        return {}
-    return {entry.uid: entry for entry in read_objects_lock(folder.objects_lock)}
+def _strangers(dataset: Dataset) -> list[str]:
+    """Return shards in the folder that nobody lists; a server's folder is not listed."""
+    if isinstance(dataset.files, RemoteFiles):
+        return []
+    listed = {shard.name for shard in dataset.manifest.shards}
+    root = dataset.files.root
+    found = [path.relative_to(root).as_posix() for path in DatasetFolder(root).shard_files()]
+    return [name for name in found if name not in listed]
 
 
-def _check_lock(folder: DatasetFolder, manifest: Manifest) -> Iterator[str]:
-    path = folder.objects_lock
+def _by_uid(lock: bytes) -> dict[str, LockedObject]:
+    return {entry.uid: entry for entry in decode_objects_lock(lock, "objects.lock.jsonl")}
+
+
+def _check_lock(lock: bytes | None, manifest: Manifest) -> Iterator[str]:
     if not manifest.objects_lock_sha256:
         if manifest.shards:
             yield "objects.lock.jsonl: the manifest has shards but no digest of the lock"
-    elif not path.exists():
+    elif lock is None:
         yield "objects.lock.jsonl: missing"
-    elif sha256_hex(path.read_bytes()) != manifest.objects_lock_sha256:
+    elif sha256_hex(lock) != manifest.objects_lock_sha256:
         yield "objects.lock.jsonl: sha256 differs from the manifest"
 
 
+def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:
+    for key in keys:
+        if (other := where.setdefault(key, shard.name)) != shard.name:
+            yield f"sample {key} occurs twice in the dataset, first in {other}"
+
+
 def _check_shard(
-    folder: DatasetFolder,
+    dataset: Dataset, shard: ShardEntry, locked: Mapping[str, LockedObject], *, fast: bool
+) -> _Found:
+    found = _Found()
+    try:
+        found.faults += _check_size(dataset, shard)
+        if found.faults or (fast and isinstance(dataset.files, RemoteFiles)):
+            return found
+        with _opened(dataset, shard) as stream:
+            if fast:
+                found.faults += _check_members(stream, shard)
+            else:
+                _check_content(stream, shard, dataset.manifest, locked, found)
+    except TrilightError as error:
+        found.faults.append(str(error))
+    except TransferFailed as error:
+        found.faults.append(f"cannot be read ({error.message})")
+    return found
+
+
+def _check_size(dataset: Dataset, shard: ShardEntry) -> Iterator[str]:
+    num_bytes = dataset.files.num_bytes(shard)
+    if num_bytes is None:
+        yield "missing"
+    elif num_bytes != shard.num_bytes:
+        yield f"{num_bytes} bytes; expected {shard.num_bytes}"
+    if len(shard.index) != shard.num_samples:
+        yield f"the manifest counts {shard.num_samples} samples and names {len(shard.index)}"
+
+
+def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
+    if isinstance(dataset.files, LocalFiles):
+        return dataset.files.open(shard, checked=False)
+    stream: BinaryIO = TemporaryFile()
+    try:
+        url = dataset.files.url.child(shard.name)
+        download(url, stream, num_bytes=shard.num_bytes, max_bytes=shard.num_bytes)
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def _check_members(stream: BinaryIO, shard: ShardEntry) -> Iterator[str]:
+    found = tuple(
+        (f"{member.key}.{member.suffix}", member.offset, member.num_bytes)
+        for member in scan_members(stream, shard.name)
+    )
+    if found != shard.members:
+        yield "the member index differs from the manifest"
+
+
+def _check_content(
+    stream: BinaryIO,
     shard: ShardEntry,
     manifest: Manifest,
-    locked: dict[str, LockedObject],
-    keys: set[str],
-    *,
-    fast: bool,
-) -> Iterator[str]:
-    path = folder.shard(shard.name)
-    if not path.exists():
-        yield "missing"
-        return
-    if path.stat().st_size != shard.num_bytes:
-        yield f"{path.stat().st_size} bytes; expected {shard.num_bytes}"
-        return
-    if fast:
-        return
-    try:
-        if index_shard(path) != shard:
-            yield "sha256 or member index differs from the manifest"
-        for key, members in iterate_samples(path):
-            if key in keys:
-                yield f"sample {key} occurs twice in the dataset"
-            keys.add(key)
-            yield from check_sample(decode_sample(key, members), shard.split, manifest, locked)
-    except TrilightError as error:
-        yield str(error)
-
-
-def check_sample(
-    sample: Sample, split: str, manifest: Manifest, locked: dict[str, LockedObject]
-) -> Iterator[str]:
-    """Yield the faults of one sample: laws of the scene, pictures, and rights of its objects."""
-    try:
-        sample.scene.check()
-    except TrilightError as error:
-        yield f"sample {sample.key}: {error}"
-    resolution = _setting(manifest, "renders", "resolution")
-    expected = (manifest.num_views, resolution, resolution, 3)
-    if sample.radiance_rgb.shape != expected or sample.scene.num_views != manifest.num_views:
-        yield f"sample {sample.key}: pictures {sample.radiance_rgb.shape}; expected {expected}"
-    if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
-        yield f"sample {sample.key}: a picture holds a value that is not finite or negative"
-    yield from _check_lights(sample, apart=bool(manifest.settings["renders"].get("per_light")))
-    if mixed := mixed_share_alike(entry.licence for entry in sample.scene.objects):
-        yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
-    for entry in sample.scene.objects:
-        if entry.kind != "object":
+    locked: Mapping[str, LockedObject],
+    found: _Found,
+) -> None:
+    if index_stream(stream, shard.name) != shard:
+        found.faults.append("sha256 or member index differs from the manifest")
+    for key, members in samples_of(stream, shard.name):
+        found.keys.append(key)
+        try:
+            sample = decode_sample(key, members)
+        except TrilightError as error:
+            found.faults.append(str(error))
             continue
-        lock = locked.get(entry.uid)
-        if lock is None:
-            yield f"sample {sample.key}: object {entry.uid!r} is not in objects.lock.jsonl"
-        elif lock.split != split:
-            yield f"sample {sample.key}: object {entry.uid!r} belongs to split {lock.split}"
-
-
-def _check_lights(sample: Sample, *, apart: bool) -> Iterator[str]:
-    """Yield the faults of the pictures of single lights; older manifests know no such setting."""
-    if (sample.lights_rgb is not None) != apart:
-        found = "lacks" if apart else "has"
-        yield f"sample {sample.key}: {found} pictures by light; renders.per_light is {apart}"
-    if sample.lights_rgb is None:
-        return
-    for view, lights in enumerate(sample.lights_rgb):
-        differs = (sum_of_lights(lights) != sample.radiance_rgb[view]).any(axis=-1)
-        if differs.any():
-            row, column = (int(index) for index in np.argwhere(differs)[0])
-            yield (
-                f"sample {sample.key}: view {view} is not the sum of its lights in "
-                f"{int(differs.sum())} pixels, first in ({row}, {column})"
-            )
-
-
-def _setting(manifest: Manifest, group: str, name: str) -> Any:
-    return manifest.settings[group][name]
+        found.faults += check_sample(sample, shard.split, manifest, locked)

@@ -5,7 +5,10 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Receives the course of a run, in this order: begin, then advance and validated, in turns."""
+    """Receives the course of a run: noted, then begin, then advance and validated, in turns."""
+
+    def noted(self, text: str) -> None:
+        """There is something about the data that the user should know."""
 
     def begin(
         self, *, step: int, num_steps: int, num_parameters: int, median_scores: Mapping[str, float]
@@ -21,6 +24,9 @@ class Progress(Protocol):
 
 class Silent:
     """A Progress that says nothing."""
+
+    def noted(self, text: str) -> None:
+        """Ignore it."""
 
     def begin(
         self, *, step: int, num_steps: int, num_parameters: int, median_scores: Mapping[str, float]

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import platform
 import time
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,13 @@ import torch
 from model.renderformer import count_parameters
 from model.weights import encode_weights
 from storage.atomic import write_atomically
-from storage.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
+from storage.training_data import TrainingData, open_training_data
+from train.data.order import Share
 from train.data.scenes import training_scene
-from train.data.splits import first_samples, shards_of
-from train.data.stream import StreamSettings, prefetched, stream_scenes
+from train.data.splits import first_samples
+from train.data.stream import StreamSettings, stream_batches
+from train.data.unusable import Unusable
 from train.evaluation.judge import Judge, Judgement, median_picture
 from train.evaluation.sheet import SheetView, write_sheet
 from train.folder import RunFolder
@@ -58,6 +61,8 @@ class TrainResult:
     """The network on the validation split (evaluation.judge)."""
     median_scores: dict[str, float]
     """The median picture of the training views on the same split."""
+    unusable: tuple[str, ...]
+    """What was wrong with data that was left out in this call."""
     seconds: float
     """Wall time of this call, from opening the data to writing the sheet."""
 
@@ -70,19 +75,22 @@ class TrainResult:
 def train_run(
     settings: TrainSettings,
     *,
-    data: str,
+    data: Sequence[str],
     out: Path,
     resume: bool = False,
+    workers: int = 1,
     progress: Progress | None = None,
 ) -> TrainResult:
     """Train a network and judge it.
 
     Args:
         settings: the run; `train.settings.named_run` returns those that have a name.
-        data: folder of a dataset with a train and a validation split.
+        data: root of a dataset with a train and a validation split, or a list of shards
+            (storage.training_data).
         out: folder of the run (train.folder), new unless `resume`.
         resume: go on from the folder's checkpoint; the weights come out the same to the bit on the
             CPU, for the same number of threads. A finished run is judged again.
+        workers: threads that read and decode samples; the weights do not depend on them.
         progress: is told how it goes.
 
     Raises:
@@ -92,10 +100,13 @@ def train_run(
     """
     began = time.monotonic()
     progress = progress or Silent()
-    dataset, folder = open_dataset(data), RunFolder(out)
-    _check_data(dataset, settings)
-    state = _begin(settings, folder, dataset, resume)
-    judge = _make_judge(dataset, settings)
+    opened, folder = open_training_data(data), RunFolder(out)
+    for note in opened.notes:
+        progress.noted(note)
+    unusable = Unusable(settings.most_unusable)
+    _check_data(opened, settings, unusable)
+    state = _begin(settings, folder, opened, resume)
+    judge = _make_judge(opened, settings, unusable)
     progress.begin(
         step=state.step,
         num_steps=settings.num_steps,
@@ -106,39 +117,49 @@ def train_run(
         state=state,
         settings=settings,
         folder=folder,
-        data_digest=dataset.digest,
+        data_digest=opened.digest,
         judge=judge,
         progress=progress,
     )
-    stream = StreamSettings(
-        seed=settings.seed,
-        window=settings.shuffle_window,
-        resolution=settings.resolution,
-        views_per_scene=settings.views_per_scene,
+    batches = stream_batches(
+        opened.split("train"),
+        StreamSettings(
+            seed=settings.seed,
+            window=settings.shuffle_shards,
+            batch_size=settings.scenes_per_step,
+            resolution=settings.resolution,
+            views_per_scene=settings.views_per_scene,
+        ),
+        state.step,
+        share=Share(),
+        workers=workers,
+        unusable=unusable,
     )
-    shards = shards_of(dataset, "train")
-    first = state.step * settings.scenes_per_step
-    with closing(prefetched(stream_scenes(dataset, shards, stream, first))) as scenes:
-        trainer.run(scenes)
-    return _finish(state, settings, folder, judge, began)
+    with closing(batches):
+        trainer.run(batches)
+    return _finish(state, settings, folder, judge, unusable.messages, began)
 
 
-def _check_data(dataset: Dataset, settings: TrainSettings) -> None:
+def _check_data(data: TrainingData, settings: TrainSettings, unusable: Unusable) -> None:
     """Find out before any work what the data cannot give."""
     for split in ("train", "validation"):
-        shards_of(dataset, split)
-    if settings.views_per_scene > dataset.manifest.num_views:
+        data.split(split)
+    num_views = data.num_views
+    if num_views is None:
+        (sample,) = first_samples(data.split("train"), 1, unusable)
+        num_views = sample.scene.num_views
+    if settings.views_per_scene > num_views:
         raise TrilightError(
-            f"views_per_scene is {settings.views_per_scene}, but scenes of {dataset.folder.root} "
-            f"have {dataset.manifest.num_views} views; expected at most that many."
+            f"views_per_scene is {settings.views_per_scene}, but scenes of {data.shown} "
+            f"have {num_views} views; expected at most that many."
         )
 
 
 def _begin(
-    settings: TrainSettings, folder: RunFolder, dataset: Dataset, resume: bool
+    settings: TrainSettings, folder: RunFolder, data: TrainingData, resume: bool
 ) -> TrainState:
     if resume:
-        return load_checkpoint(folder.checkpoint, settings, dataset.digest)
+        return load_checkpoint(folder.checkpoint, settings, data.digest)
     if folder.checkpoint.exists():
         raise TrilightError(
             f"{folder.root}: holds a run already; add --resume to go on with it, or choose "
@@ -146,7 +167,7 @@ def _begin(
         )
     record = {
         "settings": settings_record(settings),
-        "data_digest": dataset.digest,
+        "data_digest": data.digest,
         "versions": {"torch": torch.__version__, "python": platform.python_version()},
         "threads": torch.get_num_threads(),
     }
@@ -154,12 +175,13 @@ def _begin(
     return new_state(settings)
 
 
-def _make_judge(dataset: Dataset, settings: TrainSettings) -> Judge:
+def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable) -> Judge:
     training = [
         training_scene(sample, settings.resolution)
-        for sample in first_samples(dataset, "train", MEDIAN_SCENES)
+        for sample in first_samples(data.split("train"), MEDIAN_SCENES, unusable)
     ]
-    samples = list(first_samples(dataset, "validation", settings.validation_scenes))
+    # what is judged by must be whole: a score over fewer scenes would be another score
+    samples = list(first_samples(data.split("validation"), settings.validation_scenes, Unusable(0)))
     return Judge(samples, settings.resolution, median_picture(training))
 
 
@@ -168,6 +190,7 @@ def _finish(
     settings: TrainSettings,
     folder: RunFolder,
     judge: Judge,
+    unusable: Sequence[str],
     began: float,
 ) -> TrainResult:
     write_atomically(folder.weights, encode_weights(state.model))
@@ -183,6 +206,7 @@ def _finish(
         loss_at_end=loss_at_end,
         scores=judgement.scores,
         median_scores=judge.median_scores,
+        unusable=tuple(unusable),
         seconds=time.monotonic() - began,
     )
     record = dataclasses.asdict(result) | {"beats_median": result.beats_median}

@@ -45,8 +45,10 @@ class TrainSettings:
     """AdamW's memories."""
     grad_clip: float = 1.0
     """Longest gradient that is followed; a longer one is shortened to this."""
-    shuffle_window: int = 64
-    """Samples in memory to shuffle among."""
+    shuffle_shards: int = 4
+    """Shards that are open at the same time, among whose samples is shuffled."""
+    most_unusable: int = 0
+    """Damaged samples that may be replaced by others; at 0 the first one ends the run."""
     log_every: int = 10
     """Steps between rows of metrics.jsonl."""
     validate_every: int
@@ -64,7 +66,7 @@ class TrainSettings:
             "num_steps",
             "scenes_per_step",
             "views_per_scene",
-            "shuffle_window",
+            "shuffle_shards",
             "log_every",
             "validate_every",
             "checkpoint_every",
@@ -80,6 +82,8 @@ class TrainSettings:
         for name in ("learning_rate", "grad_clip"):
             if not getattr(self, name) > 0:
                 _wrong(name, getattr(self, name), "above 0")
+        if self.most_unusable < 0:
+            _wrong("most_unusable", self.most_unusable, "at least 0")
         if not self.weight_decay >= 0:
             _wrong("weight_decay", self.weight_decay, "at least 0")
 

@@ -14,7 +14,7 @@ from storage.errors import TrilightError
 if TYPE_CHECKING:
     from infra.bench.harness import Options, Result
 
-_NAMES = ("assets", "render", "scenes", "shards")
+_NAMES = ("assets", "render", "scenes", "shards", "streaming")
 
 _Measured = TypeVar("_Measured", bound="Result")
 
@@ -136,6 +136,17 @@ def _named(name: str) -> list[_Benchmark[Any]]:
                 run=shards.run,
                 rows=shards_report.rows,
                 plot=shards_report.plot,
+            )
+        ]
+    if name == "streaming":
+        from infra.bench import streaming, streaming_report
+
+        return [
+            _Benchmark(
+                num_rounds=streaming.num_rounds,
+                run=streaming.run,
+                rows=streaming_report.rows,
+                plot=streaming_report.plot,
             )
         ]
     raise TrilightError(f"benchmark {name!r} is unknown; expected one of {', '.join(_NAMES)}.")

@@ -9,6 +9,7 @@ import typer
 
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from storage.dataset import Dataset, open_dataset
+from storage.dataset_files import RemoteFiles
 from storage.errors import TrilightError
 from storage.failures import count_by_reason
 from storage.layout import DatasetFolder
@@ -18,11 +19,11 @@ if TYPE_CHECKING:
     from pipeline.documents.distributions import Distributions
 
 
-_READ_ONLY = "The folder cannot be written: choose one for report and contact sheet with --out."
+_READ_ONLY = "It cannot be written there: choose a folder for report and sheet with --out."
 
 
 def inspect(
-    dataset: Annotated[Path, typer.Argument(help="folder of the dataset")],
+    dataset: Annotated[str, typer.Argument(help="the dataset, a folder or a URL")],
     scenes: Annotated[int, typer.Option(help="scenes on the contact sheet")] = 16,
     by_template: Annotated[
         int | None, typer.Option(help="write templates.png too: so many scenes of each layout")
@@ -34,28 +35,38 @@ def inspect(
 ) -> None:
     """Write report, gallery and contact sheet anew, and print what the dataset holds.
 
-    A dataset that is read-only is only summed up, unless there is an --out.
+    A dataset that is read-only, or on a server, is only summed up, unless there is an --out.
     """
     from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
 
-    opened = open_dataset(str(dataset))
+    opened = open_dataset(dataset)
     with progress_bars() as bars:
         total = len(opened.manifest.shards)
         task = bars.add_task("shards", total=total, note="", visible=not json)
         statistics = dataset_statistics(opened)
         found = dataset_distributions(opened, shard_done=lambda _: bars.advance(task))
-    folder = opened.folder if out is None else DatasetFolder(out)
-    writable = out is not None or os.access(folder.root, os.W_OK | os.X_OK)
-    if writable:
+    folder = _folder_of_documents(opened, out)
+    if folder is not None:
         _write(opened, statistics, found, folder, max_scenes=scenes)
         if by_template is not None:
             _write_templates(opened, folder, per_template=by_template)
     if json:
         print_json(_as_json(opened, statistics, found))
         return
-    _print_summary(str(dataset), opened, statistics, found)
-    look = f"Look at {folder.report} and {folder.contact_sheet}"
-    console.print(f"\n{look if writable else _READ_ONLY}", style="bold")
+    _print_summary(opened.shown, opened, statistics, found)
+    look = f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY
+    console.print(f"\n{look}", style="bold")
+
+
+def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | None:
+    """Return where report and sheet go; None where nobody said and it cannot be there."""
+    if out is not None:
+        return DatasetFolder(out)
+    if isinstance(opened.files, RemoteFiles) or not os.access(
+        opened.folder.root, os.W_OK | os.X_OK
+    ):
+        return None
+    return opened.folder
 
 
 def _write(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
+from rich.text import Text
 
 from infra.cli.console import console, print_rows, progress_bars
 from storage.errors import TrilightError
@@ -23,6 +24,9 @@ class _BarProgress:
         self._bars = bars
         self._task: TaskID = bars.add_task("steps", total=None, start=False, note="")
         self._first_step = 0
+
+    def noted(self, text: str) -> None:
+        console.print(Text(f"Note: {text}.", style="yellow"))
 
     def begin(
         self, *, step: int, num_steps: int, num_parameters: int, median_scores: Mapping[str, float]
@@ -50,10 +54,20 @@ class _BarProgress:
 
 def train(
     run: Annotated[str, typer.Argument(help="named run, such as smoke")],
-    data: Annotated[str, typer.Option(help="folder of a dataset")],
+    data: Annotated[
+        list[str],
+        typer.Option(
+            help="root of a dataset, a folder or a URL; or shards, by name or pattern such as "
+            "s3://b/{train,validation}-{000000..000007}.tar, and may be repeated"
+        ),
+    ],
     out: Annotated[Path | None, typer.Option(help="folder of the run [runs/RUN]")] = None,
     resume: Annotated[bool, typer.Option(help="go on from the last checkpoint")] = False,
     steps: Annotated[int | None, typer.Option(help="replace the run's number of steps")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="threads that decode samples")] = 1,
+    skip_unusable: Annotated[
+        int | None, typer.Option(min=0, help="replace up to so many damaged samples [stop at one]")
+    ] = None,
     json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
 ) -> None:
     """Train a model; writes checkpoints, metrics.jsonl and a sheet of validation pictures."""
@@ -67,10 +81,17 @@ def train(
     settings = named_run(run)
     if steps is not None:
         settings = dataclasses.replace(settings, num_steps=steps)
+    if skip_unusable is not None:
+        settings = dataclasses.replace(settings, most_unusable=skip_unusable)
     folder = out or Path("runs") / run
     with progress_bars() as bars:
         result = train_run(
-            settings, data=data, out=folder, resume=resume, progress=_BarProgress(bars)
+            settings,
+            data=data,
+            out=folder,
+            resume=resume,
+            workers=workers,
+            progress=_BarProgress(bars),
         )
     if json:
         console.file.write(result.folder.summary.read_text())
@@ -98,6 +119,7 @@ def _report(result: "TrainResult") -> None:
             f"({rival['psnr_linear_db_median']:.2f})",
         ),
         ("steps", f"{result.num_steps}, of which {result.skipped_steps} not finite and skipped"),
+        *(("left out", message) for message in result.unusable),
         ("wall time", f"{result.seconds / 60:.1f} min"),
         ("weights", str(result.folder.weights)),
     ]

@@ -12,9 +12,7 @@ from pipeline.documents.scene_facts import Values, scene_values, surfaces
 from storage.conventions import SPLITS
 from storage.dataset import Dataset
 from storage.errors import TrilightError
-from storage.failures import read_failures
 from storage.manifest import Manifest
-from storage.objects_lock import read_objects_lock
 from storage.records import Failure, LockedObject
 from storage.sample import SceneRecord
 
@@ -158,15 +156,14 @@ def dataset_distributions(
         if rows:
             tally.values.setdefault(shard.split, []).append(_concatenated(rows))
         shard_done(shard.name)
-    lock = dataset.folder.objects_lock
     return Distributions(
         values={split: _concatenated(chunks) for split, chunks in tally.values.items()},
         scenes=tally.scenes,
         placements=tally.placements,
         surfaces=tally.surfaces,
         views_at_cap=tally.views_at_cap,
-        objects=read_objects_lock(lock) if lock.exists() else (),
-        failures=read_failures(dataset.folder.failures),
+        objects=dataset.objects_lock(),
+        failures=dataset.failures(),
         targets=_targets(dataset.manifest),
     )
 

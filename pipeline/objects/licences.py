@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.objects.listing import failure
-from pipeline.objects.names import printable
 from storage.errors import TrilightError
 from storage.records import Failure, ObjectRecord
+from storage.safe_url import printable
 
 USER_PROVIDED = "LicenseRef-user-provided"
 """Of files that a user names without a catalogue: theirs to use, as far as we can know."""

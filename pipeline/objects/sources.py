@@ -18,15 +18,14 @@ from pipeline.objects.licences import (
 )
 from pipeline.objects.listing import Listing
 from pipeline.objects.local.source import list_folder
-from pipeline.objects.names import printable
 from pipeline.objects.objaverse.source import PREFIX as OBJAVERSE
 from pipeline.objects.objaverse.source import list_objaverse
 from pipeline.objects.remote.source import list_remote
-from pipeline.objects.remote.url import parse_source
 from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
 from storage.records import Failure, ObjectRecord
-from storage.safe_url import safe_url
+from storage.remote.url import parse_url
+from storage.safe_url import printable, safe_url
 
 _NOT_HAD = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
 
@@ -110,7 +109,7 @@ def _list(
     if source.startswith(OBJAVERSE):
         require_unstated(licence, OBJAVERSE)
         return list_objaverse(source, allowed_licences)
-    place = parse_source(source)
+    place = parse_url(source, what="objects")
     if isinstance(place, Path):
         return list_folder(place, licence)
     return list_remote(place, licence)

@@ -139,9 +139,10 @@ def test_a_deleted_shard_is_made_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_damage_is_named(tmp_path: Path, fast: bool) -> None:
-    name = _dataset(tmp_path).manifest.shards[0].name
+    shard = _dataset(tmp_path).manifest.shards[0]
+    name, (_, offset, num_bytes) = shard.name, shard.members[-1]
     data = bytearray((tmp_path / name).read_bytes())
-    data[len(data) // 2] ^= 1
+    data[offset + num_bytes // 2] ^= 1
     (tmp_path / name).write_bytes(data)
     problems = verify_dataset(tmp_path, fast=fast).problems
     assert fast == (not problems)  # a changed byte is seen only by its hash

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.objects import transfer
+from storage.remote import tries
 from tests.objects.http_kit import Site, serve
 from tests.objects.objaverse_kit import HOST, fill_site
 
@@ -17,7 +17,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "cache"
     monkeypatch.setenv("TRILIGHT_CACHE", str(folder))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    monkeypatch.setattr(transfer, "PAUSE_S", 0.0)
+    monkeypatch.setattr(tries, "PAUSE_S", 0.0)
     return folder
 
 

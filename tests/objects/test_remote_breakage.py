@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.objects.remote import source as remote_source
-from pipeline.objects.remote import url as remote_url
 from storage.errors import TrilightError
+from storage.remote import url as remote_url
 from tests.objects.find_kit import find, reasons
 from tests.objects.http_kit import Site
 
@@ -62,7 +62,7 @@ def test_one_dead_link_costs_one_object(
     assert breaks is not grow or not site.gets()["/b.obj"]
 
 
-def test_what_may_pass_is_tried_three_times(site: Site) -> None:
+def test_what_may_pass_is_tried_again(site: Site) -> None:
     site.put("a.obj", "A")
     site.put("b.obj", "B")
     site.errors = {"/a.obj": [503, 500], "/b.obj": [-404]}

@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.remote import source as remote_source
-from pipeline.objects.remote.url import PACKAGES, RemoteUrl, open_driver, parse_source
 from pipeline.objects.sources import FoundObjects, find_objects
 from storage.errors import TrilightError
+from storage.remote.url import PACKAGES, RemoteUrl, open_driver, parse_url
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ from storage.errors import TrilightError
     ],
 )
 def test_folders_of_this_machine(source: str, path: str) -> None:
-    assert parse_source(source) == Path(path)
+    assert parse_url(source, what="objects") == Path(path)
 
 
 @pytest.mark.parametrize(
@@ -45,14 +45,14 @@ def test_folders_of_this_machine(source: str, path: str) -> None:
     ],
 )
 def test_folders_of_servers(source: str, scheme: str, root: str) -> None:
-    url = parse_source(source)
+    url = parse_url(source, what="objects")
     assert isinstance(url, RemoteUrl)
     assert (url.scheme, url.root) == (scheme, root)
     assert "cret" not in repr(url) and "cret" not in url.shown
 
 
 def test_credentials_are_kept_apart() -> None:
-    url = parse_source("http://a%40da:s3@cret@host/x?k=1&l=&k=2#m")
+    url = parse_url("http://a%40da:s3@cret@host/x?k=1&l=&k=2#m", what="objects")
     assert isinstance(url, RemoteUrl)
     assert (url.user, url.password) == ("a@da", "s3@cret")
     assert url.query == (("k", "1"), ("l", ""), ("k", "2"))
@@ -91,7 +91,7 @@ def test_other_urls_are_refused(source: str, message: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("scheme", sorted(PACKAGES))
 def test_a_missing_driver_is_named(scheme: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, PACKAGES[scheme], None)
-    url = parse_source(f"{scheme}://host/a")
+    url = parse_url(f"{scheme}://host/a", what="objects")
     assert isinstance(url, RemoteUrl)
     with pytest.raises(TrilightError, match=f"pip install {PACKAGES[scheme]}"):
         open_driver(url)

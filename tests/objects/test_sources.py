@@ -11,11 +11,11 @@ import pytest
 from pipeline.assets.reading.source_file import SUFFIXES as READABLE
 from pipeline.objects.builtin.families import FAMILIES
 from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED
-from pipeline.objects.names import printable
 from pipeline.objects.sources import FoundObjects, find_objects
 from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
 from storage.records import ObjectRecord
+from storage.safe_url import printable
 
 
 def touch(folder: Path, *names: str) -> None:

@@ -13,6 +13,7 @@ from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
+from storage.check_sample import check_sample
 from storage.errors import Rejected
 from storage.exr import decode_exr, encode_exr
 from storage.lights import MAX_LIGHTS, light_rows, rounded_to_half, sum_of_lights
@@ -21,7 +22,6 @@ from storage.metrics import psnr_log_db
 from storage.sample import decode_sample, encode_sample
 from storage.scene import Scene, SceneObject
 from storage.seeds import seed_for
-from storage.verify import check_sample
 from tests.renders.sampling import SIGMAS, Estimate, camera_of
 from tests.renders.scene_kit import join, light, material, quad, sphere
 from tests.scenes_by_hand import tiny_scene

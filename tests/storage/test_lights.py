@@ -11,6 +11,7 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
+from storage.check_sample import check_sample
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.exr import decode_exr, encode_exr
@@ -25,7 +26,6 @@ from storage.manifest import Manifest
 from storage.sample import Sample, decode_sample, encode_sample
 from storage.scene import SceneObject
 from storage.shard_writer import write_shard
-from storage.verify import check_sample
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 

@@ -1,32 +1,58 @@
-"""Laws of the stream: position p is one scene for ever, and errors arrive where they belong."""
+"""Laws of the stream: batch i is the same scenes for ever, and errors arrive where they belong."""
 
 import itertools
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from storage.dataset import Dataset
 from storage.errors import TrilightError
+from storage.training_data import TrainingData, open_training_data
 from tests.train.toy import write_toy_dataset
+from train.data.order import Share
 from train.data.scenes import TrainingScene
-from train.data.splits import first_samples, shards_of
-from train.data.stream import StreamSettings, prefetched, stream_scenes
+from train.data.splits import first_samples
+from train.data.stream import StreamSettings, prefetched, stream_batches
+from train.data.unusable import Unusable
 
-SETTINGS = StreamSettings(seed=1, window=3, resolution=16, views_per_scene=1)
+SETTINGS = StreamSettings(seed=1, window=2, batch_size=6, resolution=16, views_per_scene=1)
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=7, validation=2, per_shard=3)
+    folder = tmp_path_factory.mktemp("toy")
+    return write_toy_dataset(folder, train=14, validation=2, per_shard=3, resolution=16)
 
 
-def take(dataset: Dataset, first: int, count: int) -> list[TrainingScene]:
-    stream = stream_scenes(dataset, shards_of(dataset, "train"), SETTINGS, first)
-    return list(itertools.islice(stream, count))
+@pytest.fixture(scope="module")
+def data(dataset: Dataset) -> TrainingData:
+    return open_training_data([str(dataset.folder.root)])
+
+
+def take(
+    data: TrainingData,
+    first: int,
+    count: int,
+    *,
+    rank: int = 0,
+    world_size: int = 1,
+    workers: int = 1,
+    settings: StreamSettings = SETTINGS,
+) -> list[list[TrainingScene]]:
+    batches = stream_batches(
+        data.split("train"),
+        settings,
+        first,
+        share=Share(rank=rank, world_size=world_size),
+        workers=workers,
+        unusable=Unusable(0),
+    )
+    with closing(batches):
+        return list(itertools.islice(batches, count))
 
 
 def same(a: TrainingScene, b: TrainingScene) -> bool:
@@ -39,66 +65,117 @@ def same(a: TrainingScene, b: TrainingScene) -> bool:
     )
 
 
-@pytest.mark.parametrize("first", [1, 6, 7, 9, 20])
-def test_entering_later_gives_the_rest_of_the_same_stream(dataset: Dataset, first: int) -> None:
-    whole, tail = take(dataset, 0, 24), take(dataset, first, 24 - first)
-    assert all(same(a, b) for a, b in zip(whole[first:], tail, strict=True))
+def same_batches(a: list[list[TrainingScene]], b: list[list[TrainingScene]]) -> bool:
+    return len(a) == len(b) and all(
+        len(x) == len(y) and all(same(p, q) for p, q in zip(x, y, strict=True))
+        for x, y in zip(a, b, strict=True)
+    )
 
 
-def test_epochs_show_every_scene_and_differ(dataset: Dataset) -> None:
-    scenes = take(dataset, 0, 21)
-    epochs = [scenes[start : start + 7] for start in (0, 7, 14)]
+def by_key(batch: list[TrainingScene]) -> list[TrainingScene]:
+    return sorted(batch, key=lambda scene: (scene.key, float(scene.target_VRR3.sum())))
+
+
+WHOLE = 8
+
+
+@pytest.fixture(scope="module")
+def whole(data: TrainingData) -> list[list[TrainingScene]]:
+    """Batches of more than three epochs, uninterrupted."""
+    return take(data, 0, WHOLE)
+
+
+@pytest.mark.parametrize("first", range(WHOLE))
+def test_resuming_after_every_batch_is_uninterrupted(
+    data: TrainingData, whole: list[list[TrainingScene]], first: int
+) -> None:
+    assert same_batches(whole[first:], take(data, first, WHOLE - first))
+
+
+@pytest.mark.parametrize("world_size", [2, 3, 6])
+@pytest.mark.parametrize("first", range(0, WHOLE, 3))
+def test_any_number_of_ranks_may_go_on(
+    data: TrainingData, whole: list[list[TrainingScene]], first: int, world_size: int
+) -> None:
+    shares = [
+        take(data, first, WHOLE - first, rank=rank, world_size=world_size, workers=1 + rank % 2)
+        for rank in range(world_size)
+    ]
+    assert {len(batch) for share in shares for batch in share} == {6 // world_size}
+    together = [
+        [scene for share in parts for scene in share] for parts in zip(*shares, strict=True)
+    ]
+    assert same_batches(
+        [by_key(batch) for batch in together], [by_key(batch) for batch in whole[first:]]
+    )
+
+
+@pytest.mark.parametrize("workers", [2, 5])
+def test_the_number_of_threads_changes_nothing(
+    data: TrainingData, whole: list[list[TrainingScene]], workers: int
+) -> None:
+    before = threading.active_count()
+    assert same_batches(take(data, 0, WHOLE, workers=workers), whole)
+    assert threading.active_count() == before, "closing the stream ends its threads"
+
+
+def test_a_list_of_the_same_shards_gives_the_same_batches(
+    dataset: Dataset, whole: list[list[TrainingScene]]
+) -> None:
+    listed = open_training_data([f"{dataset.folder.root}/train-{{000000..000004}}.tar"])
+    assert "without a manifest" in listed.notes[0]
+    assert same_batches(take(listed, 0, 4), whole[:4])
+    assert same_batches(take(listed, 3, 2), whole[3:5])
+
+
+def test_epochs_show_every_scene_and_differ(whole: list[list[TrainingScene]]) -> None:
+    scenes = [scene for batch in whole for scene in batch]
+    epochs = [scenes[start : start + 14] for start in (0, 14, 28)]
     keys = [[scene.key for scene in epoch] for epoch in epochs]
-    assert all(len(set(epoch)) == 7 for epoch in keys)
-    assert len({tuple(epoch) for epoch in keys}) > 1
+    assert all(len(set(epoch)) == 14 for epoch in keys)
+    assert len({tuple(epoch) for epoch in keys}) == 3
     visits = [scene for scene in scenes if scene.key == keys[0][0]]
     assert not same(visits[0], visits[1]), "every visit draws its own views and symmetries"
 
 
-def test_a_thread_ahead_changes_nothing_and_ends_when_closed(dataset: Dataset) -> None:
-    before = threading.active_count()
-    stream = stream_scenes(dataset, shards_of(dataset, "train"), SETTINGS, 4)
-    ahead = prefetched(stream)
-    got = list(itertools.islice(ahead, 12))
-    assert all(same(a, b) for a, b in zip(got, take(dataset, 4, 12), strict=True))
-    ahead.close()
-    assert threading.active_count() == before
-
-
-def test_a_damaged_shard_is_named_when_it_is_reached(tmp_path: Path) -> None:
-    dataset = write_toy_dataset(tmp_path, train=6, validation=1, per_shard=2, resolution=8)
-    shard = tmp_path / "train-000001.tar"
-    data = bytearray(shard.read_bytes())
-    data[len(data) // 2] ^= 1
-    shard.write_bytes(data)
-    settings = StreamSettings(seed=0, window=1, resolution=8, views_per_scene=1)
-    scenes = prefetched(stream_scenes(dataset, shards_of(dataset, "train"), settings, 0))
-    with pytest.raises(TrilightError, match=r"train-000001.tar.*sha256"):
-        for _ in range(6):
-            next(scenes)
+def test_ranks_that_cannot_share_equally_are_refused(data: TrainingData) -> None:
+    with pytest.raises(TrilightError, match="not divisible by 4 ranks"):
+        take(data, 0, 1, world_size=4)
 
 
 def test_a_bug_in_the_thread_is_not_swallowed() -> None:
-    def broken() -> Iterator[TrainingScene]:
+    def broken() -> Iterator[int]:
+        yield 1
         raise RuntimeError("a bug")
-        yield
 
+    items = prefetched(broken(), 2)
+    assert next(items) == 1
     with pytest.raises(RuntimeError, match="a bug"):
-        next(prefetched(broken()))
+        next(items)
 
 
-def test_first_samples_are_the_first(dataset: Dataset) -> None:
-    keys = [sample.key for sample in first_samples(dataset, "train", 5)]
+def test_first_samples_are_the_first(data: TrainingData) -> None:
+    keys = [sample.key for sample in first_samples(data.split("train"), 5, Unusable(0))]
     assert keys == [f"{index:09d}" for index in range(5)]
-    assert len(list(first_samples(dataset, "validation", 99))) == 2
+    assert len(list(first_samples(data.split("validation"), 99, Unusable(0)))) == 2
     with pytest.raises(TrilightError, match="the test split holds no scene"):
-        shards_of(dataset, "test")
+        data.split("test")
 
 
-def test_views_are_drawn_without_repetition(dataset: Dataset) -> None:
-    settings = StreamSettings(seed=0, window=1, resolution=8, views_per_scene=2)
-    shards = shards_of(dataset, "train")
-    for scene in itertools.islice(stream_scenes(dataset, shards, settings, 0), 7):
+def test_views_are_drawn_without_repetition(data: TrainingData) -> None:
+    settings = StreamSettings(seed=0, window=1, batch_size=7, resolution=8, views_per_scene=2)
+    for scene in take(data, 0, 1, settings=settings)[0]:
         poses = scene.tensors.c2w_V44.numpy()
         assert poses.shape[0] == 2
-        assert np.abs(poses[0] - poses[1]).max() > 0
+        assert abs(poses[0] - poses[1]).max() > 0
+
+
+def test_a_damaged_shard_is_named_when_it_is_reached(tmp_path: Path) -> None:
+    write_toy_dataset(tmp_path, train=6, validation=1, per_shard=2, resolution=8)
+    shard = tmp_path / "train-000001.tar"
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    settings = StreamSettings(seed=0, window=1, batch_size=1, resolution=8, views_per_scene=1)
+    with pytest.raises(TrilightError, match=r"train-000001.tar.*sha256"):
+        take(open_training_data([str(tmp_path)]), 0, 6, settings=settings)

@@ -42,7 +42,7 @@ def run(
     progress: Silent | None = None,
 ) -> TrainResult:
     return train_run(
-        settings, data=str(dataset.folder.root), out=out, resume=resume, progress=progress
+        settings, data=[str(dataset.folder.root)], out=out, resume=resume, progress=progress
     )
 
 
@@ -161,7 +161,7 @@ def test_progress_hears_of_every_step(dataset: Dataset, tmp_path: Path) -> None:
 
 def test_mistakes_are_named(dataset: Dataset, whole: TrainResult, tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match=r"no manifest\.json here"):
-        train_run(tiny_run(), data=str(tmp_path / "nowhere"), out=tmp_path / "a")
+        train_run(tiny_run(), data=[str(tmp_path / "nowhere")], out=tmp_path / "a")
     with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):
         run(tiny_run(resolution=24), dataset, tmp_path / "b")
     with pytest.raises(TrilightError, match="views_per_scene is 3, .* have 2 views"):

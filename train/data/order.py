@@ -1,45 +1,133 @@
-"""The order in which a run sees its scenes: a pure function of (seed, epoch).
+"""The order in which a run sees its scenes: a pure function of (seed, epoch, sizes of the shards).
 
-Shards are read whole and one after another in a permuted order, as a disk or a bucket likes it; a
-small window of samples is then shuffled. A sample therefore moves by about a window at most within
-its epoch. Nothing has to be stored to resume: position p of the stream is known from p.
+Shards are permuted; then the samples of a window, a few shards in a row, are permuted among each
+other. Epochs follow one another without a seam, and global batch i is the samples at positions
+i B to (i + 1) B - 1 of that endless order, whatever the number of ranks and workers. Nothing has to
+be stored to resume: the number of the batch says it all.
+
+The ranks share out a batch by shard, so that each reads few shards of a window and not all.
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from storage.errors import TrilightError
 from storage.seeds import rng_for
 
-Place = tuple[int, int]
-"""(index of the shard, row in it)."""
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Place:
+    """One sample, at one point of the order."""
+
+    position: int
+    """In the endless order; what is drawn for a visit is drawn by it."""
+    shard: int
+    """Number of the shard."""
+    row: int
+    """Of the sample in the shard."""
+    arrival: int
+    """Number of the shard in the order of its epoch."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class EpochOrder:
-    """One pass over a split."""
+class Window:
+    """Shards that are open at the same time, and the order of their samples."""
 
     shards: tuple[int, ...]
-    """In which order the shards are read."""
+    """Numbers of the shards, in the order of the epoch."""
     places: tuple[Place, ...]
-    """In which order their samples are used; each place exactly once."""
+    """Every sample of theirs exactly once."""
 
 
-def epoch_order(num_samples: Sequence[int], *, seed: int, epoch: int, window: int) -> EpochOrder:
-    """Return the order of one epoch over shards of the given sizes.
+@dataclass(frozen=True, kw_only=True)
+class OrderSettings:
+    """What the order depends on, beside the shards."""
+
+    seed: int
+    """Seed of the run."""
+    window: int
+    """Shards among whose samples is shuffled, at least 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share:
+    """Which part of every global batch a process takes."""
+
+    rank: int = 0
+    """Number of the process, from 0."""
+    world_size: int = 1
+    """How many processes train together."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rank < self.world_size:
+            raise TrilightError(
+                f"rank {self.rank} of {self.world_size}; expected a rank from 0 to "
+                f"{self.world_size - 1}."
+            )
+
+    def require_equal(self, batch_size: int) -> None:
+        """Raise TrilightError where the ranks cannot all take the same number of samples."""
+        if batch_size % self.world_size:
+            raise TrilightError(
+                f"a batch of {batch_size} scenes is not divisible by {self.world_size} ranks; "
+                "expected a multiple, so that each takes the same number."
+            )
+
+    def of_batch(self, places: Sequence[Place]) -> list[Place]:
+        """Return this process's part of a global batch, in the order of positions."""
+        size = len(places) // self.world_size
+        by_shard = sorted(places, key=lambda place: (place.arrival, place.position))
+        mine = by_shard[self.rank * size : (self.rank + 1) * size]
+        return sorted(mine, key=lambda place: place.position)
+
+
+def shard_order(num_shards: int, settings: OrderSettings, epoch: int) -> list[int]:
+    """Return the numbers of the shards in the order of an epoch."""
+    rng = rng_for(settings.seed, "shards", epoch)
+    return [int(shard) for shard in rng.permutation(num_shards)]
+
+
+def windows_from(
+    num_shards: int, num_samples: Callable[[int], int], settings: OrderSettings, first: int
+) -> Iterator[Window]:
+    """Yield windows without end, from the one that holds position `first` on.
 
     Args:
-        num_samples: samples of each shard.
-        seed, epoch: what the order depends on.
-        window: how many samples wait in memory to be drawn from, at least 1 (1 keeps the order).
+        num_shards: how many shards there are.
+        num_samples: size of a shard by number; asked only for shards that have been reached.
+        settings: seed and window.
+        first: a position.
+
+    Raises:
+        TrilightError: all shards are empty.
     """
-    rng = rng_for(seed, "order", epoch)
-    shards = tuple(int(shard) for shard in rng.permutation(len(num_samples)))
-    waiting: list[Place] = []
-    places: list[Place] = []
-    for arrival in ((shard, row) for shard in shards for row in range(num_samples[shard])):
-        waiting.append(arrival)
-        if len(waiting) == window:
-            places.append(waiting.pop(int(rng.integers(len(waiting)))))
-    while waiting:
-        places.append(waiting.pop(int(rng.integers(len(waiting)))))
-    return EpochOrder(shards=shards, places=tuple(places))
+    total = sum(num_samples(shard) for shard in range(num_shards)) if first else 0
+    epoch, start = (first // total, first // total * total) if total else (0, 0)
+    while True:
+        begun = start
+        order = shard_order(num_shards, settings, epoch)
+        for number, at in enumerate(range(0, num_shards, settings.window)):
+            shards = order[at : at + settings.window]
+            sizes = [num_samples(shard) for shard in shards]
+            if any(sizes) and start + sum(sizes) > first:
+                rng = rng_for(settings.seed, "samples", epoch, number)
+                arrivals = [(a, row) for a, size in enumerate(sizes) for row in range(size)]
+                places = (
+                    Place(position=start + p, shard=shards[a], row=row, arrival=at + a)
+                    for p, (a, row) in enumerate(arrivals[i] for i in rng.permutation(sum(sizes)))
+                )
+                yield Window(shards=tuple(shards), places=tuple(places))
+            start += sum(sizes)
+        if start == begun:
+            raise TrilightError(f"all {num_shards} shards are empty; expected a sample.")
+        epoch += 1
+
+
+def batches_from(
+    windows: Iterator[Window], first: int, batch_size: int
+) -> Iterator[tuple[Place, ...]]:
+    """Yield global batches without end; the first begins at position `first`."""
+    places = (place for window in windows for place in window.places if place.position >= first)
+    while True:
+        yield tuple(itertools.islice(places, batch_size))

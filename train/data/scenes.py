@@ -1,6 +1,7 @@
 """`Sample` -> `TrainingScene`: the tensors that one scene contributes to a step."""
 
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -32,17 +33,21 @@ def training_scene(sample: Sample, resolution: int) -> TrainingScene:
         TrilightError: the resolution is no divisor of the sample's, or a picture holds a value
             that is not finite or is negative. Such a value would reach every weight in one step.
     """
-    wrong = np.argwhere(~(np.isfinite(sample.radiance_rgb) & (sample.radiance_rgb >= 0)))
-    if len(wrong):
-        view, row, column, channel = (int(index) for index in wrong[0])
-        value = sample.radiance_rgb[view, row, column, channel]
-        raise TrilightError(
-            f"sample {sample.key}: view {view} has radiance {value} at pixel ({row}, {column}); "
-            "expected finite values from 0. Run `trilight verify` on the dataset."
-        )
+    if not (sample.radiance_rgb.min() >= 0 and sample.radiance_rgb.max() < np.inf):
+        _refuse(sample)
     radiance_VRR3 = block_mean(sample.radiance_rgb, resolution)
     return TrainingScene(
         key=sample.key,
         tensors=scene_tensors(sample.scene),
         target_VRR3=torch.from_numpy(log10_radiance(radiance_VRR3).astype(np.float32)),
+    )
+
+
+def _refuse(sample: Sample) -> NoReturn:
+    wrong = np.argwhere(~(np.isfinite(sample.radiance_rgb) & (sample.radiance_rgb >= 0)))
+    view, row, column, channel = (int(index) for index in wrong[0])
+    value = sample.radiance_rgb[view, row, column, channel]
+    raise TrilightError(
+        f"sample {sample.key}: view {view} has radiance {value} at pixel ({row}, {column}); "
+        "expected finite values from 0. Run `trilight verify` on the dataset."
     )

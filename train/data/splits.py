@@ -1,28 +1,43 @@
-"""Shards of one split, and their first scenes."""
+"""The first scenes of a split."""
 
-import itertools
 from collections.abc import Iterator
+from contextlib import closing
 
-from storage.dataset import Dataset
 from storage.errors import TrilightError
-from storage.manifest import ShardEntry
 from storage.sample import Sample
+from storage.shard_set import ShardSet
+from train.data.unusable import Unusable
 
 
-def shards_of(dataset: Dataset, split: str) -> list[ShardEntry]:
-    """Return the shards of a split by name; raises TrilightError where it holds no scene."""
-    shards = [shard for shard in dataset.shards_of(split) if shard.num_samples]
-    if not shards:
-        raise TrilightError(
-            f"{dataset.folder.root}: the {split} split holds no scene; expected at least one. "
-            "Generate the dataset with more scenes."
-        )
-    return shards
+def first_samples(shards: ShardSet, limit: int, unusable: Unusable) -> Iterator[Sample]:
+    """Yield the first usable samples of a split, at most `limit`, in the order of the shards.
+
+    Raises:
+        TrilightError: more is unusable than may be.
+    """
+    left = limit
+    for number, name in enumerate(shards.names):
+        if not left:
+            return
+        try:
+            shard = shards.open(number)
+        except TrilightError as error:
+            unusable.add(name, lost_with(shards, number), error)
+            continue
+        with closing(shard):
+            for row, key in enumerate(shard.keys[:left]):
+                try:
+                    sample = shard.sample(row)
+                except TrilightError as error:
+                    unusable.add(f"{shard.name}: sample {key}", 1, error)
+                    continue
+                yield sample
+                left -= 1
 
 
-def first_samples(dataset: Dataset, split: str, limit: int) -> Iterator[Sample]:
-    """Yield the first samples of a split, at most `limit`, in the order of the shards."""
-    samples = (
-        sample for shard in shards_of(dataset, split) for sample in dataset.read_shard(shard)
-    )
-    return itertools.islice(samples, limit)
+def lost_with(shards: ShardSet, number: int) -> int:
+    """Return how many samples are lost with a shard; 1 where nothing tells."""
+    try:
+        return shards.num_samples(number)
+    except TrilightError:
+        return 1

@@ -1,28 +1,43 @@
-"""Shards -> an endless stream of training scenes, decoded in a background thread.
+"""Shards -> an endless stream of batches of training scenes, fetched and decoded ahead in threads.
 
-Position p of the stream is the same scene with the same augmentation whoever asks and wherever the
-stream was entered, so a run resumes by its step number alone.
+Batch i holds the same scenes with the same augmentation whoever asks, wherever the stream was
+entered, and however many ranks and threads there are: a run resumes by the number of its step.
 """
 
-import itertools
 import queue
 import threading
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import suppress
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, suppress
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
-from storage.dataset import Dataset
-from storage.manifest import ShardEntry
-from storage.sample import Sample
+from storage.errors import TrilightError
 from storage.seeds import rng_for
+from storage.shard_set import ShardSet
 from train.data.augment import augmented, with_views
-from train.data.order import EpochOrder, Place, epoch_order
+from train.data.open_shards import OpenShards
+from train.data.order import (
+    OrderSettings,
+    Place,
+    Share,
+    batches_from,
+    shard_order,
+    windows_from,
+)
 from train.data.scenes import TrainingScene, training_scene
+from train.data.splits import lost_with
+from train.data.unusable import Unusable
 
 PREFETCHED_SCENES = 16
-"""Scenes decoded ahead of the network."""
+"""Scenes decoded ahead of the network, at least one batch."""
+MOST_REPLACED = 1000
+"""Unusable samples in a row, after which nothing more is looked for."""
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,80 +45,184 @@ class StreamSettings:
     """What the stream depends on."""
 
     seed: int
-    """Seed of the order."""
+    """Seed of the order and of what is drawn at each visit."""
     window: int
-    """Samples in memory to shuffle among."""
+    """Shards among whose samples is shuffled."""
+    batch_size: int
+    """Scenes of a global batch, over all ranks."""
     resolution: int
     """Pixels across the pictures."""
     views_per_scene: int
     """Views that are drawn of each scene."""
 
-
-def stream_scenes(
-    dataset: Dataset, shards: Sequence[ShardEntry], settings: StreamSettings, first: int
-) -> Iterator[TrainingScene]:
-    """Yield the scenes at positions first, first + 1, ... without end.
-
-    Raises:
-        TrilightError: a shard is missing or damaged; when it is reached.
-    """
-    num_samples = [shard.num_samples for shard in shards]
-    samples = _endless_samples(dataset, shards, num_samples, settings, first)
-    for position, sample in enumerate(samples, start=first):
-        scene = training_scene(sample, settings.resolution)
-        rng = rng_for(settings.seed, "visit", position)
-        views = rng.permutation(len(scene.target_VRR3))[: settings.views_per_scene]
-        yield augmented(with_views(scene, np.sort(views)), rng)
+    @property
+    def order(self) -> OrderSettings:
+        return OrderSettings(seed=self.seed, window=self.window)
 
 
-def _endless_samples(
-    dataset: Dataset,
-    shards: Sequence[ShardEntry],
-    num_samples: Sequence[int],
+def stream_batches(
+    shards: ShardSet,
     settings: StreamSettings,
     first: int,
-) -> Iterator[Sample]:
-    first_epoch, within = divmod(first, sum(num_samples))
-    for epoch in itertools.count(first_epoch):
-        order = epoch_order(num_samples, seed=settings.seed, epoch=epoch, window=settings.window)
-        yield from _read_in_order(dataset, shards, order, order.places[within:])
-        within = 0
+    *,
+    share: Share,
+    workers: int,
+    unusable: Unusable,
+) -> Generator[list[TrainingScene], None, None]:
+    """Yield this process's part of the global batches first, first + 1, ... without end.
+
+    Closing the returned iterator ends its threads.
+
+    Args:
+        shards: of the train split.
+        settings: what decides the order and the scenes.
+        first: number of a global batch.
+        share: which part of each batch; the ranks' parts are equally large and make up the batch.
+        workers: threads that read and decode; what comes out does not depend on them.
+        unusable: counts damaged data, or stops at it. An unusable sample is replaced by the next
+            usable one of its shard, a shard that cannot be opened by the one of the next number.
+
+    Raises:
+        TrilightError: the ranks cannot share a batch equally, or data is unusable beyond the limit;
+            when it is reached.
+    """
+    share.require_equal(settings.batch_size)
+    with OpenShards(shards) as opened, ThreadPoolExecutor(workers, "decode") as decoders:
+        maker = _SceneMaker(shards, opened, settings, unusable)
+        plan = _planned(shards, settings, first, share, opened, unusable)
+        waiting: deque[tuple[list[Place], list[Future[TrainingScene]]]] = deque()
+        depth = -(-PREFETCHED_SCENES * share.world_size // settings.batch_size)
+        try:
+            with closing(prefetched(plan, _plan_ahead(shards, settings, unusable))) as batches:
+                for mine in batches:
+                    waiting.append((mine, [decoders.submit(maker.scene, p) for p in mine]))
+                    if len(waiting) > depth:
+                        places, scenes = waiting.popleft()
+                        ready = [scene.result() for scene in scenes]
+                        opened.done(place.shard for place in places)
+                        yield ready
+        finally:
+            decoders.shutdown(wait=True, cancel_futures=True)
 
 
-def _read_in_order(
-    dataset: Dataset, shards: Sequence[ShardEntry], order: EpochOrder, places: Sequence[Place]
-) -> Iterator[Sample]:
-    """Yield the samples at `places`; no shard is opened of which none is wanted."""
-    wanted = set(places)
-    waiting: dict[Place, Sample] = {}
-    arrivals = (
-        ((shard, row), sample)
-        for shard in order.shards
-        if any((shard, row) in wanted for row in range(shards[shard].num_samples))
-        for row, sample in enumerate(dataset.read_shard(shards[shard]))
-    )
-    for place in places:
-        while place not in waiting:
-            arrived, sample = next(arrivals)
-            if arrived in wanted:
-                waiting[arrived] = sample
-        yield waiting.pop(place)
+def _planned(
+    shards: ShardSet,
+    settings: StreamSettings,
+    first: int,
+    share: Share,
+    opened: OpenShards,
+    unusable: Unusable,
+) -> Iterator[list[Place]]:
+    """Yield this process's places batch by batch, and have their shards opened."""
+    position = first * settings.batch_size
+    count = _counter(shards, unusable)
+    windows = windows_from(len(shards.names), count, settings.order, position)
+    for batch in batches_from(windows, position, settings.batch_size):
+        mine = share.of_batch(batch)
+        opened.plan(place.shard for place in mine)
+        yield mine
 
 
-def prefetched(scenes: Iterator[TrainingScene]) -> Generator[TrainingScene, None, None]:
-    """Yield the same scenes, made ahead in a thread; an error arrives at its place in the stream.
+def _counter(shards: ShardSet, unusable: Unusable) -> Callable[[int], int]:
+    """Return what counts the samples of a shard; those of an unusable one are none."""
+
+    def count(number: int) -> int:
+        try:
+            return shards.num_samples(number)
+        except TrilightError as error:
+            unusable.add(shards.names[number], 1, error)
+            return 0
+
+    return count
+
+
+def _plan_ahead(shards: ShardSet, settings: StreamSettings, unusable: Unusable) -> int:
+    """Return how many batches to plan ahead: about a window, so that the next shards are opened."""
+    some = shard_order(len(shards.names), settings.order, 0)[0]
+    return max(_counter(shards, unusable)(some) * settings.window // settings.batch_size, 1)
+
+
+class _SceneMaker:
+    """Makes the scene of a place; called in several threads."""
+
+    def __init__(
+        self, shards: ShardSet, opened: OpenShards, settings: StreamSettings, unusable: Unusable
+    ) -> None:
+        self._shards = shards
+        self._opened = opened
+        self._settings = settings
+        self._unusable = unusable
+
+    def scene(self, place: Place) -> TrainingScene:
+        """Return the scene that is seen at a place of the order."""
+        settings = self._settings
+        scene = self._usable(place)
+        rng = rng_for(settings.seed, "visit", place.position)
+        views = rng.permutation(len(scene.target_VRR3))[: settings.views_per_scene]
+        return augmented(with_views(scene, np.sort(views)), rng)
+
+    def _usable(self, place: Place) -> TrainingScene:
+        shard, row = place.shard, place.row
+        for _ in range(MOST_REPLACED):
+            try:
+                found, num_samples = self._read(shard, row, planned=shard == place.shard)
+            except TrilightError as error:
+                self._unusable.add(self._shards.names[shard], lost_with(self._shards, shard), error)
+                shard = (shard + 1) % len(self._shards.names)
+                continue
+            if isinstance(found, TrainingScene):
+                return found
+            row = (row + 1) % max(num_samples, 1)
+        raise TrilightError(
+            f"{self._shards.names[place.shard]}: {MOST_REPLACED} samples in a row are unusable."
+        )
+
+    def _read(self, number: int, row: int, *, planned: bool) -> tuple[TrainingScene | None, int]:
+        """Return a scene, or None where it is unusable, and how many samples its shard holds.
+
+        Raises:
+            TrilightError: the shard cannot be opened.
+        """
+        shard = self._opened.read(number) if planned else self._shards.open(number)
+        try:
+            keys = shard.keys
+            if not keys:
+                raise TrilightError(f"{shard.name}: holds no sample; expected at least one.")
+            try:
+                sample = shard.sample(row % len(keys))
+                return training_scene(sample, self._settings.resolution), len(keys)
+            except TrilightError as error:
+                key = keys[row % len(keys)]
+                self._unusable.add(f"{shard.name}: sample {key}", 1, _named(shard.name, error))
+                return None, len(keys)
+        finally:
+            if not planned:
+                shard.close()
+
+
+def _named(shard: str, error: TrilightError) -> TrilightError:
+    text = str(error)
+    return error if text.startswith(shard) else TrilightError(f"{shard}: {text}")
+
+
+def prefetched(items: Iterator[Item], depth: int) -> Generator[Item, None, None]:
+    """Yield the same items, made ahead in a thread; an error arrives at its place in the stream.
 
     Closing the returned iterator ends the thread.
+
+    Args:
+        items: what to take them from.
+        depth: how many to make ahead.
     """
-    ready: queue.Queue[TrainingScene | BaseException | None] = queue.Queue(PREFETCHED_SCENES)
+    ready: queue.Queue[tuple[Item] | BaseException | None] = queue.Queue(depth)
     closed = threading.Event()
-    worker = threading.Thread(target=_fill, args=(scenes, ready, closed), daemon=True)
+    worker = threading.Thread(target=_fill, args=(items, ready, closed), daemon=True)
     worker.start()
     try:
         while (item := ready.get()) is not None:
             if isinstance(item, BaseException):
                 raise item
-            yield item
+            yield item[0]
     finally:
         closed.set()
         with suppress(queue.Empty):
@@ -113,19 +232,21 @@ def prefetched(scenes: Iterator[TrainingScene]) -> Generator[TrainingScene, None
 
 
 def _fill(
-    scenes: Iterator[TrainingScene],
-    ready: "queue.Queue[TrainingScene | BaseException | None]",
+    items: Iterator[Item],
+    ready: "queue.Queue[tuple[Item] | BaseException | None]",
     closed: threading.Event,
 ) -> None:
-    item: TrainingScene | BaseException | None
+    made: tuple[Item] | BaseException | None
     while not closed.is_set():
         try:
-            item = next(scenes, None)
+            made = (next(items),)
+        except StopIteration:
+            made = None
         except Exception as error:
-            item = error
+            made = error
         while not closed.is_set():
             with suppress(queue.Full):
-                ready.put(item, timeout=0.1)
+                ready.put(made, timeout=0.1)
                 break
-        if not isinstance(item, TrainingScene):
+        if not isinstance(made, tuple):
             return

@@ -1,6 +1,5 @@
 """The loop: step, log, validate, save, and stop when asked to."""
 
-import itertools
 import math
 import time
 from collections.abc import Iterator
@@ -65,15 +64,15 @@ class Trainer:
         self.window = Window()
         self.skipped_in_a_row = 0
 
-    def run(self, scenes: Iterator[TrainingScene]) -> None:
-        """Take all remaining steps; `scenes` begins at the state's position in the data.
+    def run(self, batches: Iterator[list[TrainingScene]]) -> None:
+        """Take all remaining steps; `batches` begins with that of the state's step.
 
         Raises:
             TrilightError: a signal asked to stop (the state is saved), or the steps keep failing.
         """
         with deferred_interrupts() as asked_to_stop:
             while self.state.step < self.settings.num_steps:
-                report = self._step(scenes)
+                report = self._step(batches)
                 self._after_step(report)
                 if asked_to_stop() and self.state.step < self.settings.num_steps:
                     self._save()
@@ -82,9 +81,9 @@ class Trainer:
                         "lost. Run the same command with --resume to go on."
                     )
 
-    def _step(self, scenes: Iterator[TrainingScene]) -> StepReport:
+    def _step(self, batches: Iterator[list[TrainingScene]]) -> StepReport:
         asked = time.monotonic()
-        drawn = list(itertools.islice(scenes, self.settings.scenes_per_step))
+        drawn = next(batches)
         self.window.waited_s += time.monotonic() - asked
         report = train_step(
             self.state.model,

@@ -11,9 +11,9 @@ from typing import Any
 
 from pipeline.objects.licences import UNKNOWN
 from pipeline.objects.local.catalogue_rows import csv_rows, jsonl_rows
-from pipeline.objects.names import printable
 from storage.errors import TrilightError
 from storage.records import ObjectRecord
+from storage.safe_url import printable
 
 CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")
 

@@ -6,9 +6,9 @@ from pipeline.objects.licences import require_unstated, stated_licence
 from pipeline.objects.listing import Listing
 from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
 from pipeline.objects.local.folder import scan_folder
-from pipeline.objects.names import printable
 from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
+from storage.safe_url import printable
 
 
 def list_folder(folder: Path, licence: str | None) -> Listing:

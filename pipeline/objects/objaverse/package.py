@@ -15,9 +15,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from pipeline.objects.transfer import TransferFailed, with_tries
 from storage.atomic import write_error
 from storage.errors import TrilightError
+from storage.remote.tries import TransferFailed, with_tries
 
 Result = TypeVar("Result")
 

@@ -11,11 +11,12 @@ from typing import Any
 
 from pipeline.objects.licences import UNKNOWN, refuse_licences
 from pipeline.objects.listing import Fetched, Listing, Progress, failure
-from pipeline.objects.names import printable
 from pipeline.objects.objaverse.package import ObjaversePackage
-from pipeline.objects.transfer import TransferFailed, fetch_all
+from pipeline.objects.transfer import fetch_all
 from storage.errors import TrilightError
 from storage.records import Failure, ObjectRecord
+from storage.remote.tries import TransferFailed
+from storage.safe_url import printable
 
 PREFIX = "objaverse:"
 _CATEGORY = "category/"

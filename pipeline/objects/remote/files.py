@@ -16,18 +16,14 @@ from typing import Any
 
 from fsspec.callbacks import Callback
 
-from pipeline.objects.names import printable
 from pipeline.objects.remote.folder import RemoteFolder
 from pipeline.objects.remote.gltf_buffers import buffer_names
-from pipeline.objects.transfer import Interrupted, TransferFailed, with_tries
 from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_atomically
 from storage.errors import TrilightError
+from storage.remote.fetch import version_of
+from storage.remote.tries import Interrupted, TransferFailed, with_tries
+from storage.safe_url import printable
 
-_VERSION_FIELDS = (
-    "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "updated",
-    "md5Hash", "Content-MD5", "blob_id",
-)  # fmt: skip
-"""Under which names the drivers say when a file changed."""
 _MAX_NAME_BYTES = 220
 """File systems allow 255; the rest is for the name of an unfinished file."""
 _MAX_PATH_BYTES = 2000
@@ -116,7 +112,7 @@ class RemoteFiles:
             raise TransferFailed("download_failed", "is a folder, not a file")
         size = facts.get("size")
         self._check_size(size or 0)
-        version = {key: str(facts[key]) for key in _VERSION_FIELDS if facts.get(key)}
+        version = version_of(facts)
         if size is not None:
             version["size"] = str(size)
         note = self._versions / f"{hashlib.sha256(os.fsencode(name)).hexdigest()}.json"

@@ -5,9 +5,9 @@ from functools import partial
 from typing import Any
 from urllib.parse import quote, unquote
 
-from pipeline.objects.remote.url import RemoteUrl, open_driver
-from pipeline.objects.transfer import TransferFailed, is_absent, with_tries
 from storage.errors import TrilightError
+from storage.remote.tries import TransferFailed, is_absent, with_tries
+from storage.remote.url import RemoteUrl, open_driver
 
 _MAX_FOLDERS = 10_000
 _MAX_DEPTH = 32

@@ -8,17 +8,17 @@ from pipeline.objects.licences import StatedLicence, require_unstated, stated_li
 from pipeline.objects.listing import Fetched, Listing, Progress, failure
 from pipeline.objects.local.catalogue import CATALOGUE_NAMES, only_catalogue, read_catalogue
 from pipeline.objects.local.folder import file_record
-from pipeline.objects.names import printable
 from pipeline.objects.remote.files import RemoteFiles
 from pipeline.objects.remote.folder import RemoteFolder
-from pipeline.objects.remote.url import RemoteUrl
-from pipeline.objects.transfer import TransferFailed, fetch_all
+from pipeline.objects.transfer import fetch_all
 from pipeline.objects.uids import assign_uids, is_object_file
 from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records import Failure, ObjectRecord
-from storage.safe_url import safe_url
+from storage.remote.tries import TransferFailed
+from storage.remote.url import RemoteUrl
+from storage.safe_url import printable, safe_url
 
 MAX_BYTES = 200_000_000
 """Largest object that is fetched, with its buffers: what the mesh stage reads at most."""

@@ -1,17 +1,19 @@
-"""URLs of remote folders: which are admitted, and the driver that reads each."""
+"""URLs of files and folders on servers: which are admitted, and the driver that reads each."""
 
 import base64
+import dataclasses
+import functools
 import importlib
 import logging
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, quote, unquote
 
-from pipeline.objects.names import printable
 from storage.errors import TrilightError
-from storage.safe_url import safe_text
+from storage.safe_url import printable, safe_text
 
 PACKAGES = {
     "http": "aiohttp",
@@ -24,7 +26,7 @@ PACKAGES = {
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.\-]*)://(.*)", re.DOTALL)
 _BRACKETED_HOST = re.compile(r"\[[0-9A-Fa-f:.]*\]")
-_ADMITTED = "expected a folder, or a URL of http, https, s3, gs, hf or file"
+_ADMITTED = "expected a path, or a URL of http, https, s3, gs, hf or file"
 _CONNECT_S = 20.0
 _SILENCE_S = 60.0
 _WHOLE_FILE_S = 3600.0
@@ -33,14 +35,16 @@ _WHOLE_FILE_S = 3600.0
 
 @dataclass(frozen=True, kw_only=True)
 class RemoteUrl:
-    """A folder on a server."""
+    """A folder or file on a server."""
 
+    what: str = field(compare=False)
+    """What it is in messages, such as `objects`."""
     scheme: str
     """A key of PACKAGES."""
     root: str
-    """What the driver calls the folder: without secrets, query and final slash."""
+    """What the driver calls it: without secrets, query and final slash."""
     query: tuple[tuple[str, str], ...] = field(default=(), repr=False)
-    """Sent with every request, since it may hold the key to the folder; http and https only."""
+    """Sent with every request, since it may hold the key; http and https only."""
     user: str = field(default="", repr=False)
     """Sent with every request; http and https only."""
     password: str = field(default="", repr=False)
@@ -53,12 +57,22 @@ class RemoteUrl:
 
     @property
     def shown(self) -> str:
-        """The folder for people, and for naming what is kept of it."""
+        """The URL for people, and for naming what is kept of it."""
         return printable(self.root if self.is_http else f"{self.scheme}://{self.root}")
 
+    def child(self, name: str) -> "RemoteUrl":
+        """Return a file below this folder by its name, which must be a safe one."""
+        return dataclasses.replace(
+            self, root=f"{self.root}/{quote(name) if self.is_http else name}"
+        )
 
-def parse_source(source: str) -> RemoteUrl | Path:
-    """Return where a source is: a folder of this machine, or one on a server.
+
+def parse_url(source: str, *, what: str) -> RemoteUrl | Path:
+    """Return where something is: on this machine, or on a server.
+
+    Args:
+        source: a path, or a URL.
+        what: begins every message, such as `objects`.
 
     Raises:
         TrilightError: the URL is chained (`::`), runs a program (`pipe:`), has a scheme that is not
@@ -66,20 +80,22 @@ def parse_source(source: str) -> RemoteUrl | Path:
     """
     shown = printable(safe_text(source))
     if source.startswith("pipe:"):
-        raise TrilightError(f"objects is a pipe: command; {_ADMITTED}. Programs are not run.")
+        raise TrilightError(f"{what} is a pipe: command; {_ADMITTED}. Programs are not run.")
     if "://" in source and "::" in _BRACKETED_HOST.sub("", source):
-        raise TrilightError(f"objects {shown!r} is chained with '::'; {_ADMITTED}, on its own.")
+        raise TrilightError(f"{what} {shown!r} is chained with '::'; {_ADMITTED}, on its own.")
     match = _SCHEME.match(source)
     if match is None:
         return Path(source).expanduser()
     scheme, rest = match[1].lower(), match[2]
     if scheme == "file":
-        return _local(rest, shown)
+        return _local(rest, what, shown)
     if scheme not in PACKAGES:
-        raise TrilightError(f"objects {shown!r} has the scheme {printable(scheme)!r}; {_ADMITTED}.")
+        raise TrilightError(f"{what} {shown!r} has the scheme {printable(scheme)!r}; {_ADMITTED}.")
     if not rest.partition("/")[0].rpartition("@")[2]:
-        raise TrilightError(f"objects {shown!r} names no host or bucket; {_ADMITTED}.")
-    return _http(scheme, rest) if scheme in ("http", "https") else _bucket(scheme, rest, shown)
+        raise TrilightError(f"{what} {shown!r} names no host or bucket; {_ADMITTED}.")
+    if scheme in ("http", "https"):
+        return _http(scheme, rest, what)
+    return _bucket(scheme, rest, what, shown)
 
 
 def open_driver(url: RemoteUrl) -> Any:
@@ -94,8 +110,8 @@ def open_driver(url: RemoteUrl) -> Any:
         import fsspec
     except ImportError as error:
         raise TrilightError(
-            f"objects {url.shown!r}: {url.scheme}:// needs the package {package}; expected it to "
-            f"be installed. Run pip install {package}."
+            f"{url.what} {url.shown!r}: {url.scheme}:// needs the package {package}; expected it "
+            f"to be installed. Run pip install {package}."
         ) from error
     # Drivers log whole requests, with their secrets, on the way to an error that we report anyway.
     logging.getLogger(package).setLevel(logging.CRITICAL)
@@ -103,6 +119,19 @@ def open_driver(url: RemoteUrl) -> Any:
     return fsspec.filesystem(
         url.scheme, skip_instance_cache=True, use_listings_cache=False, **options
     )
+
+
+def shared_driver(url: RemoteUrl) -> Any:
+    """Return the driver that all files of a host or bucket share, so that connections last."""
+    place, slash, rest = url.root.partition("://")
+    host = place + slash + rest.partition("/")[0] if url.is_http else place.partition("/")[0]
+    return _driver_of(dataclasses.replace(url, root=host), os.getpid())
+
+
+@functools.lru_cache(maxsize=16)
+def _driver_of(access: RemoteUrl, process: int) -> Any:
+    """A driver made before a fork cannot be used after it, hence `process`."""
+    return open_driver(access)
 
 
 def _http_options(url: RemoteUrl) -> dict[str, Any]:
@@ -131,13 +160,14 @@ def _http_options(url: RemoteUrl) -> dict[str, Any]:
     return options
 
 
-def _http(scheme: str, rest: str) -> RemoteUrl:
+def _http(scheme: str, rest: str, what: str) -> RemoteUrl:
     rest = rest.partition("#")[0]
     rest, _, query = rest.partition("?")
     authority, slash, path = rest.partition("/")
     access, _, host = authority.rpartition("@")
     user, _, password = access.partition(":")
     return RemoteUrl(
+        what=what,
         scheme=scheme,
         # A percent sign stays, since the path may be quoted already.
         root=f"{scheme}://{host}{slash}{quote(path, safe='/%:@!$&()*+,;=~')}".rstrip("/"),
@@ -147,17 +177,17 @@ def _http(scheme: str, rest: str) -> RemoteUrl:
     )
 
 
-def _bucket(scheme: str, rest: str, shown: str) -> RemoteUrl:
+def _bucket(scheme: str, rest: str, what: str, shown: str) -> RemoteUrl:
     if "@" in rest.partition("/")[0]:
         raise TrilightError(
-            f"objects {shown!r} came with a user or password; expected none in URLs of {scheme}. "
+            f"{what} {shown!r} came with a user or password; expected none in URLs of {scheme}. "
             f"Give them in the way of {PACKAGES[scheme]}, such as by its environment variables."
         )
-    return RemoteUrl(scheme=scheme, root=rest.strip("/"))
+    return RemoteUrl(what=what, scheme=scheme, root=rest.strip("/"))
 
 
-def _local(rest: str, shown: str) -> Path:
+def _local(rest: str, what: str, shown: str) -> Path:
     host, slash, path = rest.partition("/")
     if host not in ("", "localhost") or not slash:
-        raise TrilightError(f"objects {shown!r}; expected file:///FOLDER, with three slashes.")
+        raise TrilightError(f"{what} {shown!r}; expected file:///FOLDER, with three slashes.")
     return Path("/" + unquote(path))

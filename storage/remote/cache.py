@@ -1,0 +1,168 @@
+"""Shards of servers on this machine: fetched whole, checked on arrival, bounded, shared.
+
+Any number of processes may use the same folder. A shard appears by rename, when all of it has come
+and its hash is right. Who reads one holds a shared lock on it; what is locked is never removed. One
+process fetches a shard while the others wait for it. Locks die with the process that holds them.
+"""
+
+import contextlib
+import fcntl
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_error
+from storage.cache import cache_folder
+from storage.digests import canonical_json, sha256_hex, sha256_of_file
+from storage.errors import TrilightError
+from storage.remote.fetch import download, facts_of, unreadable
+from storage.remote.tries import TransferFailed
+from storage.remote.url import RemoteUrl
+
+LIMIT_VARIABLE = "TRILIGHT_SHARD_CACHE_GB"
+"""Environment variable with the size of the cache."""
+DEFAULT_LIMIT_GB = 64.0
+_ARRIVALS = 2
+"""How often a shard is fetched whose bytes are wrong: the second time tells a bad line from a bad
+file."""
+_LOCKS = 64
+"""Two shards may share a lock by chance; one is then fetched after the other."""
+_STALE_S = 24 * 3600.0
+
+
+class ShardCache:
+    """A folder of shards by URL and hash."""
+
+    def __init__(self, root: Path, max_bytes: int) -> None:
+        """Remember the folder.
+
+        Args:
+            root: the folder; belongs to the cache alone.
+            max_bytes: what all shards together may take. What is being read stays even beyond it.
+        """
+        self.root = root
+        self.max_bytes = max_bytes
+
+    def open(self, url: RemoteUrl, *, num_bytes: int | None, sha256: str | None) -> BinaryIO:
+        """Return a shard, open for reading and safe from removal until it is closed.
+
+        Args:
+            url: the shard.
+            num_bytes: its size, where a manifest says it.
+            sha256: its digest, where a manifest says it; without one, the shard is known by what
+                the server says of it, and whatever arrives is taken.
+
+        Raises:
+            TrilightError: it cannot be had, has another size, its bytes are wrong twice in a row,
+                or the disk is full.
+        """
+        try:
+            path = self.root / _name(url, sha256)
+            while True:
+                if (stream := _open_shared(path)) is not None:
+                    return stream
+                with self._only_fetcher_of(path):
+                    if not path.exists():
+                        self._fetch(url, path, num_bytes, sha256)
+        except TransferFailed as error:
+            raise unreadable(url, error) from error
+
+    def _fetch(self, url: RemoteUrl, path: Path, num_bytes: int | None, sha256: str | None) -> None:
+        for _ in range(_ARRIVALS):
+            self._make_room(num_bytes or 0)
+            with contextlib.suppress(_WrongBytes), atomic_writer(path) as stream:
+                download(url, stream, num_bytes=num_bytes, max_bytes=self.max_bytes)
+                stream.flush()
+                if sha256 is not None and sha256_of_file(Path(stream.name)) != sha256:
+                    raise _WrongBytes
+                return
+        raise TrilightError(
+            f"{url.what} {url.shown!r}: the bytes are not those of the manifest (sha256 differs, "
+            f"{_ARRIVALS} times); expected {sha256}. Mend the file on the server."
+        )
+
+    def _make_room(self, num_bytes: int) -> None:
+        """Remove what was not read for longest, until so many bytes more are within the limit."""
+        found = []
+        for path in self.root.glob("*"):
+            with contextlib.suppress(OSError):
+                stat = path.stat()
+                if path.suffix != TEMPORARY_SUFFIX:
+                    found.append((stat.st_mtime_ns, path, stat.st_size))
+                elif time.time() - stat.st_mtime > _STALE_S:  # a killed process left it
+                    path.unlink()
+        taken = num_bytes + sum(size for _, _, size in found)
+        for _, path, size in sorted(found):
+            if taken <= self.max_bytes:
+                return
+            if _remove_unread(path):
+                taken -= size
+
+    @contextlib.contextmanager
+    def _only_fetcher_of(self, path: Path) -> Iterator[None]:
+        folder = self.root.with_name(f"{self.root.name}-locks")
+        lock = folder / f"{int(sha256_hex(path.name.encode())[:8], 16) % _LOCKS:02d}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise write_error(lock, error) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(descriptor)
+
+
+class _WrongBytes(Exception):
+    """A shard arrived with another hash."""
+
+
+def shard_cache() -> ShardCache:
+    """Return the user's cache; raises TrilightError for a size that is no number above 0."""
+    text = os.environ.get(LIMIT_VARIABLE, str(DEFAULT_LIMIT_GB))
+    try:
+        limit_gb = float(text)
+    except ValueError:
+        limit_gb = 0.0
+    if not 0 < limit_gb < float("inf"):
+        raise TrilightError(
+            f"{LIMIT_VARIABLE} is {text!r}; expected a number of gigabytes above 0."
+        )
+    return ShardCache(cache_folder("shards"), int(limit_gb * 1e9))
+
+
+def _name(url: RemoteUrl, sha256: str | None) -> str:
+    """Return the name of a shard in the cache: nothing but hexadecimal digits and a dash."""
+    if sha256 is not None:
+        return f"{sha256_hex(url.shown.encode())[:16]}-{sha256}"
+    facts = facts_of(url)
+    # without a digest, a query may be what tells two files apart
+    place = canonical_json([url.shown, url.query])
+    version = canonical_json([facts.num_bytes, facts.version])
+    return f"{sha256_hex(place)[:16]}-{sha256_hex(version)}"
+
+
+def _open_shared(path: Path) -> BinaryIO | None:
+    """Open a shard that is there, lock it against removal, and note that it was used."""
+    try:
+        stream = path.open("rb")
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    fcntl.flock(stream, fcntl.LOCK_SH)  # what is removed before this stays readable all the same
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    return stream
+
+
+def _remove_unread(path: Path) -> bool:
+    """Remove a shard unless somebody reads it; returns whether its bytes are free."""
+    try:
+        with path.open("rb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink(missing_ok=True)
+        return True
+    except OSError:
+        return False

@@ -1,0 +1,182 @@
+"""Bytes of one file on a server: facts about it, all of a small one, or a large one to disk.
+
+A transfer that breaks off goes on where it stopped, where the server can do that, and ends only
+when all announced bytes are there.
+"""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+from storage.errors import TrilightError
+from storage.remote.tries import Interrupted, TransferFailed, with_tries
+from storage.remote.url import RemoteUrl, shared_driver
+
+PIECE_BYTES = 8 << 20
+"""What is asked of a bucket at once, and held in memory."""
+_CHUNK_BYTES = 1 << 18
+_VERSION_FIELDS = (
+    "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "updated",
+    "md5Hash", "Content-MD5", "blob_id",
+)  # fmt: skip
+"""Under which names the drivers say when a file changed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What a server says about a file."""
+
+    num_bytes: int | None
+    """Size; None where it is not said."""
+    version: Mapping[str, str]
+    """What changes when the file does; may be empty."""
+
+
+def facts_of(url: RemoteUrl) -> Facts:
+    """Ask about a file.
+
+    Raises:
+        TransferFailed: there is none, it may not be seen, or the server gives no answer.
+        TrilightError: the driver's package is missing.
+    """
+    driver = shared_driver(url)
+    found: dict[str, Any] = with_tries(lambda: dict(driver.info(url.root)))
+    if found.get("type") == "directory":
+        raise TransferFailed("download_failed", "is a folder, not a file")
+    return Facts(num_bytes=found.get("size"), version=version_of(found))
+
+
+def version_of(facts: Mapping[str, Any]) -> dict[str, str]:
+    """Return of a driver's facts about a file what changes when the file does."""
+    return {key: str(facts[key]) for key in _VERSION_FIELDS if facts.get(key)}
+
+
+def read_bytes(url: RemoteUrl, *, max_bytes: int) -> bytes:
+    """Return a small file.
+
+    Raises:
+        TransferFailed: as `facts_of`, or it is larger than `max_bytes`.
+        TrilightError: the driver's package is missing.
+    """
+    stream = io.BytesIO()
+    download(url, stream, num_bytes=None, max_bytes=max_bytes)
+    return stream.getvalue()
+
+
+def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_bytes: int) -> None:
+    """Write all bytes of a file to an open one, from its start.
+
+    Args:
+        url: the file.
+        stream: where they go.
+        num_bytes: how many there must be, where that is known.
+        max_bytes: how many there may be, where it is not.
+
+    Raises:
+        TransferFailed: as `facts_of`, it has another size than `num_bytes`, or it breaks off again
+            and again without moving on.
+        TrilightError: the driver's package is missing, or the disk is full.
+    """
+    driver = shared_driver(url)
+    fill = _fill_http if url.is_http else _fill_bucket
+    expected = _Expected(num_bytes, max_bytes if num_bytes is None else num_bytes)
+    with_tries(lambda: fill(driver, url, stream, expected), position=stream.tell)
+
+
+class _Expected:
+    """What is known of a file before it has come."""
+
+    def __init__(self, exact: int | None, most: int) -> None:
+        self.exact = exact
+        self.most = most
+        self.version: dict[str, str] | None = None
+
+    def require(self, found: int) -> None:
+        """Refuse a file that is announced with another size."""
+        if self.exact is not None and found != self.exact:
+            raise TransferFailed("download_failed", f"has {found} bytes; expected {self.exact}")
+        self.bound(found)
+
+    def bound(self, reached: int) -> None:
+        """Refuse to go on with a file that is longer than it may be."""
+        if reached > self.most:
+            message = f"is longer than {self.most} bytes"
+            raise TransferFailed("too_large_bytes", message)
+
+    def is_same(self, version: Mapping[str, str]) -> bool:
+        """Say whether the file is still the one that the bytes so far came from."""
+        before, self.version = self.version, dict(version)
+        return before in (None, self.version)
+
+    def require_all(self, reached: int) -> None:
+        """Notice an end that came early."""
+        if self.exact is not None and reached != self.exact:
+            raise Interrupted from EOFError(f"got {reached} of {self.exact} bytes")
+
+
+def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expected) -> None:
+    """Ask for piece after piece; buckets always know the size and always give ranges."""
+    facts = driver.info(url.root)
+    num_bytes = facts["size"]
+    expected.require(num_bytes)
+    if not expected.is_same(version_of(facts)):
+        _start_over(stream)
+    while stream.tell() < num_bytes:
+        start = stream.tell()
+        end = min(start + PIECE_BYTES, num_bytes)
+        piece = driver.cat_file(url.root, start=start, end=end)
+        if len(piece) != end - start:
+            raise Interrupted from EOFError(f"got {len(piece)} of {end - start} bytes")
+        stream.write(piece)
+    if num_bytes > PIECE_BYTES and not expected.is_same(version_of(driver.info(url.root))):
+        _start_over(stream)
+        raise Interrupted from EOFError("the file changed while it was read")
+
+
+def _fill_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expected) -> None:
+    from fsspec.asyn import sync
+
+    sync(driver.loop, _stream_http, driver, url, stream, expected)
+
+
+async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expected) -> None:
+    """Read one answer to its end, from where the file stands; from the start if it must be."""
+    session = await driver.set_session()
+    start = stream.tell()
+    headers = {"Range": f"bytes={start}-"} if start else {}
+    async with session.get(driver.encode_url(url.root), headers=headers, **driver.kwargs) as answer:
+        if start and answer.status == 416:  # it has become shorter
+            _start_over(stream)
+            raise Interrupted from EOFError("the file changed while it was read")
+        if answer.status == 404:
+            raise FileNotFoundError(url.shown)
+        answer.raise_for_status()
+        if answer.status != 206:
+            _start_over(stream)
+        elif not answer.headers.get("Content-Range", "").startswith(f"bytes {start}-"):
+            _start_over(stream)
+            raise Interrupted from EOFError("the server sent another part than was asked for")
+        if not expected.is_same(version_of(answer.headers)) and stream.tell():
+            _start_over(stream)
+            raise Interrupted from EOFError("the file changed while it was read")
+        if answer.content_length is not None:
+            expected.require(stream.tell() + answer.content_length)
+        async for chunk in answer.content.iter_chunked(_CHUNK_BYTES):
+            expected.bound(stream.tell() + len(chunk))
+            stream.write(chunk)
+    expected.require_all(stream.tell())
+
+
+def _start_over(stream: BinaryIO) -> None:
+    stream.seek(0)
+    stream.truncate()
+
+
+def unreadable(url: RemoteUrl, error: TransferFailed) -> TrilightError:
+    """Return the user's view of a file that cannot be had."""
+    hint = " Public buckets need FSSPEC_S3_ANON=true." if url.scheme == "s3" else ""
+    return TrilightError(
+        f"{url.what} {url.shown!r}: cannot be read ({error.message}); expected a file that can be "
+        f"reached. Check the URL and your access to it.{hint}"
+    )

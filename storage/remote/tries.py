@@ -1,0 +1,136 @@
+"""Trying again what may pass by itself, and saying what went wrong without secrets."""
+
+import errno
+import os
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from storage.errors import TrilightError
+from storage.safe_url import printable, safe_text
+
+Result = TypeVar("Result")
+
+TRIES = 5
+"""In a row without any progress."""
+PAUSE_S = 0.5
+"""Before the second try; doubled before each further one, up to MAX_PAUSE_S."""
+MAX_PAUSE_S = 20.0
+_MOST_TRIES = 1000
+"""Of a transfer that moves on a little each time."""
+_MAX_MESSAGE = 200
+_MAY_PASS_STATUS = (408, 425, 429)
+
+
+class TransferFailed(Exception):
+    """Something cannot be had, for good.
+
+    Attributes:
+        reason: a stable code in snake_case.
+        message: a sentence without secrets.
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(reason, message)
+        self.reason = reason
+        self.message = message
+
+
+class Interrupted(Exception):
+    """A transfer ended early, for the reason that is its `__cause__`."""
+
+
+def with_tries(
+    function: Callable[[], Result], *, position: Callable[[], int] = lambda: 0
+) -> Result:
+    """Call a function again while what goes wrong may pass by itself, after longer and longer.
+
+    The pause before try n is PAUSE_S 2^(n-1), at most MAX_PAUSE_S, times a random factor between a
+    half and one and a half, so that many readers of one server do not come back all at once.
+
+    Args:
+        function: what to try.
+        position: how far the transfer is; where it has moved on since the last error, the tries
+            are counted anew.
+
+    Raises:
+        TransferFailed: as the function raised it, or `download_failed` for any other exception.
+        TrilightError: as the function raised it, or the disk is full.
+    """
+    number, reached = 0, position()
+    for _ in range(_MOST_TRIES):
+        try:
+            return function()
+        except (TransferFailed, TrilightError):
+            raise
+        except Exception as error:  # drivers raise what they like
+            cause = root_error(error)
+            if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise TrilightError(
+                    "download: the disk is full. What was downloaded is safe: free some space and "
+                    "run the same command again."
+                ) from error
+            number, reached = (0 if position() > reached else number) + 1, position()
+            if number == TRIES or not may_pass(cause):
+                raise TransferFailed("download_failed", describe(cause)) from error
+            time.sleep(min(PAUSE_S * 2 ** (number - 1), MAX_PAUSE_S) * (0.5 + _chance()))
+    raise TransferFailed("download_failed", f"it was interrupted {_MOST_TRIES} times")
+
+
+def root_error(error: BaseException) -> BaseException:
+    """Return what went wrong: the HTTP driver reports every error of a question as a lack."""
+    while isinstance(error, FileNotFoundError | Interrupted) and error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
+def is_missing(error: BaseException) -> bool:
+    """Say whether a server answered that there is no such file."""
+    cause = root_error(error)
+    return isinstance(cause, FileNotFoundError) or _status(cause) in (404, 410)
+
+
+def is_absent(error: BaseException) -> bool:
+    """Say whether a server answered that there is no such file, or none that we may see."""
+    cause = root_error(error)
+    return is_missing(error) or isinstance(cause, PermissionError) or _status(cause) in (401, 403)
+
+
+def may_pass(error: BaseException) -> bool:
+    """Say whether the same request may succeed a little later."""
+    status = _status(error)
+    if status is not None:
+        return status >= 500 or status in _MAY_PASS_STATUS
+    return not isinstance(error, FileNotFoundError | PermissionError)
+
+
+def describe(error: BaseException) -> str:
+    """Return what went wrong in a few words without secrets."""
+    status = _status(error)
+    if status is not None:
+        return f"the server answered with HTTP status {status}"
+    if isinstance(error, FileNotFoundError):
+        return "there is no such file"
+    if isinstance(error, TimeoutError):
+        return "no answer in time"
+    text = printable(safe_text(str(error).partition("\n")[0]))
+    return f"{type(error).__name__}: {text}"[:_MAX_MESSAGE].removesuffix(": ")
+
+
+def _status(error: BaseException) -> int | None:
+    """Return the HTTP status of an error, where the driver gives one (not all name it alike)."""
+    response = getattr(error, "response", None)
+    if isinstance(response, dict):  # botocore's
+        status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
+        return status if isinstance(status, int) else None
+    for holder in (error, response):
+        for name in ("status", "status_code", "code"):
+            status = getattr(holder, name, None)
+            if isinstance(status, int) and 300 <= status < 600:
+                return status
+    return None
+
+
+def _chance() -> float:
+    """Return a number in [0, 1) that no two processes share; it decides nothing but a pause."""
+    return int.from_bytes(os.urandom(4), "little") / 2**32

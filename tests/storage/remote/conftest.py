@@ -1,0 +1,39 @@
+"""A small dataset behind a server, a cache of its own, and no pauses between tries."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from storage.dataset import Dataset, open_dataset
+from storage.digests import sha256_hex
+from storage.remote import tries, url
+from tests.documents.dataset_by_hand import edit_manifest, five_scenes
+from tests.storage.remote.fault_server import Server, serve
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of the cached shards."""
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("TRILIGHT_SHARD_CACHE_GB", raising=False)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.setattr(tries, "PAUSE_S", 0.0)
+    return tmp_path / "cache" / "shards"
+
+
+@pytest.fixture
+def local(tmp_path: Path) -> Dataset:
+    """Return the same dataset as the server's, in its folder; it verifies."""
+    dataset = five_scenes(tmp_path / "served")
+    digest = sha256_hex(dataset.folder.objects_lock.read_bytes())
+    return open_dataset(str(edit_manifest(dataset, objects_lock_sha256=digest)))
+
+
+@pytest.fixture
+def server(cache: Path, local: Dataset, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    monkeypatch.setattr(url, "_SILENCE_S", 0.5)
+    url._driver_of.cache_clear()  # the silence above is an option of the driver
+    with serve(local.folder.root) as running:
+        yield running
+    url._driver_of.cache_clear()

@@ -1,0 +1,190 @@
+"""The cache: one fetch for many readers, bounded, and nobody loses what he reads."""
+
+import fcntl
+import json
+import multiprocessing
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from storage.dataset import Dataset, open_dataset
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.remote.cache import ShardCache, shard_cache
+from storage.remote.url import RemoteUrl, parse_url
+from tests.storage.remote.fault_server import Fault, Server
+
+BYTES = 1000
+
+
+def put(server: Server, *names: str) -> list[RemoteUrl]:
+    """Serve files of BYTES bytes each, that differ."""
+    for name in names:
+        (server.root / name).write_bytes(name[:1].encode() * BYTES)
+    return [remote(f"{server.url}/{name}") for name in names]
+
+
+def remote(text: str) -> RemoteUrl:
+    url = parse_url(text, what="shard")
+    assert isinstance(url, RemoteUrl)
+    return url
+
+
+def digest(name: str) -> str:
+    return sha256_hex(name[:1].encode() * BYTES)
+
+
+def fetch(cache: ShardCache, url: RemoteUrl) -> bytes:
+    name = url.root.rpartition("/")[2]
+    with cache.open(url, num_bytes=BYTES, sha256=digest(name)) as stream:
+        return stream.read()
+
+
+def gets(server: Server, name: str) -> int:
+    return [got for got, _ in server.gets].count(name)
+
+
+def test_equal_names_of_different_places_do_not_meet(server: Server, cache: Path) -> None:
+    for folder in "ab":
+        (server.root / folder).mkdir()
+    urls = put(server, "a/x.tar", "b/x.tar")
+    store = ShardCache(cache, 10**6)
+    found = [
+        store.open(url, num_bytes=None, sha256=digest(name)).read()
+        for url, name in zip(urls, "ab", strict=True)
+    ]
+    assert found == [b"a" * BYTES, b"b" * BYTES]
+
+
+def test_what_was_not_read_for_longest_goes_first(server: Server, cache: Path) -> None:
+    a, b, c, d = put(server, "a.tar", "b.tar", "c.tar", "d.tar")
+    store = ShardCache(cache, 3 * BYTES)
+    for number, url in enumerate((a, b, c, a)):
+        fetch(store, url)
+        for path in cache.iterdir():  # clocks of files are coarse
+            os.utime(path, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns - 10**9))
+        assert len(list(cache.iterdir())) <= 3, number
+    fetch(store, d)
+    assert len(list(cache.iterdir())) == 3
+    fetch(store, a)
+    fetch(store, c)
+    assert (gets(server, "a.tar"), gets(server, "b.tar"), gets(server, "c.tar")) == (1, 1, 1)
+    fetch(store, b)
+    assert gets(server, "b.tar") == 2
+
+
+def test_what_is_being_read_stays(server: Server, cache: Path) -> None:
+    a, b, c = put(server, "a.tar", "b.tar", "c.tar")
+    store = ShardCache(cache, BYTES)
+    with store.open(a, num_bytes=BYTES, sha256=digest("a")) as stream:
+        fetch(store, b)
+        fetch(store, c)
+        assert {path.read_bytes()[:1] for path in cache.iterdir()} == {b"a", b"c"}
+        assert stream.read() == b"a" * BYTES
+    fetch(store, b)
+    assert [path.read_bytes()[:1] for path in cache.iterdir()] == [b"b"]
+
+
+def test_without_a_hash_the_version_tells(server: Server, cache: Path) -> None:
+    (url,) = put(server, "a.tar")
+    store = ShardCache(cache, 10**6)
+    for content in (b"a" * BYTES, b"a" * BYTES, b"z" * BYTES):
+        (server.root / "a.tar").write_bytes(content)
+        with store.open(url, num_bytes=None, sha256=None) as stream:
+            assert stream.read() == content
+    assert gets(server, "a.tar") == 2
+
+
+def test_without_a_hash_a_query_may_tell_two_files_apart(server: Server, cache: Path) -> None:
+    put(server, "a.tar")
+    for query in ("part=1", "part=2"):
+        server.needed_query = query
+        url = remote(f"{server.url}/a.tar?{query}")
+        ShardCache(cache, 10**6).open(url, num_bytes=None, sha256=None).close()
+    assert len(list(cache.iterdir())) == 2
+
+
+def test_threads_fetch_a_shard_once(server: Server, cache: Path) -> None:
+    (url,) = put(server, "a.tar")
+    server.faults["a.tar"] = [Fault(stall_after=10)]  # so that all are waiting together
+    store = ShardCache(cache, 10**6)
+    found: list[bytes] = []
+    threads = [threading.Thread(target=lambda: found.append(fetch(store, url))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [b"a" * BYTES] * 8
+    assert [asked for _, asked in server.gets] == ["", "bytes=10-"]
+
+
+def _read_all(names: list[str], url: str, root: str, start: str) -> None:
+    """Read every file many times in another process, in an order of its own."""
+    store = ShardCache(Path(root), 3 * BYTES)
+    for turn in range(30):
+        name = names[(turn * (3 + len(start)) + len(start)) % len(names)]
+        assert fetch(store, remote(f"{url}/{name}")) == name[:1].encode() * BYTES
+
+
+def test_processes_share_a_cache_that_is_too_small(server: Server, cache: Path) -> None:
+    """Every read is right while the others evict; afterwards the cache keeps its bound."""
+    names = [f"{letter}.tar" for letter in "abcdef"]
+    put(server, *names)
+    context = multiprocessing.get_context("spawn")
+    children = [
+        context.Process(target=_read_all, args=(names, server.url, str(cache), "x" * number))
+        for number in range(3)
+    ]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join()
+    assert [child.exitcode for child in children] == [0, 0, 0]
+    fetch(ShardCache(cache, 3 * BYTES), remote(f"{server.url}/a.tar"))
+    assert len(list(cache.iterdir())) <= 3 + len(children), "each may add one at the same time"
+    assert all(len(path.read_bytes()) == BYTES for path in cache.iterdir())
+
+
+def test_a_fetcher_that_was_killed_holds_nobody_up(server: Server, cache: Path) -> None:
+    (url,) = put(server, "a.tar")
+    store = ShardCache(cache, 10**6)
+    cache.mkdir(parents=True)
+    leftover = cache / "0-0.77.part"
+    leftover.write_bytes(b"half")
+    old = time.time() - 2 * 86400
+    os.utime(leftover, (old, old))
+    assert fetch(store, url) == b"a" * BYTES
+    assert not leftover.exists()
+    locks = list(cache.with_name("shards-locks").iterdir())
+    for lock in locks:
+        with lock.open() as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # nobody holds it
+
+
+def test_names_in_the_cache_hold_no_secret(server: Server, cache: Path) -> None:
+    put(server, "a.tar")
+    server.needed_query = "key=s3cret"
+    url = remote(f"{server.url}/a.tar?key=s3cret")
+    shard_cache().open(url, num_bytes=None, sha256=None).close()
+    (path,) = cache.iterdir()
+    assert set(path.name) <= set("0123456789abcdef-")
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1", "much", "nan", "inf"])
+def test_a_wrong_size_is_named(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.setenv("TRILIGHT_SHARD_CACHE_GB", text)
+    with pytest.raises(TrilightError, match="TRILIGHT_SHARD_CACHE_GB is .*gigabytes above 0"):
+        shard_cache()
+
+
+def test_a_manifest_that_lies_about_a_hash_is_refused(server: Server, local: Dataset) -> None:
+    record = json.loads(local.folder.manifest.read_text())
+    for shard in record["shards"]:
+        shard["sha256"] = "0" * 64
+    local.folder.manifest.write_text(json.dumps(record))
+    dataset = open_dataset(server.url)
+    with pytest.raises(TrilightError, match="sha256 differs"):
+        list(dataset.read_shard(dataset.manifest.shards[0]))

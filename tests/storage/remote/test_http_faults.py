@@ -1,0 +1,152 @@
+"""Shards over a line that breaks in every way: whole and right, or named, and never half."""
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from storage.dataset import Dataset, open_dataset
+from storage.errors import TrilightError
+from storage.sample import Sample, encode_sample
+from storage.shard_places import listed_shards
+from tests.storage.remote.fault_server import Fault, Server
+
+SHARD = "train-000000.tar"
+
+
+def read(url: str) -> list[Sample]:
+    dataset = open_dataset(url)
+    return list(dataset.read_shard(dataset.shards_of("train")[0]))
+
+
+def expected(local: Dataset) -> list[dict[str, bytes]]:
+    return [encode_sample(sample) for sample in local.read_shard(local.shards_of("train")[0])]
+
+
+def test_a_dataset_is_the_same_through_a_server(server: Server, local: Dataset) -> None:
+    remote = open_dataset(f"{server.url}/")
+    assert remote.manifest == local.manifest
+    assert remote.objects_lock() == local.objects_lock()
+    assert remote.failures() == local.failures()
+    assert [encode_sample(sample) for sample in read(server.url)] == expected(local)
+    with pytest.raises(TrilightError, match="is on a server; expected a local folder"):
+        _ = remote.folder
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        [Fault(status=500), Fault(status=503), Fault(status=429)],
+        [Fault(cut_after=0), Fault(cut_after=5000), Fault(cut_after=1)],
+        [Fault(stall_after=3000)],
+        [Fault(flip=True)],
+        [Fault(cut_after=4000), Fault(other_part=True)],
+        [Fault(cut_after=100)] * 12,
+        [Fault(cut_after=4000, no_length=True), Fault(no_length=True)],
+    ],
+    ids=[
+        "statuses",
+        "cut",
+        "stalled",
+        "changed bytes",
+        "another part",
+        "cut often",
+        "lengths unsaid",
+    ],
+)
+@pytest.mark.parametrize("ranges", [True, False])
+def test_what_passes_by_itself_is_outlived(
+    server: Server, local: Dataset, cache: Path, faults: list[Fault], ranges: bool
+) -> None:
+    if len(faults) > 4 and not ranges:
+        pytest.skip("without ranges, a line that always breaks gets nowhere")
+    server.faults[SHARD], server.ranges = list(faults), ranges
+    assert [encode_sample(sample) for sample in read(server.url)] == expected(local)
+    assert not server.faults[SHARD]
+    (kept,) = cache.iterdir()
+    assert kept.read_bytes() == (local.folder.root / SHARD).read_bytes()
+
+
+def test_a_transfer_goes_on_where_it_broke(server: Server, local: Dataset) -> None:
+    size = local.shards_of("train")[0].num_bytes
+    server.faults[SHARD] = [Fault(cut_after=size // 2), Fault(cut_after=size // 4)]
+    read(server.url)
+    ranges = [asked for name, asked in server.gets if name == SHARD]
+    assert ranges == ["", f"bytes={size // 2}-", f"bytes={size // 2 + size // 4}-"]
+    beside = (local.folder.root / "manifest.json").stat().st_size
+    assert server.sent == size + beside, "no byte of the shard came twice"
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (Fault(status=403), "cannot be read .*status 403"),
+        (Fault(status=404), "cannot be read .*no such file"),
+        (Fault(status=500), "cannot be read .*status 500"),
+        (Fault(cut_after=0), "cannot be read .*Payload"),
+        (Fault(flip=True), "not those of the manifest .sha256 differs, 2 times"),
+    ],
+)
+def test_what_stays_broken_is_named(
+    server: Server, cache: Path, fault: Fault, message: str
+) -> None:
+    server.always[SHARD] = fault
+    server.needed_query = "key=s3cret"
+    with pytest.raises(TrilightError, match=message) as caught:
+        read(f"{server.url.replace('//', '//ada:pa55@')}?key=s3cret")
+    text = str(caught.value)
+    assert SHARD in text and "expected" in text and "\n" not in text
+    assert "s3cret" not in text and "ada" not in text and "pa55" not in text
+    assert not list(cache.iterdir()), "nothing is left, under any name"
+    tried = [name for name, _ in server.gets if name == SHARD]
+    assert len(tried) == {403: 1, 404: 1, 500: 5}.get(fault.status, 2 if fault.flip else 5)
+
+
+def test_a_shard_of_another_size_is_named_at_once(server: Server, local: Dataset) -> None:
+    path = local.folder.root / SHARD
+    content = path.read_bytes()
+    path.write_bytes(content + bytes(512))
+    with pytest.raises(TrilightError, match=rf"has {len(content) + 512} bytes; expected"):
+        read(server.url)
+    assert [name for name, _ in server.gets].count(SHARD) == 1
+
+
+def test_a_file_that_changes_meanwhile_is_read_from_the_start(
+    server: Server, local: Dataset
+) -> None:
+    """Without a manifest there is no hash that would tell, but the server names the version."""
+    path = local.folder.root / SHARD
+    other = (local.folder.root / "train-000001.tar").read_bytes()
+    server.faults[SHARD] = [Fault(stall_after=4000)]
+    (place,) = listed_shards([f"{server.url}/{SHARD}"])
+    facts_asked = len(server.gets)
+
+    def change() -> None:
+        while len(server.gets) == facts_asked:
+            pass
+        path.write_bytes(other)
+
+    changer = threading.Thread(target=change)
+    changer.start()
+    with place.open() as stream:
+        assert stream.read() == other
+    changer.join()
+
+
+def test_a_manifest_that_is_not_there_is_named(server: Server) -> None:
+    with pytest.raises(TrilightError, match=r"no manifest\.json here"):
+        open_dataset(f"{server.url}/nowhere")
+    server.needed_query = "key"
+    with pytest.raises(TrilightError, match=r"manifest\.json.* cannot be read .*status 403"):
+        open_dataset(server.url)
+    with pytest.raises(TrilightError, match="cannot be read .*Connect"):
+        open_dataset("http://127.0.0.1:1/data")
+
+
+def test_a_cache_that_cannot_be_written_is_named(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "file"))
+    with pytest.raises(TrilightError, match="cannot write"):
+        read(server.url)

@@ -1,0 +1,95 @@
+"""A run from a server, or from a list, is the run from the folder."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from storage.dataset import Dataset
+from storage.errors import TrilightError
+from storage.remote import tries
+from storage.training_data import NO_MANIFEST
+from tests.storage.remote.fault_server import Fault, Server, serve
+from tests.train.kit import tiny_run
+from tests.train.toy import write_toy_dataset
+from train.progress import Silent
+from train.run import train_run
+
+pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=7, validation=2, per_shard=3)
+
+
+@pytest.fixture(scope="module")
+def weights(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The weights of the run from the folder, uninterrupted."""
+    out = tmp_path_factory.mktemp("whole")
+    return train_run(
+        tiny_run(), data=[str(dataset.folder.root)], out=out
+    ).folder.weights.read_bytes()
+
+
+@pytest.fixture
+def server(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.setattr(tries, "PAUSE_S", 0.0)
+    with serve(dataset.folder.root) as running:
+        yield running
+
+
+class StopAt(Silent):
+    def __init__(self, step: int) -> None:
+        self.step = step
+        self.notes: list[str] = []
+
+    def noted(self, text: str) -> None:
+        self.notes.append(text)
+
+    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
+        if step == self.step:
+            raise KeyboardInterrupt
+
+
+def test_a_run_begun_in_a_folder_goes_on_from_a_server(
+    dataset: Dataset, weights: bytes, server: Server, tmp_path: Path
+) -> None:
+    """In the middle of an epoch, over a bad line, with another number of threads."""
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        train_run(tiny_run(), data=[str(dataset.folder.root)], out=out, progress=StopAt(7))
+    faults = [Fault(status=503), Fault(cut_after=5000), Fault(flip=True)]
+    server.faults = {f"train-{number:06d}.tar": list(faults) for number in range(3)}
+    result = train_run(tiny_run(), data=[server.url], out=out, resume=True, workers=3)
+    assert result.folder.weights.read_bytes() == weights
+    assert result.unusable == ()
+
+
+def test_a_list_gives_the_same_weights_and_says_what_it_lacks(
+    dataset: Dataset, weights: bytes, server: Server, tmp_path: Path
+) -> None:
+    listener = StopAt(99)
+    pattern = f"{server.url}/{{train-000000,train-000001,train-000002,validation-000000}}.tar"
+    result = train_run(tiny_run(), data=[pattern], out=tmp_path / "out", progress=listener)
+    assert result.folder.weights.read_bytes() == weights
+    assert listener.notes == [NO_MANIFEST]
+    with pytest.raises(TrilightError, match=r"resume: data\.digest is"):
+        train_run(tiny_run(), data=[str(dataset.folder.root)], out=tmp_path / "out", resume=True)
+
+
+def test_damaged_data_is_left_out_when_it_is_allowed(dataset: Dataset, tmp_path: Path) -> None:
+    root = tmp_path / "damaged"
+    copied = write_toy_dataset(root, train=7, validation=2, per_shard=3)
+    path = copied.folder.shard("train-000002.tar")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(TrilightError, match=r"train-000002\.tar.*sha256"):
+        train_run(tiny_run(), data=[str(root)], out=tmp_path / "a")
+    result = train_run(tiny_run(most_unusable=1), data=[str(root)], out=tmp_path / "b")
+    (message,) = result.unusable
+    assert "train-000002.tar" in message
+    assert message in result.folder.summary.read_text().replace("\\n", "\n")

@@ -1,0 +1,66 @@
+"""Shards that are open because samples of them are planned: opened ahead, closed after the last."""
+
+import threading
+from collections import Counter
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+
+from storage.shard_set import OpenShard, ShardSet
+
+OPENED_AT_ONCE = 4
+"""Shards that are fetched and checked at the same time."""
+
+
+class OpenShards:
+    """The open ones of a set, by number. Safe to use from several threads."""
+
+    def __init__(self, shards: ShardSet) -> None:
+        self._shards = shards
+        self._opening = ThreadPoolExecutor(OPENED_AT_ONCE, thread_name_prefix="open-shard")
+        self._open: dict[int, Future[OpenShard]] = {}
+        self._planned: Counter[int] = Counter()
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> "OpenShards":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close all; one that is on its way is waited for, since its file must not be left open."""
+        self._opening.shutdown(wait=True, cancel_futures=True)
+        with self._lock:
+            for future in self._open.values():
+                _close(future)
+            self._open.clear()
+
+    def plan(self, numbers: Iterable[int]) -> None:
+        """Begin to open the shards of samples that will be read; a number for each sample."""
+        with self._lock:
+            for number in numbers:
+                self._planned[number] += 1
+                if number not in self._open:
+                    self._open[number] = self._opening.submit(self._shards.open, number)
+
+    def read(self, number: int) -> OpenShard:
+        """Return a planned shard, when it is open; raises what opening it raised."""
+        with self._lock:
+            future = self._open[number]
+        return future.result()
+
+    def done(self, numbers: Iterable[int]) -> None:
+        """Say that samples have been read; a number for each, as it was planned."""
+        with self._lock:
+            self._planned.subtract(numbers)
+            for number in [number for number, left in self._planned.items() if not left]:
+                del self._planned[number]
+                self._open.pop(number).add_done_callback(_close)
+
+
+def _close(future: Future[OpenShard]) -> None:
+    if not future.cancel() and future.exception() is None:
+        future.result().close()
