@@ -21,6 +21,7 @@ from storage.renderformer_h5 import (
     TEXTURE_EMISSION,
     filled_cells,
 )
+from storage.rows import distinct_rows
 from storage.safe_h5 import (
     iterate_blocks,
     names_in,
@@ -155,7 +156,7 @@ def _indexed(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
     """Return vertices and faces; vertices are in the order in which they are first used."""
     corners = np.concatenate([triangles, normals], axis=2).reshape(-1, 6)
-    first, rows = _distinct(corners)
+    first, rows = distinct_rows(corners)
     kept = corners[first]
     faces = rows.astype(np.uint32).reshape(-1, 3)
     return kept[:, :3].copy(), kept[:, 3:].copy(), faces
@@ -171,7 +172,7 @@ def _palette(rows: NDArray[np.float32], lost: list[str]) -> dict[str, Any]:
     materials[emits, : ROUGHNESS + 1] = [0, 0, 0, 0, 0, 0, 1]
     _within_one(materials, lost)
     order = np.where(emits, np.cumsum(emits), 0)  # emitters stay apart, even of equal radiance
-    first, index = _distinct(np.column_stack([materials, order.astype(np.float32)]))
+    first, index = distinct_rows(np.column_stack([materials, order.astype(np.float32)]))
     if len(first) > MAX_PALETTE or emits.sum() >= MAX_PALETTE:
         raise TrilightError(
             f"texture: {len(first)} materials and {emits.sum()} emitters; expected at most "
@@ -201,14 +202,3 @@ def _within_one(materials: NDArray[np.float32], lost: list[str]) -> None:
         materials[:, SPECULAR] = np.where(
             rounded, np.maximum(1 - materials[:, DIFFUSE], 0), materials[:, SPECULAR]
         )
-
-
-def _distinct(rows: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return where each distinct row first stands, in that order, and which one each row is.
-
-    Rows are compared by their bytes.
-    """
-    keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * 4))).ravel()
-    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    rank = np.argsort(np.argsort(first, kind="stable"), kind="stable")
-    return np.sort(first), rank[inverse]

@@ -8,7 +8,18 @@ from typing import NoReturn
 
 import typer
 
-from infra.cli import assets, bench, doctor, generate, inspect, render, shards, train, verify
+from infra.cli import (
+    assets,
+    bench,
+    convert,
+    doctor,
+    generate,
+    inspect,
+    render,
+    shards,
+    train,
+    verify,
+)
 from storage.errors import TrilightError
 
 app = typer.Typer(
@@ -22,6 +33,7 @@ app.command("doctor")(doctor.doctor)
 app.command("assets")(assets.assets)
 app.command("generate")(generate.generate)
 app.command("render")(render.render)
+app.command("convert")(convert.convert)
 app.command("verify")(verify.verify)
 app.command("inspect")(inspect.inspect)
 app.command("train")(train.train)

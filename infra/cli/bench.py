@@ -109,47 +109,28 @@ def _named(name: str) -> list[_Benchmark[Any]]:
     if name == "assets":
         from infra.bench import assets, assets_report
 
-        return [
-            _Benchmark(
-                num_rounds=assets.num_rounds,
-                run=assets.run,
-                rows=assets_report.rows,
-                plot=assets_report.plot,
-            )
-        ]
+        return [_whole(assets, assets_report)]
     if name == "render":
         return _render_parts()
     if name == "scenes":
         from infra.bench import scenes
 
-        return [
-            _Benchmark(
-                num_rounds=scenes.num_rounds, run=scenes.run, rows=scenes.rows, plot=scenes.plot
-            )
-        ]
+        return [_whole(scenes, scenes)]
     if name == "shards":
         from infra.bench import shards, shards_report
 
-        return [
-            _Benchmark(
-                num_rounds=shards.num_rounds,
-                run=shards.run,
-                rows=shards_report.rows,
-                plot=shards_report.plot,
-            )
-        ]
+        return [_whole(shards, shards_report)]
     if name == "streaming":
         from infra.bench import streaming, streaming_report
 
-        return [
-            _Benchmark(
-                num_rounds=streaming.num_rounds,
-                run=streaming.run,
-                rows=streaming_report.rows,
-                plot=streaming_report.plot,
-            )
-        ]
+        return [_whole(streaming, streaming_report)]
     raise TrilightError(f"benchmark {name!r} is unknown; expected one of {', '.join(_NAMES)}.")
+
+
+def _whole(module: Any, report: Any) -> _Benchmark[Any]:
+    return _Benchmark(
+        num_rounds=module.num_rounds, run=module.run, rows=report.rows, plot=report.plot
+    )
 
 
 def _render_parts() -> list[_Benchmark[Any]]:

@@ -1,4 +1,4 @@
-"""`trilight inspect`: what is in a dataset, for a person."""
+"""`trilight inspect`: what is in a dataset or in one scene, for a person."""
 
 import os
 from collections import Counter
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.text import Text
 
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from storage.dataset import Dataset, open_dataset
@@ -23,7 +24,13 @@ _READ_ONLY = "It cannot be written there: choose a folder for report and sheet w
 
 
 def inspect(
-    dataset: Annotated[str, typer.Argument(help="the dataset, a folder or a URL")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SRC",
+            help="a dataset (folder or URL), or one scene in any form that render reads",
+        ),
+    ],
     scenes: Annotated[int, typer.Option(help="scenes on the contact sheet")] = 16,
     by_template: Annotated[
         int | None, typer.Option(help="write templates.png too: so many scenes of each layout")
@@ -31,15 +38,24 @@ def inspect(
     out: Annotated[
         Path | None, typer.Option(help="write the report and the sheet here [the dataset]")
     ] = None,
+    turntable: Annotated[
+        Path | None, typer.Option(help="of one scene: write views from all sides here, X.png")
+    ] = None,
     json: Annotated[bool, typer.Option(help="print the summary as JSON")] = False,
 ) -> None:
     """Write report, gallery and contact sheet anew, and print what the dataset holds.
 
-    A dataset that is read-only, or on a server, is only summed up, unless there is an --out.
+    A dataset that is read-only, or on a server, is only summed up, unless there is an --out. Of one
+    scene the summary is printed, with what of its file could not be carried over.
     """
+    if not ("://" in source or Path(source).is_dir()):
+        _inspect_scene(source, turntable, json=json)
+        return
+    if turntable is not None:
+        raise TrilightError(f"--turntable: {source} is a dataset; expected one scene.")
     from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
 
-    opened = open_dataset(dataset)
+    opened = open_dataset(source)
     with progress_bars() as bars:
         total = len(opened.manifest.shards)
         task = bars.add_task("shards", total=total, note="", visible=not json)
@@ -67,6 +83,23 @@ def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | N
     ):
         return None
     return opened.folder
+
+
+def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
+    from pipeline.flows.inspect_scene import inspect_scene
+    from pipeline.flows.scene_source import scene_source
+
+    found = inspect_scene(scene_source(source), turntable)
+    if json:
+        print_json({**found.facts, "notes": list(found.notes)})
+        return
+    for note in found.notes:
+        console.print(Text(f"Note: {note}.", style="yellow"))
+    print_rows(
+        source, [(name.replace("_", " "), str(value)) for name, value in found.facts.items()]
+    )
+    if turntable is not None:
+        console.print(f"\nLook at {turntable}", style="bold")
 
 
 def _write(

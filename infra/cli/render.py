@@ -26,7 +26,8 @@ def render(
         str,
         typer.Argument(
             metavar="SRC",
-            help="scene .json or .h5 of RenderFormer, .safetensors scene, or SHARD.tar::KEY",
+            help="scene .usda .usdc .usdz .usd, RenderFormer .json or .h5, .safetensors, or "
+            "SHARD.tar::KEY",
         ),
     ],
     out: Annotated[Path, typer.Option(help="the picture, X.exr; X.png is written beside it")],

@@ -3,7 +3,9 @@
     scene.json                 RenderFormer scene; its meshes lie in the folder of the file
     scene.safetensors          storage.scene_file
     scene.h5                   the published layout (storage.renderformer_h5)
+    scene.usda .usdc .usdz .usd   a USD stage (pipeline.scenes.usd)
     train-000000.tar::KEY      the sample KEY of a shard
+    scenes.usdc::KEY           a scene of a shard in USD, or a time code of a stage that moves
 
 The last form is taken apart here and nowhere else: no library that knows URLs ever sees it.
 """
@@ -15,6 +17,7 @@ from pathlib import Path
 from pipeline.assets.settings import AssetSettings
 from pipeline.flows.scene_files import build_scene, described_by
 from pipeline.objects.licences import USER_PROVIDED
+from pipeline.scenes.usd.read import read_usd, usd_keys
 from storage.errors import TrilightError
 from storage.profiles import PACKED, PLAIN
 from storage.renderformer_h5_read import read_renderformer_h5
@@ -22,13 +25,14 @@ from storage.safe_url import safe_url
 from storage.sample import decode_scene
 from storage.scene import Scene
 from storage.scene_file import read_scene_file
-from storage.shard_reader import read_members
+from storage.shard_reader import iterate_samples, read_members
+from storage.usd.opening import SUFFIXES as USD_SUFFIXES
 
 SEPARATOR = "::"
 """Between a shard and the key of a sample."""
 
-_KEY = re.compile(r"[0-9A-Za-z_\-]+")
-_EXPECTED = "expected a scene .json, .safetensors or .h5, or SHARD.tar::KEY"
+_KEY = re.compile(r"[0-9A-Za-z_.\-]+")
+_EXPECTED = "expected a scene .json, .safetensors, .h5 or .usda .usdc .usdz, or SHARD.tar::KEY"
 _MEMBERS = ("json", PLAIN, PACKED)
 
 
@@ -39,7 +43,9 @@ class SceneSource:
     path: Path
     """The file."""
     key: str | None
-    """The sample in it, where it is a shard."""
+    """Which scene of it, where it holds many."""
+    usd_folder: Path | None = None
+    """A USD file may name files below it; below its own folder by default."""
 
     @property
     def name(self) -> str:
@@ -57,28 +63,48 @@ class LoadedScene:
     """What a person should know: what of a file means nothing, or could not be carried over."""
 
 
-def scene_source(text: str) -> SceneSource:
+def scene_source(text: str, *, many: bool = False, usd_folder: Path | None = None) -> SceneSource:
     """Return what the user's `SRC` names; the file is not opened yet.
 
+    Args:
+        text: what the user typed.
+        many: whether a shard without a key will do.
+        usd_folder: see `SceneSource`.
+
     Raises:
-        TrilightError: a URL, no such file, or a name that is none of the three forms.
+        TrilightError: a URL, no such file, or a name that is none of the forms.
     """
     if "://" in text:
         raise TrilightError(f"{safe_url(text)}: only files of this machine are read; {_EXPECTED}.")
     name, separator, key = text.rpartition(SEPARATOR)
     path = Path(name if separator else text)
     suffix = path.suffix.lower()
-    if separator and (suffix != ".tar" or not _KEY.fullmatch(key)):
+    if separator and (suffix not in (".tar", *USD_SUFFIXES) or not _KEY.fullmatch(key)):
         raise TrilightError(f"{text}: no shard and key; {_EXPECTED}.")
     if path.is_dir():
         raise TrilightError(f"{text}: a folder; {_EXPECTED}.")
     if not path.exists():
         raise TrilightError(f"{text}: no such file; {_EXPECTED}.")
-    if not separator and suffix == ".tar":
+    if not separator and suffix == ".tar" and not many:
         raise TrilightError(f"{text}: a shard holds many scenes; expected {text}{SEPARATOR}KEY.")
-    if not separator and suffix not in (".json", ".safetensors", ".h5"):
+    if not separator and suffix not in (".json", ".safetensors", ".h5", ".tar", *USD_SUFFIXES):
         raise TrilightError(f"{text}: cannot be read as a scene; {_EXPECTED}.")
-    return SceneSource(path=path, key=key if separator else None)
+    return SceneSource(path=path, key=key if separator else None, usd_folder=usd_folder)
+
+
+def source_keys(source: SceneSource) -> list[str | None]:
+    """Return the key of every scene that a source names; [None] where it is one scene.
+
+    Only children come here, since a stage may be read.
+    """
+    if source.key is not None:
+        return [source.key]
+    suffix = source.path.suffix.lower()
+    if suffix == ".tar":
+        return [key for key, _ in iterate_samples(source.path)]
+    if suffix in USD_SUFFIXES:
+        return [key or None for key in usd_keys(source.path, source.usd_folder)]
+    return [None]
 
 
 def load_source(source: SceneSource) -> LoadedScene:
@@ -87,6 +113,12 @@ def load_source(source: SceneSource) -> LoadedScene:
     Raises:
         TrilightError: anything in the file is unusable, or breaks a law of scenes.
     """
+    suffix = source.path.suffix.lower()
+    if suffix in USD_SUFFIXES:
+        usd = read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED)
+        return LoadedScene(
+            scene=usd.scene, notes=tuple(f"{source.name}: {text}" for text in usd.lost)
+        )
     if source.key is not None:
         members = read_members(source.path, source.key, _MEMBERS)
         scene = decode_scene(source.key, members).scene
@@ -95,10 +127,10 @@ def load_source(source: SceneSource) -> LoadedScene:
         except TrilightError as error:
             raise TrilightError(f"sample {source.key}: {error}") from error
         return LoadedScene(scene=scene, notes=())
-    if source.path.suffix.lower() == ".safetensors":
+    if suffix == ".safetensors":
         return LoadedScene(scene=read_scene_file(source.path), notes=())
     root, name = source.path.parent.resolve(), source.path.name
-    if source.path.suffix.lower() == ".h5":
+    if suffix == ".h5":
         found = read_renderformer_h5(source.path)
         return LoadedScene(scene=found.scene, notes=tuple(f"{name}: {text}" for text in found.lost))
     unknown = described_by(root, name).unknown_fields

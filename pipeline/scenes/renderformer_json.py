@@ -23,9 +23,11 @@ from storage.errors import TrilightError
 MAX_BYTES = 4 << 20
 """Largest accepted file; an object takes about 1 KiB."""
 
-MAX_OBJECTS = 1000
+MAX_OBJECTS = 8192
+"""Of one file: where every triangle has a colour of its own, each is an object there."""
+
 MAX_CAMERAS = 1000
-"""Most objects and cameras of one file."""
+"""Of one file."""
 
 _VERSION = "1.0"
 _MAX_LENGTH = 1e6

@@ -1,0 +1,137 @@
+"""One scene, or all that a file holds, from one form to another; in a child process with limits.
+
+USD holds many scenes in one file. The other forms hold one: many become `NAME.KEY.SUFFIX`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.flows.scene_source import LoadedScene, SceneSource, load_source, source_keys
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.scenes.renderformer_json_write import described_files
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+from storage.renderformer_h5 import write_renderformer_h5
+from storage.scene import Scene
+from storage.scene_file import encode_scene
+from storage.usd.export import SUFFIXES, write_usd, write_usd_shard
+
+_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
+_EXPECTED = "expected the name of a file: .usda .usdc .usdz, .json, .h5 or .safetensors"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Converted:
+    """What came of a conversion."""
+
+    files: tuple[Path, ...]
+    """What was written, without the meshes beside a scene JSON."""
+    triangles: int
+    """Of all scenes."""
+    notes: tuple[str, ...]
+    """What could not be carried over, for people."""
+
+
+def convert_scene(
+    source: SceneSource, target: Path, *, budget: int | None, done: Callable[[int, int], None]
+) -> Converted:
+    """Read a source and write it in the form that the target's name says.
+
+    Args:
+        source: one scene, or a file of many.
+        target: the file to write.
+        budget: most triangles of each scene, or None for all of them.
+        done: called with (finished, all) files.
+
+    Raises:
+        TrilightError: the source is unusable, the target's form cannot hold it, or it cannot be
+            written.
+    """
+    suffix = target.suffix.lower()
+    if suffix not in (*SUFFIXES, ".json", ".h5", ".safetensors") or target.is_dir():
+        raise TrilightError(f"{target}: cannot be written as a scene; {_EXPECTED}.")
+    child = IsolatedChild(limits=_LIMITS, setup=_no_set_up)
+    try:
+        keys = child.call(source_keys, source)
+        if not keys:
+            raise TrilightError(f"{source.name}: holds no scene.")
+        if suffix in SUFFIXES and len(keys) > 1:
+            found = [child.call(_many_to_usd, source, keys, target, budget)]
+            done(1, 1)
+        else:
+            found = []
+            for key in keys:
+                wanted = source if key is None else dataclasses.replace(source, key=key)
+                out = target if len(keys) == 1 else target.with_suffix(f".{key}{target.suffix}")
+                found.append(child.call(_one, wanted, out, budget))
+                done(len(found), len(keys))
+    except ChildFailed as failure:
+        raise TrilightError(f"{source.name}: could not be converted ({failure}).") from failure
+    finally:
+        child.close()
+    return Converted(
+        files=tuple(path for each in found for path in each.files),
+        triangles=sum(each.triangles for each in found),
+        notes=tuple(dict.fromkeys(note for each in found for note in each.notes)),
+    )
+
+
+def _no_set_up() -> None:
+    pass
+
+
+def _one(source: SceneSource, target: Path, budget: int | None) -> Converted:
+    loaded = _loaded(source, budget)
+    suffix, lost = target.suffix.lower(), tuple[str, ...]()
+    if suffix in SUFFIXES:
+        write_usd(target, loaded.scene)
+    elif suffix == ".json":
+        lost = _write_json(target, loaded.scene)
+    elif suffix == ".h5":
+        write_renderformer_h5(target, loaded.scene)
+    else:
+        write_atomically(target, encode_scene(loaded.scene))
+    notes = (*loaded.notes, *(f"{target.name}: cannot hold {text}" for text in lost))
+    return Converted(files=(target,), triangles=loaded.scene.num_triangles, notes=notes)
+
+
+def _many_to_usd(
+    source: SceneSource, keys: list[str | None], target: Path, budget: int | None
+) -> Converted:
+    triangles, notes = 0, list[str]()
+
+    def scenes() -> Iterator[tuple[str, Scene]]:
+        nonlocal triangles
+        for key in keys:
+            loaded = _loaded(dataclasses.replace(source, key=key), budget)
+            triangles += loaded.scene.num_triangles
+            notes.extend(loaded.notes)
+            yield _variant_name(str(key)), loaded.scene
+
+    write_usd_shard(target, scenes())
+    return Converted(files=(target,), triangles=triangles, notes=tuple(notes))
+
+
+def _variant_name(key: str) -> str:
+    """Return a key as a variant of USD may be called: a time code has a point, or a minus."""
+    return key.replace(".", "_").replace("-", "m")
+
+
+def _loaded(source: SceneSource, budget: int | None) -> LoadedScene:
+    loaded = load_source(source)
+    if budget is None or loaded.scene.num_triangles <= budget:
+        return loaded
+    from pipeline.flows.scene_budget import within_budget  # loads mesh libraries
+
+    scene, notes = within_budget(loaded.scene, budget)
+    return LoadedScene(scene=scene, notes=(*loaded.notes, *notes))
+
+
+def _write_json(target: Path, scene: Scene) -> tuple[str, ...]:
+    described = described_files(scene, target.stem)
+    for path, data in described.meshes.items():
+        write_atomically(target.parent / path, data)
+    write_atomically(target, described.json)  # last: what it names is there
+    return described.lost

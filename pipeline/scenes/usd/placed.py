@@ -1,0 +1,118 @@
+"""Every mesh, light and camera of a composed stage with its place in our world, instances too."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import TrilightError
+
+MAX_PLACED = 100_000
+"""Most prims that are looked at, instances counted each."""
+
+_READ = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight")
+_SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "SkelRoot", "")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placed:
+    """A prim in its place."""
+
+    prim: Any
+    """The USD prim; several places may share one."""
+    to_world: NDArray[np.float64]
+    """[4, 4], for column vectors, into metres with +Z up."""
+
+
+def placed_prims(stage: Any, time: Any, lost: list[str]) -> list[Placed]:
+    """Return what is seen of a stage at a time, in its own order.
+
+    Invisible prims, guides and proxies are left out; kinds of prims that cannot be read are noted.
+
+    Raises:
+        TrilightError: more than MAX_PLACED prims with all instances, or a place that is not finite.
+    """
+    found: list[Placed] = []
+    unread: Counter[str] = Counter()
+    visits = 0
+    for prim, to_world in _visited(stage.GetPseudoRoot(), _base(stage), time):
+        visits += 1
+        if visits > MAX_PLACED:
+            raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
+        kind = str(prim.GetTypeName())
+        if kind in _READ:
+            if not np.isfinite(to_world).all():
+                raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
+            found.append(Placed(prim=prim, to_world=to_world))
+        elif kind not in _SILENT and kind != "PointInstancer":
+            unread[kind] += 1
+    lost += [f"{count} x {kind}: such prims are not read" for kind, count in sorted(unread.items())]
+    return found
+
+
+def _base(stage: Any) -> NDArray[np.float64]:
+    """Return the matrix from a stage's units and axis to metres with +Z up."""
+    from pxr import UsdGeom
+
+    metres = UsdGeom.GetStageMetersPerUnit(stage)
+    base = np.diag([metres, metres, metres, 1.0])
+    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
+        base[:3, :3] = metres * np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    return base
+
+
+def _visited(
+    prim: Any, above: NDArray[np.float64], time: Any
+) -> Iterator[tuple[Any, NDArray[np.float64]]]:
+    from pxr import Usd, UsdGeom
+
+    to_world = above
+    if not prim.IsPseudoRoot():
+        seen = UsdGeom.Imageable(prim)
+        if seen:
+            if seen.GetVisibilityAttr().Get(time) == UsdGeom.Tokens.invisible:
+                return
+            if seen.GetPurposeAttr().Get(time) in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
+                return
+        to_world = _moved(prim, above, time)
+        yield prim, to_world
+    if prim.IsA(UsdGeom.PointInstancer):
+        yield from _instances(prim, to_world, time)
+        return
+    for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies()):
+        yield from _visited(child, to_world, time)
+
+
+def _moved(prim: Any, above: NDArray[np.float64], time: Any) -> NDArray[np.float64]:
+    from pxr import UsdGeom
+
+    move = UsdGeom.Xformable(prim)
+    if not move:
+        return above
+    local = np.array(move.GetLocalTransformation(time)).T
+    start = _base(prim.GetStage()) if move.GetResetXformStack() else above
+    return np.einsum("ij,jk->ik", start, local)
+
+
+def _instances(
+    prim: Any, to_world: NDArray[np.float64], time: Any
+) -> Iterator[tuple[Any, NDArray[np.float64]]]:
+    from pxr import UsdGeom
+
+    instancer = UsdGeom.PointInstancer(prim)
+    targets = instancer.GetPrototypesRel().GetForwardedTargets()
+    which = instancer.GetProtoIndicesAttr().Get(time) or []
+    moves = instancer.ComputeInstanceTransformsAtTime(
+        time, time, UsdGeom.PointInstancer.ExcludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
+    )
+    shown = instancer.ComputeMaskAtTime(time) or [True] * len(which)
+    for index, move, visible in zip(which, moves, shown, strict=False):
+        if not visible or not 0 <= index < len(targets):
+            continue
+        prototype = prim.GetStage().GetPrimAtPath(targets[index])
+        if prototype:
+            place = np.einsum("ij,jk->ik", to_world, np.array(move).T)
+            yield from _visited(prototype, place, time)

@@ -1,0 +1,107 @@
+"""Writing prims and attributes straight into a layer: a hundred times fewer calls than by schema.
+
+An attribute is stated as (type name of USD, value); a table of them by name is both what is written
+and what an exact reader expects to find.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.usd.names import NAMESPACE
+
+Attributes = Mapping[str, tuple[str, Any]]
+"""Type name and value of each attribute; a type that begins with "uniform " is uniform."""
+
+UNIFORM = "uniform "
+
+
+def add_prim(layer: Any, path: str, type_name: str, schemas: Sequence[str] = ()) -> Any:
+    """Return a new prim of a type, with API schemas applied."""
+    from pxr import Sdf
+
+    prim = Sdf.CreatePrimInLayer(layer, path)
+    prim.specifier = Sdf.SpecifierDef
+    prim.typeName = type_name
+    if schemas:
+        prim.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=list(schemas)))
+    return prim
+
+
+def add_attributes(prim: Any, attributes: Attributes) -> None:
+    """Write attributes with their default values."""
+    from pxr import Sdf
+
+    for name, (kind, value) in attributes.items():
+        uniform = kind.startswith(UNIFORM)
+        attribute = Sdf.AttributeSpec(
+            prim,
+            name,
+            _value_type(kind),
+            Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying,
+            name.startswith(NAMESPACE),
+        )
+        attribute.default = _vt(kind, value)
+
+
+def add_relationship(prim: Any, name: str, target: str) -> None:
+    """Write a relationship to one prim."""
+    from pxr import Sdf
+
+    relationship = Sdf.RelationshipSpec(prim, name, False)
+    relationship.targetPathList.explicitItems = [_target(target)]
+
+
+def add_output(prim: Any, name: str, source: str | None = None) -> None:
+    """Write a token output, connected to another one where there is a source."""
+    from pxr import Sdf
+
+    output = Sdf.AttributeSpec(prim, name, Sdf.ValueTypeNames.Token)
+    if source is not None:
+        output.connectionPathList.explicitItems = [_target(source)]
+
+
+def as_expected(prim: Any, attributes: Attributes) -> bool:
+    """Return whether a prim holds these attributes with these values and no other time."""
+    for name, (kind, value) in attributes.items():
+        found = prim.attributes.get(name)
+        if found is None or found.HasInfo("timeSamples"):
+            return False
+        if found.typeName != _value_type(kind) or found.default != _vt(kind, value):
+            return False
+    return True
+
+
+def _target(path: str) -> Any:
+    """Return the path by which others name a prim: the one that it has once variants are chosen."""
+    from pxr import Sdf
+
+    return Sdf.Path(path).StripAllVariantSelections()
+
+
+def _value_type(kind: str) -> Any:
+    from pxr import Sdf
+
+    return Sdf.ValueTypeNames.Find(kind.removeprefix(UNIFORM))
+
+
+def _vt(kind: str, value: Any) -> Any:
+    """Return a value as USD holds it."""
+    from pxr import Gf, Vt
+
+    if isinstance(value, np.ndarray):
+        return _vt_array(value)
+    if kind.endswith("token[]"):
+        return Vt.TokenArray(value)
+    if kind in ("color3f", "float2") or kind.endswith("matrix4d"):
+        return {"color3f": Gf.Vec3f, "float2": Gf.Vec2f}.get(kind, Gf.Matrix4d)(value)
+    return Vt.Float(value) if kind == "float" and not isinstance(value, float) else value
+
+
+def _vt_array(values: NDArray) -> Any:
+    from pxr import Vt
+
+    kind = Vt.IntArray if values.ndim == 1 else Vt.Vec3fArray
+    return kind.FromNumpy(np.ascontiguousarray(values))

@@ -1,0 +1,123 @@
+"""`trilight convert`: every form to every form, shards, budgets, and one line for a mistake."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from infra.cli.app import app
+from pipeline.flows.scene_source import load_source, scene_source
+from storage.errors import TrilightError
+from storage.profiles import Profile
+from storage.sample import encode_sample
+from storage.scene import Scene
+from storage.scene_file import encode_scene
+from storage.shard_writer import write_shard
+from tests.scenes.strangers_stage import write_stage
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+FORMS = ("usda", "usdc", "usdz", "json", "h5", "safetensors")
+PROFILE: Profile = "lossless"
+
+
+def convert(*arguments: str | Path) -> dict[str, Any]:
+    """Return what `trilight convert --json` prints."""
+    words = ["convert", *(str(argument) for argument in arguments), "--json"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.exception
+    return dict(json.loads(result.output))
+
+
+def refused(*arguments: str | Path) -> str:
+    """Return the one line that a mistake ends in."""
+    words = ["convert", *(str(argument) for argument in arguments)]
+    result = CliRunner().invoke(app, words)
+    assert isinstance(result.exception, TrilightError), result.exception
+    assert "\n" not in str(result.exception)
+    return str(result.exception)
+
+
+def loaded(path: Path, key: str = "") -> Scene:
+    return load_source(scene_source(f"{path}::{key}" if key else str(path))).scene
+
+
+@pytest.fixture
+def shard(tmp_path: Path) -> Path:
+    path = tmp_path / "train-000000.tar"
+    samples = {key: encode_sample(tiny_sample(key), PROFILE) for key in ("000000003", "000000005")}
+    write_shard(path, samples.items())
+    return path
+
+
+def test_a_scene_goes_round_through_every_form(tmp_path: Path) -> None:
+    """From exact to exact form the bytes stay; JSON and HDF5 keep every triangle and its light."""
+    source = tmp_path / "a.safetensors"
+    source.write_bytes(encode_scene(tiny_scene()))
+    for form in FORMS:
+        found = convert(source, tmp_path / f"b.{form}")
+        assert found["triangles"] == 3
+        back = loaded(tmp_path / f"b.{form}")
+        if form not in ("json", "h5"):
+            assert encode_scene(back) == source.read_bytes()
+        want = tiny_scene()
+        assert np.array_equal(back.vertex_positions[back.faces], want.vertex_positions[want.faces])
+        assert np.array_equal(
+            back.materials[back.material_index], want.materials[want.material_index]
+        )
+
+
+def test_a_sample_and_a_whole_shard(tmp_path: Path, shard: Path) -> None:
+    convert(f"{shard}::000000005", tmp_path / "one.usdz")
+    assert encode_scene(loaded(tmp_path / "one.usdz")) == encode_scene(tiny_scene())
+    convert(shard, tmp_path / "all.usdc")
+    assert loaded(tmp_path / "all.usdc", "000000003").num_triangles == 3
+    found = convert(tmp_path / "all.usdc", tmp_path / "each.safetensors")
+    assert [Path(path).name for path in found["files"]] == [
+        "each.000000003.safetensors", "each.000000005.safetensors",
+    ]  # fmt: skip
+    assert encode_scene(loaded(Path(found["files"][1]))) == encode_scene(tiny_scene())
+
+
+def test_a_strangers_stage_within_a_budget(tmp_path: Path) -> None:
+    stage = write_stage(tmp_path, sphere=True)
+    whole = convert(stage, tmp_path / "whole.safetensors")
+    assert any("DomeLight" in note for note in whole["notes"])
+    fewer = convert(stage, tmp_path / "few.safetensors", "--budget", "600")
+    assert fewer["triangles"] <= 600 < whole["triangles"]
+    assert any("reduced to" in note for note in fewer["notes"])
+    loaded(tmp_path / "few.safetensors").check()
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "message"),
+    [
+        ("absent.usda", "a.json", "no such file"),
+        ("a.txt", "a.json", "cannot be read as a scene"),
+        ("a.usda", "a.obj", "cannot be written as a scene"),
+        ("a.usda", "a.usd", "cannot be written as a scene"),
+        ("broken.usda", "a.json", "not readable as USD"),
+        ("broken.json", "a.usda", "not readable as JSON"),
+        ("empty.h5", "a.usda", "not a readable HDF5 file"),
+        ("https://x.y/a.usda", "a.json", "only files of this machine"),
+    ],
+)
+def test_mistakes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, target: str, message: str
+) -> None:
+    for name in ("a.txt", "empty.h5"):
+        (tmp_path / name).touch()
+    (tmp_path / "a.usda").write_text("#usda 1.0\n")
+    for name in ("broken.usda", "broken.json"):
+        (tmp_path / name).write_text("{")
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(source, target)
+    assert not (tmp_path / "a.json").exists()
+
+
+def test_budgets_that_cannot_be(tmp_path: Path) -> None:
+    stage = write_stage(tmp_path)
+    assert "expected at least 1" in refused(stage, tmp_path / "a.json", "--budget", "0")
+    assert "emitters take" in refused(stage, tmp_path / "a.json", "--budget", "20")
