@@ -115,7 +115,8 @@ def scenes(draw: st.DrawFn) -> Scene:
     emits = np.arange(triangles) == triangles - 1
     pose = look_at_c2w(eye=rng.normal(size=3), target=rng.normal(size=3), up=rng.normal(size=3))
     text = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8)
-    kinds: list[ObjectKind] = ["object"] * (objects - 1) + ["emitter"]
+    kinds: list[ObjectKind] = ["object" for _ in range(objects - 1)]
+    kinds.append("emitter")
     return Scene(
         vertex_positions=(scale * rng.normal(size=(count, 3))).astype(np.float32),
         vertex_normals=normals.astype(np.float32),
