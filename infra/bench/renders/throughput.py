@@ -117,7 +117,7 @@ def num_rounds(options: Options) -> int:
 
 
 def run(options: Options, round_done: Callable[[], None]) -> Throughput:
-    """Measure; quickly three scenes with at most 512 samples, otherwise twelve with 4096.
+    """Measure; quickly three scenes with at most 512 samples, otherwise twelve with 1024.
 
     Raises:
         TrilightError: the folder of scenes holds none.
@@ -164,7 +164,7 @@ def _plan(options: Options, chosen: Sequence[NamedScene]) -> Plan:
         scenes=tuple(named.name for named in chosen),
         resolutions=(256, 512),
         targets_db=(38.0, 42.0, 46.0, 50.0),
-        max_spp=512 if options.quick else 4096,
+        max_spp=512 if options.quick else 1024,
         threads=os.cpu_count() or 1,
     )
 
