@@ -41,6 +41,12 @@ def _sliver(aspect: float) -> Part:
     return flat([[[-0.5, 0, 0.5], [0.5, 0, 0.5], [0, aspect, 0.5]]], material(diffuse=0.5))
 
 
+def _mirror(side: float = 1.0) -> Part:
+    """A smooth wall beside the floor: it throws light of the lamp on it."""
+    corners = np.array([[1, -1, 0], [1, 1, 0], [1, 1, 2], [1, -1, 2]]) * [side, 1, 1]
+    return quad(corners, material(specular=1.0, roughness=0.0))
+
+
 SURFACES = {
     "black": material(),
     "white diffuse": material(diffuse=1.0),
@@ -63,6 +69,10 @@ SHAPES = {
     "faint light": [_floor(), _lamp(1e-3)],
     "white lights face to face": [_floor(), _lamp(diffuse=1.0), _lamp(scale=1.001, diffuse=1.0)],
     "64 lights": [_floor(), *[_lamp(1.0 + i, 1 + 0.01 * i) for i in range(64)]],
+    "caustic of a mirror": [_floor(), _mirror(), _lamp()],
+    "caustic of a tiny light": [_floor(), _mirror(), light(np.array(LAMP) * [1e-3, 1e-3, 1], 1e6)],
+    "a light between two mirrors": [_floor(), _mirror(), _mirror(-1), _lamp()],
+    "a light far away": [_floor(), _mirror(), light(np.add(LAMP, [0, 0, 1e3]), 1e7)],
     "light of a millimetre": [_floor(), light(np.array(LAMP) * [1e-3, 1e-3, 1], 1e6)],
 }  # fmt: skip
 
