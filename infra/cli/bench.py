@@ -127,9 +127,13 @@ def _named(name: str) -> list[_Benchmark[Any]]:
     raise TrilightError(f"benchmark {name!r} is unknown; expected one of {', '.join(_NAMES)}.")
 
 
-def _whole(module: Any, report: Any) -> _Benchmark[Any]:
+def _whole(module: Any, report: Any, part: str = "") -> _Benchmark[Any]:
     return _Benchmark(
-        num_rounds=module.num_rounds, run=module.run, rows=report.rows, plot=report.plot
+        num_rounds=module.num_rounds,
+        run=module.run,
+        rows=report.rows,
+        plot=report.plot,
+        part=part,
     )
 
 
@@ -143,25 +147,7 @@ def _render_parts() -> list[_Benchmark[Any]]:
     )
 
     return [
-        _Benchmark(
-            part="frontier",
-            num_rounds=frontier.num_rounds,
-            run=frontier.run,
-            rows=frontier_report.rows,
-            plot=frontier_report.plot,
-        ),
-        _Benchmark(
-            part="throughput",
-            num_rounds=throughput.num_rounds,
-            run=throughput.run,
-            rows=throughput_report.rows,
-            plot=throughput_report.plot,
-        ),
-        _Benchmark(
-            part="cost",
-            num_rounds=cost.num_rounds,
-            run=cost.run,
-            rows=cost.rows,
-            plot=cost.plot,
-        ),
+        _whole(frontier, frontier_report, "frontier"),
+        _whole(throughput, throughput_report, "throughput"),
+        _whole(cost, cost, "cost"),
     ]
