@@ -14,7 +14,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
-from storage.scene import ObjectKind, Scene, SceneObject
+from storage.scene import Scene, SceneObject
 from storage.scene_file import encode_scene
 from storage.usd.exact import read_exact, scene_keys
 from storage.usd.export import SUFFIXES, write_usd, write_usd_shard
@@ -31,8 +31,7 @@ OPENPBR_INPUTS = {
     "emission_luminance": "float",
     "emission_color": "color3f",
 }
-"""Inputs of OpenPBR 1.1's node in MaterialX that we write, and their types: usd-core does not know
-the node, so that no validator checks them."""
+"""What we write of OpenPBR 1.1's node in MaterialX, by type: no validator knows the node."""
 
 
 def written(tmp_path: Path, scene: Scene, name: str = "a.usdc") -> Any:
@@ -115,8 +114,6 @@ def scenes(draw: st.DrawFn) -> Scene:
     emits = np.arange(triangles) == triangles - 1
     pose = look_at_c2w(eye=rng.normal(size=3), target=rng.normal(size=3), up=rng.normal(size=3))
     text = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8)
-    kinds: list[ObjectKind] = ["object" for _ in range(objects - 1)]
-    kinds.append("emitter")
     return Scene(
         vertex_positions=(scale * rng.normal(size=(count, 3))).astype(np.float32),
         vertex_normals=normals.astype(np.float32),
@@ -132,9 +129,11 @@ def scenes(draw: st.DrawFn) -> Scene:
         fov_deg=rng.uniform(1e-3, 179.9, 1).astype(np.float32),
         objects=tuple(
             SceneObject(
-                name=f"{row}{draw(text)}", kind=kind, uid=draw(text), attribution=draw(text)
+                name=f"{row}{draw(text)}",
+                kind="emitter" if row == objects - 1 else "object",
+                **{field: draw(text) for field in ("uid", "attribution")},
             )
-            for row, kind in enumerate(kinds)
+            for row in range(objects)
         ),
         provenance={
             "text": draw(text),
