@@ -120,9 +120,10 @@ def _size_category(num_scenes: int) -> str:
 def _lead(manifest: Manifest) -> str:
     resolution = _setting(manifest.settings, "renders.resolution")
     size = f" of {text(resolution)} x {text(resolution)} pixels" if resolution else ""
+    pictures = "picture" if manifest.num_views == 1 else "pictures"
     return (
         f"{manifest.num_samples} scenes of triangles with materials, lights and cameras, and "
-        f"{text(manifest.num_views)} path-traced HDR pictures{size} of each, to train and judge "
+        f"{text(manifest.num_views)} path-traced HDR {pictures}{size} of each, to train and judge "
         f"neural renderers in the manner of RenderFormer. {manifest.num_bytes / 1e6:.1f} MB in "
         f"{len(manifest.shards)} shards. Made by Trilight."
     )
