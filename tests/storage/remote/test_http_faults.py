@@ -124,7 +124,9 @@ def test_a_file_that_changes_meanwhile_is_read_from_the_start(
     def change() -> None:
         while len(server.gets) == facts_asked:
             pass
-        path.write_bytes(other)
+        fresh = path.with_suffix(".fresh")
+        fresh.write_bytes(other)
+        fresh.replace(path)  # at once: the server must not find half of it
 
     changer = threading.Thread(target=change)
     changer.start()
