@@ -15,24 +15,18 @@ matplotlib.use("Agg")  # before pyplot: no display is needed
 import matplotlib.pyplot as plt
 
 from infra.bench.harness import Comparison, Options, compare
+from infra.bench.render_child import render_child
 from infra.bench.scene_detail import ERRORS, picture_errors
-from pipeline.flows.accept_objects import accept_objects
 from pipeline.flows.builds import BUILDS
-from pipeline.flows.environment import environment
 from pipeline.flows.make_scene import (
     MAX_ATTEMPTS,
-    SceneSource,
     assets_of,
     attempt_scene,
-    set_up_child,
 )
-from pipeline.flows.publication import begin
 from pipeline.flows.training_builds import smoke
-from pipeline.isolation import ChildLimits, IsolatedChild
-from pipeline.renders.variant import choose_variant
+from pipeline.isolation import IsolatedChild
 from pipeline.scenes.compose import compose_scene
 from storage.errors import Rejected
-from storage.layout import DatasetFolder
 
 NAME = "scenes"
 COMPOSED = (
@@ -43,7 +37,6 @@ COMPOSED = (
     "out-of-range",
 )
 RENDERED = "smoke, composed and rendered"
-_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=10_000)
 _LEVELS = ("finest", *(f"{error:.2%}" for error in ERRORS))
 
 
@@ -51,7 +44,7 @@ def run(options: Options, round_done: Callable[[], None]) -> Comparison:
     """Measure; quickly 40 scenes a build and 2 pictures, otherwise 200 and 8."""
     count, pictures, repeats = (40, 2, 1) if options.quick else (200, 8, 2)
     with tempfile.TemporaryDirectory() as folder:
-        child = _child(DatasetFolder(Path(folder)), options)
+        child = render_child(Path(folder), smoke(), objects=options.objects[0], threads=1)
         sides: dict[str, Callable[[], Mapping[str, float]]] = {
             build: _calling(child, composed, build, count) for build in COMPOSED
         }
@@ -66,14 +59,6 @@ def run(options: Options, round_done: Callable[[], None]) -> Comparison:
 def num_rounds(options: Options) -> int:
     """Return how often `round_done` will be called."""
     return (len(COMPOSED) + 1 + len(_LEVELS)) * (1 + (1 if options.quick else 2))
-
-
-def _child(folder: DatasetFolder, options: Options) -> IsolatedChild:
-    variant, build = choose_variant(), smoke()
-    publication = begin(folder, build, environment(variant), 1, accept_environment=False)
-    accepted = accept_objects(options.objects[0], None, build, publication, workers=1)
-    source = SceneSource(settings=build, variant=variant, threads=1, objects=accepted.objects)
-    return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(source,))
 
 
 def _calling(

@@ -65,9 +65,16 @@ def _render(
     scene: Any, integrator: Any, camera: Camera, *, seed: int, spp: int, jitter: bool = True
 ) -> NDArray[np.float32]:
     """Return the picture [R, R, channels]; without jitter, samples lie on a regular grid."""
+    sensor = stock_sensor(camera, {"type": "multijitter", "sample_count": spp, "jitter": jitter})
+    picture = mi.render(scene, sensor=sensor, integrator=integrator, seed=mi.UInt32(seed), spp=spp)
+    return np.array(picture)
+
+
+def stock_sensor(camera: Camera, sampler: dict[str, Any]) -> Any:
+    """Return Mitsuba's own camera for a view: box-filtered pixels, the sampler as its plugin."""
     # Mitsuba's cameras look along +Z with +X to the left.
     to_world = camera.c2w @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    sensor = mi.load_dict(
+    return mi.load_dict(
         {
             "type": "perspective",
             "fov": camera.fov_deg,
@@ -82,8 +89,6 @@ def _render(
                 "pixel_format": "rgb",
                 "component_format": "float32",
             },
-            "sampler": {"type": "multijitter", "sample_count": spp, "jitter": jitter},
+            "sampler": sampler,
         }
     )
-    picture = mi.render(scene, sensor=sensor, integrator=integrator, seed=mi.UInt32(seed), spp=spp)
-    return np.array(picture)

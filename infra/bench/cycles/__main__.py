@@ -18,7 +18,7 @@ from rich.table import Table
 from infra.bench import harness
 from infra.bench.cycles import comparison, environment
 from infra.bench.cycles.comparison import NamedScene, Plan, SceneResult
-from infra.bench.renders.render_child import smoke_child
+from infra.bench.render_child import smoke_child
 from infra.cli.console import console, progress_bars
 from storage.atomic import write_atomically
 from storage.errors import TrilightError

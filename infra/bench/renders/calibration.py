@@ -19,9 +19,9 @@ from rich.table import Table
 
 from infra.bench import harness
 from infra.bench.cycles.comparison import sampled
+from infra.bench.render_child import smoke_child
 from infra.bench.renders.ladder import render_ladder
 from infra.bench.renders.named_set import NUM_SAMPLED
-from infra.bench.renders.render_child import smoke_child
 from infra.cli.console import console, progress_bars
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings

@@ -21,8 +21,8 @@ import matplotlib.pyplot as plt
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from infra.bench.harness import Comparison, Options, Spread, compare
+from infra.bench.render_child import smoke_child
 from infra.bench.renders.cost_scene import cost_scene
-from infra.bench.renders.render_child import smoke_child
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer

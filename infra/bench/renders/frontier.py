@@ -22,6 +22,7 @@ from infra.bench.cycles import environment
 from infra.bench.cycles.comparison import NamedScene
 from infra.bench.cycles.cycles_picture import Request, cycles_picture
 from infra.bench.harness import Options, Result, machine
+from infra.bench.render_child import smoke_child
 from infra.bench.renders.claims import (
     Claim,
     Shot,
@@ -35,7 +36,6 @@ from infra.bench.renders.ladder import render_ladder
 from infra.bench.renders.named_set import named_set
 from infra.bench.renders.plain_mitsuba import render_levels
 from infra.bench.renders.references import RESOLUTION, Reference, make_reference
-from infra.bench.renders.render_child import smoke_child
 from pipeline.isolation import IsolatedChild
 from storage.metrics import psnr_linear_db, psnr_log_db
 from storage.scene import Scene

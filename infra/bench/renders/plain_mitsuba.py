@@ -9,7 +9,6 @@ denoiser reads our own guide pictures: both favour this side.
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,6 @@ from storage.seeds import seed_for
 
 _RR_DEPTH = 5
 """Mitsuba's default."""
-
-_NEAR_CLIP, _FAR_CLIP = 1e-4, 1e4
-"""World units; wide enough to cut nothing of a scene around the unit cube."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,33 +112,13 @@ class _Plain:
 
     def radiance(self, camera: Camera, seed: int, spp: int) -> NDArray[np.float64]:
         """Return the mean of `spp` samples, [R, R, 3]."""
-        mi = self._mi
-        picture = mi.render(
+        from pipeline.renders.plugin_tracer import stock_sensor
+
+        picture = self._mi.render(
             self._scene,
-            sensor=mi.load_dict(_sensor(mi, camera, spp)),
+            sensor=stock_sensor(camera, {"type": "independent", "sample_count": spp}),
             integrator=self._path,
-            seed=mi.UInt32(seed),
+            seed=self._mi.UInt32(seed),
             spp=spp,
         )
         return np.array(picture, np.float64)
-
-
-def _sensor(mi: Any, camera: Camera, spp: int) -> dict[str, Any]:
-    # Mitsuba's cameras look along +Z with +X to the left.
-    to_world = camera.c2w @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    return {
-        "type": "perspective",
-        "fov": camera.fov_deg,
-        "to_world": mi.ScalarTransform4f(to_world.tolist()),
-        "near_clip": _NEAR_CLIP,
-        "far_clip": _FAR_CLIP,
-        "film": {
-            "type": "hdrfilm",
-            "width": camera.resolution,
-            "height": camera.resolution,
-            "rfilter": {"type": "box"},
-            "pixel_format": "rgb",
-            "component_format": "float32",
-        },
-        "sampler": {"type": "independent", "sample_count": spp},
-    }

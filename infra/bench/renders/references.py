@@ -17,8 +17,8 @@ import typer
 from numpy.typing import NDArray
 
 from infra.bench.cycles.comparison import NamedScene
+from infra.bench.render_child import smoke_child
 from infra.bench.renders.named_set import named_set
-from infra.bench.renders.render_child import smoke_child
 from infra.cli.console import progress_bars
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.renderer import RenderedView, SceneRenderer

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from infra.bench.cycles.comparison import sampled
 from infra.bench.harness import RESULTS
-from infra.bench.renders.render_child import smoke_child
+from infra.bench.render_child import smoke_child
 from infra.cli.console import console
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings

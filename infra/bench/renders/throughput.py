@@ -19,10 +19,10 @@ import numpy as np
 
 from infra.bench.cycles.comparison import NamedScene
 from infra.bench.harness import Options, Result, machine
+from infra.bench.render_child import smoke_child
 from infra.bench.renders.kept import Kept
 from infra.bench.renders.ladder import Ladder, render_ladder
 from infra.bench.renders.named_set import named_set
-from infra.bench.renders.render_child import smoke_child
 from pipeline.isolation import IsolatedChild
 
 NAME = "render-throughput"

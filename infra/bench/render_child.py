@@ -1,4 +1,4 @@
-"""A render child with built-in objects at hand, as the build `smoke` has them."""
+"""A render child to measure with: a build's settings, and its objects at hand."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ from pipeline.flows.accept_objects import accept_objects
 from pipeline.flows.environment import environment
 from pipeline.flows.make_scene import SceneSource, set_up_child
 from pipeline.flows.publication import begin
+from pipeline.flows.settings import BuildSettings
 from pipeline.flows.training_builds import smoke
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import choose_variant
@@ -14,16 +15,25 @@ from storage.layout import DatasetFolder
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10_000)
 
 
-def smoke_child(folder: Path, *, threads: int) -> IsolatedChild:
-    """Return a child that can compose the sampled scenes and render.
+def render_child(
+    folder: Path, build: BuildSettings, *, objects: str, threads: int
+) -> IsolatedChild:
+    """Return a child that can compose the scenes of a build and render them.
 
     Args:
         folder: an empty one, for the record of its objects.
+        build: the settings.
+        objects: source of the objects.
         threads: of Mitsuba and the denoiser.
     """
-    variant, build = choose_variant(), smoke()
+    variant = choose_variant()
     here = environment(variant)
     publication = begin(DatasetFolder(folder), build, here, 1, accept_environment=False)
-    accepted = accept_objects("builtin:", None, build, publication, workers=threads)
+    accepted = accept_objects(objects, None, build, publication, workers=threads)
     source = SceneSource(settings=build, variant=variant, threads=threads, objects=accepted.objects)
     return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(source,))
+
+
+def smoke_child(folder: Path, *, threads: int) -> IsolatedChild:
+    """Return a child for the sampled scenes: the build `smoke`, of built-in objects."""
+    return render_child(folder, smoke(), objects="builtin:", threads=threads)
