@@ -151,7 +151,7 @@ def _plan(options: Options, chosen: Sequence[NamedScene]) -> Plan:
         scenes=tuple(named.name for named in chosen),
         resolution=RESOLUTION,
         targets_db=(38.0, 42.0, 46.0, 50.0),
-        max_spp=1024,  # a quarter of the references'
+        max_spp=1024,  # a sixteenth of the references'
         mitsuba_spp=tuple(64 << doubling for doubling in range(num_levels)),
         cycles_spp=tuple(sorted(options.cycles_spp)),
         threads=os.cpu_count() or 1,

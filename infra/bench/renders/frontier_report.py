@@ -13,6 +13,9 @@ from infra.bench.renders.claims import Claim, Summary
 from infra.bench.renders.frontier import Frontier, cycles_side, mitsuba_side, our_side
 from infra.bench.renders.log_axis import plain_log
 
+_FIRM_DB = 6.0
+"""A reference this far above a picture adds a quarter of its squared error: a decibel."""
+
 
 def rows(result: Frontier) -> list[tuple[str, str]]:
     """Return the result for people."""
@@ -22,8 +25,25 @@ def rows(result: Frontier) -> list[tuple[str, str]]:
     missed = [cycles_side(spp) for spp in result.plan.cycles_spp if cycles_side(spp) not in as_good]
     lines += [(side, "no target of ours is as good over this set") for side in missed]
     floors = sorted(result.reference_floors_db.values())
-    lines.append(("references", f"own floors {floors[0]:.1f} to {floors[-1]:.1f} dB"))
+    firm, total = _firm(result)
+    lines.append(
+        (
+            "references",
+            f"own floors {floors[0]:.1f} to {floors[-1]:.1f} dB; of our pictures {firm} of {total} "
+            f"state at least {_FIRM_DB:.0f} dB less than their reference",
+        )
+    )
     return lines
+
+
+def _firm(result: Frontier) -> tuple[int, int]:
+    """Return how many of our pictures the references are well above, and how many there are."""
+    above_db = [
+        result.reference_floors_db[shot.scene] - shot.noise_floor_db
+        for shot in result.shots
+        if shot.noise_floor_db is not None
+    ]
+    return sum(db >= _FIRM_DB for db in above_db), len(above_db)
 
 
 def _line(summary: Summary) -> str:
