@@ -1,9 +1,11 @@
 """The account of what lies between two renderers, on pictures whose parts are known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from infra.bench.cycles.residual import account
+from infra.bench.cycles.residual import Pictures, account, draw
 from storage.metrics import MAX_DB
 
 _SIZE = 128
@@ -47,3 +49,10 @@ def test_a_glint_is_in_the_worst_pixels() -> None:
     assert found.worst_share == 1.0
     # clamped to 1, hence off by a half: one pixel of 16,384; exact in these numbers
     assert found.between_db == pytest.approx(10 * np.log10(4 * _SIZE**2), abs=1e-6)
+
+
+def test_the_pictures_are_drawn(tmp_path: Path) -> None:
+    even = np.full((16, 16, 3), 0.5, dtype=np.float32)
+    made = Pictures(name="made", ours=(even, even), cycles=(even, even))
+    draw([made, made], tmp_path / "residual.png")
+    assert (tmp_path / "residual.png").stat().st_size > 10_000  # an empty page has fewer

@@ -67,10 +67,15 @@ class Account:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Pictures:
+class Pictures:
+    """One view by both renderers."""
+
     name: str
+    """Of the scene."""
     ours: Pair
+    """By our renderer."""
     cycles: Pair
+    """By Cycles."""
 
 
 def account(ours: Pair, cycles: Pair) -> Account:
@@ -164,7 +169,7 @@ def main(
     chosen = [described(scenes.resolve(), f"{name}.json") for name in scene or ()] if scenes else []
     chosen += [sampled(index) for index in sampled_scene or (0, 4, 12)]
     threads = os.cpu_count() or 1
-    made: list[_Pictures] = []
+    made: list[Pictures] = []
     with tempfile.TemporaryDirectory() as folder, progress_bars() as bars:
         task = bars.add_task("scenes", total=len(chosen), note="")
         child = smoke_child(Path(folder), threads=threads)
@@ -176,27 +181,27 @@ def main(
         finally:
             child.close()
     console.print(_table(made))
-    _draw([one for one, named in zip(made, chosen, strict=True) if named.publishable], out)
+    draw([one for one, named in zip(made, chosen, strict=True) if named.publishable], out)
     console.print(f"written: {out}")
 
 
 def _pictures(
     named: NamedScene, child: IsolatedChild, resolution: int, spp: int, threads: int
-) -> _Pictures:
+) -> Pictures:
     made = named.make(child)
-    return _Pictures(
+    return Pictures(
         name=named.name,
         ours=child.call(rendered_twice, made, resolution, spp),
         cycles=_by_cycles(made, resolution, spp, threads),
     )
 
 
-def _table(made: list[_Pictures]) -> Table:
+def _table(made: list[Pictures]) -> Table:
     table = Table(box=None)
-    for title in ("scene", "between", "Cycles' noise", "our noise", "rest", "rest, 8 x 8"):
-        table.add_column(title)
-    table.add_column("worst 1 % hold")
-    table.add_column("mean, ours / Cycles")
+    table.add_column("scene", no_wrap=True)
+    titles = ("between", "Cycles", "ours", "rest", "blocks", "worst 1 %", "mean ratio")
+    for title in titles:
+        table.add_column(title, justify="right", no_wrap=True)
     for one in made:
         found = account(one.ours, one.cycles)
         parts = (
@@ -211,8 +216,8 @@ def _table(made: list[_Pictures]) -> Table:
     return table
 
 
-def _draw(made: list[_Pictures], out: Path) -> None:
-    """Draw ours, Cycles', their difference, and Cycles' with itself."""
+def draw(made: list[Pictures], out: Path) -> None:
+    """Draw ours, Cycles', their difference, and Cycles' with itself, a row a view."""
     figure, rows = plt.subplots(
         len(made), 4, figsize=(11, 2.9 * len(made)), layout="constrained", squeeze=False
     )
@@ -234,7 +239,10 @@ def _draw(made: list[_Pictures], out: Path) -> None:
             panel.set_title(title, fontsize=10)
             panel.set_axis_off()
     figure.colorbar(
-        shown, ax=rows.tolist(), label="mean |difference|, radiance clamped to [0, 1]", shrink=0.6
+        shown,
+        ax=rows.ravel().tolist(),
+        label="mean |difference|, radiance clamped to [0, 1]",
+        shrink=0.6,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=100)
