@@ -52,4 +52,5 @@ $(VENV)/.dataset-ready: requirements/dataset.txt pyproject.toml infra/setup/syst
 
 $(VENV)/.all-ready: requirements/all.txt $(VENV)/.dataset-ready
 	$(BIN)/python -m pip install --quiet --requirement requirements/all.txt
+	$(if $(WITHOUT_GPL),infra/setup/without_gpl.sh $(BIN)/python)
 	touch $@

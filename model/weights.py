@@ -9,6 +9,7 @@ from torch import Tensor
 
 from model.config import ModelConfig
 from model.renderformer import RenderFormer
+from model.trained_range import TrainedRange
 from storage.errors import TrilightError
 from storage.safe_read import read_safetensors
 
@@ -16,10 +17,16 @@ CONFIG_KEY = "trilight_model"
 """Metadata entry that holds the configuration as JSON."""
 
 
-def encode_weights(model: RenderFormer) -> bytes:
-    """Return the file of a network; equal networks give equal bytes."""
+def encode_weights(model: RenderFormer, trained: TrainedRange | None = None) -> bytes:
+    """Return the file of a network; equal networks give equal bytes.
+
+    Args:
+        model: the network.
+        trained: what it was trained on, where that is known.
+    """
     tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
-    return save(tensors, metadata={CONFIG_KEY: encode_config(model.config)})
+    known = {} if trained is None else trained.as_metadata()
+    return save(tensors, metadata={CONFIG_KEY: encode_config(model.config), **known})
 
 
 def decode_weights(data: bytes) -> RenderFormer:

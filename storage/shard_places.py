@@ -75,22 +75,22 @@ def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
     return places
 
 
-def expanded(pattern: str) -> list[str]:
-    """Return what a brace pattern stands for; raises as `listed_shards`."""
-    groups = [_alternatives(group[1], pattern) for group in _GROUP.finditer(pattern)]
+def expanded(pattern: str, what: str = "shards") -> list[str]:
+    """Return what a brace pattern of `what` stands for; raises as `listed_shards`."""
+    named = f"{what} {_shown(pattern)}"
+    groups = [_alternatives(group[1], named) for group in _GROUP.finditer(pattern)]
     fixed = _GROUP.split(pattern)[::2]
     if any("{" in text or "}" in text for text in fixed):
         raise TrilightError(
-            f"shards {_shown(pattern)}: a brace is not closed, or stands within another; expected "
-            "such as train-{000000..000007}.tar."
+            f"{named}: a brace is not closed, or stands within another; expected such as "
+            "train-{000000..000007}.tar."
         )
     count = 1
     for group in groups:
         count *= len(group)
         if count > MAX_SHARDS:
             raise TrilightError(
-                f"shards {_shown(pattern)}: stands for more than {MAX_SHARDS} names; expected at "
-                "most that many."
+                f"{named}: stands for more than {MAX_SHARDS} names; expected at most that many."
             )
     return [_joined(fixed, chosen) for chosen in itertools.product(*groups)]
 
@@ -99,15 +99,15 @@ def _joined(fixed: Sequence[str], chosen: Sequence[str]) -> str:
     return "".join(text for pair in zip(fixed, [*chosen, ""], strict=True) for text in pair)
 
 
-def _alternatives(group: str, pattern: str) -> Sequence[str]:
+def _alternatives(group: str, named: str) -> Sequence[str]:
     match = _RANGE.fullmatch(group)
     if match is None:
         return group.split(",")
     first, last = int(match[1]), int(match[2])
     if not first <= last <= first + MAX_SHARDS:
         raise TrilightError(
-            f"shards {_shown(pattern)}: the range {group} is backwards or longer than "
-            f"{MAX_SHARDS}; expected such as 000000..000007."
+            f"{named}: the range {group} is backwards or longer than {MAX_SHARDS}; expected such "
+            "as 000000..000007."
         )
     return list(_numbers(first, last, len(match[1])))
 

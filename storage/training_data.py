@@ -38,6 +38,8 @@ class TrainingData:
     """By split; those without a shard are left out."""
     num_views: int | None
     """Pictures per scene, where a manifest says it."""
+    max_triangles: int | None = None
+    """Most triangles of a scene, where a manifest says it."""
     notes: tuple[str, ...] = ()
     """What the user should know, once."""
 
@@ -86,7 +88,14 @@ def _of_dataset(root: str) -> TrainingData:
         digest=dataset.digest,
         splits=splits,
         num_views=dataset.manifest.num_views,
+        max_triangles=_max_triangles(dataset.manifest),
     )
+
+
+def _max_triangles(manifest: Manifest) -> int | None:
+    scenes = manifest.settings.get("scenes")
+    found = scenes.get("max_triangles") if isinstance(scenes, Mapping) else None
+    return found if isinstance(found, int) else None
 
 
 def _of_list(patterns: Sequence[str]) -> TrainingData:

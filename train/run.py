@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from model.renderformer import count_parameters
+from model.trained_range import TrainedRange
 from model.weights import encode_weights
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
@@ -137,7 +138,7 @@ def train_run(
     )
     with closing(batches):
         trainer.run(batches)
-    return _finish(state, settings, folder, judge, unusable.messages, began)
+    return _finish(state, settings, folder, opened, judge, unusable.messages, began)
 
 
 def _check_data(data: TrainingData, settings: TrainSettings, unusable: Unusable) -> None:
@@ -189,11 +190,14 @@ def _finish(
     state: TrainState,
     settings: TrainSettings,
     folder: RunFolder,
+    data: TrainingData,
     judge: Judge,
     unusable: Sequence[str],
     began: float,
 ) -> TrainResult:
-    write_atomically(folder.weights, encode_weights(state.model))
+    most = data.max_triangles
+    trained = None if most is None else TrainedRange(max_triangles=most)
+    write_atomically(folder.weights, encode_weights(state.model, trained))
     judgement = judge.judge(state.model)
     loss_at_start, loss_at_end = _losses(folder, settings)
     _write_sheet(folder, settings, judge, judgement)

@@ -13,7 +13,8 @@ _HEAD = """# Third-party packages
 Made by `make third-party` from the exact versions in `requirements/all.txt`. Trilight itself is
 MIT. pymeshlab is GPL-3: whoever ships a bundle that contains it (an image, an installer) must offer
 that bundle under terms that the GPL allows; using it from a checkout, as the Makefile does, puts no
-duty on Trilight's own code or on the datasets that it makes. `make setup WITHOUT_GPL=1` leaves it
+duty on Trilight's own code or on the datasets that it makes. The wheel of av (BSD-3) holds x264
+and x265, GPL-2, which make the .mp4 of `trilight render`. `make setup WITHOUT_GPL=1` leaves both
 out, together with the parts of libigl's wheel that are not under its MPL: bindings of CGAL, TetGen
 and Triangle, which nothing here calls.
 

@@ -10,11 +10,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.assets.settings import AssetSettings
 from pipeline.flows.settings import BuildSettings
 from pipeline.scenes.description import DescribedObject, SceneDescription
-from pipeline.scenes.from_description import LoadedMesh, scene_from_description
-from pipeline.scenes.renderformer_json import MAX_BYTES, read_description
+from pipeline.scenes.from_description import (
+    LoadedMesh,
+    described_cameras,
+    scene_from_description,
+)
+from pipeline.scenes.renderformer_json import MAX_BYTES, read_cameras, read_description
 from storage.digests import sha256_hex
 from storage.errors import Rejected, TrilightError
 from storage.scene import Scene
@@ -132,6 +139,19 @@ def find_scene_files(folder: str) -> SceneFolder:
 def described_by(root: Path, name: str) -> SceneDescription:
     """Return what a scene file in the folder `root` describes; raises TrilightError."""
     return read_description(_read_scene_file(root, name), name)
+
+
+def cameras_by(root: Path, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the poses [C, 4, 4] and angles [C] of a scene file or a list of cameras.
+
+    Raises:
+        TrilightError: the file or a camera in it is unusable, named.
+    """
+    cameras = read_cameras(_read_scene_file(root, name), name)
+    try:
+        return described_cameras(cameras)
+    except TrilightError as error:
+        raise TrilightError(f"{name}: {error}") from error
 
 
 def build_scene(

@@ -14,8 +14,11 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.assets.settings import AssetSettings
-from pipeline.flows.scene_files import build_scene, described_by
+from pipeline.flows.scene_files import build_scene, cameras_by, described_by
 from pipeline.objects.licences import USER_PROVIDED
 from pipeline.scenes.usd.read import read_usd, usd_keys
 from storage.errors import TrilightError
@@ -30,6 +33,9 @@ from storage.usd.opening import SUFFIXES as USD_SUFFIXES
 
 SEPARATOR = "::"
 """Between a shard and the key of a sample."""
+
+SUFFIXES = (".json", ".safetensors", ".h5", *USD_SUFFIXES)
+"""Of files that are scenes."""
 
 _KEY = re.compile(r"[0-9A-Za-z_.\-]+")
 _EXPECTED = "expected a scene .json, .safetensors, .h5 or .usda .usdc .usdz, or SHARD.tar::KEY"
@@ -87,7 +93,7 @@ def scene_source(text: str, *, many: bool = False, usd_folder: Path | None = Non
         raise TrilightError(f"{text}: no such file; {_EXPECTED}.")
     if not separator and suffix == ".tar" and not many:
         raise TrilightError(f"{text}: a shard holds many scenes; expected {text}{SEPARATOR}KEY.")
-    if not separator and suffix not in (".json", ".safetensors", ".h5", ".tar", *USD_SUFFIXES):
+    if not separator and suffix not in (".tar", *SUFFIXES):
         raise TrilightError(f"{text}: cannot be read as a scene; {_EXPECTED}.")
     return SceneSource(path=path, key=key if separator else None, usd_folder=usd_folder)
 
@@ -105,6 +111,20 @@ def source_keys(source: SceneSource) -> list[str | None]:
     if suffix in USD_SUFFIXES:
         return [key or None for key in usd_keys(source.path, source.usd_folder)]
     return [None]
+
+
+def load_cameras(source: SceneSource) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Read the cameras alone, poses [C, 4, 4] and angles [C]; only children come here.
+
+    A JSON file needs nothing but its list `cameras`.
+
+    Raises:
+        TrilightError: as `load_source`.
+    """
+    if source.path.suffix.lower() == ".json":
+        return cameras_by(source.path.parent.resolve(), source.path.name)
+    scene = load_source(source).scene
+    return scene.c2w, scene.fov_deg
 
 
 def load_source(source: SceneSource) -> LoadedScene:

@@ -101,11 +101,11 @@ def scene_from_description(
             raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
     try:
         _check_counts(pieces)
-        cameras = [_pose(camera, at) for at, camera in enumerate(description.cameras[:num_views])]
+        c2w, fov_deg = described_cameras(description.cameras[:num_views])
         scene = Scene(
             **joined(pieces),
-            c2w=np.array(cameras, np.float32).reshape(-1, 4, 4),
-            fov_deg=np.array([c.fov_deg for c in description.cameras[:num_views]], np.float32),
+            c2w=c2w,
+            fov_deg=fov_deg,
             objects=tuple(piece.entry for piece in pieces),
             provenance=provenance,
         )
@@ -199,6 +199,15 @@ def _emitters(
 def _entry(name: str, kind: ObjectKind, mesh: LoadedMesh) -> SceneObject:
     uid = mesh.uid if kind == "object" else ""
     return SceneObject(name=name, kind=kind, uid=uid, licence=mesh.licence)
+
+
+def described_cameras(
+    cameras: Sequence[DescribedCamera],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError."""
+    poses = [_pose(camera, at) for at, camera in enumerate(cameras)]
+    angles = np.array([camera.fov_deg for camera in cameras], np.float32)
+    return np.array(poses, np.float32).reshape(-1, 4, 4), angles
 
 
 def _pose(camera: DescribedCamera, row: int) -> NDArray[np.float64]:

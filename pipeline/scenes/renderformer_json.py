@@ -74,6 +74,18 @@ def read_description(data: bytes, name: str) -> SceneDescription:
     )
 
 
+def read_cameras(data: bytes, name: str) -> tuple[DescribedCamera, ...]:
+    """Return the cameras of a scene file, or of a JSON file that has nothing but `cameras`.
+
+    Raises:
+        TrilightError: as `read_description`, for what of it is read.
+    """
+    if len(data) > MAX_BYTES:
+        raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_BYTES}.")
+    fields = Fields(_parsed(data, name), file=name, where="", unknown=[])
+    return tuple(_camera(camera) for camera in fields.groups("cameras", MAX_CAMERAS))
+
+
 def _parsed(data: bytes, name: str) -> Any:
     try:
         return json.loads(

@@ -10,9 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
+from model.trained_range import TrainedRange, trained_range
 from model.weights import decode_weights
 from storage.dataset import Dataset
 from storage.errors import TrilightError
+from storage.safe_read import safetensors_header
 from tests.train.kit import tiny_run
 from tests.train.toy import write_toy_dataset
 from train.loop.metrics_log import read_rows
@@ -127,7 +129,11 @@ def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResu
     assert rows[-1]["validation"] == whole.scores
     with Image.open(folder.sheet) as sheet:
         assert min(sheet.size) > 200
-    model = decode_weights(folder.weights.read_bytes())
+    weights = folder.weights.read_bytes()
+    assert trained_range(safetensors_header(weights)["__metadata__"]) == TrainedRange(
+        max_triangles=64  # of the manifest of the toy dataset
+    )
+    model = decode_weights(weights)
     assert sum(weight.numel() for weight in model.parameters()) == whole.num_parameters
 
 

@@ -141,7 +141,7 @@ def write_toy_dataset(
             shards.append(index_shard(path))
     manifest = Manifest(
         build="toy",
-        settings={"resolution": resolution},
+        settings={"resolution": resolution, "scenes": {"max_triangles": 64}},
         environment={},
         num_scenes=index,
         num_views=views,

@@ -1,0 +1,116 @@
+"""Where pictures are taken from: a scene's own camera, a turn around the scene, or a path."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.flows.read_scenes import SceneReader
+from pipeline.flows.scene_source import SceneSource, scene_source
+from storage.errors import TrilightError
+from storage.scene import Scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Camera:
+    """One camera."""
+
+    c2w: NDArray[np.float32]
+    """[4, 4] camera to world."""
+    fov_deg: float
+    """Full field of view in degrees."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shot:
+    """One picture that is wanted."""
+
+    source: SceneSource
+    """The scene."""
+    camera: Camera | None
+    """From where; None for the camera of the scene that `--view` names."""
+
+
+def shots(sources: Sequence[SceneSource], cameras: Sequence[Camera] | None) -> list[Shot]:
+    """Return the pictures of scenes by cameras, in order.
+
+    One scene is seen by all cameras, many scenes each by its own camera or by the only one that is
+    given; as many cameras as scenes go together in pairs.
+
+    Raises:
+        TrilightError: many of both, but not as many.
+    """
+    if cameras is None:
+        return [Shot(source=source, camera=None) for source in sources]
+    if len(sources) > 1 and len(cameras) > 1 and len(sources) != len(cameras):
+        raise TrilightError(
+            f"{len(sources)} scenes and {len(cameras)} cameras; expected one of either, or as many "
+            "cameras as scenes."
+        )
+    count = max(len(sources), len(cameras))
+    return [
+        Shot(source=sources[at % len(sources)], camera=cameras[at % len(cameras)])
+        for at in range(count)
+    ]
+
+
+def own_camera(scene: Scene, view: int) -> Camera:
+    """Return a camera of a scene; raises TrilightError where it has no such view."""
+    if not 0 <= view < scene.num_views:
+        raise TrilightError(
+            f"--view is {view}; expected 0 to {scene.num_views - 1}: the scene has "
+            f"{scene.num_views} cameras."
+        )
+    return Camera(c2w=scene.c2w[view], fov_deg=float(scene.fov_deg[view]))
+
+
+def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camera]:
+    """Return `count` cameras on a circle around what `start` looks at, about the vertical.
+
+    The middle of the circle is the point on the camera's axis that is nearest to the middle of all
+    that reflects. The whole circle begins at `start`; a shorter arc has it in its middle.
+    """
+    points = scene.vertex_positions[scene.faces[~scene.triangle_emits]].reshape(-1, 3)
+    if not len(points):
+        points = scene.vertex_positions
+    middle = (points.min(axis=0).astype(np.float64) + points.max(axis=0)) / 2
+    pose = start.c2w.astype(np.float64)
+    eye, forward = pose[:3, 3], -pose[:3, 2]
+    target = eye + forward * max(float(np.einsum("i,i->", middle - eye, forward)), 0.0)
+    if arc_deg == 360:
+        turns_deg = 360 * np.arange(count) / count
+    else:
+        turns_deg = np.linspace(-arc_deg / 2, arc_deg / 2, count) if count > 1 else np.zeros(1)
+    return [_turned(start, target, float(np.radians(turn))) for turn in turns_deg]
+
+
+def camera_path(text: str, reader: SceneReader, view: int) -> list[Camera]:
+    """Return the cameras of a file: all of one scene, or one of each frame of a stage that moves.
+
+    Args:
+        text: a JSON file with a list `cameras` as in RenderFormer's scenes, or any scene.
+        reader: opens it.
+        view: which camera of each frame.
+
+    Raises:
+        TrilightError: the file is unusable, or has no such camera.
+    """
+    source = scene_source(text, many=True)
+    frames = reader.scenes_of(source)
+    if len(frames) > 1:
+        return [own_camera(reader.load(frame).scene, view) for frame in frames]
+    c2w, fov_deg = reader.cameras(frames[0])
+    return [
+        Camera(c2w=pose, fov_deg=float(angle)) for pose, angle in zip(c2w, fov_deg, strict=True)
+    ]
+
+
+def _turned(start: Camera, target: NDArray[np.float64], turn: float) -> Camera:
+    """Return a camera that went around the vertical through `target`, as a rigid body."""
+    cos, sin = np.cos(turn), np.sin(turn)
+    rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    pose = start.c2w.astype(np.float64)
+    pose[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])
+    pose[:3, 3] = np.einsum("ij,j->i", rotation, pose[:3, 3] - target) + target
+    return Camera(c2w=pose.astype(np.float32), fov_deg=start.fov_deg)

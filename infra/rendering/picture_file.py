@@ -1,0 +1,128 @@
+"""One EXR file of a picture that says how it was made, and is kept if it would come out again."""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from infra.rendering.cameras import Camera
+from infra.rendering.engines import Engine, Fact, Rendered
+from storage.atomic import write_atomically
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+from storage.exr import decode_exr, encode_exr
+from storage.lights import rounded_to_half
+
+Radiance = NDArray[np.float32]
+"""[R, R, 3] linear radiance."""
+
+_PREFIX = "trilight."
+_REQUEST = "request_sha256"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """All that decides a picture."""
+
+    engine: str
+    """Name of the engine."""
+    identity: Mapping[str, Any]
+    """What it depends on beside scene and camera."""
+    source: str
+    """Name of the scene's file, without its folders."""
+    scene_sha256: str
+    """Digest of the scene."""
+    camera: Mapping[str, Any]
+    """Pose and angle as JSON values."""
+
+    @property
+    def header(self) -> dict[str, Fact]:
+        """What a picture says about itself: nothing of the clock, and no folder."""
+        values = {
+            "engine": self.engine,
+            "source": self.source,
+            "scene_sha256": self.scene_sha256,
+            "camera": self.camera,
+            **self.identity,
+        }
+        plain = {
+            name: value if isinstance(value, Fact) else canonical_json(value).decode()
+            for name, value in values.items()
+        }
+        return {**plain, _REQUEST: sha256_hex(canonical_json(values))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureFile:
+    """A picture on disk: what is remembered of it, and a film may have thousands."""
+
+    path: Path
+    """The EXR file."""
+    facts: Mapping[str, Fact]
+    """What its engine says of it."""
+    was_kept: bool
+    """Whether it was there already."""
+    is_black: bool
+    """Whether it shows nothing at all."""
+
+
+def request(
+    engine: Engine, *, source: str, scene_sha256: str, camera: Camera, view: int | None
+) -> Request:
+    """Return what is asked of an engine; `view` is the row of the scene's own camera, or None."""
+    pose: dict[str, Any] = {"c2w": camera.c2w.tolist(), "fov_deg": camera.fov_deg}
+    return Request(
+        engine=engine.name,
+        identity=engine.identity,
+        source=source,
+        scene_sha256=scene_sha256,
+        camera=pose if view is None else {**pose, "view": view},
+    )
+
+
+def kept_picture(path: Path, wanted: Request) -> tuple[PictureFile, Radiance] | None:
+    """Return the picture in a file, as `write_picture`, if it is the one that is wanted."""
+    try:
+        data = path.read_bytes()
+        header = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()
+        if header.get(_PREFIX + _REQUEST) != wanted.header[_REQUEST]:
+            return None
+        radiance_rgb = decode_exr(data)
+    except (OSError, RuntimeError, ValueError, TrilightError):
+        return None
+    described = {_PREFIX + name for name in wanted.header}
+    facts = {
+        name.removeprefix(_PREFIX): value
+        for name, value in header.items()
+        if name.startswith(_PREFIX) and name not in described
+    }
+    return _remembered(path, facts, radiance_rgb, was_kept=True), radiance_rgb
+
+
+def write_picture(path: Path, wanted: Request, rendered: Rendered) -> tuple[PictureFile, Radiance]:
+    """Write a picture, and return it as the file holds it.
+
+    Equal requests and pictures give equal bytes.
+
+    Raises:
+        TrilightError: a value is not finite, or the file cannot be written.
+    """
+    header = {
+        _PREFIX + name: value for name, value in (wanted.header | dict(rendered.facts)).items()
+    }
+    write_atomically(path, encode_exr(rendered.radiance_rgb, attributes=header))
+    radiance_rgb = rounded_to_half(rendered.radiance_rgb)
+    return _remembered(path, rendered.facts, radiance_rgb, was_kept=False), radiance_rgb
+
+
+def _remembered(
+    path: Path, facts: Mapping[str, Fact], radiance_rgb: Radiance, *, was_kept: bool
+) -> PictureFile:
+    return PictureFile(
+        path=path, facts=dict(facts), was_kept=was_kept, is_black=not radiance_rgb.any()
+    )

@@ -1,0 +1,61 @@
+"""What `--out` means: one picture, or a folder of numbered ones with or without a video."""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from infra.rendering.video import SUFFIXES, require_encoder
+from storage.atomic import write_error
+from storage.errors import TrilightError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where pictures go."""
+
+    stem: Path | None
+    """Of the only picture, without its suffix; None for many."""
+    folder: Path
+    """Where the pictures are."""
+    video: Path | None
+    """The file that shows them in a row."""
+
+    @property
+    def is_sequence(self) -> bool:
+        """Whether there may be many pictures."""
+        return self.stem is None
+
+    def stem_of(self, index: int) -> Path:
+        """Return the path of a picture without its suffix."""
+        return self.stem or self.folder / f"{index:06d}"
+
+
+def place(out: Path) -> Place:
+    """Return what is written for `--out`.
+
+    Raises:
+        TrilightError: no such form, a video that cannot be made here, or a place that cannot be
+            written.
+    """
+    suffix = out.suffix.lower()
+    if out.is_dir() or not suffix:
+        return Place(stem=None, folder=_writable(out, out), video=None)
+    if suffix == ".exr":
+        return Place(stem=out.with_suffix(""), folder=_writable(out.parent, out), video=None)
+    if suffix not in SUFFIXES:
+        raise TrilightError(
+            f"--out is {out}; expected picture.exr, or for many pictures a folder, or X.mp4 or "
+            "X.webp, beside which they are kept in a folder X."
+        )
+    require_encoder(out)
+    return Place(stem=None, folder=_writable(out.with_suffix(""), out), video=out)
+
+
+def _writable(folder: Path, out: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise write_error(out, error) from error
+    return folder

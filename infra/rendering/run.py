@@ -1,0 +1,150 @@
+"""Shots to files: every picture by every engine, those that are there already kept."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from infra.rendering.cameras import Shot, own_camera
+from infra.rendering.comparison import comparison_sheet
+from infra.rendering.engines import Engine
+from infra.rendering.picture_file import (
+    PictureFile,
+    Radiance,
+    kept_picture,
+    request,
+    write_picture,
+)
+from infra.rendering.places import Place
+from infra.rendering.tone_maps import ToneMap, tone_mapped
+from pipeline.documents.png import encode_png
+from pipeline.flows.read_scenes import SceneReader
+from pipeline.flows.scene_source import LoadedScene
+from storage.atomic import write_atomically
+from storage.lights import num_lights
+from storage.metrics import psnr_log_db
+from storage.scene_file import scene_digest
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFacts:
+    """What there is to say of a scene."""
+
+    name: str
+    """Its file, without folders."""
+    digest: str
+    """storage.scene_file.scene_digest."""
+    num_triangles: int
+    """All of them, emitting ones too."""
+    num_lights: int
+    """Emitter objects."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FinishedShot:
+    """What came of one shot."""
+
+    scene: SceneFacts
+    """The scene."""
+    pictures: Mapping[str, PictureFile]
+    """By engine."""
+    png: Path
+    """What people look at."""
+    psnr_log_db: float | None
+    """Of the network's picture against the traced one, where there are both."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _OpenScene:
+    """The scene of the shots at hand."""
+
+    loaded: LoadedScene
+    facts: SceneFacts
+    opened_by: set[str]
+    """Engines that have taken it."""
+
+
+class ShotRun:
+    """Renders shots one after the other; scenes are read once for shots in a row."""
+
+    def __init__(
+        self, engines: Sequence[Engine], place: Place, *, view: int, tone_map: ToneMap
+    ) -> None:
+        """Remember how.
+
+        Args:
+            engines: one or both.
+            place: where files go.
+            view: which of a scene's own cameras is meant.
+            tone_map: of the PNG.
+        """
+        self._engines, self._place = engines, place
+        self._view, self._tone_map = view, tone_map
+        self.notes: dict[str, None] = {}
+        """What a person should know, each once, in order."""
+
+    def run(
+        self, wanted: Sequence[Shot], reader: SceneReader, done: Callable[[int], None]
+    ) -> list[FinishedShot]:
+        """Render; `done` hears how many shots are finished. Raises TrilightError."""
+        finished, scene = list[FinishedShot](), None
+        for index, shot in enumerate(wanted):
+            if scene is None or shot.source != wanted[index - 1].source:
+                scene = self._read(shot, reader)
+            finished.append(self._finish(index, shot, scene))
+            done(index + 1)
+        return finished
+
+    def _read(self, shot: Shot, reader: SceneReader) -> _OpenScene:
+        loaded = reader.load(shot.source)
+        self.notes |= dict.fromkeys(loaded.notes)
+        facts = SceneFacts(
+            name=shot.source.name,
+            digest=scene_digest(loaded.scene),
+            num_triangles=loaded.scene.num_triangles,
+            num_lights=num_lights(loaded.scene),
+        )
+        return _OpenScene(loaded=loaded, facts=facts, opened_by=set())
+
+    def _finish(self, index: int, shot: Shot, scene: _OpenScene) -> FinishedShot:
+        stem = self._place.stem_of(index)
+        files, radiances = dict[str, PictureFile](), dict[str, Radiance]()
+        for engine in self._engines:
+            found = self._picture(engine, stem, shot, scene)
+            files[engine.name], radiances[engine.name] = found
+        agreement = None
+        if len(self._engines) == 1:
+            (radiance_rgb,) = radiances.values()
+            shown = tone_mapped(radiance_rgb, self._tone_map)
+        else:
+            traced, neural = radiances["mitsuba"], radiances["neural"]
+            agreement = psnr_log_db(neural, traced)
+            shown = comparison_sheet(traced, neural, self._tone_map)
+        png = Path(f"{stem}.png")
+        write_atomically(png, encode_png(shown))
+        return FinishedShot(scene=scene.facts, pictures=files, png=png, psnr_log_db=agreement)
+
+    def _exr(self, stem: Path, engine: Engine) -> Path:
+        return Path(f"{stem}.exr" if len(self._engines) == 1 else f"{stem}.{engine.name}.exr")
+
+    def _picture(
+        self, engine: Engine, stem: Path, shot: Shot, scene: _OpenScene
+    ) -> tuple[PictureFile, Radiance]:
+        path = self._exr(stem, engine)
+        camera = shot.camera or own_camera(scene.loaded.scene, self._view)
+        wanted = request(
+            engine,
+            source=scene.facts.name,
+            scene_sha256=scene.facts.digest,
+            camera=camera,
+            view=None if shot.camera else self._view,
+        )
+        kept = kept_picture(path, wanted) if self._place.is_sequence else None
+        if kept is not None:
+            return kept
+        if engine.name not in scene.opened_by:
+            notes = engine.open(scene.loaded.scene, scene.facts.name)
+            self.notes |= dict.fromkeys(notes)
+            scene.opened_by.add(engine.name)
+        which = f"view {self._view}" if shot.camera is None else f"picture {stem.name}"
+        name = f"{scene.facts.name}, {which}"
+        return write_picture(path, wanted, engine.render(camera.c2w, camera.fov_deg, name))

@@ -1,0 +1,237 @@
+"""One call of `trilight render`: from what the user asked for to files."""
+
+import os
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from infra.rendering.cameras import Camera, Shot, camera_path, orbit, own_camera, shots
+from infra.rendering.engines import Engine, MitsubaEngine, NeuralEngine
+from infra.rendering.places import Place, place
+from infra.rendering.run import FinishedShot, ShotRun
+from infra.rendering.sources import scene_sources
+from infra.rendering.tone_maps import require_tone_map
+from infra.rendering.video import write_video
+from pipeline.flows.read_scenes import SceneReader
+from pipeline.flows.scene_source import SceneSource, scene_source
+from pipeline.renders.settings import PASS_SPP, RenderSettings
+from pipeline.renders.variant import choose_variant
+from storage.errors import TrilightError
+
+if TYPE_CHECKING:
+    from pipeline.renders.renderer import Sampling
+
+ENGINES = {"mitsuba": ("mitsuba",), "neural": ("neural",), "both": ("mitsuba", "neural")}
+"""What `--engine` may be."""
+
+FIRST_SPP = 2 * PASS_SPP[1]
+"""Fewer samples, and the noise floor may flatter (pipeline.renders.noise_floor)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """What the user asked for; names are those of the options."""
+
+    source: str
+    """SRC."""
+    out: Path
+    """See infra.rendering.places."""
+    engine: str
+    """A key of ENGINES."""
+    checkpoint: str | None
+    """Of the network."""
+    resolution: int
+    """Width of pictures."""
+    noise_floor_db: float
+    """Target of the path tracer."""
+    max_spp: int
+    """Its cap."""
+    view: int
+    """Row of a scene's own cameras."""
+    orbit: int | None
+    """Number of pictures of a turn."""
+    arc_deg: float
+    """Its angle."""
+    cameras: str | None
+    """File of a camera path."""
+    fps: int
+    """Pictures a second of a video."""
+    tone_map: str
+    """A name of infra.rendering.tone_maps."""
+    lights_per_pass: int
+    """Most emitting triangles of a group (model.light_groups)."""
+    seed: int
+    """Of samples."""
+    threads: int | None
+    """Of the processor; None for all cores."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """What came of it."""
+
+    place: Place
+    """Where the files are."""
+    shots: tuple[FinishedShot, ...]
+    """Picture by picture."""
+    settings: RenderSettings
+    """Of the path tracer."""
+    notes: tuple[str, ...]
+    """What a person should know."""
+
+
+class Watcher(Protocol):
+    """Is told how far a render is."""
+
+    def pictures(self, done: int, total: int) -> None:
+        """So many pictures are finished."""
+
+    def sampled(self, now: "Sampling") -> None:
+        """The path tracer has finished a pass."""
+
+
+def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
+    """Render what was asked for and write its files.
+
+    Raises:
+        TrilightError: an option that means nothing, a source, camera or checkpoint that is
+            unusable, a scene that cannot be rendered, or files that cannot be written.
+    """
+    _check(asked)
+    settings, tone_map = _settings(asked), require_tone_map(asked.tone_map)
+    if asked.out.suffix.lower() == ".exr":
+        scene_source(asked.source)  # a wrong name is said before any library is loaded
+    where = place(asked.out)
+    with ExitStack() as stack:
+        reader = stack.enter_context(SceneReader())
+        wanted = _shots(asked, where, reader)
+        engines = [_engine(name, asked, settings, watcher, stack) for name in ENGINES[asked.engine]]
+        run = ShotRun(engines, where, view=asked.view, tone_map=tone_map)
+        watcher.pictures(0, len(wanted))
+        finished = run.run(wanted, reader, lambda now: watcher.pictures(now, len(wanted)))
+    if where.video is not None:
+        write_video(where.video, [shot.png for shot in finished], asked.fps)
+    return Outcome(
+        place=where,
+        shots=tuple(finished),
+        settings=settings,
+        notes=(*run.notes, *_notes(asked, finished)),
+    )
+
+
+def _check(asked: Asked) -> None:
+    neural = asked.engine in ("neural", "both")
+    for law, option, got, expected in (
+        (asked.engine in ENGINES, "--engine", asked.engine, "mitsuba, neural or both"),
+        (asked.seed >= 0, "--seed", asked.seed, "an integer from 0"),
+        (asked.threads is None or asked.threads > 0, "--threads", asked.threads, "at least 1"),
+        (asked.lights_per_pass > 0, "--lights-per-pass", asked.lights_per_pass, "at least 1"),
+        (1 <= asked.fps <= 240, "--fps", asked.fps, "1 to 240"),
+        (asked.orbit is None or asked.orbit > 0, "--orbit", asked.orbit, "at least 1"),
+        (0 < asked.arc_deg <= 360, "--arc", asked.arc_deg, "degrees above 0, up to 360"),
+        (
+            asked.orbit is None or asked.cameras is None,
+            "--cameras",
+            asked.cameras,
+            "no --orbit beside it",
+        ),
+        (
+            neural == (asked.checkpoint is not None),
+            "--checkpoint",
+            asked.checkpoint,
+            "the model.safetensors of a run with --engine neural or both, and only with them",
+        ),
+    ):
+        if not law:
+            raise TrilightError(f"{option} is {got}; expected {expected}.")
+
+
+def _settings(asked: Asked) -> RenderSettings:
+    return RenderSettings(
+        resolution=asked.resolution,
+        noise_floor_db=asked.noise_floor_db,
+        min_spp=min(FIRST_SPP, asked.max_spp),
+        max_spp=asked.max_spp,
+        min_mean_radiance=0.0,  # who asks for a dark picture gets it
+    )
+
+
+def _shots(asked: Asked, where: Place, reader: SceneReader) -> list[Shot]:
+    if where.is_sequence:
+        sources = scene_sources(asked.source, reader)
+        return shots(sources, _cameras(asked, sources[0], reader))
+    if asked.orbit is not None or asked.cameras is not None:
+        raise TrilightError(f"--out is {asked.out}; expected a folder, X.mp4 or X.webp for many.")
+    return shots([scene_source(asked.source)], None)
+
+
+def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[Camera] | None:
+    if asked.cameras is not None:
+        return camera_path(asked.cameras, reader, asked.view)
+    if asked.orbit is None:
+        return None
+    scene = reader.load(first).scene
+    return orbit(scene, own_camera(scene, asked.view), asked.orbit, asked.arc_deg)
+
+
+def _engine(
+    name: str, asked: Asked, settings: RenderSettings, watcher: Watcher, stack: ExitStack
+) -> Engine:
+    make: Callable[..., Engine] = _mitsuba if name == "mitsuba" else _neural
+    engine = make(asked, settings, watcher)
+    stack.callback(engine.close)
+    return engine
+
+
+def _mitsuba(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
+    from pipeline.flows.render_scene import PathTracer
+
+    tracer = PathTracer(
+        settings,
+        seed=asked.seed,
+        variant=choose_variant(),
+        threads=asked.threads or os.cpu_count() or 1,
+        sampled=watcher.sampled,
+    )
+    return MitsubaEngine(tracer)
+
+
+def _neural(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
+    try:
+        import torch
+    except ImportError as error:
+        raise TrilightError(
+            "--engine neural needs PyTorch, which is not installed; expected it: make setup-all."
+        ) from error
+    from model.neural_renderer import NeuralRenderer
+
+    if asked.threads is not None:
+        torch.set_num_threads(asked.threads)
+    assert asked.checkpoint is not None
+    return NeuralEngine(
+        NeuralRenderer.load(asked.checkpoint),
+        checkpoint=asked.checkpoint,
+        resolution=settings.resolution,
+        lights_per_pass=asked.lights_per_pass,
+    )
+
+
+def _notes(asked: Asked, finished: list[FinishedShot]) -> list[str]:
+    notes = []
+    for name in ENGINES[asked.engine]:
+        pictures = [shot.pictures[name] for shot in finished]
+        black = sum(picture.is_black for picture in pictures)
+        if black:
+            which = "the picture is" if len(pictures) == 1 else f"{black} pictures are"
+            notes.append(f"{name}: {which} black: the camera sees nothing that is lit")
+        if any(int(picture.facts.get("clipped_pixels", 0)) for picture in pictures):
+            notes.append(f"{name}: pixels beyond what half floats hold were clipped")
+    if "mitsuba" in ENGINES[asked.engine]:
+        if any(int(shot.pictures["mitsuba"].facts["spp"]) < FIRST_SPP for shot in finished):
+            notes.append(f"below {FIRST_SPP} samples the measured noise floor may flatter")
+        variant = choose_variant()
+        if variant.note:
+            notes.append(f"{variant.note}; see trilight doctor")
+    return notes

@@ -1,0 +1,43 @@
+"""What `SRC` means where many scenes will do: a file of many, a folder, or numbered files."""
+
+import re
+from pathlib import Path
+
+from pipeline.flows.read_scenes import SceneReader
+from pipeline.flows.scene_source import SUFFIXES, SceneSource, scene_source
+from storage.errors import TrilightError
+from storage.shard_places import expanded
+
+
+def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
+    """Return every scene that the user's `SRC` names, in order.
+
+    Args:
+        text: one file; `scenes/{000..119}.json` for numbered ones; or a folder, whose scene files
+            are taken in the order of the numbers in their names. Of a shard all samples are taken,
+            of a USD stage that moves all frames.
+        reader: opens files that may hold many.
+
+    Raises:
+        TrilightError: as `pipeline.flows.scene_source.scene_source`, or there is no scene.
+    """
+    if "://" not in text and Path(text).is_dir():
+        return [scene_source(str(path)) for path in _scene_files(Path(text))]
+    names = expanded(text, "scenes") if "{" in text else [text]
+    found = [scene_source(name, many=True) for name in names]
+    return [scene for source in found for scene in reader.scenes_of(source)]
+
+
+def _scene_files(folder: Path) -> list[Path]:
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    if not paths:
+        raise TrilightError(
+            f"{folder}: holds no scene file; expected files that end in {' '.join(SUFFIXES)}."
+        )
+    return sorted(paths, key=lambda path: _by_number(path.name))
+
+
+def _by_number(name: str) -> list[tuple[int, str]]:
+    """Return a key that sorts frame9 before frame10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]

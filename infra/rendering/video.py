@@ -1,0 +1,96 @@
+"""Pictures in a row as one file: H.264 in .mp4, which everything plays, or animated .webp.
+
+WebP needs nothing but Pillow and shows in browsers; MP4 is made by FFmpeg through PyAV.
+"""
+
+import io
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+
+SUFFIXES = (".mp4", ".webp")
+
+_CRF = "16"
+"""Quality of H.264: below about 18 losses are not seen; 0 would be none."""
+_WEBP_QUALITY = 90
+_BT709, _SRGB, _STUDIO_RANGE = 1, 13, 1
+"""Of the video's colours, by their numbers in ITU-T H.273 and in FFmpeg."""
+
+
+def require_encoder(path: Path) -> None:
+    """Raise TrilightError where the file's form cannot be made here; cheap, so asked first."""
+    if path.suffix.lower() == ".mp4":
+        _av()
+
+
+def write_video(path: Path, frames: Sequence[Path], fps: int) -> None:
+    """Write pictures of equal size, of even width and height, as a video.
+
+    A .webp takes all pictures into memory; an .mp4 one after the other.
+
+    Args:
+        path: X.mp4 or X.webp.
+        frames: PNG files in order.
+        fps: pictures a second.
+
+    Raises:
+        TrilightError: the form needs a package that is missing, or the file cannot be written.
+    """
+    encode = _mp4 if path.suffix.lower() == ".mp4" else _webp
+    write_atomically(path, encode(frames, fps))
+
+
+def _opened(frames: Sequence[Path]) -> Iterator[Image.Image]:
+    for path in frames:
+        with Image.open(path) as picture:
+            yield picture.convert("RGB")
+
+
+def _mp4(frames: Sequence[Path], fps: int) -> bytes:
+    av, stream = _av(), io.BytesIO()
+    with av.open(stream, "w", format="mp4") as container:
+        track: Any = None
+        for picture in _opened(frames):
+            if track is None:
+                track = container.add_stream("libx264", Fraction(fps), options={"crf": _CRF})
+                track.width, track.height, track.pix_fmt = *picture.size, "yuv420p"
+                track.codec_context.colorspace = _BT709  # players guess by size where none is told
+                track.codec_context.color_primaries = _BT709
+                track.codec_context.color_trc = _SRGB
+                track.codec_context.color_range = _STUDIO_RANGE
+            frame = av.VideoFrame.from_image(picture)
+            container.mux(track.encode(frame.reformat(format="yuv420p", dst_colorspace=_BT709)))
+        container.mux(track.encode(None))
+    return stream.getvalue()
+
+
+def _webp(frames: Sequence[Path], fps: int) -> bytes:
+    first, *others = _opened(frames)
+    stream = io.BytesIO()
+    first.save(
+        stream,
+        "WEBP",
+        save_all=True,
+        append_images=others,
+        duration=round(1000 / fps),
+        loop=0,
+        quality=_WEBP_QUALITY,
+    )
+    return stream.getvalue()
+
+
+def _av() -> Any:
+    try:
+        import av
+    except ImportError as error:
+        raise TrilightError(
+            "--out X.mp4 needs PyAV, which is not installed: pip install av (it holds x264, GPL), "
+            "or choose --out X.webp."
+        ) from error
+    return av

@@ -1,0 +1,255 @@
+"""Pictures of scenes by a trained network.
+
+renderer = NeuralRenderer.load("runs/smoke/model.safetensors")
+picture = renderer.render(read_scene_file("scene.safetensors"), resolution=512)
+
+All of the network that is used here is in `_open`, `_encode` and `_decode`.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from model.light_groups import light_groups
+from model.renderformer import RenderFormer, radiance
+from model.scene_tensors import SceneBatch, batch_scenes, scene_tensors
+from model.trained_range import MAX_LIGHTS, PUBLISHED, TrainedRange, trained_range
+from model.weights import CONFIG_KEY, decode_weights, encode_config
+from storage.errors import TrilightError
+from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
+from storage.scene import Scene
+
+_FLOAT_BYTES = 4
+_WEIGHTS_NAME = "model.safetensors"
+
+_Encoded = tuple[Tensor, SceneBatch]
+"""What the view-independent stage made of one scene."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PreparedScene:
+    """A scene that is ready for any number of cameras."""
+
+    groups: tuple[tuple[_Encoded, float], ...]
+    """Each group of lights and its share of the picture (model.light_groups)."""
+    notes: tuple[str, ...]
+    """What a person should know of this scene and this network."""
+
+
+class NeuralRenderer:
+    """A network in evaluation mode, on a processor or a graphics card."""
+
+    def __init__(self, model: RenderFormer, trained: TrainedRange | None = None) -> None:
+        """Take a network, which stays where it is; `load` reads one.
+
+        Args:
+            model: the network.
+            trained: what it was trained on, if that is known.
+        """
+        self._model = model.eval()
+        self._trained = trained
+
+    @classmethod
+    def load(cls, checkpoint: str | Path, *, device: str | None = None) -> "NeuralRenderer":
+        """Read a checkpoint.
+
+        Args:
+            checkpoint: the `model.safetensors` of a run, or its folder.
+            device: of torch; by default the graphics card where there is one.
+
+        Raises:
+            TrilightError: no such file, or no network.
+        """
+        source = str(checkpoint)
+        model = _open(source)
+        place = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        return cls(model.to(place), _trained_range(source))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network is."""
+        return next(self._model.parameters()).device
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """The sha256 of configuration and weights, whatever file they came from."""
+        digest = hashlib.sha256(encode_config(self._model.config).encode())
+        for name, tensor in sorted(self._model.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().data)
+        return digest.hexdigest()
+
+    def render(self, scene: Scene, resolution: int) -> NDArray[np.float32]:
+        """Return the pictures of all cameras of a scene.
+
+        Warns where `prepare` has notes.
+
+        Args:
+            scene: passes `Scene.check`; `scene.with_cameras` gives it others.
+            resolution: width and height in pixels, a multiple of the network's ray bundles.
+
+        Returns:
+            Linear radiance [V, R, R, 3] of at least 0.
+
+        Raises:
+            TrilightError: as `prepare` and `view`.
+        """
+        self.require_resolution(resolution)
+        prepared = self.prepare(scene)
+        for note in prepared.notes:
+            warnings.warn(note, stacklevel=2)
+        return np.stack(
+            [
+                self.view(prepared, c2w, float(fov_deg), resolution)
+                for c2w, fov_deg in zip(scene.c2w, scene.fov_deg, strict=True)
+            ]
+        )
+
+    @torch.inference_mode()
+    def prepare(self, scene: Scene, *, lights_per_pass: int = MAX_LIGHTS) -> PreparedScene:
+        """Run the stage that no camera changes, once for each group of lights.
+
+        Args:
+            scene: passes `Scene.check`; its cameras do not matter.
+            lights_per_pass: most emitting triangles of a group (model.light_groups).
+
+        Raises:
+            TrilightError: the scene is larger than memory.
+        """
+        self._require_memory(scene.num_triangles)
+        groups = [
+            (_encode(self._model, group.scene, self.device), group.share)
+            for group in light_groups(scene, lights_per_pass)
+        ]
+        return PreparedScene(groups=tuple(groups), notes=self._notes(scene, len(groups)))
+
+    @torch.inference_mode()
+    def view(
+        self, prepared: PreparedScene, c2w: ArrayLike, fov_deg: float, resolution: int
+    ) -> NDArray[np.float32]:
+        """Return the picture [R, R, 3] of one camera, linear radiance of at least 0.
+
+        Args:
+            prepared: the scene.
+            c2w: [4, 4] camera to world.
+            fov_deg: full field of view in degrees.
+            resolution: as in `render`.
+
+        Raises:
+            TrilightError: the resolution is none for this network.
+        """
+        self.require_resolution(resolution)
+        c2w_44 = torch.as_tensor(np.asarray(c2w, np.float32), device=self.device)
+        angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
+        total = torch.zeros(resolution, resolution, 3, dtype=torch.float64)
+        for encoded, share in prepared.groups:
+            log10_RR3 = _decode(self._model, encoded, c2w_44, angle, resolution)
+            total += share * radiance(log10_RR3.double().cpu()).clamp(min=0)
+        picture: NDArray[np.float32] = total.numpy().astype(np.float32)
+        return picture
+
+    def require_resolution(self, resolution: int) -> None:
+        """Raise TrilightError unless pictures of this width can be made."""
+        step = self._model.config.patch_px
+        if resolution < step or resolution % step:
+            raise TrilightError(
+                f"resolution is {resolution}; expected a positive multiple of {step}, the width of "
+                "this network's ray bundles."
+            )
+
+    def _notes(self, scene: Scene, num_groups: int) -> tuple[str, ...]:
+        notes = []
+        if num_groups > 1:
+            notes.append(
+                f"the {int(scene.triangle_emits.sum())} emitting triangles are rendered in "
+                f"{num_groups} groups, whose pictures are added"
+            )
+        if self._trained is not None and scene.num_triangles > self._trained.max_triangles:
+            notes.append(
+                f"{scene.num_triangles} triangles, and the network was trained on at most "
+                f"{self._trained.max_triangles}: expect less detail (trilight convert --budget)"
+            )
+        return tuple(notes)
+
+    def _require_memory(self, num_triangles: int) -> None:
+        """Refuse what cannot be: one layer's tokens alone are more than the memory that is free."""
+        config = self._model.config
+        least = num_triangles * (2 * config.hidden_width + 2 * config.width) * _FLOAT_BYTES
+        free = _free_bytes(self.device)
+        if free is not None and least > free:
+            raise TrilightError(
+                f"{num_triangles} triangles need more than {least / 1e9:.1f} GB of memory, and "
+                f"{free / 1e9:.1f} GB are free; expected fewer (trilight convert --budget)."
+            )
+
+
+def _open(source: str) -> RenderFormer:
+    """Return the network of a checkpoint, on the CPU."""
+    path = _weights_file(source)
+    if not path.is_file():
+        raise TrilightError(
+            f"checkpoint {source}: no such file; expected the {_WEIGHTS_NAME} of a run."
+        )
+    try:
+        return decode_weights(path.read_bytes())
+    except (OSError, TrilightError) as error:
+        raise TrilightError(f"checkpoint {source}: {error}") from error
+
+
+def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> _Encoded:
+    batch = batch_scenes([scene_tensors(scene)])
+    moved = SceneBatch(
+        triangles_BT33=batch.triangles_BT33.to(device),
+        normals_BT33=batch.normals_BT33.to(device),
+        material_BT10=batch.material_BT10.to(device),
+        c2w_BV44=batch.c2w_BV44.to(device),
+        fov_deg_BV=batch.fov_deg_BV.to(device),
+        is_triangle_BT=None,
+    )
+    return model.encoder(moved), moved
+
+
+def _decode(
+    model: RenderFormer, encoded: _Encoded, c2w_44: Tensor, fov_deg: Tensor, resolution: int
+) -> Tensor:
+    """Return log10(1 + radiance) [R, R, 3] from one camera."""
+    context, batch = encoded
+    seen = dataclasses.replace(batch, c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
+    pictures: Tensor = model.decoder(context, seen, resolution)
+    return pictures[0, 0]
+
+
+def _trained_range(source: str) -> TrainedRange | None:
+    """Return what the network of a readable checkpoint was trained on, if that is known."""
+    path = _weights_file(source)
+    if not path.is_file():
+        return PUBLISHED  # a name on the hub
+    with path.open("rb") as file:
+        header = safetensors_header(file.read(8 + MAX_HEADER_BYTES))
+    metadata = header.get("__metadata__", {})
+    return trained_range(metadata) if CONFIG_KEY in metadata else PUBLISHED
+
+
+def _weights_file(source: str) -> Path:
+    path = Path(source)
+    return path / _WEIGHTS_NAME if path.is_dir() else path
+
+
+def _free_bytes(device: torch.device) -> int | None:
+    """Return how much memory can still be taken there, or None where nobody says."""
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0])
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        fields = dict(line.split(":", 1) for line in lines)
+        return int(fields["MemAvailable"].split()[0]) << 10
+    except (OSError, KeyError, ValueError):
+        return None

@@ -1,0 +1,44 @@
+"""What a network was trained on, as far as its checkpoint says: for warnings, not refusals."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+from storage.errors import TrilightError
+
+RANGE_KEY = "trilight_trained_range"
+"""Metadata entry of a weights file."""
+
+MAX_LIGHTS = 8
+"""Emitting triangles of a training scene, at most: in the published data as in ours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainedRange:
+    """The largest scenes of the training data."""
+
+    max_triangles: int
+    """Of a whole scene."""
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return the entries for the metadata of a safetensors file."""
+        return {RANGE_KEY: json.dumps(asdict(self), sort_keys=True)}
+
+
+PUBLISHED = TrainedRange(max_triangles=4096)
+"""Of the published checkpoints: their second stage (Zeng et al. 2025)."""
+
+
+def trained_range(metadata: Mapping[str, str]) -> TrainedRange | None:
+    """Return what the metadata of a file says, or None where it says nothing.
+
+    Raises:
+        TrilightError: the entry is not readable.
+    """
+    if RANGE_KEY not in metadata:
+        return None
+    try:
+        fields = json.loads(metadata[RANGE_KEY])
+        return TrainedRange(max_triangles=int(fields["max_triangles"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise TrilightError(f"{RANGE_KEY}: not readable ({error}).") from error

@@ -1,0 +1,67 @@
+"""Scenes of a user's files, read in a child process with limits; only checked scenes come out."""
+
+import dataclasses
+from collections.abc import Callable
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.flows.scene_source import (
+    LoadedScene,
+    SceneSource,
+    load_cameras,
+    load_source,
+    source_keys,
+)
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result
+from storage.errors import TrilightError
+
+_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
+
+
+class SceneReader:
+    """One child for any number of sources; close it, or use it in a `with` block."""
+
+    def __init__(self) -> None:
+        self._child = IsolatedChild(limits=_LIMITS, setup=_no_set_up)
+
+    def scenes_of(self, source: SceneSource) -> list[SceneSource]:
+        """Return each scene that a file holds as a source of its own, in the order of the file.
+
+        Raises:
+            TrilightError: the file is unusable, or holds no scene.
+        """
+        keys = self._call(source_keys, source)
+        if not keys:
+            raise TrilightError(f"{source.name}: holds no scene.")
+        return [dataclasses.replace(source, key=key) for key in keys]
+
+    def load(self, source: SceneSource) -> LoadedScene:
+        """Read one scene; raises TrilightError as `scene_source.load_source`."""
+        return self._call(load_source, source)
+
+    def cameras(self, source: SceneSource) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return poses and angles; raises TrilightError as `scene_source.load_cameras`."""
+        return self._call(load_cameras, source)
+
+    def __enter__(self) -> "SceneReader":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._child.close()
+
+    def _call(self, function: Callable[[SceneSource], Result], source: SceneSource) -> Result:
+        try:
+            return self._child.call(function, source)
+        except ChildFailed as failure:
+            raise TrilightError(f"{source.name}: could not be read ({failure}).") from failure
+
+
+def _no_set_up() -> None:
+    pass

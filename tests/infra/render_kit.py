@@ -1,0 +1,46 @@
+"""What the tests of `trilight render` share: the command, its mistakes, and a small network."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from typer.testing import CliRunner
+
+from infra.cli.app import app
+from model.config import smoke
+from model.trained_range import TrainedRange
+from model.weights import encode_weights
+from storage.errors import TrilightError
+from tests.model.kit import awake
+
+SMALL = ("--resolution", "16", "--max-spp", "8", "--noise-floor", "90")
+
+
+def render(*arguments: str | Path) -> dict[str, Any]:
+    """Return what `trilight render --json` prints."""
+    words = ["render", *(str(argument) for argument in arguments), *SMALL, "--json"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.exception
+    return dict(json.loads(result.output))
+
+
+def mistake(*arguments: str | Path) -> str:
+    """Return the one line that a mistake becomes."""
+    result = CliRunner().invoke(app, ["render", *(str(argument) for argument in arguments)])
+    assert isinstance(result.exception, TrilightError), result.output
+    assert "\n" not in str(result.exception)
+    return str(result.exception)
+
+
+def write_network(path: Path, max_triangles: int | None = None, bias: float = 0.3) -> Path:
+    """Write a network of the size `smoke` that nobody trained: its pictures are a pattern."""
+    model = awake(smoke(), torch.float32)
+    last = model.decoder.head.last
+    assert last.bias is not None
+    with torch.no_grad():
+        last.weight *= 0.1
+        last.bias.fill_(bias)
+    known = None if max_triangles is None else TrainedRange(max_triangles=max_triangles)
+    path.write_bytes(encode_weights(model, known))
+    return path

@@ -1,0 +1,141 @@
+"""`trilight render --engine neural|both`: a network's pictures of every kind of source."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from infra.cli.app import app
+from model.neural_renderer import NeuralRenderer
+from storage.conventions import preview_srgb8
+from storage.exr import decode_exr
+from storage.metrics import psnr_log_db
+from storage.renderformer_h5 import write_renderformer_h5
+from storage.sample import encode_sample
+from storage.scene_file import encode_scene, scene_digest
+from storage.shard_writer import write_shard
+from storage.usd.export import write_usd
+from tests.infra.render_kit import SMALL, mistake, render, write_network
+from tests.model.test_neural_renderer import many_lights
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+from train.evaluation.sheet import error_picture
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Path:
+    return write_network(tmp_path / "model.safetensors", max_triangles=2)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
+    return tmp_path / "tiny.safetensors"
+
+
+def neural(source: str | Path, out: Path, network: Path, *more: str) -> dict[str, object]:
+    return render(source, "--out", out, "--engine", "neural", "--checkpoint", network, *more)
+
+
+def test_every_form_of_a_scene_gives_the_picture_of_the_api(
+    network: Path, scene: Path, tmp_path: Path
+) -> None:
+    shard = tmp_path / "train-000000.tar"
+    write_shard(shard, [("000000012", encode_sample(tiny_sample(key="000000012")))])
+    write_usd(tmp_path / "tiny.usda", tiny_scene())
+    write_renderformer_h5(tmp_path / "tiny.h5", tiny_scene(), texture_type="float32")
+    renderer = NeuralRenderer.load(network, device="cpu")
+    with pytest.warns(UserWarning, match="3 triangles"):
+        expected = renderer.render(tiny_scene(), 16)[1]
+    sources: list[str | Path] = [
+        scene,
+        f"{shard}::000000012",
+        tmp_path / "tiny.usda",
+        tmp_path / "tiny.h5",
+    ]
+    for row, source in enumerate(sources):
+        out = tmp_path / f"{row}.exr"
+        found = neural(source, out, network, "--view", "1")
+        picture = decode_exr(out.read_bytes())
+        # half floats are exact to 2^-11 of their value; HDF5 orders the triangles anew
+        np.testing.assert_allclose(picture, expected, rtol=1e-3, atol=1e-4)
+        shown = np.asarray(Image.open(out.with_suffix(".png")))
+        np.testing.assert_array_equal(shown, preview_srgb8(picture))
+        assert (found["engine"], found["passes"], found["triangles"]) == ("neural", 1, 3)
+    assert "trained on at most 2" in str(found["notes"])
+
+
+def test_the_picture_names_its_network(network: Path, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    neural(scene, out, network)
+    first = out.read_bytes()
+    header = OpenEXR.File(io.BytesIO(first), header_only=True).header()
+    assert header["trilight.engine"] == "neural"
+    assert header["trilight.checkpoint"] == "model.safetensors"
+    assert header["trilight.network_sha256"] == NeuralRenderer.load(network).digest
+    assert header["trilight.scene_sha256"] == scene_digest(tiny_scene())
+    assert json.loads(header["trilight.settings"]) == {"lights_per_pass": 8, "resolution": 16}
+    assert str(tmp_path) not in str(header)
+    neural(scene, out, network)
+    assert out.read_bytes() == first
+
+
+def test_both_engines_stand_side_by_side(network: Path, scene: Path, tmp_path: Path) -> None:
+    out, arguments = tmp_path / "x.exr", ("--engine", "both", "--checkpoint", network)
+    found = render(scene, "--out", out, *arguments)
+    traced, drawn = (
+        decode_exr((tmp_path / f"x.{name}.exr").read_bytes()) for name in ("mitsuba", "neural")
+    )
+    assert not out.exists()
+    assert found["psnr_log_db"] == pytest.approx(psnr_log_db(drawn, traced), abs=1e-3)
+    assert found["mitsuba"]["spp"] == 8
+    assert found["neural"]["passes"] == 1
+    sheet = np.asarray(Image.open(tmp_path / "x.png"))
+    assert sheet.shape == (16 + 24, 3 * 16 + 2 * 8, 3)
+    np.testing.assert_array_equal(sheet[24:, :16], preview_srgb8(traced))
+    np.testing.assert_array_equal(sheet[24:, 24:40], preview_srgb8(drawn))
+    np.testing.assert_array_equal(sheet[24:, 48:], error_picture(drawn, traced))
+    words = [str(word) for word in ("render", scene, "--out", out, *arguments, *SMALL)]
+    printed = CliRunner().invoke(app, words).output.replace("\n", "")
+    for text in ("agreement", "samples per pixel", "model.safetensors; passes: 1", "x.png"):
+        assert text in printed
+
+
+def test_radiance_beyond_half_floats_is_clipped_and_told(scene: Path, tmp_path: Path) -> None:
+    bright = write_network(tmp_path / "bright.safetensors", bias=6.0)
+    found = neural(scene, tmp_path / "x.exr", bright)
+    assert found["clipped_pixels"] == 16 * 16
+    assert "neural: pixels beyond what half floats hold were clipped" in str(found["notes"])
+    assert decode_exr((tmp_path / "x.exr").read_bytes()).max() == 65504
+
+
+def test_lights_are_rendered_in_groups_of_the_size_that_is_asked_for(
+    network: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "many.safetensors").write_bytes(encode_scene(many_lights(9)))
+    for most, passes in (("8", 2), ("3", 3), ("9", 1)):
+        found = neural(
+            tmp_path / "many.safetensors", tmp_path / "x.exr", network, "--lights-per-pass", most
+        )
+        assert found["passes"] == passes
+
+
+def test_mistakes_are_one_line(network: Path, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    for words, message in (
+        (("--engine", "neural"), "--checkpoint is None; expected the model.safetensors of a run"),
+        (("--checkpoint", network), "and only with them"),
+        (
+            ("--engine", "neural", "--checkpoint", tmp_path / "no"),
+            f"checkpoint {tmp_path / 'no'}: no such file",
+        ),
+        (("--engine", "neural", "--checkpoint", scene), str(tmp_path)),
+        (("--engine", "neural", "--checkpoint", network, "--resolution", "20"), "resolution is 20"),
+        (("--engine", "both", "--checkpoint", network, "--view", "2"), "--view is 2"),
+    ):
+        assert message in mistake(scene, "--out", out, *words)
+    assert not out.exists()

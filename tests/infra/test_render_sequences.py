@@ -1,0 +1,87 @@
+"""`trilight render` to many pictures: turns, moving stages, shards, and calls that go on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from pxr import Usd, UsdGeom
+from typer.testing import CliRunner
+
+from infra.cli.app import app
+from storage.exr import decode_exr
+from storage.sample import encode_sample
+from storage.scene_file import encode_scene
+from storage.shard_writer import write_shard
+from tests.infra.render_kit import SMALL, mistake, render, write_network
+from tests.scenes.strangers_stage import write_stage
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
+    return tmp_path / "tiny.safetensors"
+
+
+def test_a_turn_is_path_traced_to_a_video_and_kept(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "turn.webp"
+    words = (scene, "--out", out, "--orbit", "3", "--fps", "10")
+    found = render(*words)
+    assert found["video"] == str(out)
+    assert [picture["kept"] for picture in found["pictures"]] == [False] * 3
+    exrs = [Path(picture["exr"]) for picture in found["pictures"]]
+    assert [path.name for path in exrs] == ["000000.exr", "000001.exr", "000002.exr"]
+    pictures = [decode_exr(path.read_bytes()) for path in exrs]
+    assert min(picture.mean() for picture in pictures) > 0.01
+    assert (pictures[0] != pictures[1]).any()
+    with Image.open(out) as video:
+        assert (getattr(video, "n_frames", 1), video.size) == (3, (16, 16))
+    exrs[1].unlink()
+    again = render(*words)
+    assert [picture["kept"] for picture in again["pictures"]] == [True, False, True]
+    np.testing.assert_array_equal(decode_exr(exrs[1].read_bytes()), pictures[1])
+
+
+def test_a_stage_that_moves_is_drawn_frame_by_frame_by_both_engines(tmp_path: Path) -> None:
+    path, network = write_stage(tmp_path), write_network(tmp_path / "model.safetensors")
+    stage = Usd.Stage.Open(str(path))
+    move = UsdGeom.Xformable(stage.GetPrimAtPath("/W/Grid")).AddTranslateOp()
+    for frame, height in ((1, 0), (3, 20)):
+        move.Set((0, height, 0), frame)
+    stage.SetStartTimeCode(1)
+    stage.SetEndTimeCode(3)
+    stage.GetRootLayer().Save()
+    out = tmp_path / "both"
+    found = render(path, "--out", out, "--engine", "both", "--checkpoint", network)
+    assert found["video"] is None
+    assert len({picture["scene_sha256"] for picture in found["pictures"]}) == 3
+    assert all(0 < picture["psnr_log_db"] < 100 for picture in found["pictures"])
+    names = sorted(path.name for path in out.iterdir())
+    suffixes = ("mitsuba.exr", "neural.exr", "png")
+    assert names == [f"{at:06d}.{suffix}" for at in range(3) for suffix in suffixes]
+    words = ["render", path, "--out", out, "--engine", "both", "--checkpoint", network, *SMALL]
+    printed = CliRunner().invoke(app, [str(word) for word in words]).output
+    assert "6, of which 6 were there already" in printed
+    assert "agreement" in printed
+
+
+def test_a_shard_is_a_row_of_scenes_each_from_its_camera(tmp_path: Path) -> None:
+    shard, network = tmp_path / "train-000000.tar", write_network(tmp_path / "model.safetensors")
+    keys = ["000000003", "000000007"]
+    write_shard(shard, [(key, encode_sample(tiny_sample(key=key))) for key in keys])
+    arguments = ("--engine", "neural", "--checkpoint", network, "--view", "1")
+    found = render(shard, "--out", tmp_path / "all", *arguments)
+    assert len(found["pictures"]) == 2
+    alone = render(f"{shard}::{keys[1]}", "--out", tmp_path / "one.exr", *arguments)
+    assert alone["scene_sha256"] == found["pictures"][1]["scene_sha256"]
+    one, second = (tmp_path / name for name in ("one.exr", "all/000001.exr"))
+    np.testing.assert_array_equal(decode_exr(one.read_bytes()), decode_exr(second.read_bytes()))
+
+
+def test_mistakes_are_one_line(scene: Path, tmp_path: Path) -> None:
+    assert "no such file" in mistake(tmp_path / "none", "--out", tmp_path / "all")
+    assert "only files of this machine" in mistake("https://h/{0..1}.h5", "--out", tmp_path / "all")
+    bad = mistake(scene, "--out", tmp_path / "all", "--cameras", tmp_path / "none.json")
+    assert "none.json: no such file" in bad
+    assert "--view is 9" in mistake(scene, "--out", tmp_path / "all", "--orbit", "2", "--view", "9")
