@@ -14,7 +14,7 @@ from storage.errors import TrilightError
 if TYPE_CHECKING:
     from infra.bench.harness import Options, Result
 
-_NAMES = ("assets", "render", "scenes", "shards", "streaming")
+_NAMES = ("assets", "exchange", "render", "scenes", "shards", "streaming")
 
 _Measured = TypeVar("_Measured", bound="Result")
 
@@ -110,6 +110,10 @@ def _named(name: str) -> list[_Benchmark[Any]]:
         from infra.bench import assets, assets_report
 
         return [_whole(assets, assets_report)]
+    if name == "exchange":
+        from infra.bench import exchange
+
+        return [_whole(exchange, exchange)]
     if name == "render":
         return _render_parts()
     if name == "scenes":

@@ -8,6 +8,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.flows.scene_source import LoadedScene, SceneSource, load_source, source_keys
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from pipeline.scenes.renderformer_json_write import described_files
@@ -82,17 +85,34 @@ def _no_set_up() -> None:
     pass
 
 
-def _one(source: SceneSource, target: Path, budget: int | None) -> Converted:
-    loaded = _loaded(source, budget)
-    suffix, lost = target.suffix.lower(), tuple[str, ...]()
+def write_scene(
+    target: Path, scene: Scene, radiance_rgb: NDArray[np.float32] | None = None
+) -> tuple[str, ...]:
+    """Write a scene in the form that the target's name says; return what that cannot hold.
+
+    Args:
+        target: the file to write.
+        scene: that passes `Scene.check`.
+        radiance_rgb: [V, R, R, 3] pictures of its views, which HDF5 alone holds.
+
+    Raises:
+        TrilightError: the form cannot hold it, or it cannot be written.
+    """
+    suffix = target.suffix.lower()
     if suffix in SUFFIXES:
-        write_usd(target, loaded.scene)
+        write_usd(target, scene)
     elif suffix == ".json":
-        lost = _write_json(target, loaded.scene)
+        return _write_json(target, scene)
     elif suffix == ".h5":
-        write_renderformer_h5(target, loaded.scene)
+        write_renderformer_h5(target, scene, radiance_rgb)
     else:
-        write_atomically(target, encode_scene(loaded.scene))
+        write_atomically(target, encode_scene(scene))
+    return ()
+
+
+def _one(source: SceneSource, target: Path, budget: int | None) -> Converted:
+    loaded = _loaded(source, budget, pictures=target.suffix.lower() == ".h5")
+    lost = write_scene(target, loaded.scene, loaded.radiance_rgb)
     notes = (*loaded.notes, *(f"{target.name}: cannot hold {text}" for text in lost))
     return Converted(files=(target,), triangles=loaded.scene.num_triangles, notes=notes)
 
@@ -119,13 +139,15 @@ def _variant_name(key: str) -> str:
     return key.replace(".", "_").replace("-", "m")
 
 
-def _loaded(source: SceneSource, budget: int | None) -> LoadedScene:
-    loaded = load_source(source)
+def _loaded(source: SceneSource, budget: int | None, *, pictures: bool = False) -> LoadedScene:
+    loaded = load_source(source, pictures=pictures)
     if budget is None or loaded.scene.num_triangles <= budget:
         return loaded
     from pipeline.flows.scene_budget import within_budget  # loads mesh libraries
 
     scene, notes = within_budget(loaded.scene, budget)
+    if loaded.radiance_rgb is not None:
+        notes = (*notes, "pictures left out: they show the scene before that")
     return LoadedScene(scene=scene, notes=(*loaded.notes, *notes))
 
 

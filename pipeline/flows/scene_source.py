@@ -25,7 +25,7 @@ from storage.errors import TrilightError
 from storage.profiles import PACKED, PLAIN
 from storage.renderformer_h5_read import read_renderformer_h5
 from storage.safe_url import safe_url
-from storage.sample import decode_scene
+from storage.sample import decode_sample, decode_scene
 from storage.scene import Scene
 from storage.scene_file import read_scene_file
 from storage.shard_reader import iterate_samples, read_members
@@ -67,6 +67,8 @@ class LoadedScene:
     """It passes `Scene.check`."""
     notes: tuple[str, ...]
     """What a person should know: what of a file means nothing, or could not be carried over."""
+    radiance_rgb: NDArray[np.float32] | None = None
+    """[V, R, R, 3] pictures of all views, where they were asked for and the source has them."""
 
 
 def scene_source(text: str, *, many: bool = False, usd_folder: Path | None = None) -> SceneSource:
@@ -127,8 +129,12 @@ def load_cameras(source: SceneSource) -> tuple[NDArray[np.float32], NDArray[np.f
     return scene.c2w, scene.fov_deg
 
 
-def load_source(source: SceneSource) -> LoadedScene:
+def load_source(source: SceneSource, *, pictures: bool = False) -> LoadedScene:
     """Read a scene, with all of its cameras; only children come here, since meshes may be read.
+
+    Args:
+        source: which.
+        pictures: whether to read those of a shard's sample or an HDF5 file too.
 
     Raises:
         TrilightError: anything in the file is unusable, or breaks a law of scenes.
@@ -140,19 +146,17 @@ def load_source(source: SceneSource) -> LoadedScene:
             scene=usd.scene, notes=tuple(f"{source.name}: {text}" for text in usd.lost)
         )
     if source.key is not None:
-        members = read_members(source.path, source.key, _MEMBERS)
-        scene = decode_scene(source.key, members).scene
-        try:
-            scene.check()
-        except TrilightError as error:
-            raise TrilightError(f"sample {source.key}: {error}") from error
-        return LoadedScene(scene=scene, notes=())
+        return _load_sample(source.path, source.key, pictures=pictures)
     if suffix == ".safetensors":
         return LoadedScene(scene=read_scene_file(source.path), notes=())
     root, name = source.path.parent.resolve(), source.path.name
     if suffix == ".h5":
         found = read_renderformer_h5(source.path)
-        return LoadedScene(scene=found.scene, notes=tuple(f"{name}: {text}" for text in found.lost))
+        return LoadedScene(
+            scene=found.scene,
+            notes=tuple(f"{name}: {text}" for text in found.lost),
+            radiance_rgb=found.radiance_rgb if pictures else None,
+        )
     unknown = described_by(root, name).unknown_fields
     scene, _ = build_scene(
         root,
@@ -164,3 +168,16 @@ def load_source(source: SceneSource) -> LoadedScene:
         seed=0,
     )
     return LoadedScene(scene=scene, notes=tuple(f"{name}: unknown field {f}" for f in unknown))
+
+
+def _load_sample(path: Path, key: str, *, pictures: bool) -> LoadedScene:
+    record = decode_scene(key, read_members(path, key, _MEMBERS))
+    try:
+        record.scene.check()
+    except TrilightError as error:
+        raise TrilightError(f"sample {key}: {error}") from error
+    if not pictures:
+        return LoadedScene(scene=record.scene, notes=())
+    names = (*_MEMBERS, *(f"{view}.exr" for view in range(len(record.views))))
+    sample = decode_sample(key, read_members(path, key, names))
+    return LoadedScene(scene=sample.scene, notes=(), radiance_rgb=sample.radiance_rgb)

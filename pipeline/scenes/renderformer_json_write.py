@@ -17,9 +17,14 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.from_description import SHELL_FOLDER, SMOOTH_ANGLE_DEG
 from pipeline.scenes.posing import without_slivers
-from pipeline.scenes.renderformer_json import MAX_BYTES, MAX_CAMERAS, MAX_OBJECTS
+from pipeline.scenes.renderformer_json import (
+    MAX_BYTES,
+    MAX_CAMERAS,
+    MAX_OBJECTS,
+    read_description,
+)
 from pipeline.scenes.shading import face_normals, smooth_shaded
-from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.conventions import DIFFUSE, EMISSION, HALF_FLOAT_MAX, ROUGHNESS, SPECULAR
 from storage.errors import TrilightError
 from storage.scene import Scene
 
@@ -27,7 +32,10 @@ _FLAT = 1e-5
 """Most that a float32 normal of a flat face lies from its geometric one."""
 _CLOSE = 1e-2
 """How far a normal may lie from the one that a reader makes before it counts as lost: 0.6 deg."""
-_NAME_LETTERS = 180
+_NAME_LETTERS = 48
+"""Of an object: the published converter makes a file of that name, of at most 255 bytes."""
+_NO_FILE_LETTERS = '/\\:*?"<>|'
+"""Letters that a name of a file must not have, on some system."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,14 +58,15 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
         stem: of the scene file; its meshes stand in folders of that name.
 
     Raises:
-        TrilightError: more objects or cameras than a file may have.
+        TrilightError: more objects or cameras than a file may have, or a number beyond its range.
     """
     scene.check()
     lost: list[str] = []
     meshes: dict[str, bytes] = {}
     objects: dict[str, Any] = {}
+    taken: set[str] = set()
     for row, material, faces in _parts(scene):
-        name = _unique(_name(scene, row, material), objects)
+        name = _unique(_name(scene, row, material), taken)
         normals = scene.vertex_normals[scene.faces[faces]]
         path = _mesh_path(scene, row, material, stem)
         meshes[path] = _obj(scene, faces)
@@ -74,6 +83,7 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
         }
     ).encode()
     _require_size(scene, data, len(objects))
+    read_description(data, f"{stem}.json")  # nothing is written that its readers would refuse
     return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
 
 
@@ -90,19 +100,22 @@ def _parts(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
 
 def _name(scene: Scene, row: int, material: int) -> str:
     own = scene.material_index[scene.object_index == row]
-    name = _printable(scene.objects[row].name) or f"object{row}"
+    name = _printable(scene.objects[row].name).lstrip(".") or f"object{row}"
     return name if (own == material).all() else f"{name}.material{material}"
 
 
 def _printable(text: str) -> str:
-    return "".join(letter if letter.isprintable() else "_" for letter in text)[:_NAME_LETTERS]
+    legal = (c if c.isprintable() and c not in _NO_FILE_LETTERS else "_" for c in text)
+    return "".join(legal)[:_NAME_LETTERS]
 
 
-def _unique(name: str, taken: dict[str, Any]) -> str:
+def _unique(name: str, taken: set[str]) -> str:
+    """Return a name that no other has, capitals or not, since it becomes that of a file."""
     chosen, count = name, 1
-    while chosen in taken:
+    while chosen.casefold() in taken:
         count += 1
         chosen = f"{name}.{count}"
+    taken.add(chosen.casefold())
     return chosen
 
 
@@ -178,6 +191,8 @@ def _losses(scene: Scene) -> list[str]:
     solid = len(without_slivers(scene.vertex_positions, scene.faces))
     if solid < scene.num_triangles:
         found.append(f"{scene.num_triangles - solid} triangles without an area, which readers drop")
+    if (scene.materials[:, EMISSION] > HALF_FLOAT_MAX).any():
+        found.append(f"emission over {HALF_FLOAT_MAX:.0f}, which the published converter cuts off")
     return found
 
 

@@ -4,7 +4,8 @@ An attribute is stated as (type name of USD, value); a table of them by name is 
 and what an exact reader expects to find.
 """
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ def add_attributes(prim: Any, attributes: Attributes) -> None:
             Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying,
             name.startswith(NAMESPACE),
         )
-        attribute.default = _vt(kind, value)
+        attribute.default = usd_value(kind, value)
 
 
 def add_relationship(prim: Any, name: str, target: str) -> None:
@@ -69,7 +70,7 @@ def as_expected(prim: Any, attributes: Attributes) -> bool:
         found = prim.attributes.get(name)
         if found is None or found.HasInfo("timeSamples"):
             return False
-        if found.typeName != _value_type(kind) or found.default != _vt(kind, value):
+        if found.typeName != _value_type(kind) or found.default != usd_value(kind, value):
             return False
     return True
 
@@ -81,27 +82,39 @@ def _target(path: str) -> Any:
     return Sdf.Path(path).StripAllVariantSelections()
 
 
+@functools.cache
 def _value_type(kind: str) -> Any:
     from pxr import Sdf
 
     return Sdf.ValueTypeNames.Find(kind.removeprefix(UNIFORM))
 
 
-def _vt(kind: str, value: Any) -> Any:
-    """Return a value as USD holds it."""
+def usd_value(kind: str, value: Any) -> Any:
+    """Return a value as USD holds one of that type."""
+    return _converter(kind)(value)
+
+
+@functools.cache
+def _converter(kind: str) -> Callable[[Any], Any]:
+    """Return what makes USD's value of ours; asked once a type, since scenes have 10^5 values."""
     from pxr import Gf, Vt
 
-    if isinstance(value, np.ndarray):
-        return _vt_array(value)
-    if kind.endswith("token[]"):
-        return Vt.TokenArray(value)
-    if kind in ("color3f", "float2") or kind.endswith("matrix4d"):
-        return {"color3f": Gf.Vec3f, "float2": Gf.Vec2f}.get(kind, Gf.Matrix4d)(value)
-    return Vt.Float(value) if kind == "float" and not isinstance(value, float) else value
+    known: dict[str, Callable[[Any], Any]] = {
+        "token[]": Vt.TokenArray,
+        "int[]": Vt.IntArray.FromNumpy,
+        "color3f": Gf.Vec3f,
+        "float2": Gf.Vec2f,
+        "matrix4d": Gf.Matrix4d,
+    }
+    plain = kind.removeprefix(UNIFORM)
+    return known.get(plain, _vectors if plain.endswith("[]") else _as_it_is)
 
 
-def _vt_array(values: NDArray) -> Any:
+def _vectors(values: NDArray[np.float32]) -> Any:
     from pxr import Vt
 
-    kind = Vt.IntArray if values.ndim == 1 else Vt.Vec3fArray
-    return kind.FromNumpy(np.ascontiguousarray(values))
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values))
+
+
+def _as_it_is(value: Any) -> Any:
+    return value

@@ -7,13 +7,14 @@ a stranger's (pipeline.scenes.usd).
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import MATERIAL_WIDTH, require_readable
+from storage.errors import TrilightError
 from storage.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.scene_file import scene_digest, scene_provenance
 from storage.usd import names
@@ -74,13 +75,19 @@ def read_exact(layer: Any, key: str | None = None) -> Scene | None:
     root = _root_of(layer, key)
     if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
         return None
-    require_readable(root.attributes[names.VERSION].default, "USD")
+    name = layer.GetDisplayName()
+    require_readable(root.attributes[names.VERSION].default, name)
     try:
         scene = _scene(root)
     except (_Changed, LookupError, TypeError, ValueError, AttributeError):
         return None
-    scene.check()
-    return scene if scene_digest(scene) == root.attributes[names.DIGEST].default else None
+    if scene_digest(scene) != root.attributes[names.DIGEST].default:
+        return None
+    try:
+        scene.check()
+    except TrilightError as error:
+        raise TrilightError(f"{name}: {error}") from error
+    return scene
 
 
 def _root_of(layer: Any, key: str | None) -> Any:
@@ -126,10 +133,9 @@ def _scene(root: Any) -> Scene:
 
 
 def _materials(folder: Any) -> NDArray[np.float32]:
-    count = len(folder.nameChildren)
-    rows = np.zeros((count, MATERIAL_WIDTH), np.float32)
-    for row in range(count):
-        prim = folder.nameChildren[names.material_name(row)]
+    prims = _numbered(folder, names.material_name)
+    rows = np.zeros((len(prims), MATERIAL_WIDTH), np.float32)
+    for row, prim in enumerate(prims):
         for name, columns in _MATERIAL_COLUMNS:
             rows[row, columns] = prim.attributes[name].default
         _children(prim, {PREVIEW, OPENPBR})
@@ -205,16 +211,21 @@ def _bound(prim: Any) -> int:
 
 
 def _cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    count = len(folder.nameChildren)
-    c2w, fov_deg = np.zeros((count, 4, 4), np.float32), np.zeros(count, np.float32)
-    for row in range(count):
-        prim = folder.nameChildren[names.camera_name(row)]
+    prims = _numbered(folder, names.camera_name)
+    c2w, fov_deg = np.zeros((len(prims), 4, 4), np.float32), np.zeros(len(prims), np.float32)
+    for row, prim in enumerate(prims):
         c2w[row] = np.array(prim.attributes["xformOp:transform"].default).T
         fov_deg[row] = prim.attributes[names.FOV_DEG].default
         expected = camera_attributes(c2w[row], float(fov_deg[row]))
         _require(as_expected(prim, expected))
         _plain(prim, set(expected))
     return c2w, fov_deg
+
+
+def _numbered(folder: Any, name: Callable[[int], str]) -> list[Any]:
+    """Return the children of a folder by their rows; asking it for each by name is quadratic."""
+    prims = {prim.name: prim for prim in folder.nameChildren}
+    return [prims[name(row)] for row in range(len(prims))]
 
 
 def _children(prim: Any, expected: set[str]) -> Any:

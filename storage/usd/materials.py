@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
-from storage.usd.authoring import Attributes, add_attributes, add_output, add_prim
+from storage.usd.authoring import Attributes, add_attributes, add_output, add_prim, usd_value
 from storage.usd.names import (
     DIFFUSE_ALBEDO,
     EMITTED_RADIANCE,
@@ -51,7 +51,7 @@ def add_materials(layer: Any, folder: str, materials: NDArray[np.float32]) -> No
             prim = layer.GetPrimAtPath(path + place)
             for name, (kind, value) in attributes.items():
                 if kind in ("color3f", "float"):
-                    _set(prim.attributes[name], kind, value)
+                    prim.attributes[name].default = usd_value(kind, value)
 
 
 def material_tables(values: NDArray[np.float32]) -> dict[str, Attributes]:
@@ -99,12 +99,6 @@ def _add_material(layer: Any, path: str, values: NDArray[np.float32]) -> None:
         else:
             add_output(prim, "outputs:surface", f"{path}/{PREVIEW}.outputs:surface")
             add_output(prim, "outputs:mtlx:surface", f"{path}/{OPENPBR}.outputs:out")
-
-
-def _set(attribute: Any, kind: str, value: Any) -> None:
-    from pxr import Gf
-
-    attribute.default = Gf.Vec3f(value) if kind == "color3f" else value
 
 
 def _rgb(values: NDArray[np.float32]) -> tuple[float, float, float]:

@@ -10,11 +10,11 @@ does so in a child process with limits (pipeline.isolation).
 
 import re
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from storage.errors import TrilightError
+from storage.usd.diagnostics import said
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 MAX_FILE_BYTES = 1 << 30
@@ -130,8 +130,8 @@ class OpenedUsd:
         try:
             layer = Sdf.Layer.FindOrOpen(resolved)
         except Tf.ErrorException as error:
-            said = _one_line(error).replace(f"{outer.parent}/", "")
-            raise TrilightError(f"{outer.name}: not readable as USD ({said}).") from error
+            why = said(error, outer)
+            raise TrilightError(f"{outer.name}: not readable as USD ({why}).") from error
         if layer is None:
             raise TrilightError(f"{outer.name}: not readable as USD.")
         self._layers[resolved] = layer
@@ -225,18 +225,6 @@ class _Walk:
                 self._sublayers(below, stack, [*above, layer.identifier])
 
 
-def quiet(read: Callable[[], Any]) -> Any:
-    """Return what `read` returns, without USD's own warnings on standard error."""
-    from pxr import UsdUtils
-
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()
-    try:
-        return read()
-    finally:
-        delegate.TakeUncoalescedDiagnostics()
-        del delegate
-
-
 def _check_file(path: Path) -> None:
     """Refuse what is too large; and an archive that is compressed, or names what is not in it."""
     try:
@@ -270,10 +258,3 @@ def _check_package(path: Path, size: int) -> None:
             )
         if member.filename.startswith("/") or ".." in Path(member.filename).parts:
             raise TrilightError(f"{path.name}: member {member.filename!r:.80} leads outside.")
-
-
-def _one_line(error: Exception) -> str:
-    """Return what USD says, without its own source files."""
-    text = " ".join(str(error).split())
-    said = re.findall(r"\.(?:cpp|h|yy) : '(.*?)'?(?= Error in |$)", text)
-    return (said[-1] if said else text)[:300]

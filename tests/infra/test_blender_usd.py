@@ -1,59 +1,30 @@
 """Blender opens what we export, and shows it as we do: minutes long, and only where it is there."""
 
 import json
-import os
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from infra.bench.cycles import environment
-from infra.bench.cycles.child import our_picture
-from pipeline.isolation import ChildLimits, IsolatedChild
-from pipeline.renders.variant import activate, choose_variant
 from pipeline.scenes.usd.read import read_usd
 from storage.metrics import psnr_linear_db
 from storage.scene import Scene
 from storage.usd.export import write_usd
+from tests.infra.blender_kit import ours, run_blender
 from tests.scenes.example_scenes import example_scene
 
 pytestmark = pytest.mark.slow
 
 RESOLUTION, SPP = 96, 256
-PROCESS = Path(__file__).with_name("blender_usd_process.py")
 
 
 def blender(folder: Path, usd: Path, **request: Any) -> tuple[dict[str, Any], np.ndarray]:
     """Return what Blender says of a USD file, and its picture [R, R, 3]."""
-    python = environment.installed_python()
-    if python is None:
-        pytest.skip("Blender is not installed: run `python -m infra.bench.cycles` once")
-    folder.mkdir()
-    asked = {
-        "usd": str(usd), "exact": False, "export": None, "camera": "camera_0", "bounces": 8,
-        "resolution": RESOLUTION, "spp": SPP, "denoise": True, "seed": 0, "threads": 2,
-    }  # fmt: skip
-    (folder / "request.json").write_text(json.dumps({**asked, **request}))
-    result = subprocess.run(
-        [str(python), "-I", str(PROCESS), str(folder)],
-        env={**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr[-2000:]
-    return json.loads((folder / "facts.json").read_text()), np.load(folder / "picture.npy")
-
-
-def ours(scene: Scene) -> np.ndarray:
-    limits = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1)
-    child = IsolatedChild(limits=limits, setup=activate, setup_args=(choose_variant(),))
-    try:
-        return child.call(our_picture, scene, 0, RESOLUTION, SPP, 0).radiance_rgb
-    finally:
-        child.close()
+    asked = {"usd": str(usd), "exact": False, "export": None, "camera": "camera_0"}
+    asked |= {"resolution": RESOLUTION, "spp": SPP, **request}
+    picture = run_blender("blender_usd_process.py", folder, asked)
+    return json.loads((folder / "facts.json").read_text()), picture
 
 
 @pytest.mark.parametrize("name", ["cbox"])
@@ -66,7 +37,7 @@ def test_blender_shows_what_we_show(
     facts, imported = blender(tmp_path / "imported", tmp_path / "a.usdc", export=str(theirs))
     assert_found(facts, scene)
     _, exact = blender(tmp_path / "exact", tmp_path / "a.usdc", exact=True)
-    picture = ours(scene)
+    picture = ours(scene, RESOLUTION, SPP)
     figures = {
         "as imported": psnr_linear_db(imported, picture),
         "after our script": psnr_linear_db(exact, picture),

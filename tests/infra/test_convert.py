@@ -1,17 +1,24 @@
 """`trilight convert`: every form to every form, shards, budgets, and one line for a mistake."""
 
 import json
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from infra.cli.app import app
+from pipeline.flows import convert_scene
 from pipeline.flows.scene_source import load_source, scene_source
+from pipeline.scenes.renderformer_json_write import described_files
 from storage.errors import TrilightError
 from storage.profiles import Profile
+from storage.renderformer_h5 import write_renderformer_h5
+from storage.renderformer_h5_read import read_renderformer_h5
 from storage.sample import encode_sample
 from storage.scene import Scene
 from storage.scene_file import encode_scene
@@ -81,6 +88,19 @@ def test_a_sample_and_a_whole_shard(tmp_path: Path, shard: Path) -> None:
     assert encode_scene(loaded(Path(found["files"][1]))) == encode_scene(tiny_scene())
 
 
+def test_hdf5_takes_the_pictures_of_a_sample_along(tmp_path: Path, shard: Path) -> None:
+    """From a shard, and from HDF5; a scene without pictures has none there."""
+    convert(f"{shard}::000000003", tmp_path / "a.h5")
+    convert(tmp_path / "a.h5", tmp_path / "b.h5")
+    for name in ("a.h5", "b.h5"):
+        found = read_renderformer_h5(tmp_path / name).radiance_rgb
+        assert found is not None
+        assert np.array_equal(found, tiny_sample().radiance_rgb)
+    convert(f"{shard}::000000003", tmp_path / "a.usdz")
+    convert(tmp_path / "a.usdz", tmp_path / "c.h5")
+    assert read_renderformer_h5(tmp_path / "c.h5").radiance_rgb is None
+
+
 def test_a_strangers_stage_within_a_budget(tmp_path: Path) -> None:
     stage = write_stage(tmp_path, sphere=True)
     whole = convert(stage, tmp_path / "whole.safetensors")
@@ -102,6 +122,11 @@ def test_a_strangers_stage_within_a_budget(tmp_path: Path) -> None:
         ("broken.json", "a.usda", "not readable as JSON"),
         ("empty.h5", "a.usda", "not a readable HDF5 file"),
         ("https://x.y/a.usda", "a.json", "only files of this machine"),
+        ("circle.usda", "a.json", "in a circle"),
+        ("outside.usda", "a.json", "outside of its folder"),
+        ("meshless.json", "a.usda", "absent.obj"),
+        ("nan.json", "a.usda", "NaN is no JSON number"),
+        ("shapes.h5", "a.usda", "has shape"),
     ],
 )
 def test_mistakes(
@@ -112,9 +137,32 @@ def test_mistakes(
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     for name in ("broken.usda", "broken.json"):
         (tmp_path / name).write_text("{")
+    for name, layer in (("circle", "circle"), ("outside", "../other")):
+        arc = f'def "A" (references = @./{layer}.usda@</A>) {{}}'
+        (tmp_path / f"{name}.usda").write_text(f"#usda 1.0\n{arc}")
+    described = described_files(tiny_scene(), "s").json.decode()
+    (tmp_path / "meshless.json").write_text(described.replace("templates/", "absent.obj/"))
+    (tmp_path / "nan.json").write_text(described.replace("0.5", "NaN"))
+    write_renderformer_h5(tmp_path / "shapes.h5", tiny_scene())
+    with h5py.File(tmp_path / "shapes.h5", "r+") as file:
+        del file["vn"]
+        file["vn"] = np.zeros((2, 3, 3), np.float32)
     monkeypatch.chdir(tmp_path)
     assert message in refused(source, target)
     assert not (tmp_path / "a.json").exists()
+
+
+def _crash(*arguments: object) -> None:
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def test_a_crash_in_native_code_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = write_stage(tmp_path)
+    monkeypatch.setattr(convert_scene, "source_keys", _crash)
+    told = refused(stage, tmp_path / "a.json")
+    assert told.startswith("stage.usda: could not be converted (crashed_signal_11")
 
 
 def test_budgets_that_cannot_be(tmp_path: Path) -> None:

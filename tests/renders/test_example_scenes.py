@@ -11,13 +11,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipeline.flows.convert_scene import convert_scene
+from pipeline.flows.scene_source import load_source, scene_source
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from storage.exr import decode_exr
 from storage.metrics import psnr_linear_db
+from storage.scene import Scene
 from tests.scenes.example_scenes import example_scene
 
 BLOCK = 8
+DIRECT = RenderSettings(
+    resolution=256, noise_floor_db=99, min_spp=512, max_spp=512, max_depth=2, denoiser="off"
+)
+"""Direct light alone, without a denoiser."""
 
 
 def _blocks(picture: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -27,8 +34,7 @@ def _blocks(picture: NDArray[np.float32]) -> NDArray[np.float64]:
     return cut.mean(axis=(1, 3))
 
 
-def _render(shared: Path, name: str, settings: RenderSettings) -> NDArray[np.float32]:
-    scene = example_scene(shared, name)
+def _render(scene: Scene, settings: RenderSettings) -> NDArray[np.float32]:
     renderer = SceneRenderer(scene, settings)
     return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), 1).radiance_rgb
 
@@ -49,15 +55,25 @@ def test_direct_light_is_that_of_cycles(
     Measured: 79.7, 76.4, 75.4 and 68.0. With single scattering 57.6, 57.6, 59.1 and 21.9; vertices
     joined before normalising the bunny give 53.3.
     """
-    settings = RenderSettings(
-        resolution=256, noise_floor_db=99, min_spp=512, max_spp=512, max_depth=2, denoiser="off"
-    )
-    ours = _blocks(_render(shared, name, settings))
+    ours = _blocks(_render(example_scene(shared, name), DIRECT))
     theirs = _blocks(_reference(shared, f"{name}.direct_raw.exr"))
     assert psnr_linear_db(ours, theirs) > least_db
     # Half of the blocks agree to the rounding of half floats (5e-4) and what noise is left.
     lit = theirs > 0.02
     assert np.median(abs(ours - theirs)[lit] / theirs[lit]) < 0.001
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["usdz", "json", "h5"])
+def test_what_was_converted_is_still_that_of_cycles(
+    shared: Path, tmp_path: Path, llvm: None, form: str
+) -> None:
+    """By the command's own way there and back; bound and measure as above, where no form is."""
+    source = scene_source(str(shared / "renderformer_scenes" / "cbox.json"))
+    target = tmp_path / f"cbox.{form}"
+    convert_scene(source, target, budget=None, done=lambda finished, of: None)
+    ours = _blocks(_render(load_source(scene_source(str(target))).scene, DIRECT))
+    assert psnr_linear_db(ours, _blocks(_reference(shared, "cbox.direct_raw.exr"))) > 76
 
 
 @pytest.mark.slow
@@ -80,7 +96,7 @@ def test_all_light_agrees_with_cycles(
     leave 0.4 to 2.5 dB to the samples of another processor. With single scattering tree has 17.5.
     """
     settings = RenderSettings(resolution=256, noise_floor_db=99, min_spp=spp, max_spp=spp)
-    ours, theirs = _render(shared, name, settings), _reference(shared, f"{name}.exr")
+    ours, theirs = _render(example_scene(shared, name), settings), _reference(shared, f"{name}.exr")
     assert psnr_linear_db(ours, theirs) > least_db
     assert psnr_linear_db(_blocks(ours), _blocks(theirs)) > least_block_db
     # What pixels can show; beyond 1, single pixels decide.

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from pipeline.scenes.usd.polygons import triangulated
 from pipeline.scenes.usd.read import UsdScene, read_usd, usd_keys
@@ -80,6 +80,23 @@ def test_lights_have_their_area_and_radiance(
     # sums of up to 128 areas in single precision
     assert facing(corners) == pytest.approx(area_vector, abs=1e-6)
     assert rows[:, EMISSION] == pytest.approx(np.tile(radiance, (len(rows), 1)), rel=1e-5)
+
+
+@pytest.mark.parametrize(("kelvin", "redder"), [(None, 1.0), (3000.0, 6.5)])
+def test_a_stated_temperature_tints_a_light(
+    tmp_path: Path, kelvin: float | None, redder: float
+) -> None:
+    """USD's own table for 3000 K, red over blue; Blender switches it on and states none."""
+    path = write_stage(tmp_path)
+    opened = Usd.Stage.Open(str(path))
+    light = UsdLux.RectLight.Get(opened, "/W/rect")
+    light.CreateEnableColorTemperatureAttr(True)
+    if kelvin is not None:
+        light.CreateColorTemperatureAttr(kelvin)
+    opened.GetRootLayer().Save()
+    red, _, blue = object_of(read(path).scene, "rect")[1][0, EMISSION]
+    assert red / blue == pytest.approx(redder, rel=0.01)  # 6.51 in the table
+    assert (red == blue == 20) == (kelvin is None)
 
 
 def test_a_sphere_has_the_area_of_a_sphere(stage: UsdScene) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
+from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
@@ -19,6 +19,7 @@ from storage.scene_file import encode_scene
 from storage.usd.exact import read_exact, scene_keys
 from storage.usd.export import SUFFIXES, write_usd, write_usd_shard
 from tests.scenes_by_hand import LIGHT, tiny_scene
+from tests.storage.usd_validators import errors_of
 
 OPENPBR_INPUTS = {
     "base_color": "color3f",
@@ -37,19 +38,6 @@ OPENPBR_INPUTS = {
 def written(tmp_path: Path, scene: Scene, name: str = "a.usdc") -> Any:
     write_usd(tmp_path / name, scene)
     return Usd.Stage.Open(str(tmp_path / name))
-
-
-def errors_of(stage: Any) -> list[str]:
-    """Return what all of USD's validators say, but for the one thing that usd-core cannot know."""
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    assert len(validators) >= 30
-    return [
-        f"{error.GetName()}: {error.GetMessage()}"
-        for error in UsdValidation.ValidationContext(validators).Validate(stage)
-        if not (
-            error.GetName() == "MissingShaderIdInRegistry" and "shaderId 'ND_" in error.GetMessage()
-        )
-    ]
 
 
 def odd_scene() -> Scene:

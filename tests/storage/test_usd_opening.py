@@ -9,15 +9,16 @@ import pytest
 
 from storage.errors import TrilightError
 from storage.usd import opening
+from storage.usd.diagnostics import quietly
 from storage.usd.export import write_usd
-from storage.usd.opening import OpenedUsd, quiet
+from storage.usd.opening import OpenedUsd
 from tests.scenes_by_hand import tiny_scene
 
 HEAD = "#usda 1.0\n"
 
 
 def prims_of(path: Path) -> list[str]:
-    stage = quiet(OpenedUsd(path).compose)
+    stage = quietly(path, OpenedUsd(path).compose)
     return [str(prim.GetPath()) for prim in stage.Traverse()]
 
 
@@ -132,7 +133,7 @@ def test_depth(tmp_path: Path) -> None:
 def test_what_is_missing_is_noted(tmp_path: Path) -> None:
     (tmp_path / "a.usda").write_text(f'{HEAD}def "A" (references = @./no.usda@</A>) {{}}')
     opened = OpenedUsd(tmp_path / "a.usda")
-    quiet(opened.compose)
+    quietly(opened.path, opened.compose)
     assert opened.lost == ["file './no.usda' is missing"]
 
 

@@ -54,9 +54,10 @@ def radiance(prim: Any, triangles: NDArray[np.float32], time: Any) -> NDArray[np
     light = UsdLux.LightAPI(prim)
     strength = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
     colour = np.array(light.GetColorAttr().Get(time), np.float64)
-    if light.GetEnableColorTemperatureAttr().Get(time):
-        kelvin = light.GetColorTemperatureAttr().Get(time)
-        colour = colour * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin))
+    kelvin = light.GetColorTemperatureAttr()
+    # Blender switches it on for every light and states none; the default of USD would tint by 4 %
+    if light.GetEnableColorTemperatureAttr().Get(time) and kelvin.HasAuthoredValue():
+        colour = colour * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin.Get(time)))
     if light.GetNormalizeAttr().Get(time):
         strength = strength / max(_area(triangles.astype(np.float64)), 1e-30)
     found = np.maximum(strength * colour, 0)

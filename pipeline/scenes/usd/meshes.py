@@ -163,4 +163,5 @@ def _cross(positions: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _array(values: Any, dtype: type, shape: tuple[int, ...]) -> NDArray:
-    return np.array([] if values is None else values, dtype).reshape(shape)
+    found = np.zeros(0, dtype) if values is None else np.array(values)
+    return found.astype(dtype, casting="same_kind").reshape(shape)

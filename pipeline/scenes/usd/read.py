@@ -13,8 +13,9 @@ import numpy as np
 from pipeline.scenes.usd.assemble import scene_of_stage
 from storage.errors import TrilightError
 from storage.scene import Scene
+from storage.usd.diagnostics import quietly
 from storage.usd.exact import is_marked, read_exact, scene_keys
-from storage.usd.opening import OpenedUsd, quiet
+from storage.usd.opening import OpenedUsd
 
 MAX_FRAMES = 10_000
 """Most scenes of a stage with time samples."""
@@ -42,8 +43,7 @@ def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
     Raises:
         TrilightError: the file is unusable (storage.usd.opening).
     """
-    found: list[str] = quiet(lambda: _keys(OpenedUsd(path, folder)))
-    return found
+    return quietly(path, lambda: _keys(OpenedUsd(path, folder)))
 
 
 def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
@@ -58,8 +58,7 @@ def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> 
     Raises:
         TrilightError: the file is unusable, has no such scene, or is none that a `Scene` can hold.
     """
-    found: UsdScene = quiet(lambda: _read(path, key, folder, licence))
-    return found
+    return quietly(path, lambda: _read(path, key, folder, licence))
 
 
 def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:

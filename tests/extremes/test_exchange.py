@@ -1,0 +1,148 @@
+"""Scenes at the ends of what they may hold, in USD, JSON and HDF5: back, or refused."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from infra.bench.renders.cost_scene import cost_scene
+from pipeline.scenes.renderformer_json_write import described_files
+from storage.conventions import EMISSION
+from storage.errors import TrilightError
+from storage.scene import Scene
+from tests.renders.scene_kit import join, light, quad
+from tests.scenes.exchange_kit import (
+    assert_h5_keeps_light,
+    assert_json_keeps_light,
+    assert_usd_keeps_all,
+    h5_and_back,
+    json_and_back,
+)
+from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
+
+ENDS = np.finfo(np.float32)
+
+
+def surface(**columns: ArrayLike) -> Scene:
+    """Return the tiny scene with another floor: diffuse, specular, roughness."""
+    scene = tiny_scene()
+    for name, part in (("diffuse", slice(0, 3)), ("specular", slice(3, 6)), ("roughness", 6)):
+        if name in columns:
+            scene.materials[FLOOR, part] = np.asarray(columns[name], np.float32)
+    return scene
+
+
+def glowing(radiance: ArrayLike) -> Scene:
+    scene = tiny_scene()
+    scene.materials[LIGHT, EMISSION] = np.asarray(radiance, np.float32)
+    return scene
+
+
+def seen_at(*fov_deg: float) -> Scene:
+    return tiny_scene(fov_deg=np.array(fov_deg, np.float32))
+
+
+def many_lights() -> Scene:
+    """Sixty-four triangles that emit differently."""
+    lamps = [
+        light([[x, y, 2], [x + 0.05, y, 2], [x, y + 0.05, 2]], 1.0 + 8 * x + y)
+        for x in np.linspace(0, 1, 8)
+        for y in np.linspace(0, 1, 8)
+    ]
+    floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], tiny_scene().materials[FLOOR])
+    return join([floor, *lamps])
+
+
+def scaled(size: float) -> Scene:
+    scene = tiny_scene()
+    scene.vertex_positions[:] *= np.float32(size)
+    return scene
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "roughness 0": lambda: surface(roughness=0),
+    "roughness 1": lambda: surface(roughness=1),
+    "smallest roughness": lambda: surface(roughness=ENDS.smallest_subnormal),
+    "black": lambda: surface(diffuse=0, specular=0),
+    "white": lambda: surface(diffuse=1, specular=0),
+    "mirror": lambda: surface(diffuse=0, specular=1, roughness=0),
+    "sum of exactly 1": lambda: surface(diffuse=[0.25, 0.1, 0.7], specular=[0.75, 0.9, 0.3]),
+    "emission 1e-3": lambda: glowing(1e-3),
+    "emission 1e6": lambda: glowing(1e6),
+    "emission in one channel": lambda: glowing([0, float(ENDS.tiny), 0]),
+    "fov 1 and 170": lambda: seen_at(1, 170),
+    "fov 0.001 and 179": lambda: seen_at(0.001, 179),
+    "64 lights": many_lights,
+    "a micrometre": lambda: scaled(1e-3),
+    "a kilometre": lambda: scaled(1e3),
+}
+
+
+@pytest.mark.parametrize("make", SCENES.values(), ids=SCENES.keys())
+def test_every_form_holds_it(tmp_path: Path, make: Callable[[], Scene]) -> None:
+    scene = make()
+    for suffix in (".usda", ".usdc"):
+        assert_usd_keeps_all(scene, tmp_path, suffix)
+    assert_json_keeps_light(json_and_back(scene, tmp_path)[0], scene)
+    assert_h5_keeps_light(h5_and_back(scene, tmp_path), scene)
+
+
+def test_sixteen_thousand_triangles(tmp_path: Path) -> None:
+    """Without HDF5, whose textures of them are 850 MB."""
+    scene = cost_scene(16384, 8)
+    assert scene.num_triangles > 15000
+    assert_usd_keeps_all(scene, tmp_path, ".usdc")
+    assert_json_keeps_light(json_and_back(scene, tmp_path)[0], scene)
+
+
+def at_the_ends_of_floats() -> Scene:
+    scene = tiny_scene()
+    scene.vertex_positions[0] = np.array([ENDS.max, -ENDS.tiny, -0.0], np.float32)
+    scene.vertex_positions[1] = np.array([ENDS.smallest_subnormal, 0, -ENDS.max], np.float32)
+    scene.materials[LIGHT, EMISSION] = np.array([1e38, ENDS.smallest_subnormal, 0], np.float32)
+    return scene
+
+
+def test_the_ends_of_floats_come_back_in_usd_and_hdf5(tmp_path: Path) -> None:
+    scene = at_the_ends_of_floats()
+    for suffix in (".usda", ".usdc", ".usdz"):
+        assert_usd_keeps_all(scene, tmp_path, suffix)
+    assert_h5_keeps_light(h5_and_back(scene, tmp_path), scene)
+
+
+REFUSED: dict[str, tuple[Callable[[], Scene], str]] = {
+    "brighter than the form says": (lambda: glowing(2e9), "emissive.*expected"),
+    "the ends of floats": (at_the_ends_of_floats, "emissive.*expected"),
+    "wider than the form says": (lambda: seen_at(40, 179.5), "fov.*expected"),
+    "narrower": (lambda: seen_at(40, 5e-4), "fov.*expected"),
+}
+
+
+@pytest.mark.parametrize(("make", "message"), REFUSED.values(), ids=REFUSED.keys())
+def test_json_that_readers_would_refuse_is_not_written(
+    make: Callable[[], Scene], message: str
+) -> None:
+    with pytest.raises(TrilightError, match=message):
+        described_files(make(), "a")
+
+
+UNLAWFUL: dict[str, dict[str, object]] = {
+    "NaN": {"vertex_positions": np.full((7, 3), np.nan, np.float32)},
+    "infinite": {"vertex_positions": np.full((7, 3), np.inf, np.float32)},
+    "fov 0": {"fov_deg": np.array([0, 40], np.float32)},
+    "fov 180": {"fov_deg": np.array([40, 180], np.float32)},
+    "sum over 1": {"materials": tiny_scene().materials + np.float32(0.5)},
+}
+
+
+@pytest.mark.parametrize("changes", UNLAWFUL.values(), ids=UNLAWFUL.keys())
+def test_what_no_scene_may_be_is_not_written(tmp_path: Path, changes: dict[str, object]) -> None:
+    scene = dataclasses.replace(tiny_scene(), **changes)  # type: ignore[arg-type]
+    with pytest.raises(TrilightError):
+        assert_usd_keeps_all(scene, tmp_path, ".usda")
+    with pytest.raises(TrilightError):
+        described_files(scene, "a")
+    assert not list(tmp_path.iterdir())
