@@ -6,7 +6,9 @@ from pathlib import Path
 from pipeline.flows.builds import named_build
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.flows.settings import differences
-from storage.dataset import open_dataset
+from pipeline.objects.licences import BY_USER
+from storage.dataset import Dataset, open_dataset
+from storage.derived import derivation_of
 from storage.errors import TrilightError
 from storage.manifest import Manifest
 from storage.remote.url import parse_url
@@ -14,8 +16,13 @@ from storage.remote.url import parse_url
 ASIDE = ".bad"
 """Ends the name of a bad shard until its successor is there."""
 
+_OF_SCENE_FILES = ("scenes.num_views", "splits.listed_scenes", "splits.one_split")
+"""Settings that follow from the scene files, and are not to be given beside them."""
 
-def repair(dataset: str, bad_shards: Sequence[str], *, objects: str | None) -> None:
+
+def repair(
+    dataset: str, bad_shards: Sequence[str], *, objects: str | None, scenes_from: str | None
+) -> None:
     """Set bad shards aside and have `generate` make them, from the settings of the manifest.
 
     Shards that are whole stay as they are, to the byte. The bad files are deleted at the end; where
@@ -25,10 +32,13 @@ def repair(dataset: str, bad_shards: Sequence[str], *, objects: str | None) -> N
         dataset: folder of the dataset.
         bad_shards: their names (storage.verify).
         objects: where the objects come from, as it was said to `generate`.
+        scenes_from: folder of the scene files, as it was said to `generate`; their digests are in
+            the lock, so that no other files are taken.
 
     Raises:
-        TrilightError: the dataset is on a server, was made from scene files, or was begun in
-            another environment; or what was made has other bytes than the manifest says.
+        TrilightError: the dataset is on a server, was made of other datasets, or was begun in
+            another environment; the scene files are lacking, or others; or what was made has other
+            bytes than the manifest says.
     """
     root = parse_url(dataset, what="dataset")
     if not isinstance(root, Path):
@@ -36,8 +46,10 @@ def repair(dataset: str, bad_shards: Sequence[str], *, objects: str | None) -> N
             f"dataset {root.shown!r} is on a server; expected a folder to repair. Repair the "
             "folder that it was copied from."
         )
-    manifest = open_dataset(str(root)).manifest
-    changes = _changes(manifest)
+    opened = open_dataset(str(root))
+    manifest = opened.manifest
+    _require_generated(manifest, scenes_from)
+    changes, licence = _changes(manifest), _stated_licence(opened)
     quiet_prefect()
     for name in bad_shards:
         if (root / name).exists():
@@ -49,7 +61,10 @@ def repair(dataset: str, bad_shards: Sequence[str], *, objects: str | None) -> N
             build=manifest.build,
             objects=objects,
             out=str(root),
-            scenes=manifest.num_scenes,
+            scenes=None if scenes_from else manifest.num_scenes,
+            licence=licence,
+            scenes_from=scenes_from,
+            views=manifest.num_views if scenes_from else None,
             changes=changes,
         )
     if outcome.digest != manifest.dataset_digest:
@@ -61,12 +76,36 @@ def repair(dataset: str, bad_shards: Sequence[str], *, objects: str | None) -> N
         (root / f"{name}{ASIDE}").unlink(missing_ok=True)
 
 
+def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:
+    """Refuse what `generate` cannot make again with what was given."""
+    if (derivation := derivation_of(manifest.settings)) is not None:
+        raise TrilightError(
+            f"the dataset was made by `trilight shards {derivation.operation}`; expected one of "
+            "`trilight generate`. Make it again of its sources: the same bytes come out."
+        )
+    of_files = manifest.settings["splits"].get("listed_scenes") is not None
+    if of_files and scenes_from is None:
+        raise TrilightError(
+            f"build {manifest.build!r} was made of scene files; expected --scenes-from FOLDER, "
+            "the one that it was made of."
+        )
+    if scenes_from is not None and not of_files:
+        raise TrilightError(
+            f"--scenes-from is {scenes_from}, but the dataset draws its scenes; expected it only "
+            "for one that was made with it."
+        )
+
+
 def _changes(manifest: Manifest) -> dict[str, object]:
     """Return in what the settings of a dataset differ from those of its build's name."""
-    if manifest.settings["splits"].get("listed_scenes") is not None:
-        raise TrilightError(
-            f"build {manifest.build!r} was made from scene files; expected one that draws its "
-            "scenes. Delete the bad shards and run `trilight generate --scenes-from` again."
-        )
     build = named_build(manifest.build).as_json()
-    return {name: now for name, _, now in differences(build, manifest.settings)}
+    changed = {name: now for name, _, now in differences(build, manifest.settings)}
+    if manifest.settings["splits"].get("listed_scenes") is not None:
+        return {name: now for name, now in changed.items() if name not in _OF_SCENE_FILES}
+    return changed
+
+
+def _stated_licence(dataset: Dataset) -> str | None:
+    """Return what `--licence` said when the objects were frozen; it holds for all of them."""
+    locked = dataset.objects_lock()
+    return next((entry.licence for entry in locked if entry.licence_source == BY_USER), None)

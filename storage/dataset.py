@@ -1,6 +1,6 @@
 """A finished dataset, for whoever reads it: the manifest and the samples of its shards."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import BinaryIO
 
 from storage.dataset_files import DatasetFiles, RemoteFiles, dataset_files
@@ -118,18 +118,26 @@ def _require_lawful(record: SceneRecord | Sample) -> None:
         )
 
 
-def open_dataset(url: str) -> Dataset:
+def open_dataset(
+    url: str, *, shard_read: Callable[[ShardEntry], ShardEntry] = lambda shard: shard
+) -> Dataset:
     """Open the dataset in a local folder, or below a URL of http, https, s3, gs or hf.
+
+    Args:
+        url: where it is.
+        shard_read: returns what is kept of each shard of the manifest (storage.manifest).
 
     Raises:
         TrilightError: there is no readable manifest, the URL is refused, or the driver for it is
             not installed.
     """
     files = dataset_files(url)
-    data = files.read("manifest.json")
-    if data is None:
+    stream = files.open_beside("manifest.json")
+    if stream is None:
         raise TrilightError(
             f"{files.shown}: no manifest.json here; expected a dataset, as `trilight generate ... "
             "--out` makes it."
         )
-    return Dataset(files, decode_manifest(data, f"{files.shown}/manifest.json"))
+    with stream:
+        place = f"{files.shown}/manifest.json"
+        return Dataset(files, decode_manifest(stream, place, shard_read))

@@ -1,14 +1,16 @@
 """The files of a dataset: in a folder of this machine, or below a URL."""
 
 import os
+from abc import ABC, abstractmethod
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import BinaryIO
 
 from storage.digests import sha256_of_stream
 from storage.errors import TrilightError
 from storage.manifest import ShardEntry
 from storage.remote.cache import shard_cache
-from storage.remote.fetch import facts_of, read_bytes, unreadable
+from storage.remote.fetch import download, facts_of, unreadable
 from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
 
@@ -16,7 +18,23 @@ MAX_BESIDE_BYTES = 1 << 30
 """Largest file beside the shards: a manifest takes about 200 bytes a member."""
 
 
-class LocalFiles:
+class _Files(ABC):
+    """What is beside the shards."""
+
+    @abstractmethod
+    def open_beside(self, name: str) -> BinaryIO | None:
+        """Open a file beside the shards, or return None where there is none."""
+
+    def read(self, name: str) -> bytes | None:
+        """Return a file beside the shards, or None where there is none."""
+        stream = self.open_beside(name)
+        if stream is None:
+            return None
+        with stream:
+            return stream.read()
+
+
+class LocalFiles(_Files):
     """A folder of this machine."""
 
     def __init__(self, root: Path) -> None:
@@ -24,10 +42,9 @@ class LocalFiles:
         self.shown = str(root)
         self._checked: dict[str, tuple[int, ...]] = {}
 
-    def read(self, name: str) -> bytes | None:
-        """Return a file beside the shards, or None where there is none."""
+    def open_beside(self, name: str) -> BinaryIO | None:
         try:
-            return (self.root / name).read_bytes()
+            return (self.root / name).open("rb")
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
@@ -80,19 +97,24 @@ class LocalFiles:
         self._checked[shard.name] = seen
 
 
-class RemoteFiles:
+class RemoteFiles(_Files):
     """A folder on a server. Its shards come whole to the cache of this machine."""
 
     def __init__(self, url: RemoteUrl) -> None:
         self.url = url
         self.shown = url.shown
 
-    def read(self, name: str) -> bytes | None:
-        """Return a file beside the shards, or None where there is none."""
+    def open_beside(self, name: str) -> BinaryIO | None:
         url = self.url.child(name)
+        stream: BinaryIO = TemporaryFile()
         try:
-            return read_bytes(url, max_bytes=MAX_BESIDE_BYTES)
-        except TransferFailed as error:
+            download(url, stream, num_bytes=None, max_bytes=MAX_BESIDE_BYTES)
+            stream.seek(0)
+            return stream
+        except BaseException as error:
+            stream.close()
+            if not isinstance(error, TransferFailed):
+                raise
             if error.__cause__ is not None and is_missing(error.__cause__):
                 return None
             raise unreadable(url, error) from error

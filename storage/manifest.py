@@ -8,20 +8,25 @@ over the shards, the object lock and the settings; "the same bytes" always means
 import dataclasses
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
-from storage.atomic import write_atomically
+from storage.atomic import atomic_writer
 from storage.conventions import SCHEMA_VERSION, SPLITS, require_readable
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
+from storage.json_pieces import entries
 from storage.layout import numbered
+from storage.member_table import MemberTable
 from storage.shard_reader import MAX_MEMBER_BYTES, MEMBER_NAME, scan_samples
 
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
+
+_MOST_BYTES = 1 << 62
+"""Of a shard; what fits into a MemberTable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +43,13 @@ class ShardEntry:
     """Size of the file."""
     sha256: str
     """Digest of the file."""
-    members: tuple[tuple[str, int, int], ...]
+    members: MemberTable
     """Name, offset of the first byte, and number of bytes of each member."""
+
+    @property
+    def keys(self) -> Sequence[str]:
+        """The keys of its samples, in the order of the file."""
+        return list(dict.fromkeys(name.partition(".")[0] for name, _, _ in self.members))
 
     @property
     def index(self) -> Mapping[str, Mapping[str, tuple[int, int]]]:
@@ -111,7 +121,7 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
         num_samples=len(samples),
         num_bytes=num_bytes,
         sha256=sha256_of_stream(stream),
-        members=tuple(
+        members=MemberTable(
             (f"{key}.{suffix}", member.offset, member.num_bytes)
             for key, members in samples
             for suffix, member in members.items()
@@ -121,10 +131,18 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
 
 def write_manifest(path: Path, manifest: Manifest) -> None:
     """Write the manifest atomically; equal manifests give equal bytes."""
-    record = dataclasses.asdict(manifest)
+    record = _fields(manifest)
+    record["shards"] = [{**_fields(s), "members": list(s.members)} for s in manifest.shards]
     record["totals"] = {"samples": manifest.num_samples, "bytes": manifest.num_bytes}
     record["dataset_digest"] = manifest.dataset_digest
-    write_atomically(path, json.dumps(record, indent=1, sort_keys=True).encode() + b"\n")
+    with atomic_writer(path) as stream:  # bit by bit: the whole text has many small ones
+        for text in json.JSONEncoder(indent=1, sort_keys=True).iterencode(record):
+            stream.write(text.encode())
+        stream.write(b"\n")
+
+
+def _fields(record: Manifest | ShardEntry) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -134,7 +152,8 @@ def read_manifest(path: Path) -> Manifest:
         TrilightError: missing, not JSON, another schema version, or a shard name that is none.
     """
     try:
-        data = path.read_bytes()
+        with path.open("rb") as stream:
+            return decode_manifest(stream, str(path))
     except FileNotFoundError as error:
         raise TrilightError(
             f"{path.parent}: no manifest.json here; expected the folder of a dataset, as "
@@ -142,32 +161,49 @@ def read_manifest(path: Path) -> Manifest:
         ) from error
     except OSError as error:
         raise TrilightError(f"{path}: not a readable manifest ({error}).") from error
-    return decode_manifest(data, str(path))
 
 
-def decode_manifest(data: bytes, place: str) -> Manifest:
-    """Return the manifest of the bytes of a file; raises as `read_manifest`, naming `place`."""
+def decode_manifest(
+    stream: BinaryIO, place: str, shard_read: Callable[[ShardEntry], ShardEntry] = lambda s: s
+) -> Manifest:
+    """Return the manifest of an open file.
+
+    One shard at a time is held as JSON: the index of a million samples then takes the 200 bytes for
+    each that it needs, and not ten times as many on the way.
+
+    Args:
+        stream: the file.
+        place: where it is, for messages.
+        shard_read: returns what is kept of each shard; may leave its members out.
+
+    Raises:
+        TrilightError: as `read_manifest`, or as `shard_read`.
+    """
+    record: dict[str, Any] = {}
+    shards: list[ShardEntry] = []
     try:
-        record = json.loads(data)
-        version = record.pop("schema_version")
-    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
-        raise TrilightError(f"{place}: not a readable manifest ({error}).") from error
-    require_readable(version, place)
-    try:
-        return _decode(record, version)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        for name, value in entries(stream):
+            if name == "shards":
+                shards.append(shard_read(_shard(value)))
+                continue
+            if name == "schema_version":  # it comes before the shards, which it explains
+                require_readable(value, place)
+            record[name] = value
+        require_readable(record.get("schema_version"), place)
+        del record["totals"], record["dataset_digest"]
+        return Manifest(shards=tuple(shards), **record)
+    except TrilightError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise TrilightError(f"{place}: not a readable manifest ({error}).") from error
 
 
-def _decode(record: dict[str, Any], version: int) -> Manifest:
-    del record["totals"], record["dataset_digest"]
-    shards = []
-    for row in record.pop("shards"):
-        if not SHARD_NAME.fullmatch(row["name"]):
-            raise ValueError(f"shard name {row['name']!r}")
-        row["members"] = tuple((str(n), int(at), int(size)) for n, at, size in row["members"])
-        for name, at, size in row["members"]:
-            if not (MEMBER_NAME.fullmatch(name) and at >= 0 and 0 <= size <= MAX_MEMBER_BYTES):
-                raise ValueError(f"member {name!r} of {size} bytes at {at}")
-        shards.append(ShardEntry(**row))
-    return Manifest(shards=tuple(shards), schema_version=version, **record)
+def _shard(row: dict[str, Any]) -> ShardEntry:
+    if not SHARD_NAME.fullmatch(row["name"]):
+        raise ValueError(f"shard name {row['name']!r}")
+    members = [(str(name), int(at), int(size)) for name, at, size in row.pop("members")]
+    for name, at, size in members:
+        placed = 0 <= at < _MOST_BYTES and 0 <= size <= MAX_MEMBER_BYTES
+        if not (MEMBER_NAME.fullmatch(name) and placed):
+            raise ValueError(f"member {name!r} of {size} bytes at {at}")
+    return ShardEntry(**row, members=MemberTable(members))

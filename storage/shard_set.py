@@ -92,8 +92,7 @@ class ManifestShards(ShardSet):
     def __init__(self, dataset: Dataset, entries: Sequence[ShardEntry]) -> None:
         self.names = [entry.name for entry in entries]
         self._files = dataset.files
-        # without the members, a set takes the same few bytes a shard however large shards are
-        self._entries = [_without_members(entry) for entry in entries]
+        self._entries = entries
 
     def num_samples(self, number: int) -> int:
         return self._entries[number].num_samples
@@ -152,17 +151,6 @@ def _opened(name: str, stream: BinaryIO) -> OpenShard:
     except BaseException:
         stream.close()
         raise
-
-
-def _without_members(entry: ShardEntry) -> ShardEntry:
-    return ShardEntry(
-        name=entry.name,
-        split=entry.split,
-        num_samples=entry.num_samples,
-        num_bytes=entry.num_bytes,
-        sha256=entry.sha256,
-        members=(),
-    )
 
 
 class ListedShards(ShardSet):

@@ -1,15 +1,19 @@
 """What `--data` means: a dataset by its root, or shards by a list."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from storage.conventions import SPLITS
 from storage.dataset import open_dataset
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.manifest import Manifest
+from storage.manifest import Manifest, ShardEntry
+from storage.member_table import MemberTable
 from storage.shard_places import listed_shards
 from storage.shard_set import (
     KeysSeen,
@@ -76,8 +80,16 @@ def open_training_data(data: Sequence[str]) -> TrainingData:
 
 
 def _of_dataset(root: str) -> TrainingData:
-    dataset = open_dataset(root)
-    _require_unique_keys(dataset.manifest)
+    hashes: list[NDArray[np.uint64]] = []
+
+    def without_members(shard: ShardEntry) -> ShardEntry:
+        hashes.append(_hashes_of_keys(shard))
+        return dataclasses.replace(shard, members=MemberTable())
+
+    # without the members, a set takes the same few bytes a shard however large shards are
+    dataset = open_dataset(root, shard_read=without_members)
+    if twice := _found_twice(hashes):
+        _name_key_twice(open_dataset(root).manifest, twice)
     splits: dict[str, ShardSet] = {}
     for split in SPLITS:
         entries = [shard for shard in dataset.shards_of(split) if shard.num_samples]
@@ -115,19 +127,24 @@ def _of_list(patterns: Sequence[str]) -> TrainingData:
     )
 
 
-def _require_unique_keys(manifest: Manifest) -> None:
-    hashes = [np.zeros(0, np.uint64)]
-    for shard in manifest.shards:
-        keys = list(shard.index)
-        if len(keys) != shard.num_samples:
-            raise TrilightError(
-                f"{shard.name}: the manifest counts {shard.num_samples} samples and names "
-                f"{len(keys)}; expected the same. Run `trilight verify`."
-            )
-        hashes.append(hashes_of(keys))
-    every = np.sort(np.concatenate(hashes))
-    twice = set(every[1:][every[1:] == every[:-1]].tolist())
-    for shard in manifest.shards if twice else ():
-        for key, hashed in zip(shard.index, hashes_of(list(shard.index)), strict=True):
-            if int(hashed) in twice:
-                raise key_twice(shard.name, key)
+def _hashes_of_keys(shard: ShardEntry) -> NDArray[np.uint64]:
+    keys = shard.keys
+    if len(keys) != shard.num_samples:
+        raise TrilightError(
+            f"{shard.name}: the manifest counts {shard.num_samples} samples and names "
+            f"{len(keys)}; expected the same. Run `trilight verify`."
+        )
+    return hashes_of(keys)
+
+
+def _found_twice(hashes: Sequence[NDArray[np.uint64]]) -> set[int]:
+    every = np.concatenate([np.zeros(0, np.uint64), *hashes])
+    every.sort()
+    return set(every[1:][every[1:] == every[:-1]].tolist())
+
+
+def _name_key_twice(manifest: Manifest, twice: set[int]) -> NoReturn:
+    shards = ((shard.name, shard.keys) for shard in manifest.shards)
+    every = ((name, key) for name, keys in shards for key in keys)
+    name, key = next(at for at in every if int(hashes_of([at[1]])[0]) in twice)
+    raise key_twice(name, key)

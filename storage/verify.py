@@ -15,6 +15,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry, index_stream
+from storage.member_table import MemberTable
 from storage.objects_lock import decode_objects_lock
 from storage.records import LockedObject
 from storage.remote.fetch import download
@@ -171,7 +172,7 @@ def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
 
 
 def _check_members(stream: BinaryIO, shard: ShardEntry) -> Iterator[str]:
-    found = tuple(
+    found = MemberTable(
         (f"{member.key}.{member.suffix}", member.offset, member.num_bytes)
         for member in scan_members(stream, shard.name)
     )

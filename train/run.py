@@ -104,10 +104,9 @@ def train_run(
     opened, folder = open_training_data(data), RunFolder(out)
     for note in opened.notes:
         progress.noted(note)
-    unusable = Unusable(settings.most_unusable)
-    _check_data(opened, settings, unusable)
+    _check_data(opened, settings)
     state = _begin(settings, folder, opened, resume)
-    judge = _make_judge(opened, settings, unusable)
+    judge = _make_judge(opened, settings, state.unusable)
     progress.begin(
         step=state.step,
         num_steps=settings.num_steps,
@@ -134,20 +133,20 @@ def train_run(
         state.step,
         share=Share(),
         workers=workers,
-        unusable=unusable,
+        unusable=state.unusable,
     )
     with closing(batches):
         trainer.run(batches)
-    return _finish(state, settings, folder, opened, judge, unusable.messages, began)
+    return _finish(state, settings, folder, opened, judge, began)
 
 
-def _check_data(data: TrainingData, settings: TrainSettings, unusable: Unusable) -> None:
-    """Find out before any work what the data cannot give."""
+def _check_data(data: TrainingData, settings: TrainSettings) -> None:
+    """Find out before any work what the data cannot give; damage is counted when it is used."""
     for split in ("train", "validation"):
         data.split(split)
     num_views = data.num_views
     if num_views is None:
-        (sample,) = first_samples(data.split("train"), 1, unusable)
+        (sample,) = first_samples(data.split("train"), 1, Unusable(settings.most_unusable))
         num_views = sample.scene.num_views
     if settings.views_per_scene > num_views:
         raise TrilightError(
@@ -192,7 +191,6 @@ def _finish(
     folder: RunFolder,
     data: TrainingData,
     judge: Judge,
-    unusable: Sequence[str],
     began: float,
 ) -> TrainResult:
     most = data.max_triangles
@@ -210,7 +208,7 @@ def _finish(
         loss_at_end=loss_at_end,
         scores=judgement.scores,
         median_scores=judge.median_scores,
-        unusable=tuple(unusable),
+        unusable=tuple(state.unusable.messages),
         seconds=time.monotonic() - began,
     )
     record = dataclasses.asdict(result) | {"beats_median": result.beats_median}

@@ -7,13 +7,17 @@ import matplotlib.pyplot as plt
 
 from infra.bench.harness import Comparison, Spread
 from infra.bench.streaming import (
+    APART,
     CAT,
     COLD,
+    MANIFESTS,
     OFF,
     OFF_CHECKED,
     PARTS,
+    PROCESSES,
     THREADS,
     WARM,
+    manifest_side,
     threads_side,
 )
 
@@ -31,17 +35,24 @@ def rows(result: Comparison) -> list[tuple[str, str]]:
         samples = figures["samples_per_s"].median
         lines.append((side, f"{rate:.0f} MB/s, {rate / cat:.0%} of cat; {samples:.0f} a second"))
     parts = result.sides[PARTS]
-    decode, tensors = parts["decode_ms"].median, parts["tensors_ms"].median
-    lines.append((PARTS, f"{decode:.1f} ms decoding, {tensors:.1f} ms tensors"))
+    named = {name.removesuffix("_ms"): parts[name].median for name in parts if name != "seconds"}
+    lines.append((PARTS, ", ".join(f"{name} {value:.2f} ms" for name, value in named.items())))
     sides = [threads_side(threads) for threads in THREADS]
     lines += [(side, _rate(result.sides[side])) for side in sides]
+    lines.append((APART, f"{result.sides[APART]['samples_per_s'].median:.0f} samples a second"))
     for side in (COLD, WARM):
         figures = result.sides[side]
         wire, held = figures["wire_bytes_per_sample"].median, figures["bytes_per_sample"].median
         lines.append(
             (side, f"{_rate(figures)}; {wire:.0f} bytes on the wire a sample of {held:.0f}")
         )
-    return lines
+    return lines + [(manifest_side(size), _opening(result, size)) for size in MANIFESTS]
+
+
+def _opening(result: Comparison, size: int) -> str:
+    figures = result.sides[manifest_side(size)]
+    peak, held = figures["peak_bytes"].median / 1e6, figures["held_bytes"].median / 1e6
+    return f"{peak:.1f} MB at most, {held:.1f} MB held, {figures['open_s'].median:.2f} s"
 
 
 def _rate(figures: Mapping[str, Spread]) -> str:
@@ -65,6 +76,9 @@ def plot(result: Comparison, path: Path) -> None:
         [rate.high - rate.median for rate in rates],
     ]
     of_samples.errorbar(THREADS, middle, spread, fmt="o-", capsize=3)
+    apart = result.sides[APART]["samples_per_s"].median
+    of_samples.plot([PROCESSES], [apart], "k^", label=f"{PROCESSES} processes, a thread each")
+    of_samples.legend()
     of_samples.set_xlabel("decoding threads")
     of_samples.set_ylabel("samples a second")
     of_samples.set_ylim(bottom=0)

@@ -6,6 +6,8 @@ import typer
 
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from storage.dataset import open_dataset
+from storage.derived import derivation_of
+from storage.remote.url import RemoteUrl, parse_url
 from storage.verify import Verification, verify_dataset
 
 
@@ -18,6 +20,9 @@ def verify(
     objects: Annotated[
         str | None, typer.Option(help="with --repair: the source of objects, as for generate")
     ] = None,
+    scenes_from: Annotated[
+        str | None, typer.Option(help="with --repair: the folder of scenes, as for generate")
+    ] = None,
     json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
 ) -> None:
     """Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."""
@@ -27,17 +32,14 @@ def verify(
 
         if not json:
             _report(found, fast=fast)
-        make_anew(dataset, found.bad_shards, objects=objects)
+        make_anew(dataset, found.bad_shards, objects=objects, scenes_from=scenes_from)
         found = _verified(dataset, fast=fast, silent=json)
     if json:
         print_json(_as_json(found))
     else:
         _report(found, fast=fast)
-        if found.problems:
-            console.print(
-                "\nNext: trilight verify --repair makes the named shards of a folder anew.",
-                style="bold",
-            )
+        if found.bad_shards:
+            console.print(f"\nNext: {_next_step(found, dataset)}", style="bold")
     if found.problems:
         raise typer.Exit(1)
 
@@ -47,6 +49,18 @@ def _verified(dataset: str, *, fast: bool, silent: bool) -> Verification:
     with progress_bars() as bars:
         task = bars.add_task("shards", total=num_shards, note="", visible=not silent)
         return verify_dataset(dataset, fast=fast, shard_done=lambda _: bars.advance(task))
+
+
+def _next_step(found: Verification, dataset: str) -> str:
+    """Return what makes bad shards whole, which depends on where the dataset is from."""
+    settings = found.manifest.settings
+    if isinstance(parse_url(dataset, what="dataset"), RemoteUrl):
+        return "repair the folder that it was copied from, and copy the named shards again."
+    if (derivation := derivation_of(settings)) is not None:
+        return f"make it again of its sources: trilight shards {derivation.operation}."
+    if settings.get("splits", {}).get("listed_scenes") is not None:
+        return "trilight verify --repair --scenes-from FOLDER makes the named shards anew."
+    return "trilight verify --repair makes the named shards anew."
 
 
 def _as_json(found: Verification) -> dict[str, object]:

@@ -37,6 +37,9 @@ DEFAULT_ALLOWED: tuple[str, ...] = (
 """SPDX identifiers that permit derived and commercial use; attribution and share-alike are kept
 with the object. Not here: unknown, non-commercial (NC) and no-derivatives (ND) licences."""
 
+BY_USER = "stated by the user (--licence)"
+"""Who says so, where `--licence` did."""
+
 _IDENTIFIER = re.compile(r"[A-Za-z0-9.+-]{1,64}")
 _COMPOUND = re.compile(r"(?i)\s(?:AND|OR|WITH)\s")
 _EXPECTED = (
@@ -65,7 +68,7 @@ def stated_licence(licence: str | None) -> StatedLicence:
         return StatedLicence(licence=USER_PROVIDED, licence_source="assumed: the user's own files")
     if not _IDENTIFIER.fullmatch(licence):
         raise TrilightError(f"--licence is {printable(licence)!r}; {_EXPECTED}.")
-    return StatedLicence(licence=licence, licence_source="stated by the user (--licence)")
+    return StatedLicence(licence=licence, licence_source=BY_USER)
 
 
 def require_unstated(licence: str | None, source: str) -> None:

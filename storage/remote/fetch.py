@@ -1,10 +1,9 @@
-"""Bytes of one file on a server: facts about it, all of a small one, or a large one to disk.
+"""Bytes of one file on a server: facts about it, or all of it to a file.
 
 A transfer that breaks off goes on where it stopped, where the server can do that, and ends only
 when all announced bytes are there.
 """
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO
@@ -41,27 +40,21 @@ def facts_of(url: RemoteUrl) -> Facts:
         TrilightError: the driver's package is missing.
     """
     driver = shared_driver(url)
-    found: dict[str, Any] = with_tries(lambda: dict(driver.info(url.root)))
+    found = with_tries(lambda: _fresh_info(driver, url))
     if found.get("type") == "directory":
         raise TransferFailed("download_failed", "is a folder, not a file")
     return Facts(num_bytes=found.get("size"), version=version_of(found))
 
 
+def _fresh_info(driver: Any, url: RemoteUrl) -> dict[str, Any]:
+    """Ask the server itself: one of the drivers keeps listings though it is told not to."""
+    driver.invalidate_cache()
+    return dict(driver.info(url.root))
+
+
 def version_of(facts: Mapping[str, Any]) -> dict[str, str]:
     """Return of a driver's facts about a file what changes when the file does."""
     return {key: str(facts[key]) for key in _VERSION_FIELDS if facts.get(key)}
-
-
-def read_bytes(url: RemoteUrl, *, max_bytes: int) -> bytes:
-    """Return a small file.
-
-    Raises:
-        TransferFailed: as `facts_of`, or it is larger than `max_bytes`.
-        TrilightError: the driver's package is missing.
-    """
-    stream = io.BytesIO()
-    download(url, stream, num_bytes=None, max_bytes=max_bytes)
-    return stream.getvalue()
 
 
 def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_bytes: int) -> None:
@@ -117,7 +110,7 @@ class _Expected:
 
 def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expected) -> None:
     """Ask for piece after piece; buckets always know the size and always give ranges."""
-    facts = driver.info(url.root)
+    facts = _fresh_info(driver, url)
     num_bytes = facts["size"]
     expected.require(num_bytes)
     if not expected.is_same(version_of(facts)):
@@ -129,7 +122,7 @@ def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expec
         if len(piece) != end - start:
             raise Interrupted from EOFError(f"got {len(piece)} of {end - start} bytes")
         stream.write(piece)
-    if num_bytes > PIECE_BYTES and not expected.is_same(version_of(driver.info(url.root))):
+    if num_bytes > PIECE_BYTES and not expected.is_same(version_of(_fresh_info(driver, url))):
         _start_over(stream)
         raise Interrupted from EOFError("the file changed while it was read")
 

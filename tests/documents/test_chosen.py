@@ -6,6 +6,7 @@ import pytest
 
 from pipeline.documents.chosen import choose_scenes
 from storage.manifest import Manifest, ShardEntry
+from storage.member_table import MemberTable
 
 
 def manifest(**counts: int) -> Manifest:
@@ -23,7 +24,9 @@ def manifest(**counts: int) -> Manifest:
                     num_samples=len(keys),
                     num_bytes=0,
                     sha256="",
-                    members=tuple((f"{k:09d}.{s}", 0, 0) for k in keys for s in ("json", "0.exr")),
+                    members=MemberTable(
+                        (f"{k:09d}.{s}", 0, 0) for k in keys for s in ("json", "0.exr")
+                    ),
                 )
             )
     return Manifest(

@@ -62,6 +62,17 @@ def test_existing_scenes_become_a_dataset(trilight: Trilight, scenes: Path, tmp_
     assert len(log.read_text().splitlines()) == before + 1
     assert generate("other", "--workers", "2")["dataset_digest"] == outcome["dataset_digest"]
 
+    whole = (tmp_path / "set" / shard.name).read_bytes()
+    damaged = bytearray(whole)
+    damaged[len(damaged) // 2] ^= 1
+    (tmp_path / "set" / shard.name).write_bytes(damaged)
+    refused = trilight("verify", "set", "--repair")
+    assert "expected --scenes-from FOLDER" in refused.stderr
+    repaired = trilight("verify", "set", "--repair", "--scenes-from", "scenes")
+    assert repaired.returncode == 0, repaired.stdout + repaired.stderr
+    assert (tmp_path / "set" / shard.name).read_bytes() == whole
+    assert open_dataset(str(tmp_path / "set")).manifest == dataset.manifest
+
     with (scenes / "objects/cbox/tall-box.obj").open("a") as stream:
         stream.write("\n")
     changed = trilight("generate", "smoke", "--scenes-from", "scenes", "--out", "set", *SMALL)

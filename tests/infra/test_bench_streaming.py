@@ -25,6 +25,8 @@ def _samples(build: object, options: Options, count: int, done: Callable[[], Non
 
 def test_a_small_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(streaming, "rendered_samples", _samples)
+    monkeypatch.setattr(streaming, "MANIFESTS", (20, 3000))
+    monkeypatch.setattr(streaming_report, "MANIFESTS", (20, 3000))
     rounds: list[None] = []
     result = streaming.run(OPTIONS, lambda: rounds.append(None))
     assert len(rounds) == streaming.num_rounds(OPTIONS)
@@ -36,5 +38,7 @@ def test_a_small_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     lines = dict(streaming_report.rows(result))
     assert "of cat" in lines[streaming.OFF]
     assert "on the wire" in lines[streaming.COLD]
+    assert "samples a second" in lines[streaming.APART]
+    assert "MB held" in lines["opening 3,000 samples"]
     streaming_report.plot(result, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 10_000

@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from infra.cli.app import app
+from infra.repair import repair
 from storage.dataset import open_dataset
 from storage.errors import TrilightError
 from tests.flows.derive_kit import finished, scenes
@@ -41,3 +42,21 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="expected --split, --template or --min-noise-floor"):
         shards("select", a, "--out", out)
     assert not out.exists()
+
+
+def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> None:
+    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
+    shards("merge", a, b, "--out", tmp_path / "ab")
+    (tmp_path / "ab" / "train-000001.tar").unlink()
+    found = CliRunner().invoke(app, ["verify", str(tmp_path / "ab")])
+    assert found.exit_code == 1
+    assert "make it again of its sources: trilight shards merge" in found.output
+    with pytest.raises(TrilightError, match=r"made by `trilight shards merge`; expected one of"):
+        repair(str(tmp_path / "ab"), ["train-000001.tar"], objects=None, scenes_from=None)
+    found = CliRunner().invoke(app, ["verify", str(_without_a_shard(a))])
+    assert "trilight verify --repair makes the named shards anew" in found.output
+
+
+def _without_a_shard(root: Path) -> Path:
+    (root / "train-000000.tar").unlink()
+    return root

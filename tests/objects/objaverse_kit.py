@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.sources import FoundObjects, find_objects
-from tests.objects.http_kit import Site
+from tests.http_server import Site
 
 HOST = "https://huggingface.co/datasets/allenai/objaverse/resolve/main"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from storage.errors import TrilightError
-from tests.objects.http_kit import Site
+from tests.http_server import Site
 from tests.objects.objaverse_kit import (
     FREE,
     IN_ORDER,

@@ -10,14 +10,18 @@ import pytest
 from pipeline.objects.remote import source as remote_source
 from storage.errors import TrilightError
 from storage.remote import url as remote_url
+from tests.http_server import Fault, Site
 from tests.objects.find_kit import find, reasons
-from tests.objects.http_kit import Site
 
 pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
 
 
+def always(path: str, fault: Fault) -> Callable[[Site], None]:
+    return lambda site: site.always.update({path: fault})
+
+
 def fail_always(path: str, status: int) -> Callable[[Site], None]:
-    return lambda site: site.errors.update({path: [-status]})
+    return always(path, Fault(status=status))
 
 
 def grow(site: Site) -> None:
@@ -26,7 +30,7 @@ def grow(site: Site) -> None:
 
 def grow_in_secret(site: Site) -> None:
     grow(site)
-    site.without_length.add("/b.obj")
+    site.always["/b.obj"] = Fault(no_length=True)
 
 
 @pytest.mark.parametrize(
@@ -34,10 +38,10 @@ def grow_in_secret(site: Site) -> None:
     [
         (fail_always("/b.obj", 404), "download_failed", "no such file"),
         (fail_always("/b.obj", 500), "download_failed", "status 500"),
-        (lambda site: site.cut.update({"/b.obj": 3}), "download_failed", "Payload"),
+        (always("/b.obj", Fault(cut_after=3)), "download_failed", "Payload"),
         (grow, "too_large_bytes", "2000 bytes; expected <= 1000"),
         (grow_in_secret, "too_large_bytes", "expected <= 1000"),
-        (lambda site: site.silent.add("/b.obj"), "download_failed", "no answer in time"),
+        (always("/b.obj", Fault(silent=True)), "download_failed", "no answer in time"),
     ],
 )
 def test_one_dead_link_costs_one_object(
@@ -65,7 +69,8 @@ def test_one_dead_link_costs_one_object(
 def test_what_may_pass_is_tried_again(site: Site) -> None:
     site.put("a.obj", "A")
     site.put("b.obj", "B")
-    site.errors = {"/a.obj": [503, 500], "/b.obj": [-404]}
+    site.faults = {"/a.obj": [Fault(status=503), Fault(status=500)]}
+    site.always = {"/b.obj": Fault(status=404)}
     found = find(site.url)
     assert [record.uid for record in found.records] == ["a"]
     assert (site.gets()["/a.obj"], site.gets()["/b.obj"]) == (3, 1)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.digests import sha256_of_file
@@ -14,7 +16,7 @@ from storage.errors import TrilightError
 from storage.manifest import index_shard
 from storage.profiles import PROFILES, Profile, keeps_law
 from storage.sample import encode_sample
-from storage.shard_reader import iterate_samples
+from storage.shard_reader import iterate_samples, scan_members
 from storage.shard_writer import write_shard
 from tests.scenes_by_hand import tiny_sample
 
@@ -167,3 +169,26 @@ def _write_through_full_device() -> None:
             stream.write(b"x")
     except OSError as error:
         raise write_error(Path("/somewhere/shard.tar"), error) from error
+
+
+@settings(deadline=None)  # a busy machine is no failure
+@given(
+    st.from_regex(r"[0-9a-z]{1,30}\.[a-z]{1,30}", fullmatch=True),
+    st.integers(0, 1 << 40),
+    st.booleans(),
+    st.integers(0, 511),
+)
+def test_headers_are_read_as_tarfile_reads_them(name: str, size: int, gnu: bool, at: int) -> None:
+    """And one in which a byte has changed is refused, wherever it is."""
+    member = tarfile.TarInfo(name)
+    member.size = size if gnu else size % (1 << 33)
+    header = bytearray(member.tobuf(tarfile.GNU_FORMAT if gnu else tarfile.USTAR_FORMAT))
+    try:
+        (found,) = scan_members(io.BytesIO(header + bytes(1024)), "x")
+    except TrilightError as error:
+        assert f"claims {member.size} bytes" in str(error) or "is cut short" in str(error)
+    else:
+        assert (f"{found.key}.{found.suffix}", found.num_bytes) == (name, 0) == (name, member.size)
+    header[at] ^= 0x04  # in the sum's own field, 4 turns digits into digits and spaces into $
+    with pytest.raises(TrilightError):
+        list(scan_members(io.BytesIO(header + bytes(1024)), "x"))

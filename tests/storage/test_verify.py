@@ -1,6 +1,7 @@
 """Verifying: every bad shard and sample is named, and nothing that is whole."""
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def test_a_key_in_two_shards_is_named(dataset: Dataset) -> None:
 @pytest.mark.parametrize("fast", [False, True])
 def test_sizes_counts_and_members_are_compared(dataset: Dataset, fast: bool) -> None:
     root = dataset.folder.root
-    shards = [dataclasses.asdict(shard) for shard in dataset.manifest.shards]
+    shards = json.loads(dataset.folder.manifest.read_text())["shards"]
     shards[0]["num_samples"] += 1
     shards[1]["members"] = [[n, at + 512, size] for n, at, size in shards[1]["members"]]
     edit_manifest(dataset, shards=shards)

@@ -59,6 +59,21 @@ def test_equal_states_give_equal_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
+def test_damage_that_was_met_is_not_forgotten(tmp_path: Path) -> None:
+    settings = tiny_run(most_unusable=3)
+    state = new_state(settings)
+    error = TrilightError("x")
+    for name in ("b", "a"):
+        state.unusable.add(name, 1, error)
+    save_checkpoint(tmp_path / "c", state, settings, DIGEST)
+    loaded = load_checkpoint(tmp_path / "c", settings, DIGEST).unusable
+    assert loaded.met == state.unusable.met and loaded.messages == ()
+    loaded.add("a", 1, error)
+    loaded.add("c", 1, error)
+    with pytest.raises(TrilightError, match="4 samples are unusable; expected at most 3"):
+        loaded.add("d", 1, error)
+
+
 def test_skipped_steps_do_not_count_as_updates(tmp_path: Path) -> None:
     state = trained(2)
     state.step, state.skipped_steps = 5, 3

@@ -9,13 +9,16 @@ from storage.dataset import Dataset
 from storage.errors import TrilightError
 from storage.remote import tries
 from storage.training_data import NO_MANIFEST
-from tests.storage.remote.fault_server import Fault, Server, serve
+from tests.http_server import Fault, Site, serve
 from tests.train.kit import tiny_run
 from tests.train.toy import write_toy_dataset
 from train.progress import Silent
 from train.run import train_run
 
 pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
+
+
+SHARDS_OF_THREE = ("train-000000.tar", "train-000001.tar")
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +36,7 @@ def weights(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> bytes
 
 
 @pytest.fixture
-def server(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+def server(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     monkeypatch.setattr(tries, "PAUSE_S", 0.0)
@@ -55,21 +58,21 @@ class StopAt(Silent):
 
 
 def test_a_run_begun_in_a_folder_goes_on_from_a_server(
-    dataset: Dataset, weights: bytes, server: Server, tmp_path: Path
+    dataset: Dataset, weights: bytes, server: Site, tmp_path: Path
 ) -> None:
     """In the middle of an epoch, over a bad line, with another number of threads."""
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         train_run(tiny_run(), data=[str(dataset.folder.root)], out=out, progress=StopAt(7))
     faults = [Fault(status=503), Fault(cut_after=5000), Fault(flip=True)]
-    server.faults = {f"train-{number:06d}.tar": list(faults) for number in range(3)}
+    server.faults = {f"/train-{number:06d}.tar": list(faults) for number in range(3)}
     result = train_run(tiny_run(), data=[server.url], out=out, resume=True, workers=3)
     assert result.folder.weights.read_bytes() == weights
     assert result.unusable == ()
 
 
 def test_a_list_gives_the_same_weights_and_says_what_it_lacks(
-    dataset: Dataset, weights: bytes, server: Server, tmp_path: Path
+    dataset: Dataset, weights: bytes, server: Site, tmp_path: Path
 ) -> None:
     listener = StopAt(99)
     pattern = f"{server.url}/{{train-000000,train-000001,train-000002,validation-000000}}.tar"
@@ -93,3 +96,30 @@ def test_damaged_data_is_left_out_when_it_is_allowed(dataset: Dataset, tmp_path:
     (message,) = result.unusable
     assert "train-000002.tar" in message
     assert message in result.folder.summary.read_text().replace("\\n", "\n")
+
+
+def test_the_budget_of_damage_is_the_run_s_and_not_the_process_s(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    """Damage that was met before a stop counts after it, though it is whole again by then."""
+    root, out = tmp_path / "damaged", tmp_path / "out"
+    copied = write_toy_dataset(root, train=7, validation=2, per_shard=3)
+    whole = {name: copied.folder.shard(name).read_bytes() for name in SHARDS_OF_THREE}
+
+    def damage(name: str) -> None:
+        data = bytearray(whole[name])
+        data[len(data) // 2] ^= 1
+        copied.folder.shard(name).write_bytes(data)
+
+    first, second = SHARDS_OF_THREE
+    settings = tiny_run(most_unusable=3)
+    damage(first)
+    with pytest.raises(KeyboardInterrupt):
+        train_run(settings, data=[str(root)], out=out, progress=StopAt(7))
+    copied.folder.shard(first).write_bytes(whole[first])
+    damage(second)
+    with pytest.raises(TrilightError, match="6 samples are unusable; expected at most 3"):
+        train_run(settings, data=[str(root)], out=out, resume=True)
+    copied.folder.shard(second).write_bytes(whole[second])
+    damage(first)
+    assert len(train_run(settings, data=[str(root)], out=out, resume=True).unusable) == 1

@@ -2,12 +2,16 @@
 
 Each function returns a scene whose path-traced picture would be exactly the one it returns. They
 hold for every scene that Trilight makes: materials are isotropic, and colour channels never mix.
+
+Tensors are moved about by numpy, which shares their memory: torch would wake threads of its own in
+every decoding thread, and they wait for cores in loops that took four times the work's own time.
 """
 
 import dataclasses
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from storage.conventions import DIFFUSE, EMISSION, SPECULAR
@@ -29,15 +33,17 @@ def mirrored(scene: TrainingScene) -> TrainingScene:
     winding), the poses (whose own x axis turns too, so that they stay rotations), and the pictures.
     """
     old = scene.tensors
-    flip_3 = torch.tensor([-1.0, 1.0, 1.0])
-    flip_44 = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0]))
+    sides_3 = np.array([-1, 1, 1], np.float32)
+    sides_4 = np.array([-1, 1, 1, 1], np.float32)
     tensors = dataclasses.replace(
         old,
-        triangles_T33=(old.triangles_T33 * flip_3).flip(1),
-        normals_T33=(old.normals_T33 * flip_3).flip(1),
-        c2w_V44=flip_44 @ old.c2w_V44 @ flip_44,
+        triangles_T33=_tensor((old.triangles_T33.numpy() * sides_3)[:, ::-1]),
+        normals_T33=_tensor((old.normals_T33.numpy() * sides_3)[:, ::-1]),
+        # the reflection before and after: row and column of x change their signs
+        c2w_V44=_tensor(sides_4[:, None] * old.c2w_V44.numpy() * sides_4),
     )
-    return dataclasses.replace(scene, tensors=tensors, target_VRR3=scene.target_VRR3.flip(2))
+    target_VRR3 = _tensor(scene.target_VRR3.numpy()[:, :, ::-1])
+    return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3)
 
 
 def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
@@ -45,11 +51,11 @@ def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
     columns = np.arange(scene.tensors.material_T10.shape[1])
     for channels in (DIFFUSE, SPECULAR, EMISSION):
         columns[channels] = columns[channels][order]
-    material_T10 = scene.tensors.material_T10[:, torch.from_numpy(columns)]
+    material_T10 = _tensor(scene.tensors.material_T10.numpy()[:, columns])
     return dataclasses.replace(
         scene,
         tensors=dataclasses.replace(scene.tensors, material_T10=material_T10),
-        target_VRR3=scene.target_VRR3[..., torch.from_numpy(order.copy())],
+        target_VRR3=_tensor(scene.target_VRR3.numpy()[..., order]),
     )
 
 
@@ -59,7 +65,7 @@ def with_vertices_turned(scene: TrainingScene, turn_T: np.ndarray) -> TrainingSc
     A triangle is the same triangle whichever vertex is named first; the network's rotary positions
     are not the same, so it has to be shown.
     """
-    order_T3 = torch.from_numpy((np.arange(3) + turn_T[:, None]) % 3)
+    order_T3 = (np.arange(3) + turn_T[:, None]) % 3
     old = scene.tensors
     tensors = dataclasses.replace(
         old,
@@ -71,12 +77,19 @@ def with_vertices_turned(scene: TrainingScene, turn_T: np.ndarray) -> TrainingSc
 
 def with_views(scene: TrainingScene, views: np.ndarray) -> TrainingScene:
     """Return the scene seen by some of its cameras."""
-    rows = torch.from_numpy(views.copy())
+    old = scene.tensors
     tensors = dataclasses.replace(
-        scene.tensors, c2w_V44=scene.tensors.c2w_V44[rows], fov_deg_V=scene.tensors.fov_deg_V[rows]
+        old,
+        c2w_V44=_tensor(old.c2w_V44.numpy()[views]),
+        fov_deg_V=_tensor(old.fov_deg_V.numpy()[views]),
     )
-    return dataclasses.replace(scene, tensors=tensors, target_VRR3=scene.target_VRR3[rows])
+    target_VRR3 = _tensor(scene.target_VRR3.numpy()[views])
+    return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3)
 
 
-def _take_vertices(values_T33: Tensor, order_T3: Tensor) -> Tensor:
-    return values_T33.gather(1, order_T3[..., None].expand(-1, -1, 3))
+def _take_vertices(values_T33: Tensor, order_T3: NDArray[np.int64]) -> Tensor:
+    return _tensor(np.take_along_axis(values_T33.numpy(), order_T3[..., None], axis=1))
+
+
+def _tensor(values: NDArray[np.float32]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values))

@@ -18,11 +18,12 @@ from model.weights import load_tensors
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 from storage.safe_read import read_safetensors
+from train.data.unusable import Unusable
 from train.loop.state import TrainState, new_state
 from train.settings import TrainSettings, settings_record
 
 HEADER_KEY = "trilight_checkpoint"
-"""Metadata entry with counters, settings and the digest of the data."""
+"""Metadata entry with counters, damage met, settings and the digest of the data."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """AdamW's memories per weight; its step count is the same for all."""
@@ -40,6 +41,7 @@ def save_checkpoint(
     header = {
         "step": state.step,
         "skipped_steps": state.skipped_steps,
+        "unusable": dict(state.unusable.met),
         "settings": settings_record(settings),
         "data_digest": data_digest,
     }
@@ -66,6 +68,7 @@ def load_checkpoint(path: Path, settings: TrainSettings, data_digest: str) -> Tr
     _require_same("data", {"digest": header["data_digest"]}, {"digest": data_digest})
     state = new_state(settings)
     state.step, state.skipped_steps = header["step"], header["skipped_steps"]
+    state.unusable = Unusable(settings.most_unusable, header["unusable"])
     load_tensors(state.model, _part(arrays, "model"))
     _load_moments(state, arrays)
     return state

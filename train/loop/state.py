@@ -1,4 +1,4 @@
-"""What changes while a run goes on: weights, AdamW's memories, and two counters.
+"""What changes while a run goes on: weights, AdamW's memories, two counters, and damage met.
 
 Everything else (order, augmentation, learning rate) is a function of the settings and the step.
 """
@@ -9,6 +9,7 @@ import torch
 
 from model.renderformer import RenderFormer
 from storage.seeds import seed_for
+from train.data.unusable import Unusable
 from train.loop.optim import make_optimizer
 from train.settings import TrainSettings
 
@@ -21,6 +22,8 @@ class TrainState:
     """The network."""
     optimizer: torch.optim.AdamW
     """Over the weights of `model`."""
+    unusable: Unusable
+    """The damaged data that was met so far, and how much there may be."""
     step: int = 0
     """Steps done, including skipped ones; also the position in the data."""
     skipped_steps: int = 0
@@ -32,4 +35,8 @@ def new_state(settings: TrainSettings) -> TrainState:
     model = RenderFormer(settings.model)
     generator = torch.Generator().manual_seed(seed_for(settings.seed, "weights"))
     model.initialise(generator)
-    return TrainState(model=model, optimizer=make_optimizer(model, settings))
+    return TrainState(
+        model=model,
+        optimizer=make_optimizer(model, settings),
+        unusable=Unusable(settings.most_unusable),
+    )

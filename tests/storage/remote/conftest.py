@@ -9,7 +9,7 @@ from storage.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.remote import tries, url
 from tests.documents.dataset_by_hand import edit_manifest, five_scenes
-from tests.storage.remote.fault_server import Server, serve
+from tests.http_server import Site, serve
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def local(tmp_path: Path) -> Dataset:
 
 
 @pytest.fixture
-def server(cache: Path, local: Dataset, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+def server(cache: Path, local: Dataset, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     monkeypatch.setattr(url, "_SILENCE_S", 0.5)
     url._driver_of.cache_clear()  # the silence above is an option of the driver
     with serve(local.folder.root) as running:

@@ -4,6 +4,7 @@ import fcntl
 import json
 import multiprocessing
 import os
+import signal
 import threading
 import time
 from pathlib import Path
@@ -15,15 +16,16 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.cache import ShardCache, shard_cache
 from storage.remote.url import RemoteUrl, parse_url
-from tests.storage.remote.fault_server import Fault, Server
+from tests.http_server import Fault, Site
+from tests.storage.remote.waiting import until
 
 BYTES = 1000
 
 
-def put(server: Server, *names: str) -> list[RemoteUrl]:
+def put(server: Site, *names: str) -> list[RemoteUrl]:
     """Serve files of BYTES bytes each, that differ."""
     for name in names:
-        (server.root / name).write_bytes(name[:1].encode() * BYTES)
+        server.put(name, name[:1].encode() * BYTES)
     return [remote(f"{server.url}/{name}") for name in names]
 
 
@@ -43,13 +45,11 @@ def fetch(cache: ShardCache, url: RemoteUrl) -> bytes:
         return stream.read()
 
 
-def gets(server: Server, name: str) -> int:
-    return [got for got, _ in server.gets].count(name)
+def gets(server: Site, name: str) -> int:
+    return server.gets()[f"/{name}"]
 
 
-def test_equal_names_of_different_places_do_not_meet(server: Server, cache: Path) -> None:
-    for folder in "ab":
-        (server.root / folder).mkdir()
+def test_equal_names_of_different_places_do_not_meet(server: Site, cache: Path) -> None:
     urls = put(server, "a/x.tar", "b/x.tar")
     store = ShardCache(cache, 10**6)
     found = [
@@ -59,7 +59,7 @@ def test_equal_names_of_different_places_do_not_meet(server: Server, cache: Path
     assert found == [b"a" * BYTES, b"b" * BYTES]
 
 
-def test_what_was_not_read_for_longest_goes_first(server: Server, cache: Path) -> None:
+def test_what_was_not_read_for_longest_goes_first(server: Site, cache: Path) -> None:
     a, b, c, d = put(server, "a.tar", "b.tar", "c.tar", "d.tar")
     store = ShardCache(cache, 3 * BYTES)
     for number, url in enumerate((a, b, c, a)):
@@ -76,7 +76,7 @@ def test_what_was_not_read_for_longest_goes_first(server: Server, cache: Path) -
     assert gets(server, "b.tar") == 2
 
 
-def test_what_is_being_read_stays(server: Server, cache: Path) -> None:
+def test_what_is_being_read_stays(server: Site, cache: Path) -> None:
     a, b, c = put(server, "a.tar", "b.tar", "c.tar")
     store = ShardCache(cache, BYTES)
     with store.open(a, num_bytes=BYTES, sha256=digest("a")) as stream:
@@ -88,17 +88,17 @@ def test_what_is_being_read_stays(server: Server, cache: Path) -> None:
     assert [path.read_bytes()[:1] for path in cache.iterdir()] == [b"b"]
 
 
-def test_without_a_hash_the_version_tells(server: Server, cache: Path) -> None:
+def test_without_a_hash_the_version_tells(server: Site, cache: Path) -> None:
     (url,) = put(server, "a.tar")
     store = ShardCache(cache, 10**6)
     for content in (b"a" * BYTES, b"a" * BYTES, b"z" * BYTES):
-        (server.root / "a.tar").write_bytes(content)
+        server.put("a.tar", content)
         with store.open(url, num_bytes=None, sha256=None) as stream:
             assert stream.read() == content
     assert gets(server, "a.tar") == 2
 
 
-def test_without_a_hash_a_query_may_tell_two_files_apart(server: Server, cache: Path) -> None:
+def test_without_a_hash_a_query_may_tell_two_files_apart(server: Site, cache: Path) -> None:
     put(server, "a.tar")
     for query in ("part=1", "part=2"):
         server.needed_query = query
@@ -107,9 +107,9 @@ def test_without_a_hash_a_query_may_tell_two_files_apart(server: Server, cache: 
     assert len(list(cache.iterdir())) == 2
 
 
-def test_threads_fetch_a_shard_once(server: Server, cache: Path) -> None:
+def test_threads_fetch_a_shard_once(server: Site, cache: Path) -> None:
     (url,) = put(server, "a.tar")
-    server.faults["a.tar"] = [Fault(stall_after=10)]  # so that all are waiting together
+    server.faults["/a.tar"] = [Fault(stall_after=10)]  # so that all are waiting together
     store = ShardCache(cache, 10**6)
     found: list[bytes] = []
     threads = [threading.Thread(target=lambda: found.append(fetch(store, url))) for _ in range(8)]
@@ -118,7 +118,7 @@ def test_threads_fetch_a_shard_once(server: Server, cache: Path) -> None:
     for thread in threads:
         thread.join()
     assert found == [b"a" * BYTES] * 8
-    assert [asked for _, asked in server.gets] == ["", "bytes=10-"]
+    assert server.ranges_of("/a.tar") == ["", "bytes=10-"]
 
 
 def _read_all(names: list[str], url: str, root: str, start: str) -> None:
@@ -129,7 +129,7 @@ def _read_all(names: list[str], url: str, root: str, start: str) -> None:
         assert fetch(store, remote(f"{url}/{name}")) == name[:1].encode() * BYTES
 
 
-def test_processes_share_a_cache_that_is_too_small(server: Server, cache: Path) -> None:
+def test_processes_share_a_cache_that_is_too_small(server: Site, cache: Path) -> None:
     """Every read is right while the others evict; afterwards the cache keeps its bound."""
     names = [f"{letter}.tar" for letter in "abcdef"]
     put(server, *names)
@@ -148,7 +148,7 @@ def test_processes_share_a_cache_that_is_too_small(server: Server, cache: Path) 
     assert all(len(path.read_bytes()) == BYTES for path in cache.iterdir())
 
 
-def test_a_fetcher_that_was_killed_holds_nobody_up(server: Server, cache: Path) -> None:
+def test_a_fetcher_that_was_killed_holds_nobody_up(server: Site, cache: Path) -> None:
     (url,) = put(server, "a.tar")
     store = ShardCache(cache, 10**6)
     cache.mkdir(parents=True)
@@ -164,7 +164,37 @@ def test_a_fetcher_that_was_killed_holds_nobody_up(server: Server, cache: Path) 
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # nobody holds it
 
 
-def test_names_in_the_cache_hold_no_secret(server: Server, cache: Path) -> None:
+def _read_one(url: str, root: str) -> None:
+    assert fetch(ShardCache(Path(root), 10**6), remote(url)) == b"a" * BYTES
+
+
+def test_a_kill_in_the_middle_of_a_download_leaves_nothing_wrong(server: Site, cache: Path) -> None:
+    """While another process waits for the same shard: it takes over, and gets all of it."""
+    put(server, "a.tar")
+    server.faults["/a.tar"] = [Fault(stall_after=BYTES // 2)]
+    context = multiprocessing.get_context("spawn")
+    arguments = (f"{server.url}/a.tar", str(cache))
+    first, second = (context.Process(target=_read_one, args=arguments) for _ in range(2))
+    first.start()
+    until(lambda: server.sent == BYTES // 2)
+    second.start()
+    until(lambda: _waits_for_a_lock(second.pid))
+    assert not [path for path in cache.iterdir() if path.suffix != ".part"]
+    first.kill()
+    first.join()
+    second.join()
+    assert (first.exitcode, second.exitcode) == (-signal.SIGKILL, 0)
+    (kept,) = [path for path in cache.iterdir() if path.suffix != ".part"]
+    assert kept.read_bytes() == b"a" * BYTES
+    assert server.ranges_of("/a.tar") == ["", ""], "what a killed process has left is not trusted"
+
+
+def _waits_for_a_lock(process: int | None) -> bool:
+    waiting = (line.split() for line in Path("/proc/locks").read_text().splitlines())
+    return any(row[1] == "->" and int(row[5]) == process for row in waiting)
+
+
+def test_names_in_the_cache_hold_no_secret(server: Site, cache: Path) -> None:
     put(server, "a.tar")
     server.needed_query = "key=s3cret"
     url = remote(f"{server.url}/a.tar?key=s3cret")
@@ -180,7 +210,7 @@ def test_a_wrong_size_is_named(monkeypatch: pytest.MonkeyPatch, text: str) -> No
         shard_cache()
 
 
-def test_a_manifest_that_lies_about_a_hash_is_refused(server: Server, local: Dataset) -> None:
+def test_a_manifest_that_lies_about_a_hash_is_refused(server: Site, local: Dataset) -> None:
     record = json.loads(local.folder.manifest.read_text())
     for shard in record["shards"]:
         shard["sha256"] = "0" * 64

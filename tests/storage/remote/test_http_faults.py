@@ -9,9 +9,10 @@ from storage.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
 from storage.sample import Sample, encode_sample
 from storage.shard_places import listed_shards
-from tests.storage.remote.fault_server import Fault, Server
+from tests.http_server import Fault, Site
 
 SHARD = "train-000000.tar"
+PATH = f"/{SHARD}"
 
 
 def read(url: str) -> list[Sample]:
@@ -23,7 +24,7 @@ def expected(local: Dataset) -> list[dict[str, bytes]]:
     return [encode_sample(sample) for sample in local.read_shard(local.shards_of("train")[0])]
 
 
-def test_a_dataset_is_the_same_through_a_server(server: Server, local: Dataset) -> None:
+def test_a_dataset_is_the_same_through_a_server(server: Site, local: Dataset) -> None:
     remote = open_dataset(f"{server.url}/")
     assert remote.manifest == local.manifest
     assert remote.objects_lock() == local.objects_lock()
@@ -56,23 +57,22 @@ def test_a_dataset_is_the_same_through_a_server(server: Server, local: Dataset) 
 )
 @pytest.mark.parametrize("ranges", [True, False])
 def test_what_passes_by_itself_is_outlived(
-    server: Server, local: Dataset, cache: Path, faults: list[Fault], ranges: bool
+    server: Site, local: Dataset, cache: Path, faults: list[Fault], ranges: bool
 ) -> None:
     if len(faults) > 4 and not ranges:
         pytest.skip("without ranges, a line that always breaks gets nowhere")
-    server.faults[SHARD], server.ranges = list(faults), ranges
+    server.faults[PATH], server.ranges = list(faults), ranges
     assert [encode_sample(sample) for sample in read(server.url)] == expected(local)
-    assert not server.faults[SHARD]
+    assert not server.faults[PATH]
     (kept,) = cache.iterdir()
     assert kept.read_bytes() == (local.folder.root / SHARD).read_bytes()
 
 
-def test_a_transfer_goes_on_where_it_broke(server: Server, local: Dataset) -> None:
+def test_a_transfer_goes_on_where_it_broke(server: Site, local: Dataset) -> None:
     size = local.shards_of("train")[0].num_bytes
-    server.faults[SHARD] = [Fault(cut_after=size // 2), Fault(cut_after=size // 4)]
+    server.faults[PATH] = [Fault(cut_after=size // 2), Fault(cut_after=size // 4)]
     read(server.url)
-    ranges = [asked for name, asked in server.gets if name == SHARD]
-    assert ranges == ["", f"bytes={size // 2}-", f"bytes={size // 2 + size // 4}-"]
+    assert server.ranges_of(PATH) == ["", f"bytes={size // 2}-", f"bytes={size // 2 + size // 4}-"]
     beside = (local.folder.root / "manifest.json").stat().st_size
     assert server.sent == size + beside, "no byte of the shard came twice"
 
@@ -87,10 +87,8 @@ def test_a_transfer_goes_on_where_it_broke(server: Server, local: Dataset) -> No
         (Fault(flip=True), "not those of the manifest .sha256 differs, 2 times"),
     ],
 )
-def test_what_stays_broken_is_named(
-    server: Server, cache: Path, fault: Fault, message: str
-) -> None:
-    server.always[SHARD] = fault
+def test_what_stays_broken_is_named(server: Site, cache: Path, fault: Fault, message: str) -> None:
+    server.always[PATH] = fault
     server.needed_query = "key=s3cret"
     with pytest.raises(TrilightError, match=message) as caught:
         read(f"{server.url.replace('//', '//ada:pa55@')}?key=s3cret")
@@ -98,31 +96,28 @@ def test_what_stays_broken_is_named(
     assert SHARD in text and "expected" in text and "\n" not in text
     assert "s3cret" not in text and "ada" not in text and "pa55" not in text
     assert not list(cache.iterdir()), "nothing is left, under any name"
-    tried = [name for name, _ in server.gets if name == SHARD]
-    assert len(tried) == {403: 1, 404: 1, 500: 5}.get(fault.status, 2 if fault.flip else 5)
+    assert server.gets()[PATH] == {403: 1, 404: 1, 500: 5}.get(fault.status, 2 if fault.flip else 5)
 
 
-def test_a_shard_of_another_size_is_named_at_once(server: Server, local: Dataset) -> None:
+def test_a_shard_of_another_size_is_named_at_once(server: Site, local: Dataset) -> None:
     path = local.folder.root / SHARD
     content = path.read_bytes()
     path.write_bytes(content + bytes(512))
     with pytest.raises(TrilightError, match=rf"has {len(content) + 512} bytes; expected"):
         read(server.url)
-    assert [name for name, _ in server.gets].count(SHARD) == 1
+    assert server.gets()[PATH] == 1
 
 
-def test_a_file_that_changes_meanwhile_is_read_from_the_start(
-    server: Server, local: Dataset
-) -> None:
+def test_a_file_that_changes_meanwhile_is_read_from_the_start(server: Site, local: Dataset) -> None:
     """Without a manifest there is no hash that would tell, but the server names the version."""
     path = local.folder.root / SHARD
     other = (local.folder.root / "train-000001.tar").read_bytes()
-    server.faults[SHARD] = [Fault(stall_after=4000)]
+    server.faults[PATH] = [Fault(stall_after=4000)]
     (place,) = listed_shards([f"{server.url}/{SHARD}"])
-    facts_asked = len(server.gets)
+    assert PATH not in server.gets()
 
     def change() -> None:
-        while len(server.gets) == facts_asked:
+        while PATH not in server.gets():
             pass
         fresh = path.with_suffix(".fresh")
         fresh.write_bytes(other)
@@ -135,7 +130,7 @@ def test_a_file_that_changes_meanwhile_is_read_from_the_start(
     changer.join()
 
 
-def test_a_manifest_that_is_not_there_is_named(server: Server) -> None:
+def test_a_manifest_that_is_not_there_is_named(server: Site) -> None:
     with pytest.raises(TrilightError, match=r"no manifest\.json here"):
         open_dataset(f"{server.url}/nowhere")
     server.needed_query = "key"
@@ -146,7 +141,7 @@ def test_a_manifest_that_is_not_there_is_named(server: Server) -> None:
 
 
 def test_a_cache_that_cannot_be_written_is_named(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "file"))

@@ -6,8 +6,7 @@ import signal
 import socket
 import subprocess
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,6 +16,7 @@ from storage.remote import tries
 from storage.remote import url as remote_url
 from storage.sample import encode_sample
 from storage.verify import verify_dataset
+from tests.storage.remote.waiting import until
 
 NGINX = shutil.which("nginx", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin")
 SHARD = "train-000000.tar"
@@ -64,12 +64,6 @@ class Nginx:
     def requests(self) -> list[list[str]]:
         """Return method, file, status, range and bytes of what was asked."""
         return [line.split() for line in (self.here / "access.log").read_text().splitlines()]
-
-
-def until(happened: Callable[[], object]) -> None:
-    """Wait for something that other processes do; the test's own time limit ends it."""
-    while not happened():
-        time.sleep(0.02)
 
 
 @pytest.fixture

@@ -1,0 +1,145 @@
+"""The smallest and largest things that a training run may be made to read, or is refused."""
+
+import itertools
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from infra.bench.manifests import SAMPLES_PER_SHARD, write_manifest_of
+from pipeline.flows.derive_dataset import derive_dataset
+from pipeline.shards.derive import Derive, derive_shards
+from pipeline.shards.finished import open_finished
+from pipeline.shards.plans import Selection
+from storage.dataset import open_dataset
+from storage.errors import TrilightError
+from storage.layout import DatasetFolder
+from storage.manifest import read_manifest, write_manifest
+from storage.training_data import open_training_data
+from storage.verify import verify_dataset
+from tests.flows.derive_kit import finished, scenes
+from tests.train.toy import write_toy_dataset
+from train.data.order import OrderSettings, Share, batches_from, windows_from
+from train.data.stream import StreamSettings, stream_batches
+from train.data.unusable import Unusable
+
+
+def keys(
+    root: Path, batch_size: int, count: int, *, first: int = 0, window: int = 4, ranks: int = 1
+) -> list[list[str]]:
+    """Return the keys of the batches first, first + 1, ... of a dataset."""
+    settings = StreamSettings(
+        seed=0, window=window, batch_size=batch_size, resolution=8, views_per_scene=1
+    )
+    shares = [_keys(root, settings, first, count, Share(rank=r, world_size=ranks))
+              for r in range(ranks)]  # fmt: skip
+    return [sorted(itertools.chain(*parts)) for parts in zip(*shares, strict=True)]
+
+
+def _keys(
+    root: Path, settings: StreamSettings, first: int, count: int, share: Share
+) -> list[list[str]]:
+    batches = stream_batches(
+        open_training_data([str(root)]).split("train"),
+        settings,
+        first,
+        share=share,
+        workers=1,
+        unusable=Unusable(0),
+    )
+    with closing(batches):
+        return [[scene.key for scene in batch] for batch in itertools.islice(batches, count)]
+
+
+def every(train: int) -> list[str]:
+    return [f"{index:09d}" for index in range(train)]
+
+
+@pytest.mark.parametrize(
+    ("train", "per_shard", "views"),
+    [(1, 1, 1), (5, 1, 1), (5, 99, 2)],
+    ids=["one sample of one view", "one sample a shard", "one shard"],
+)
+@pytest.mark.parametrize("window", [1, 1000])
+def test_small_splits_are_shown_whole_in_every_epoch(
+    tmp_path: Path, train: int, per_shard: int, views: int, window: int
+) -> None:
+    write_toy_dataset(
+        tmp_path, train=train, validation=1, per_shard=per_shard, resolution=8, views=views
+    )
+    assert keys(tmp_path, train, 3, window=window) == [every(train)] * 3
+
+
+def test_a_batch_may_be_larger_than_the_split(tmp_path: Path) -> None:
+    """It then holds scenes of several epochs, each as often as there are epochs, one more or less;
+    and a rank for every scene of it changes nothing."""
+    write_toy_dataset(tmp_path, train=3, validation=1, per_shard=2, resolution=8)
+    (batch, other) = keys(tmp_path, 8, 2)
+    assert len(batch) == len(other) == 8
+    counts = [(batch + other).count(key) for key in every(3)]
+    assert sorted(counts) == [5, 5, 6]
+    assert keys(tmp_path, 8, 2, ranks=8) == [batch, other]
+
+
+def test_a_batch_in_a_distant_epoch_is_had_at_once(tmp_path: Path) -> None:
+    write_toy_dataset(tmp_path, train=5, validation=1, per_shard=2, resolution=8)
+    first = 10**12
+    assert keys(tmp_path, 5, 2, first=first) == [every(5)] * 2  # 5 x 10^12 begins an epoch
+    order = OrderSettings(seed=2**63, window=2)
+    windows = windows_from(3, lambda shard: 7, order, 3 * first)
+    batch = next(batches_from(windows, 3 * first, 64))
+    assert [place.position for place in batch] == list(range(3 * first, 3 * first + 64))
+
+
+def test_pixels_that_do_not_divide_the_data_s_are_refused(tmp_path: Path) -> None:
+    write_toy_dataset(tmp_path, train=1, validation=1, per_shard=1, resolution=8, views=1)
+    settings = StreamSettings(seed=0, window=1, batch_size=1, resolution=3, views_per_scene=1)
+    with pytest.raises(TrilightError, match="resolution 3: expected a divisor of 8"):
+        _keys(tmp_path, settings, 0, 1, Share())
+
+
+@pytest.mark.parametrize("num_samples", [0, 1, SAMPLES_PER_SHARD + 1, 20_000])
+def test_an_index_of_any_length_comes_back(tmp_path: Path, num_samples: int) -> None:
+    write_manifest_of(tmp_path, num_samples)
+    path = DatasetFolder(tmp_path).manifest
+    manifest, text = read_manifest(path), path.read_bytes()
+    assert sum(len(shard.keys) for shard in manifest.shards) == num_samples
+    write_manifest(path, manifest)
+    assert path.read_bytes() == text
+    data = open_training_data([str(tmp_path)])
+    assert len(data.splits) == min(num_samples, 1)
+    if not num_samples:
+        with pytest.raises(TrilightError, match="the train split holds no scene"):
+            data.split("train")
+
+
+def _derived(source: Path, out: Path, derive: Derive) -> list[tuple[str, int]]:
+    """Return split and size of the shards that are made of a dataset of 4 and 2 scenes."""
+    derive_shards([open_finished(str(source))], derive, DatasetFolder(out))
+    assert verify_dataset(out).problems == []
+    return [(shard.split, shard.num_samples) for shard in open_dataset(str(out)).manifest.shards]
+
+
+@pytest.mark.parametrize(
+    ("size", "made"),
+    [
+        (1, [("train", 1)] * 4 + [("test", 1)] * 2),
+        (10**9, [("train", 4), ("test", 2)]),
+    ],
+)
+def test_shards_of_one_scene_and_one_shard_of_all(
+    tmp_path: Path, size: int, made: list[tuple[str, int]]
+) -> None:
+    source = finished(tmp_path / "a", scenes(0))
+    derive = Derive(operation="reshard", scenes_per_shard=size)
+    assert sorted(_derived(source, tmp_path / "b", derive)) == sorted(made)
+
+
+def test_a_selection_of_one_scene_is_a_dataset_and_of_none_is_refused(tmp_path: Path) -> None:
+    source = finished(tmp_path / "a", scenes(0))  # the best floor is 41 dB, of scene 5
+    one = Derive(operation="select", selection=Selection(min_noise_floor_db=40.9))
+    assert _derived(source, tmp_path / "one", one) == [("test", 1)]
+    none = Derive(operation="select", selection=Selection(min_noise_floor_db=41.1))
+    with pytest.raises(TrilightError, match="none of the 6 scenes"):
+        derive_dataset([str(source)], none, tmp_path / "none")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "one"]

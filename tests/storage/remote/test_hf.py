@@ -1,0 +1,104 @@
+"""A dataset repository of the Hugging Face hub, from a small server that answers as the hub does.
+
+The package reads where the hub is when it is imported, so it is asked in a process of its own.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from storage.dataset import Dataset
+from storage.digests import sha256_hex
+from storage.sample import encode_sample
+from tests.conftest import ROOT
+from tests.storage.remote.hub_server import REPOSITORY, serve_hub
+
+pytest.importorskip("huggingface_hub", reason="hf:// needs the package huggingface_hub")
+
+SHARD = "train-000000.tar"
+DATASET = f"hf://datasets/{REPOSITORY}"
+
+READ = """
+from storage.dataset import open_dataset
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.sample import encode_sample
+dataset = open_dataset(sys.argv[1])
+said = []
+for shard in dataset.manifest.shards:
+    try:
+        for sample in dataset.read_shard(shard):
+            said.append(sha256_hex(b"".join(encode_sample(sample).values())))
+    except TrilightError as error:
+        said.append(str(error))
+"""
+
+VERIFY = """
+from storage.verify import verify_dataset
+said = [verify_dataset(sys.argv[1], fast=fast).bad_shards for fast in (True, False)]
+"""
+
+REPLACE = """
+import pathlib
+from storage.shard_places import listed_shards
+(place,) = listed_shards([sys.argv[1]])
+said = []
+for _ in range(2):
+    with place.open() as stream:
+        said.append(len(stream.read()))
+    pathlib.Path(sys.argv[2]).write_bytes(bytes(7))
+"""
+
+
+@pytest.fixture
+def hub(local: Dataset) -> Iterator[str]:
+    with serve_hub(local.folder.root) as url:
+        yield url
+
+
+def run(hub: str, cache: Path, code: str, *arguments: str) -> list[str]:
+    """Run code in a process that knows this hub; returns what it said."""
+    ran = subprocess.run(
+        [sys.executable, "-c", f"import json, sys\n{code}\nprint(json.dumps(said))", *arguments],
+        cwd=ROOT,
+        env={**os.environ, "HF_ENDPOINT": hub, "HF_HOME": str(cache.parent / "hub")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    return list(json.loads(ran.stdout))
+
+
+def test_a_repository_holds_the_same_dataset(hub: str, cache: Path, local: Dataset) -> None:
+    expected = [
+        sha256_hex(b"".join(encode_sample(sample).values()))
+        for shard in local.manifest.shards
+        for sample in local.read_shard(shard)
+    ]
+    assert run(hub, cache, READ, DATASET) == expected
+
+
+def test_missing_and_changed_shards_are_named(hub: str, cache: Path, local: Dataset) -> None:
+    assert run(hub, cache, VERIFY, DATASET) == [[], []]
+    content = bytearray((local.folder.root / SHARD).read_bytes())
+    content[-700] ^= 1
+    (local.folder.root / SHARD).write_bytes(content)
+    (local.folder.root / "test-000005.tar").unlink()
+    fast, full = run(hub, cache, VERIFY, DATASET)
+    assert (fast, set(full)) == (["test-000005.tar"], {"test-000005.tar", SHARD})
+    said = run(hub, cache, READ, DATASET)
+    assert any("no such file" in line for line in said)
+    assert any("sha256 differs, 2 times" in line for line in said)
+
+
+def test_a_shard_that_is_replaced_is_fetched_again(hub: str, cache: Path, local: Dataset) -> None:
+    """The package remembers listings; without a hash, only a fresh one tells the new file."""
+    path = local.folder.root / SHARD
+    size = path.stat().st_size
+    assert run(hub, cache, REPLACE, f"{DATASET}/{SHARD}", str(path)) == [size, 7]
