@@ -2,6 +2,11 @@
 
 Everything that may later be faster (kernels, precisions, packed sequences) goes behind this
 signature, so that nothing above it knows.
+
+Torch picks the kernel: flash attention on CUDA in half precision without a mask, which inference
+never has, and its memory-efficient one with a mask; a fused one on CPUs. Of the alternatives,
+FlexAttention has no backward on a CPU, variable-length attention no CPU kernel, and jagged tensors
+were twenty times slower there; so lengths are evened out by buckets, and a scene alone has no mask.
 """
 
 from torch import Tensor

@@ -39,10 +39,14 @@ class ModelConfig:
     """Rotary frequencies per coordinate; 2 x 9 x rope_num_freqs may not exceed the head width."""
     rope_max_freq: float
     """Highest rotary frequency in radians per metre; the lowest is 1, the rest log-spaced."""
+    register_eps: float = 0.0
+    """Added to the number of triangles in the registers' mean position; published weights: 1e-5."""
     normal_octaves: int = 6
     """Octaves of the sines that encode vertex normals."""
     patch_px: int = 8
     """Width of a ray bundle in pixels."""
+    window_bundles: int = 0
+    """Width in bundles of the Swin windows of the view stage; 0 where a bundle sees all others."""
     head: Head
     """`dpt` mixes neighbouring bundles by convolution, `linear` reads each bundle alone."""
     dpt_features: int = 0
@@ -60,6 +64,10 @@ class ModelConfig:
             _wrong(f"rope_num_freqs {self.rope_num_freqs}", f"at most {most} for this head width")
         if self.rope_num_freqs < 1 or self.rope_max_freq < 1:
             _wrong("a rotary range without a frequency", "rope_num_freqs and rope_max_freq from 1")
+        if self.register_eps < 0:
+            _wrong(f"register_eps {self.register_eps}", "0 or a little above")
+        if self.window_bundles < 0 or self.window_bundles % 2:
+            _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
         if self.head not in ("dpt", "linear"):
             _wrong(f"head {self.head!r}", "dpt or linear")
         if self.head == "dpt":
@@ -82,6 +90,11 @@ class ModelConfig:
         """Width of one attention head."""
         return self.width // self.num_heads
 
+    @property
+    def picture_px(self) -> int:
+        """Pictures are a multiple of so many pixels wide: one bundle, or one window of them."""
+        return self.patch_px * max(1, self.window_bundles)
+
 
 def smoke() -> ModelConfig:
     """Return the size that two CPU cores train in minutes."""
@@ -98,8 +111,44 @@ def smoke() -> ModelConfig:
     )
 
 
+def tiny() -> ModelConfig:
+    """Return 5 M parameters with every part of the large ones: hours on a CPU, minutes on a GPU."""
+    return ModelConfig(
+        width=192,
+        num_heads=3,
+        encoder_layers=4,
+        decoder_layers=4,
+        hidden_width=576,
+        num_registers=8,
+        rope_num_freqs=3,
+        rope_max_freq=5.0,
+        head="dpt",
+        dpt_features=32,
+        dpt_channels=(24, 48, 96, 192),
+        dpt_taps=(0, 1, 2, 3),
+    )
+
+
+def small() -> ModelConfig:
+    """Return 71 M parameters: a third of the paper's, at two thirds of its width."""
+    return ModelConfig(
+        width=512,
+        num_heads=4,
+        encoder_layers=8,
+        decoder_layers=6,
+        hidden_width=2048,
+        num_registers=16,
+        rope_num_freqs=6,
+        rope_max_freq=5.0,
+        head="dpt",
+        dpt_features=112,
+        dpt_channels=(64, 128, 256, 512),
+        dpt_taps=(2, 3, 4, 5),
+    )
+
+
 def base() -> ModelConfig:
-    """Return the paper's configuration (Zeng et al. 2025, 205M with its texture encoder)."""
+    """Return V1-Base (Zeng et al. 2025): 205 M with its texture encoder, 195 M without."""
     return ModelConfig(
         width=768,
         num_heads=6,
@@ -116,8 +165,33 @@ def base() -> ModelConfig:
     )
 
 
-SIZES: dict[str, Callable[[], ModelConfig]] = {"smoke": smoke, "base": base}
-"""Every named size."""
+def large() -> ModelConfig:
+    """Return V1.1-Large: 483 M parameters, Swin windows in the view stage."""
+    return ModelConfig(
+        width=1024,
+        num_heads=8,
+        encoder_layers=12,
+        decoder_layers=12,
+        hidden_width=4096,
+        num_registers=32,
+        rope_num_freqs=6,
+        rope_max_freq=11.0,
+        window_bundles=8,
+        head="dpt",
+        dpt_features=256,
+        dpt_channels=(256, 512, 1024, 1024),
+        dpt_taps=(2, 5, 8, 11),
+    )
+
+
+SIZES: dict[str, Callable[[], ModelConfig]] = {
+    "smoke": smoke,
+    "tiny": tiny,
+    "small": small,
+    "base": base,
+    "large": large,
+}
+"""Every named size, smallest first."""
 
 
 def _wrong(got: str, expected: str) -> None:

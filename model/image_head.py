@@ -4,14 +4,14 @@ The linear head is smaller and as good for minutes of training; the DPT (Ranftl 
 neighbouring bundles, so that their borders do not show. Both start at a black picture.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, silu
 
 from model.config import NUM_TAPS, ModelConfig
-from model.layers import LAYER_NORM_EPS
+from model.layers import LAYER_NORM_EPS, Norm
 from model.rays import unbundle
 
 LAST_CHANNELS = 32
@@ -25,12 +25,17 @@ class LinearHead(nn.Module):
         super().__init__()
         self.patch_px = config.patch_px
         self.taps = (config.decoder_layers - 1,)
-        self.norm = nn.RMSNorm(config.width, eps=LAYER_NORM_EPS)
+        self.norm = Norm(config.width, eps=LAYER_NORM_EPS)
         self.last = nn.Linear(config.width, 3 * config.patch_px**2)
 
     def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
         """Return pictures [M, 3, R, R]."""
-        return unbundle(self.last(self.norm(taps_MQW[0])), self.patch_px)
+        tokens_MQW = taps_MQW[0].to(self.last.weight.dtype)
+        return unbundle(self.last(self.norm(tokens_MQW)), self.patch_px)
+
+    def rounded_parts(self) -> list[nn.Module]:
+        """Return no part: what the last layer rounds is seen as it is."""
+        return []
 
 
 class ResidualConv(nn.Module):
@@ -104,7 +109,12 @@ class DptHead(nn.Module):
             if level == 0:
                 height, width = 2 * grids[0].shape[-2], 2 * grids[0].shape[-1]
             fused = self.fuse[level](fused, grids[level], (height, width))
-        return self.last(silu(self.widen(self.halve(fused))))
+        halved = self.halve(fused).to(self.last.weight.dtype)
+        return self.last(silu(self.widen(halved)))
+
+    def rounded_parts(self) -> list[nn.Module]:
+        """Return all but the last two layers: what those round is seen as it is."""
+        return [self.project, self.resize, self.reassemble, self.fuse, self.halve]
 
     def _grid(self, level: int, tokens_MQW: Tensor) -> Tensor:
         per_side = round(tokens_MQW.shape[1] ** 0.5)
@@ -128,6 +138,6 @@ def blacken(head: LinearHead | DptHead) -> None:
     nn.init.zeros_(head.last.bias)
 
 
-def stack_taps(layers: Sequence[Tensor], taps: Sequence[int]) -> list[Tensor]:
+def stack_taps(layers: Mapping[int, Tensor], taps: Sequence[int]) -> list[Tensor]:
     """Return the outputs [M, Q, W] of the layers that a head reads, in its order."""
     return [torch.flatten(layers[tap], 0, 1) for tap in taps]

@@ -6,9 +6,12 @@ before the rotation, which keeps their products bounded while training.
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from model.attention import attend
-from model.positions import rotate
+from model.encoded_scene import KeysValues
+from model.positions import Rotation, rotate
+from model.windows import Windows, attend_in_windows
 
 LAYER_NORM_EPS = 1e-6
 """Of every norm inside a layer, as published."""
@@ -16,8 +19,35 @@ LAYER_NORM_EPS = 1e-6
 TOKEN_NORM_EPS = 1.1920929e-07
 """Of the norms that make tokens: float32's machine epsilon, as published."""
 
-Rotation = tuple[Tensor, Tensor]
-"""cos and sin [..., N, D / 2] of `model.positions`."""
+
+class Norm(nn.RMSNorm):
+    """RMSNorm whose result has the type of its input, whatever the type of its weight.
+
+    Under autocast the two differ, and torch then leaves its fused kernel.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[..., W] -> [..., W]."""
+        assert self.weight is not None
+        weight = self.weight.to(x.dtype)
+        return nn.functional.rms_norm(x, self.normalized_shape, weight, self.eps)
+
+
+def dtype_of(layers: nn.ModuleList) -> torch.dtype:
+    """Return the type that layers compute in."""
+    return next(layers.parameters()).dtype
+
+
+def run_layer(layer: nn.Module, *inputs: object, recompute: bool) -> Tensor:
+    """Return layer(*inputs); with `recompute`, nothing inside it is kept for the way back.
+
+    It is then computed a second time there (Chen et al. 2016): the same gradients, for less memory
+    and about a third more time.
+    """
+    if recompute and torch.is_grad_enabled():
+        output: Tensor = checkpoint(layer, *inputs, use_reentrant=False)
+        return output
+    return layer(*inputs)
 
 
 def split_heads(x_BNW: Tensor, num_heads: int) -> Tensor:
@@ -51,21 +81,35 @@ class SelfAttention(nn.Module):
         super().__init__()
         self.num_heads = num_heads
         self.qkv = nn.Linear(width, 3 * width, bias=False)
-        self.q_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
-        self.k_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.q_norm = Norm(width, eps=LAYER_NORM_EPS)
+        self.k_norm = Norm(width, eps=LAYER_NORM_EPS)
         self.out = nn.Linear(width, width, bias=False)
 
     def forward(
-        self, x_BNW: Tensor, rotation: Rotation | None = None, is_key_BN: Tensor | None = None
+        self,
+        x_BNW: Tensor,
+        *,
+        rotation: Rotation | None = None,
+        is_key_BN: Tensor | None = None,
+        windows: Windows | None = None,
     ) -> Tensor:
-        """[B, N, W] -> [B, N, W]; `rotation` is None where all positions are the origin."""
+        """[B, N, W] -> [B, N, W].
+
+        `rotation` is None where all positions are the origin; `windows` cuts the sequence into
+        parts that do not see each other, and goes with neither of the other two.
+        """
+        if windows is not None:
+            x_BNW = x_BNW[:, windows.order_Q]
         q_BNW, k_BNW, v_BNW = self.qkv(x_BNW).chunk(3, dim=-1)
         q_BHND = split_heads(self.q_norm(q_BNW), self.num_heads)
         k_BHND = split_heads(self.k_norm(k_BNW), self.num_heads)
+        v_BHND = split_heads(v_BNW, self.num_heads)
         if rotation is not None:
             q_BHND, k_BHND = rotate(q_BHND, *rotation), rotate(k_BHND, *rotation)
-        attended = attend(q_BHND, k_BHND, split_heads(v_BNW, self.num_heads), is_key_BN)
-        return self.out(merge_heads(attended))
+        if windows is None:
+            return self.out(merge_heads(attend(q_BHND, k_BHND, v_BHND, is_key_BN)))
+        attended_BNW = merge_heads(attend_in_windows(q_BHND, k_BHND, v_BHND, windows))
+        return self.out(attended_BNW)[:, windows.back_Q]
 
 
 class CrossAttention(nn.Module):
@@ -78,26 +122,30 @@ class CrossAttention(nn.Module):
     def __init__(self, width: int, num_heads: int) -> None:
         super().__init__()
         self.num_heads = num_heads
-        self.context_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.context_norm = Norm(width, eps=LAYER_NORM_EPS)
         self.q = nn.Linear(width, width, bias=False)
         self.k = nn.Linear(width, width, bias=False)
         self.v = nn.Linear(width, width, bias=False)
-        self.q_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
-        self.k_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.q_norm = Norm(width, eps=LAYER_NORM_EPS)
+        self.k_norm = Norm(width, eps=LAYER_NORM_EPS)
         self.out = nn.Linear(width, width, bias=False)
+
+    def keys_values(self, context_BNW: Tensor) -> KeysValues:
+        """Return keys, not yet rotated, and values of a context: once per scene."""
+        normed_BNW = self.context_norm(context_BNW)
+        k_BHND = split_heads(self.k_norm(self.k(normed_BNW)), self.num_heads)
+        return k_BHND, split_heads(self.v(normed_BNW), self.num_heads)
 
     def forward(
         self,
         x_BVQW: Tensor,
-        context_BNW: Tensor,
+        keys_values: KeysValues,
         rotation_BVNA: Rotation,
         is_key_BN: Tensor | None,
     ) -> Tensor:
-        """[B, V, Q, W] -> [B, V, Q, W], from a context [B, N, W]."""
+        """[B, V, Q, W] -> [B, V, Q, W]."""
         num_views = x_BVQW.shape[1]
-        normed_BNW = self.context_norm(context_BNW)
-        k_BHND = split_heads(self.k_norm(self.k(normed_BNW)), self.num_heads)
-        v_BHND = split_heads(self.v(normed_BNW), self.num_heads)
+        k_BHND, v_BHND = keys_values
         k_BVHND = rotate(k_BHND[:, None], *rotation_BVNA)
         v_BVHND = v_BHND[:, None].expand_as(k_BVHND)
         q_BVHQD = split_heads(self.q_norm(self.q(x_BVQW)), self.num_heads)
@@ -111,14 +159,16 @@ class EncoderLayer(nn.Module):
 
     def __init__(self, width: int, num_heads: int, hidden_width: int) -> None:
         super().__init__()
-        self.attention_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.attention_norm = Norm(width, eps=LAYER_NORM_EPS)
         self.attention = SelfAttention(width, num_heads)
-        self.ffn_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.ffn_norm = Norm(width, eps=LAYER_NORM_EPS)
         self.ffn = SwiGLU(width, hidden_width)
 
     def forward(self, x_BNW: Tensor, rotation: Rotation, is_key_BN: Tensor | None) -> Tensor:
         """[B, N, W] -> [B, N, W]."""
-        x_BNW = x_BNW + self.attention(self.attention_norm(x_BNW), rotation, is_key_BN)
+        x_BNW = x_BNW + self.attention(
+            self.attention_norm(x_BNW), rotation=rotation, is_key_BN=is_key_BN
+        )
         return x_BNW + self.ffn(self.ffn_norm(x_BNW))
 
 
@@ -127,23 +177,24 @@ class DecoderLayer(nn.Module):
 
     def __init__(self, width: int, num_heads: int, hidden_width: int) -> None:
         super().__init__()
-        self.cross_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.cross_norm = Norm(width, eps=LAYER_NORM_EPS)
         self.cross = CrossAttention(width, num_heads)
-        self.self_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.self_norm = Norm(width, eps=LAYER_NORM_EPS)
         self.self_attention = SelfAttention(width, num_heads)
-        self.ffn_norm = nn.RMSNorm(width, eps=LAYER_NORM_EPS)
+        self.ffn_norm = Norm(width, eps=LAYER_NORM_EPS)
         self.ffn = SwiGLU(width, hidden_width)
 
     def forward(
         self,
         x_BVQW: Tensor,
-        context_BNW: Tensor,
+        keys_values: KeysValues,
         rotation_BVNA: Rotation,
         is_key_BN: Tensor | None,
+        windows: Windows | None,
     ) -> Tensor:
-        """[B, V, Q, W] -> [B, V, Q, W]."""
+        """[B, V, Q, W] -> [B, V, Q, W]; `keys_values` are those of this layer's `cross`."""
         views = x_BVQW.shape[:2]
-        x_BVQW = x_BVQW + self.cross(self.cross_norm(x_BVQW), context_BNW, rotation_BVNA, is_key_BN)
+        x_BVQW = x_BVQW + self.cross(self.cross_norm(x_BVQW), keys_values, rotation_BVNA, is_key_BN)
         x_MQW = torch.flatten(x_BVQW, 0, 1)
-        x_MQW = x_MQW + self.self_attention(self.self_norm(x_MQW))
+        x_MQW = x_MQW + self.self_attention(self.self_norm(x_MQW), windows=windows)
         return (x_MQW + self.ffn(self.ffn_norm(x_MQW))).unflatten(0, views)

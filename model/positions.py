@@ -10,6 +10,11 @@ import math
 import torch
 from torch import Tensor, nn
 
+from model.encoded_scene import TokenPlaces
+
+Rotation = tuple[Tensor, Tensor]
+"""cos and sin [..., N, D / 2]."""
+
 
 class TriangleRotary(nn.Module):
     """Angles of triangles: coordinate x frequency, coordinate-major, no factor of 2 pi.
@@ -22,11 +27,20 @@ class TriangleRotary(nn.Module):
 
     def __init__(self, *, num_freqs: int, max_freq: float, head_width: int) -> None:
         super().__init__()
-        steps = torch.linspace(0, 1, num_freqs) if num_freqs > 1 else torch.zeros(1)
-        self.register_buffer("freqs_F", max_freq**steps, persistent=False)
+        self.num_freqs, self.max_freq = num_freqs, max_freq
         self.half_width = head_width // 2
+        self.register_buffer("freqs_F", None, persistent=False)
+        self.reset()
 
-    def forward(self, triangles_N33: Tensor) -> tuple[Tensor, Tensor]:
+    def reset(self) -> None:
+        """Compute the frequencies, float32: they survive neither the meta device nor a cast.
+
+        Log2-spaced as in the published code, so that they are its own bit by bit.
+        """
+        octaves_F = torch.linspace(0, math.log2(self.max_freq), self.num_freqs)
+        self.freqs_F = 2**octaves_F
+
+    def forward(self, triangles_N33: Tensor) -> Rotation:
         """Return (cos, sin) [..., N, D / 2] of vertex positions [..., N, 3, 3].
 
         Angles beyond the 9 x num_freqs that positions fill are 0: those pairs do not turn.
@@ -40,11 +54,13 @@ class TriangleRotary(nn.Module):
 def rotate(x_HND: Tensor, cos_NA: Tensor, sin_NA: Tensor) -> Tensor:
     """Turn each pair (channel i, channel i + D / 2) of x [..., H, N, D] by its angle.
 
-    cos and sin are [..., N, D / 2]; all heads turn alike.
+    cos and sin are [..., N, D / 2]; all heads turn alike. A half-precision x is turned in the
+    table's precision and rounded once, at the end.
     """
     cos_1NA, sin_1NA = cos_NA.unsqueeze(-3), sin_NA.unsqueeze(-3)
     a, b = x_HND.chunk(2, dim=-1)
-    return torch.cat([a * cos_1NA - b * sin_1NA, b * cos_1NA + a * sin_1NA], dim=-1)
+    turned = torch.cat([a * cos_1NA - b * sin_1NA, b * cos_1NA + a * sin_1NA], dim=-1)
+    return turned.to(x_HND.dtype)
 
 
 def encode_normals(normals_N33: Tensor, octaves: int) -> Tensor:
@@ -76,11 +92,7 @@ def to_camera(points_BT33: Tensor, c2w_BV44: Tensor) -> Tensor:
 
 
 def register_position(triangles_BT33: Tensor, is_triangle_BT: Tensor | None) -> Tensor:
-    """Return [B, 1, 3, 3]: the mean vertex of the scene, three times over.
-
-    The published code divides by T + 1e-5; we do not, because that would make the position, and so
-    the picture, depend on where the world's origin is (by 1e-5 / T, below float32's rounding).
-    """
+    """Return [B, 1, 3, 3]: the mean vertex of the scene, three times over."""
     centre_BT3 = triangles_BT33.mean(dim=-2)
     if is_triangle_BT is None:
         mean_B3 = centre_BT3.mean(dim=1)
@@ -88,3 +100,43 @@ def register_position(triangles_BT33: Tensor, is_triangle_BT: Tensor | None) -> 
         weight_BT1 = is_triangle_BT[..., None].to(centre_BT3.dtype)
         mean_B3 = (centre_BT3 * weight_BT1).sum(dim=1) / weight_BT1.sum(dim=1)
     return mean_B3[:, None, None, :].expand(-1, 1, 3, 3)
+
+
+def token_places(
+    triangles_BT33: Tensor, is_triangle_BT: Tensor | None, *, num_registers: int, eps: float
+) -> TokenPlaces:
+    """Return where registers and triangles stand.
+
+    The published code divides the registers' sum of positions by T + 1e-5, in the world and again
+    in each camera's frame, which pulls them towards that frame's origin by 1e-5 / T of their
+    distance. `eps` repeats this for published weights; at 0 the network is exactly invariant under
+    translation, which those are not.
+    """
+    batch, longest = triangles_BT33.shape[:2]
+    register_B133 = register_position(triangles_BT33, is_triangle_BT)
+    registers_BR33 = register_B133.expand(-1, num_registers, -1, -1)
+    scale_BN11 = triangles_BT33.new_ones((batch, num_registers + longest, 1, 1))
+    if is_triangle_BT is None:
+        count_B = scale_BN11.new_full((batch,), longest)
+        is_key_BN = None
+    else:
+        count_B = is_triangle_BT.sum(dim=1).to(scale_BN11.dtype)
+        is_key_BN = nn.functional.pad(is_triangle_BT, (num_registers, 0), value=True)
+    scale_BN11[:, :num_registers] = (count_B / (count_B + eps))[:, None, None, None]
+    return TokenPlaces(
+        positions_BN33=torch.cat([registers_BR33, triangles_BT33], dim=1),
+        scale_BN11=scale_BN11,
+        is_key_BN=is_key_BN,
+        num_registers=num_registers,
+    )
+
+
+def world_rotation(rotary: TriangleRotary, places: TokenPlaces) -> Rotation:
+    """Return the rotation [B, N, D / 2] of all tokens in the world."""
+    return rotary(places.positions_BN33 * places.scale_BN11)
+
+
+def camera_rotation(rotary: TriangleRotary, places: TokenPlaces, c2w_BV44: Tensor) -> Rotation:
+    """Return the rotation [B, V, N, D / 2] of all tokens in the space of each camera."""
+    positions_BVN33 = to_camera(places.positions_BN33, c2w_BV44)
+    return rotary(positions_BVN33 * places.scale_BN11[:, None])

@@ -4,9 +4,11 @@ import torch
 from torch import Tensor, nn
 
 from model.config import ModelConfig
+from model.encoded_scene import EncodedScene
 from model.image_head import blacken
 from model.positions import TriangleRotary
-from model.scene_tensors import SceneBatch
+from model.precision import tf32
+from model.scene_tensors import Cameras, SceneBatch
 from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError
@@ -28,6 +30,7 @@ class RenderFormer(nn.Module):
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.config = config
+        self.tf32 = False
         rotary = TriangleRotary(
             num_freqs=config.rope_num_freqs,
             max_freq=config.rope_max_freq,
@@ -39,18 +42,68 @@ class RenderFormer(nn.Module):
     def forward(self, batch: SceneBatch, resolution: int) -> Tensor:
         """Return log10(1 + radiance) [B, V, R, R, 3], before the ELU: what training compares.
 
-        The encoder runs once per scene, whatever the number of views.
+        Raises:
+            TrilightError: the resolution is not a multiple of `config.picture_px`.
+        """
+        return self.decode(self.encode(batch), batch.cameras, resolution)
+
+    def encode(self, batch: SceneBatch) -> EncodedScene:
+        """Return the scenes of a batch ready to be seen; their cameras are not looked at."""
+        places = self.encoder.places(batch)
+        with tf32(self.tf32):
+            keys_values = self.decoder.keys_values(self.encoder(batch, places))
+        return EncodedScene(places=places, keys_values=keys_values)
+
+    def decode(
+        self,
+        scene: EncodedScene,
+        cameras: Cameras,
+        resolution: int,
+        *,
+        skip_empty_bundles: bool = False,
+    ) -> Tensor:
+        """Return the pictures [B, V, R, R, 3] of any views of encoded scenes.
+
+        On a CPU, views asked for one by one are as fast as together, in half the memory.
+
+        Args:
+            scene: of `encode`.
+            cameras: B scenes by V views.
+            resolution: a multiple of `config.picture_px`.
+            skip_empty_bundles: compute no bundle that no triangle can reach, and leave it black.
+                The others change a little, for the bundles of a view see each other.
 
         Raises:
-            TrilightError: the resolution is not a multiple of the bundle's width.
+            TrilightError: the resolution is another, or empty bundles are to be skipped by a
+                network with windows, which have to be whole.
         """
-        patch_px = self.config.patch_px
-        if resolution < patch_px or resolution % patch_px:
+        self._require(resolution, skip_empty_bundles)
+        with tf32(self.tf32):
+            if not skip_empty_bundles:
+                return self.decoder(scene, cameras, resolution)
+            pictures = [
+                self.decoder.where_seen(scene.only(index), cameras.only(index), resolution)
+                for index in range(len(cameras.fov_deg_BV))
+            ]
+            return torch.cat(pictures)
+
+    def _require(self, resolution: int, skip_empty_bundles: bool) -> None:
+        picture_px = self.config.picture_px
+        if resolution < picture_px or resolution % picture_px:
+            unit = "a window of ray bundles" if self.config.window_bundles else "a ray bundle"
             raise TrilightError(
-                f"resolution {resolution}: expected a multiple of {patch_px}, the width of a ray "
-                "bundle. Choose the next one."
+                f"resolution {resolution}: expected a multiple of {picture_px}, the width of "
+                f"{unit}. Choose the next one."
             )
-        return self.decoder(self.encoder(batch), batch, resolution)
+        if skip_empty_bundles and self.config.window_bundles:
+            raise TrilightError(
+                "skip_empty_bundles: this network's view stage attends in windows, which have to "
+                "be whole. Render without it."
+            )
+
+    def recompute_activations(self, wanted: bool) -> None:
+        """Keep only each layer's input for the way back, or all that is in it (the default)."""
+        self.encoder.recompute = self.decoder.recompute = wanted
 
     def initialise(self, generator: torch.Generator) -> None:
         """Draw all weights: Xavier for matrices, small tokens, a black picture."""

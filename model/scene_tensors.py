@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from storage.conventions import EMISSION, MATERIAL_WIDTH, log10_radiance
+from storage.errors import TrilightError
 from storage.scene import Scene
 
 
@@ -46,6 +47,20 @@ class SceneTensors:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Cameras:
+    """Views of a batch of scenes, as many of each."""
+
+    c2w_BV44: Tensor
+    """As in SceneTensors."""
+    fov_deg_BV: Tensor
+    """As in SceneTensors."""
+
+    def only(self, index: int) -> "Cameras":
+        """Return the views of one scene."""
+        return Cameras(c2w_BV44=self.c2w_BV44[[index]], fov_deg_BV=self.fov_deg_BV[[index]])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SceneBatch:
     """Scenes of equal view count, padded with zeros to the longest."""
 
@@ -62,9 +77,28 @@ class SceneBatch:
     is_triangle_BT: Tensor | None
     """bool, False in the padding; None where nothing is padded, which spares the mask."""
 
+    @property
+    def cameras(self) -> Cameras:
+        return Cameras(c2w_BV44=self.c2w_BV44, fov_deg_BV=self.fov_deg_BV)
+
+
+MAX_POSITION_M = 1000.0
+"""Farthest coordinate that is read. At 11 radians per metre, float32 knows the rotary angles of
+positions so far out to half a thousandth of a radian, and beyond them no better."""
+
 
 def scene_tensors(scene: Scene) -> SceneTensors:
-    """Return the tensors of a scene that passes `Scene.check`; its arrays stay unchanged."""
+    """Return the tensors of a scene that passes `Scene.check`; its arrays stay unchanged.
+
+    Raises:
+        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis.
+    """
+    farthest = np.abs(scene.vertex_positions).max()
+    if farthest > MAX_POSITION_M:
+        raise TrilightError(
+            f"scene: a vertex stands {farthest:g} m from the origin; the network reads up to "
+            f"{MAX_POSITION_M:g} m. Move the scene, with its cameras, towards the origin."
+        )
     faces = scene.faces.astype(np.int64)
     material = scene.materials[scene.material_index]
     encoded = np.concatenate(

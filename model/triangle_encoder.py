@@ -8,12 +8,14 @@ import torch
 from torch import Tensor, nn
 
 from model.config import ModelConfig
-from model.layers import TOKEN_NORM_EPS, EncoderLayer
+from model.encoded_scene import TokenPlaces
+from model.layers import TOKEN_NORM_EPS, EncoderLayer, Norm, dtype_of, run_layer
 from model.positions import (
     TriangleRotary,
     encode_normals,
     encoded_normal_width,
-    register_position,
+    token_places,
+    world_rotation,
 )
 from model.scene_tensors import SceneBatch
 from storage.conventions import MATERIAL_WIDTH
@@ -31,9 +33,9 @@ class TriangleTokens(nn.Module):
         self.octaves = config.normal_octaves
         self.token_W = nn.Parameter(torch.zeros(config.width))
         self.material = nn.Linear(MATERIAL_WIDTH, config.width)
-        self.material_norm = nn.RMSNorm(config.width, eps=TOKEN_NORM_EPS)
+        self.material_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
         self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
-        self.normal_norm = nn.RMSNorm(config.width, eps=TOKEN_NORM_EPS)
+        self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
 
     def forward(self, material_BT10: Tensor, normals_BT33: Tensor) -> Tensor:
         """Return tokens [B, T, W]."""
@@ -48,6 +50,8 @@ class TriangleEncoder(nn.Module):
     def __init__(self, config: ModelConfig, rotary: TriangleRotary) -> None:
         super().__init__()
         self.rotary = rotary
+        self.register_eps = config.register_eps
+        self.recompute = False
         self.tokens = TriangleTokens(config)
         self.registers_NW = nn.Parameter(torch.zeros(config.num_registers, config.width))
         self.layers = nn.ModuleList(
@@ -55,26 +59,21 @@ class TriangleEncoder(nn.Module):
             for _ in range(config.encoder_layers)
         )
 
-    def forward(self, batch: SceneBatch) -> Tensor:
+    def forward(self, batch: SceneBatch, places: TokenPlaces) -> Tensor:
         """Return the context [B, N, W] with N = registers + triangles."""
         tokens_BTW = self.tokens(batch.material_BT10, batch.normals_BT33)
         registers_BNW = self.registers_NW.expand(len(tokens_BTW), -1, -1)
-        x_BNW = torch.cat([registers_BNW, tokens_BTW], dim=1)
-        rotation = self.rotary(token_positions(batch, len(self.registers_NW)))
-        is_key_BN = token_mask(batch, len(self.registers_NW))
+        x_BNW = torch.cat([registers_BNW, tokens_BTW], dim=1).to(dtype_of(self.layers))
+        rotation = world_rotation(self.rotary, places)
         for layer in self.layers:
-            x_BNW = layer(x_BNW, rotation, is_key_BN)
+            x_BNW = run_layer(layer, x_BNW, rotation, places.is_key_BN, recompute=self.recompute)
         return x_BNW
 
-
-def token_positions(batch: SceneBatch, num_registers: int) -> Tensor:
-    """Return the world positions [B, N, 3, 3] of registers and triangles."""
-    register_B133 = register_position(batch.triangles_BT33, batch.is_triangle_BT)
-    return torch.cat([register_B133.expand(-1, num_registers, -1, -1), batch.triangles_BT33], dim=1)
-
-
-def token_mask(batch: SceneBatch, num_registers: int) -> Tensor | None:
-    """Return which tokens [B, N] exist, or None where all do."""
-    if batch.is_triangle_BT is None:
-        return None
-    return nn.functional.pad(batch.is_triangle_BT, (num_registers, 0), value=True)
+    def places(self, batch: SceneBatch) -> TokenPlaces:
+        """Return where the tokens of a batch stand."""
+        return token_places(
+            batch.triangles_BT33,
+            batch.is_triangle_BT,
+            num_registers=len(self.registers_NW),
+            eps=self.register_eps,
+        )

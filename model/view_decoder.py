@@ -4,16 +4,24 @@ It runs in camera space: the context is turned into each camera's frame by rotat
 bundles stand at the origin. The scene's tokens themselves are the same for every view.
 """
 
+from collections.abc import Iterable
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 
 from model.config import ModelConfig
+from model.empty_bundles import blacken_absent, bundles_that_see, fill_absent
+from model.encoded_scene import EncodedScene, KeysValues
 from model.image_head import build_head, stack_taps
-from model.layers import TOKEN_NORM_EPS, DecoderLayer
-from model.positions import TriangleRotary, to_camera
+from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
+from model.positions import Rotation, TriangleRotary, camera_rotation
 from model.rays import bundle_rays, ray_directions
-from model.scene_tensors import SceneBatch
-from model.triangle_encoder import token_mask, token_positions
+from model.scene_tensors import Cameras
+from model.windows import Windows, cut_windows
+
+Cuts = tuple[Windows | None, Windows | None]
+"""Windows of even and of odd layers; None where every bundle sees all others."""
 
 
 class ViewDecoder(nn.Module):
@@ -23,30 +31,83 @@ class ViewDecoder(nn.Module):
         super().__init__()
         self.rotary = rotary
         self.patch_px = config.patch_px
-        self.num_registers = config.num_registers
+        self.window_bundles = config.window_bundles
+        self.recompute = False
         self.token_W = nn.Parameter(torch.zeros(config.width))
         self.rays = nn.Linear(3 * config.patch_px**2, config.width)
-        self.rays_norm = nn.RMSNorm(config.width, eps=TOKEN_NORM_EPS)
+        self.rays_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
         self.layers = nn.ModuleList(
             DecoderLayer(config.width, config.num_heads, config.hidden_width)
             for _ in range(config.decoder_layers)
         )
         self.head = build_head(config)
 
-    def forward(self, context_BNW: Tensor, batch: SceneBatch, resolution: int) -> Tensor:
+    def keys_values(self, context_BNW: Tensor) -> tuple[KeysValues, ...]:
+        """Return what each layer asks of a context: once per scene, for any number of views."""
+        layers = cast(Iterable[DecoderLayer], self.layers)
+        return tuple(layer.cross.keys_values(context_BNW) for layer in layers)
+
+    def forward(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
         """Return log10(1 + radiance) before the ELU, [B, V, R, R, 3]."""
-        x_BVQW = self.bundle_tokens(batch.fov_deg_BV, resolution)
-        positions_BN33 = token_positions(batch, self.num_registers)
-        rotation_BVNA = self.rotary(to_camera(positions_BN33, batch.c2w_BV44))
-        is_key_BN = token_mask(batch, self.num_registers)
-        layers = []
-        for layer in self.layers:
-            x_BVQW = layer(x_BVQW, context_BNW, rotation_BVNA, is_key_BN)
-            layers.append(x_BVQW)
-        picture_M3RR = self.head(stack_taps(layers, self.head.taps))
-        return picture_M3RR.movedim(1, -1).unflatten(0, batch.fov_deg_BV.shape)
+        x_BVQW = self.bundle_tokens(cameras.fov_deg_BV, resolution)
+        rotation_BVNA = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
+        cuts = self._cuts(resolution // self.patch_px, x_BVQW.device)
+        picture_M3RR = self.head(self._taps(x_BVQW, scene, rotation_BVNA, cuts))
+        return picture_M3RR.movedim(1, -1).unflatten(0, cameras.fov_deg_BV.shape)
+
+    def where_seen(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
+        """Return what `forward` returns for one scene, from the bundles that see it alone.
+
+        The others are black and cost nothing. View by view, as each keeps its own number of
+        bundles; a DPT, which also reads what lies around those, is given their mean there.
+        """
+        x_1VQW = self.bundle_tokens(cameras.fov_deg_BV, resolution)
+        sees_VQ = bundles_that_see(scene.places, cameras, resolution, self.patch_px)[0]
+        cos, sin = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
+        pictures = []
+        for view, sees_Q in enumerate(sees_VQ):
+            picture_3RR = x_1VQW.new_zeros((3, resolution, resolution))
+            if sees_Q.any():
+                x_11QW = x_1VQW[:, [view]][:, :, sees_Q]
+                rotation = cos[:, [view]], sin[:, [view]]
+                taps_1QW = self._taps(x_11QW, scene, rotation, (None, None))
+                filled_1QW = [fill_absent(tap_1QW, sees_Q) for tap_1QW in taps_1QW]
+                picture_3RR = blacken_absent(self.head(filled_1QW)[0], sees_Q, self.patch_px)
+            pictures.append(picture_3RR)
+        return torch.stack(pictures).movedim(1, -1)[None]
+
+    def _taps(
+        self, x_BVQW: Tensor, scene: EncodedScene, rotation_BVNA: Rotation, cuts: Cuts
+    ) -> list[Tensor]:
+        """Return what the head reads, [B V, Q, W] each."""
+        x_BVQW = x_BVQW.to(dtype_of(self.layers))
+        outputs = {}
+        for index, (layer, keys_values) in enumerate(
+            zip(self.layers, scene.keys_values, strict=True)
+        ):
+            x_BVQW = run_layer(
+                layer,
+                x_BVQW,
+                keys_values,
+                rotation_BVNA,
+                scene.places.is_key_BN,
+                cuts[index % 2],
+                recompute=self.recompute,
+            )
+            if index in self.head.taps:
+                outputs[index] = x_BVQW
+        return stack_taps(outputs, self.head.taps)
 
     def bundle_tokens(self, fov_deg_BV: Tensor, resolution: int) -> Tensor:
         """Return the tokens [B, V, Q, W] of all bundles of square pictures."""
         rays_BVQC = bundle_rays(ray_directions(fov_deg_BV, resolution), self.patch_px)
         return self.token_W + self.rays_norm(self.rays(rays_BVQC))
+
+    def _cuts(self, per_side: int, device: torch.device) -> Cuts:
+        if not self.window_bundles:
+            return None, None
+        even, odd = (
+            cut_windows(per_side, self.window_bundles, shifted=shifted, device=device)
+            for shifted in (False, True)
+        )
+        return even, odd

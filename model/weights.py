@@ -2,16 +2,19 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
+from pathlib import Path
 
 import torch
-from safetensors.torch import save
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load, save
 from torch import Tensor
 
 from model.config import ModelConfig
 from model.renderformer import RenderFormer
 from model.trained_range import TrainedRange
 from storage.errors import TrilightError
-from storage.safe_read import read_safetensors
+from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
 
 CONFIG_KEY = "trilight_model"
 """Metadata entry that holds the configuration as JSON."""
@@ -30,40 +33,103 @@ def encode_weights(model: RenderFormer, trained: TrainedRange | None = None) -> 
 
 
 def decode_weights(data: bytes) -> RenderFormer:
-    """Return the network of a file, in evaluation mode on the CPU.
+    """Return the network of a file of ours, in evaluation mode on the CPU.
 
     Raises:
         TrilightError: not such a file, or its tensors are not those of its configuration; the
-            names are listed. Published checkpoints have other names and are not read here.
+            names are listed. `model.checkpoints` reads published checkpoints too.
     """
-    arrays, metadata = read_safetensors(data)
+    header = safetensors_header(data)
+    try:
+        tensors = load(data)
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise TrilightError(f"weights: unreadable ({error}).") from error
+    return from_tensors(tensors, header.get("__metadata__", {}))
+
+
+def from_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> RenderFormer:
+    """Return the network of our tensors; raises as `decode_weights`."""
     if CONFIG_KEY not in metadata:
         raise TrilightError(
             f"weights: the file has no {CONFIG_KEY} entry; expected a model.safetensors as "
             "`trilight train` writes it."
         )
-    model = RenderFormer(decode_config(metadata[CONFIG_KEY]))
-    load_tensors(model, {name: torch.from_numpy(array) for name, array in arrays.items()})
+    return network_of(decode_config(metadata[CONFIG_KEY]), tensors)
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return tensors and metadata of a safetensors file; its header is bounded first.
+
+    Raises:
+        TrilightError: the file cannot be read, is damaged, or is pickled code, which is never run.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(8)
+        _require_safetensors(path, start)
+        with safe_open(path, "pt") as tensors:
+            arrays = {name: tensors.get_tensor(name) for name in tensors.keys()}
+            return arrays, tensors.metadata() or {}
+    except OSError as error:
+        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+    except (SafetensorError, KeyError) as error:
+        raise TrilightError(f"{path}: unreadable ({error}).") from error
+
+
+def _require_safetensors(path: Path, start: bytes) -> None:
+    if start[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
+        raise TrilightError(
+            f"{path}: pickled code, which a checkpoint could run; expected safetensors. Convert "
+            "it with the tool that wrote it."
+        )
+    length = int.from_bytes(start, "little")
+    if len(start) < 8 or length > min(MAX_HEADER_BYTES, path.stat().st_size - 8):
+        raise TrilightError(
+            f"{path}: the header claims {length} bytes; expected a safetensors file with at most "
+            f"{MAX_HEADER_BYTES}."
+        )
+
+
+def network_of(config: ModelConfig, tensors: Mapping[str, Tensor]) -> RenderFormer:
+    """Return the network that holds these very tensors, in evaluation mode.
+
+    No weight is drawn and none is copied: at 483 M parameters that is seconds and gigabytes.
+
+    Raises:
+        TrilightError: as `require_tensors`.
+    """
+    with torch.device("meta"):
+        model = RenderFormer(config)
+    require_tensors(tensors, model.state_dict())
+    model.load_state_dict(dict(tensors), assign=True)
+    model.encoder.rotary.reset()
+    # a head of convolutions reads tokens as they lie, channels last; its weights then should too
+    model.decoder.head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model.eval()
 
 
-def load_tensors(model: RenderFormer, tensors: dict[str, Tensor]) -> None:
-    """Put tensors into a network of the same configuration.
+def load_tensors(model: RenderFormer, tensors: Mapping[str, Tensor]) -> None:
+    """Copy tensors into a network of the same configuration; raises as `require_tensors`."""
+    require_tensors(tensors, model.state_dict())
+    model.load_state_dict(dict(tensors))
+
+
+def require_tensors(got: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Compare names and shapes.
 
     Raises:
         TrilightError: a name is missing, unknown, or has another shape; the first few are listed.
     """
-    expected = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
-    got = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    shapes = {name: tuple(tensor.shape) for name, tensor in got.items()}
+    wanted = {name: tuple(tensor.shape) for name, tensor in expected.items()}
     wrong = [
-        f"{name} is {got.get(name, 'missing')}, expected {expected.get(name, 'no such tensor')}"
-        for name in sorted(expected.keys() | got.keys())
-        if expected.get(name) != got.get(name)
+        f"{name} is {shapes.get(name, 'missing')}, expected {wanted.get(name, 'no such tensor')}"
+        for name in sorted(shapes.keys() | wanted.keys())
+        if shapes.get(name) != wanted.get(name)
     ]
     if wrong:
         more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
         raise TrilightError(f"weights: {'; '.join(wrong[:5])}{more}.")
-    model.load_state_dict(tensors)
 
 
 def encode_config(config: ModelConfig) -> str:

@@ -45,6 +45,8 @@ class TrainSettings:
     """AdamW's memories."""
     grad_clip: float = 1.0
     """Longest gradient that is followed; a longer one is shortened to this."""
+    recompute_activations: bool = False
+    """Trade a third more time for memory: see RenderFormer.recompute_activations."""
     shuffle_shards: int = 4
     """Shards that are open at the same time, among whose samples is shuffled."""
     most_unusable: int = 0
@@ -120,6 +122,21 @@ def named_run(name: str) -> TrainSettings:
 def settings_record(settings: TrainSettings) -> dict[str, Any]:
     """Return the settings as JSON values."""
     record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(settings)))
+    return record
+
+
+def completed_record(record: dict[str, Any]) -> dict[str, Any]:
+    """Return the record of older settings with the fields that came later.
+
+    A field came with a default that is what was done before.
+    """
+    return _defaults(TrainSettings) | record | {"model": _defaults(ModelConfig) | record["model"]}
+
+
+def _defaults(settings: type) -> dict[str, Any]:
+    known = {f.name: f.default for f in dataclasses.fields(settings)}
+    given = {name: value for name, value in known.items() if value is not dataclasses.MISSING}
+    record: dict[str, Any] = json.loads(json.dumps(given))
     return record
 
 

@@ -15,6 +15,7 @@ from infra.cli import (
     doctor,
     generate,
     inspect,
+    model,
     render,
     shards,
     train,
@@ -36,6 +37,7 @@ app.command("render")(render.render)
 app.command("convert")(convert.convert)
 app.command("verify")(verify.verify)
 app.command("inspect")(inspect.inspect)
+app.command("model")(model.model)
 app.command("train")(train.train)
 app.command("bench")(bench.bench)
 app.add_typer(shards.app, name="shards")

@@ -9,7 +9,10 @@ from model.config import ModelConfig
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes
 
-RESOLUTION = 16
+RESOLUTION = 32
+
+FAMILIES = ["linear", "dpt", "swin"]
+"""Kinds of tiny_config: a linear head, V1-Base's parts, V1.1-Large's parts."""
 
 
 def tiny_config(head: str = "linear", **changes: object) -> ModelConfig:
@@ -27,6 +30,8 @@ def tiny_config(head: str = "linear", **changes: object) -> ModelConfig:
     if head == "dpt":
         dpt = {"dpt_features": 4, "dpt_channels": (4, 6, 4, 8), "dpt_taps": (0, 1, 0, 1)}
         config = dataclasses.replace(config, head="dpt", **dpt)  # type: ignore[arg-type]
+    if head == "swin":
+        config = dataclasses.replace(tiny_config("dpt"), window_bundles=2)
     return dataclasses.replace(config, **changes)  # type: ignore[arg-type]
 
 

@@ -1,95 +1,85 @@
-"""The architecture is the published one: its outputs, from its weights, to float32's floor.
+"""We are the published network: its outputs, from its weights, to float32's own floor."""
 
-Loading checkpoints is a later feature; this holds the layers themselves to the reference now.
-"""
-
-import dataclasses
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
-from torch.nn.functional import elu
 
-from model.config import ModelConfig
-from model.renderformer import ELU_ALPHA, RenderFormer
-from model.scene_tensors import SceneBatch
-from tests.model.published import our_names
+from model.check_reference import TOLERANCE, differences, main, read_reference
+from model.weights import read_tensors
 
-TOLERANCE = 5e-7
-"""The file's own float32 rounding is 6e-8; 1e-5 would accept ten real mistakes."""
-
-CONFIG = ModelConfig(
-    width=256,
-    num_heads=2,
-    encoder_layers=1,
-    decoder_layers=4,
-    hidden_width=512,
-    num_registers=4,
-    rope_num_freqs=6,
-    rope_max_freq=5.0,
-    head="dpt",
-    dpt_features=16,
-    dpt_channels=(16, 24, 32, 48),
-    dpt_taps=(0, 1, 2, 3),
-)
-"""As the file's metadata states it."""
+FILES = ["base_tiny.safetensors", "swin_tiny.safetensors"]
 
 
-@pytest.fixture(scope="module")
-def tensors(shared: Path) -> dict[str, Tensor]:
-    path = shared / "renderformer_reference" / "base_tiny.safetensors"
+@pytest.fixture(scope="module", params=FILES)
+def reference(request: pytest.FixtureRequest, shared: Path) -> Path:
+    path = shared / "renderformer_reference" / request.param
     if not path.exists():
         pytest.skip(f"{path} is missing")
-    return {name: tensor.float() for name, tensor in load_file(path).items()}
+    return path
 
 
-@pytest.fixture(scope="module")
-def network(tensors: dict[str, Tensor]) -> RenderFormer:
-    start = "param."
-    published = {n.removeprefix(start): t for n, t in tensors.items() if n.startswith(start)}
-    model = RenderFormer(CONFIG).eval()
-    model.load_state_dict(our_names(published, CONFIG, patch=8))
-    return model
+def changed(reference: Path, folder: Path, name: str, change: Tensor) -> str:
+    """Return a copy of the file in which one tensor is another."""
+    _, metadata = read_tensors(reference)
+    tensors = load_file(reference)
+    path = folder / "changed.safetensors"
+    save_file(tensors | {name: change.to(tensors[name].dtype)}, path, metadata=metadata)
+    return str(path)
 
 
-def reference_batch(tensors: dict[str, Tensor]) -> SceneBatch:
-    material = tensors["input.material13"]
-    ten = torch.cat([material[..., :7], torch.log10(1 + material[..., 10:])], dim=-1)
-    is_triangle = tensors["input.valid_mask"].bool()
-    real = is_triangle[..., None].float()
-    return SceneBatch(
-        triangles_BT33=tensors["input.triangles"] * real[..., None],
-        normals_BT33=tensors["input.vertex_normals"] * real[..., None],
-        material_BT10=ten * real,
-        c2w_BV44=tensors["input.c2w"],
-        fov_deg_BV=tensors["input.fov_deg"][..., 0],
-        is_triangle_BT=is_triangle,
-    )
+def test_outputs_are_the_published_ones(reference: Path) -> None:
+    found = differences(read_reference(reference))
+    # float32's own rounding of these files is 6e-8; ten real mistakes would pass at 1e-5
+    assert found.padded < 5e-7
+    assert found.unpadded < 5e-7
+    assert TOLERANCE == 5e-7
 
 
-def difference(network: RenderFormer, batch: SceneBatch, expected: Tensor) -> float:
-    with torch.no_grad():
-        got = elu(network(batch, 64), alpha=ELU_ALPHA)
-    return (got - expected).abs().max().item()
+def test_the_command_passes_and_prints(reference: Path, capsys: pytest.CaptureFixture) -> None:
+    assert main([str(reference)]) == 0
+    printed = capsys.readouterr().out
+    for word in ("padded", "unpadded", "max difference", "passes"):
+        assert word in printed
 
 
-def test_outputs_are_the_published_ones(network: RenderFormer, tensors: dict[str, Tensor]) -> None:
-    expected = tensors["output.log10_radiance_bvchw"].movedim(2, -1)
-    assert difference(network, reference_batch(tensors), expected) < TOLERANCE
-
-
-def test_each_scene_alone_and_unpadded_gives_the_same(
-    network: RenderFormer, tensors: dict[str, Tensor]
+@pytest.mark.parametrize("place", [0, -1])
+def test_the_command_fails_where_one_pixel_differs(
+    reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture, place: int
 ) -> None:
-    expected = tensors["output.log10_radiance_bvchw"].movedim(2, -1)
-    batch = reference_batch(tensors)
-    assert batch.is_triangle_BT is not None
-    for scene, length in enumerate(batch.is_triangle_BT.sum(1).tolist()):
-        fields = {
-            name: value[[scene], :length] if "BT" in name else value[[scene]]
-            for name, value in vars(batch).items()
-        }
-        alone = dataclasses.replace(batch, **fields | {"is_triangle_BT": None})
-        assert difference(network, alone, expected[[scene]]) < TOLERANCE
+    """In the first or the last scene: neither comparison may stop at the other's result."""
+    name = "output.log10_radiance_bvchw"
+    expected = load_file(reference)[name]
+    expected.view(-1)[place] += 1e-6
+    path = changed(reference, tmp_path, name, expected)
+    found = differences(read_reference(Path(path)))
+    assert found.padded > TOLERANCE and found.unpadded > TOLERANCE
+    assert main([path]) == 1
+    assert "FAILS" in capsys.readouterr().out
+
+
+def test_the_command_fails_on_nan(reference: Path, tmp_path: Path) -> None:
+    name = "param.view_transformer.out_dpt.scratch.output_conv2.2.bias"
+    assert main([changed(reference, tmp_path, name, torch.full((3,), torch.nan))]) == 1
+
+
+def test_what_stands_in_the_padding_does_not_matter(reference: Path, tmp_path: Path) -> None:
+    tensors = load_file(reference)
+    triangles = tensors["input.triangles"]
+    triangles[tensors["input.valid_mask"] == 0] = torch.nan
+    assert main([changed(reference, tmp_path, "input.triangles", triangles)]) == 0
+
+
+@pytest.mark.parametrize("arguments", [[], ["a", "b"]])
+def test_the_command_takes_one_file(arguments: list[str]) -> None:
+    assert main(arguments) == 2
+
+
+def test_another_file_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = tmp_path / "other.safetensors"
+    save_file({"input.triangles": torch.zeros(1, 1, 3, 3)}, path)
+    assert main([str(path)]) == 1
+    printed = capsys.readouterr().err
+    assert "no input.vertex_normals, " in printed and "config" in printed

@@ -1,4 +1,4 @@
-"""Laws of the whole network, in float64 on tiny sizes, for both heads.
+"""Laws of the whole network, in float64 on tiny sizes, for every family.
 
 Tolerance 1e-11: pictures of size 1 after some twenty layers of float64 sums; a broken law changes
 them by 1e-3 and more, as the two guards at the end show.
@@ -15,6 +15,7 @@ from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneTensors, batch_scenes
 from storage.errors import TrilightError
 from tests.model.kit import (
+    FAMILIES,
     RESOLUTION,
     awake,
     random_pose,
@@ -26,20 +27,18 @@ from tests.model.kit import (
 
 TIGHT = 1e-11
 
-HEADS = ["linear", "dpt"]
 
-
-def model_for(head: str) -> RenderFormer:
-    return awake(tiny_config(head))
+def model_for(family: str) -> RenderFormer:
+    return awake(tiny_config(family))
 
 
 def close(got: Tensor, expected: Tensor) -> None:
     torch.testing.assert_close(got, expected, rtol=0, atol=TIGHT)
 
 
-@pytest.mark.parametrize("head", HEADS)
-def test_company_and_padding_do_not_change_a_picture(head: str) -> None:
-    model = model_for(head)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_company_and_padding_do_not_change_a_picture(family: str) -> None:
+    model = model_for(family)
     short, long = random_scene(5, seed=1), random_scene(19, seed=2)
     together = render(model, short, long)
     assert together.shape == (2, 2, RESOLUTION, RESOLUTION, 3)
@@ -47,9 +46,9 @@ def test_company_and_padding_do_not_change_a_picture(head: str) -> None:
     close(together[1], render(model, long)[0])
 
 
-@pytest.mark.parametrize("head", HEADS)
-def test_finite_garbage_in_the_padding_changes_nothing(head: str) -> None:
-    model = model_for(head)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_finite_garbage_in_the_padding_changes_nothing(family: str) -> None:
+    model = model_for(family)
     batch = batch_scenes([random_scene(3, seed=1), random_scene(6, seed=2)])
     triangles, normals = batch.triangles_BT33.clone(), batch.normals_BT33.clone()
     triangles[0, 3:], normals[0, 3:] = 1e3, 7.0
@@ -58,8 +57,8 @@ def test_finite_garbage_in_the_padding_changes_nothing(head: str) -> None:
         close(model(dirty, RESOLUTION), model(batch, RESOLUTION))
 
 
-@pytest.mark.parametrize("head", HEADS)
-def test_the_order_of_triangles_does_not_matter(head: str) -> None:
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_order_of_triangles_does_not_matter(family: str) -> None:
     scene = random_scene(11)
     order = torch.randperm(11, generator=torch.Generator().manual_seed(5))
     shuffled = dataclasses.replace(
@@ -68,21 +67,23 @@ def test_the_order_of_triangles_does_not_matter(head: str) -> None:
         normals_T33=scene.normals_T33[order],
         material_T10=scene.material_T10[order],
     )
-    model = model_for(head)
+    model = model_for(family)
     close(render(model, shuffled), render(model, scene))
 
 
-@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("distance", [1.0, 100.0])
 def test_translating_the_world_changes_neither_context_nor_picture(
-    head: str, distance: float
+    family: str, distance: float
 ) -> None:
-    model = model_for(head)
+    model = model_for(family)
     scene = random_scene(9)
     moved = translated(scene, torch.tensor([distance, -2 * distance, 0.5], dtype=torch.float64))
     with torch.no_grad():
-        context = model.encoder(batch_scenes([scene]))
-        context_moved = model.encoder(batch_scenes([moved]))
+        context, context_moved = (
+            model.encoder(batch, model.encoder.places(batch))
+            for batch in (batch_scenes([scene]), batch_scenes([moved]))
+        )
     # Angles grow with the distance, and so does what float64 loses of them.
     torch.testing.assert_close(context_moved, context, rtol=0, atol=TIGHT * distance)
     torch.testing.assert_close(
@@ -96,9 +97,9 @@ def translated(scene: SceneTensors, offset: Tensor) -> SceneTensors:
     return dataclasses.replace(scene, triangles_T33=scene.triangles_T33 + offset, c2w_V44=poses)
 
 
-@pytest.mark.parametrize("head", HEADS)
-def test_views_one_by_one_or_together(head: str) -> None:
-    model = model_for(head)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_views_one_by_one_or_together(family: str) -> None:
+    model = model_for(family)
     scene = random_scene(8, num_views=3)
     together = render(model, scene)[0]
     for view in range(3):
@@ -133,9 +134,9 @@ def test_gradients_are_those_of_finite_differences() -> None:
     assert torch.autograd.gradcheck(picture, [value.requires_grad_() for value in inputs])
 
 
-@pytest.mark.parametrize("head", HEADS)
-def test_every_parameter_reaches_the_picture(head: str) -> None:
-    model = model_for(head)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_parameter_reaches_the_picture(family: str) -> None:
+    model = model_for(family)
     scene = random_scene(6)
     before = render(model, scene)
     for name, weight in model.named_parameters():
@@ -192,16 +193,22 @@ def test_radiance_undoes_the_logarithm_and_bounds_the_dark() -> None:
     assert -2.31e-3 < darkest < -2.29e-3  # 10^-0.001 - 1
 
 
-@pytest.mark.parametrize("resolution", [0, 4, 12, -8])
-def test_a_resolution_that_bundles_do_not_fill_is_refused(resolution: int) -> None:
-    with pytest.raises(TrilightError, match=f"resolution {resolution}: expected a multiple of 8"):
-        render(model_for("linear"), random_scene(2), resolution=resolution)
+@pytest.mark.parametrize(
+    ("family", "resolution", "multiple"),
+    [*(("linear", px, 8) for px in (0, 4, 12, -8)), *(("swin", px, 16) for px in (0, 8, 24))],
+)
+def test_a_resolution_that_bundles_or_windows_do_not_fill_is_refused(
+    family: str, resolution: int, multiple: int
+) -> None:
+    message = f"resolution {resolution}: expected a multiple of {multiple}"
+    with pytest.raises(TrilightError, match=message):
+        render(model_for(family), random_scene(2), resolution=resolution)
 
 
-@pytest.mark.parametrize("head", HEADS)
-def test_rotation_and_vertex_order_do_change_the_picture(head: str) -> None:
+@pytest.mark.parametrize("family", FAMILIES)
+def test_rotation_and_vertex_order_do_change_the_picture(family: str) -> None:
     """Guards: a network without positions would pass every law above."""
-    model = model_for(head)
+    model = model_for(family)
     scene = random_scene(6)
     rotation = random_pose(torch.Generator().manual_seed(9))[:3, :3]
     pose = torch.eye(4, dtype=torch.float64)

@@ -1,17 +1,20 @@
 """Checkpoints hold all that changes, and are refused where they do not belong."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from storage.errors import TrilightError
 from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import make_batch
 from train.data.scenes import training_scene
-from train.loop.checkpoint import load_checkpoint, save_checkpoint
+from train.loop.checkpoint import HEADER_KEY, load_checkpoint, save_checkpoint
 from train.loop.metrics_log import MetricsLog, read_rows
 from train.loop.state import TrainState, new_state
 from train.loop.step import train_step
@@ -101,6 +104,21 @@ def test_another_run_or_other_data_is_refused_by_field(
     save_checkpoint(tmp_path / "c", new_state(tiny_run()), tiny_run(), DIGEST)
     with pytest.raises(TrilightError, match=message):
         load_checkpoint(tmp_path / "c", tiny_run(**changes), digest)
+
+
+def test_a_checkpoint_from_before_a_setting_existed_resumes(tmp_path: Path) -> None:
+    """With the setting's default, which is what was done then; and with no other value."""
+    path = tmp_path / "c"
+    save_checkpoint(path, new_state(tiny_run()), tiny_run(), DIGEST)
+    tensors = load_file(path)
+    with safe_open(path, "pt") as file:
+        header = json.loads(file.metadata()[HEADER_KEY])
+    del header["settings"]["recompute_activations"]
+    del header["settings"]["model"]["window_bundles"]
+    save_file(tensors, path, metadata={HEADER_KEY: json.dumps(header)})
+    assert load_checkpoint(path, tiny_run(), DIGEST).step == 0
+    with pytest.raises(TrilightError, match="recompute_activations is True, .* made with False"):
+        load_checkpoint(path, tiny_run(recompute_activations=True), DIGEST)
 
 
 def test_a_missing_or_damaged_checkpoint_is_refused(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from model.layers import Norm
 from model.trained_range import TrainedRange, trained_range
 from model.weights import decode_weights
 from storage.dataset import Dataset
@@ -194,12 +195,12 @@ class Poison(Silent):
     def __init__(self, spared: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
         self.spared = spared
         self.poisoned = False
-        original = torch.nn.RMSNorm.forward
+        original = Norm.forward
 
-        def forward(module: torch.nn.RMSNorm, x: torch.Tensor) -> torch.Tensor:
+        def forward(module: Norm, x: torch.Tensor) -> torch.Tensor:
             return original(module, x) * (torch.nan if self.poisoned else 1)
 
-        monkeypatch.setattr(torch.nn.RMSNorm, "forward", forward)
+        monkeypatch.setattr(Norm, "forward", forward)
 
     def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
         self.poisoned = step + 1 not in self.spared

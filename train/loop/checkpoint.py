@@ -20,7 +20,7 @@ from storage.errors import TrilightError
 from storage.safe_read import read_safetensors
 from train.data.unusable import Unusable
 from train.loop.state import TrainState, new_state
-from train.settings import TrainSettings, settings_record
+from train.settings import TrainSettings, completed_record, settings_record
 
 HEADER_KEY = "trilight_checkpoint"
 """Metadata entry with counters, damage met, settings and the digest of the data."""
@@ -64,7 +64,7 @@ def load_checkpoint(path: Path, settings: TrainSettings, data_digest: str) -> Tr
     if HEADER_KEY not in metadata:
         raise TrilightError(f"{path}: not a checkpoint of a run; expected one that train wrote.")
     header = json.loads(metadata[HEADER_KEY])
-    _require_same("settings", header["settings"], settings_record(settings))
+    _require_same("settings", completed_record(header["settings"]), settings_record(settings))
     _require_same("data", {"digest": header["data_digest"]}, {"digest": data_digest})
     state = new_state(settings)
     state.step, state.skipped_steps = header["step"], header["skipped_steps"]

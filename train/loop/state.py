@@ -35,6 +35,7 @@ def new_state(settings: TrainSettings) -> TrainState:
     model = RenderFormer(settings.model)
     generator = torch.Generator().manual_seed(seed_for(settings.seed, "weights"))
     model.initialise(generator)
+    model.recompute_activations(settings.recompute_activations)
     return TrainState(
         model=model,
         optimizer=make_optimizer(model, settings),

@@ -1,0 +1,156 @@
+"""`trilight model`: what a network is and costs; its errors by precision; its export."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from infra.cli.console import console, print_json, print_rows
+from storage.errors import TrilightError
+
+if TYPE_CHECKING:
+    from model.config import ModelConfig
+    from model.costs import Costs, Workload
+    from model.layer_errors import LayerError
+    from model.renderformer import RenderFormer
+
+
+def model(
+    name: Annotated[
+        str, typer.Argument(help="a size (smoke, tiny, small, base, large) or a checkpoint")
+    ],
+    triangles: Annotated[int, typer.Option(min=1, help="of the scene that is counted")] = 1536,
+    resolution: Annotated[int, typer.Option(min=8, help="pixels across a view")] = 256,
+    views: Annotated[int, typer.Option(min=1, help="of that scene")] = 1,
+    errors: Annotated[
+        bool, typer.Option(help="also measure each precision against float64, layer by layer")
+    ] = False,
+    publish: Annotated[
+        Path | None, typer.Option(help="also write the checkpoint here under published names")
+    ] = None,
+    json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
+) -> None:
+    """Print parameters, FLOPs and memory by precision of a named size or of a checkpoint."""
+    try:
+        from model.config import SIZES
+        from model.costs import Workload, costs
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise TrilightError("model: torch is not installed; run `make setup-all`.") from error
+    network = None if name in SIZES else _open(name)
+    config = network.config if network else SIZES[name]()
+    _require_pictures(config, resolution)
+    workload = Workload(triangles=triangles, views=views, resolution=resolution)
+    counted = costs(config, workload)
+    measured = _errors(network, config) if errors else {}
+    if publish:
+        _publish(name, network, publish)
+    if json:
+        found = {
+            precision: list(map(dataclasses.asdict, rows)) for precision, rows in measured.items()
+        }
+        print_json(_as_json(name, config, workload, counted) | ({"errors": found} if found else {}))
+        return
+    _report(name, workload, counted)
+    for precision, rows in measured.items():
+        _report_errors(precision, rows)
+
+
+def _open(name: str) -> "RenderFormer":
+    from model.checkpoints import open_checkpoint
+    from model.config import SIZES
+
+    try:
+        return open_checkpoint(name)
+    except TrilightError as error:
+        if Path(name).exists() or "/" in name:
+            raise
+        raise TrilightError(
+            f"model {name!r}: neither a size ({', '.join(SIZES)}) nor a checkpoint here."
+        ) from error
+
+
+def _require_pictures(config: "ModelConfig", resolution: int) -> None:
+    if resolution % config.picture_px:
+        raise TrilightError(
+            f"model: --resolution {resolution}; this network's pictures are a multiple of "
+            f"{config.picture_px} wide."
+        )
+
+
+def _errors(network: "RenderFormer | None", config: "ModelConfig") -> "dict[str, list[LayerError]]":
+    """Return the errors of the precisions of a CPU, of a checkpoint or of random weights."""
+    from model.layer_errors import PROBE_RESOLUTION, layer_errors, probe_batch, random_network
+    from model.precision import PRECISIONS
+
+    network = network or random_network(config)
+    return {
+        name: layer_errors(network, probe_batch(), PROBE_RESOLUTION, name)
+        for name, precision in PRECISIONS.items()
+        if not precision.needs_cuda
+    }
+
+
+def _publish(name: str, network: "RenderFormer | None", folder: Path) -> None:
+    from model.checkpoints import save_published
+
+    if network is None:
+        raise TrilightError(
+            f"model: --publish needs a checkpoint; {name} is a size without weights."
+        )
+    save_published(network, folder)
+
+
+def _as_json(
+    name: str, config: "ModelConfig", workload: "Workload", counted: "Costs"
+) -> dict[str, Any]:
+    return {
+        "name": name,
+        "config": dataclasses.asdict(config),
+        "workload": dataclasses.asdict(workload),
+        **dataclasses.asdict(counted),
+    }
+
+
+def _report(name: str, workload: "Workload", counted: "Costs") -> None:
+    total, flops = sum(counted.parameters.values()), sum(counted.flops.values())
+    rows = [("parameters", f"{total / 1e6:.2f} M")]
+    rows += [(f"  {part}", f"{count / 1e6:.2f} M") for part, count in counted.parameters.items()]
+    rows += [("work", f"{flops / 1e9:.1f} GFLOP")]
+    rows += [
+        (f"  {part}", f"{count / 1e9:.1f} GFLOP, {count / flops:.0%}")
+        for part, count in counted.flops.items()
+    ]
+    rows += [
+        (
+            f"memory, {precision}",
+            f"weights {size / 1e6:.0f} MB, "
+            f"encoded scene {counted.scene_bytes[precision] / 1e6:.0f} MB",
+        )
+        for precision, size in counted.weight_bytes.items()
+    ]
+    rows += [
+        (
+            "memory, training",
+            f"{counted.training_bytes / 1e6:.0f} MB: float32 weights, gradients, AdamW; "
+            "without activations",
+        )
+    ]
+    views = f"{workload.views} view{'s' if workload.views > 1 else ''}"
+    print_rows(
+        f"{name}: {workload.triangles} triangles, {views} of {workload.resolution} pixels", rows
+    )
+
+
+def _report_errors(precision: str, rows: "list[LayerError]") -> None:
+    table = Table(
+        "layer", "peak", "relative error", "largest error", box=None, title_justify="left"
+    )
+    table.title = f"{precision} against float64, random scene"
+    for row in rows:
+        numbers = (row.peak, row.relative_error, row.max_error)
+        table.add_row(row.layer, *(f"{number:.2e}" for number in numbers))
+    console.print(table)

@@ -1,0 +1,161 @@
+"""`python -m model.check_reference FILE`: are we the published network?
+
+Reads a file with a configuration, weights under published names, scenes, and what the published
+code made of them; runs this network on it, padded as the file is and each scene alone without its
+padding. Prints the largest differences of the log10 output and exits with 1 above 5e-7, which is
+eight times float32's own rounding: a tolerance of 1e-5 would accept ten real mistakes.
+"""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import elu
+
+from model.published.config import decode_published
+from model.published.convert import from_published
+from model.renderformer import ELU_ALPHA, RenderFormer
+from model.scene_tensors import SceneBatch
+from model.weights import read_tensors
+from storage.errors import TrilightError
+
+TOLERANCE = 5e-7
+"""Largest accepted difference."""
+
+_PARAMETER = "param."
+_INPUTS = ("triangles", "vertex_normals", "material13", "valid_mask", "c2w", "fov_deg")
+_OUTPUT = "output.log10_radiance_bvchw"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reference:
+    """One file: a network, scenes, and the pictures that are expected of it."""
+
+    model: RenderFormer
+    """Float32."""
+    batch: SceneBatch
+    """Padded as in the file."""
+    resolution: int
+    """Pixels across."""
+    expected_BVRR3: Tensor
+    """The published network's own output, behind its ELU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Differences:
+    """Largest absolute differences from the reference."""
+
+    padded: float
+    """Of the whole batch."""
+    unpadded: float
+    """Of each scene alone, on the triangles that exist."""
+    output_std: float
+    """Standard deviation of the expected output: what a difference is to be seen against."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether both are small; a NaN, which no comparison with is true, is not."""
+        return self.padded <= TOLERANCE and self.unpadded <= TOLERANCE
+
+
+def read_reference(path: Path) -> Reference:
+    """Return the content of a reference file.
+
+    Raises:
+        TrilightError: the file is not of this form; what is missing is named.
+    """
+    tensors, metadata = read_tensors(path)
+    inputs = [f"input.{name}" for name in _INPUTS]
+    missing = [name for name in (*inputs, _OUTPUT) if name not in tensors]
+    missing += [name for name in ("config", "resolution") if name not in metadata]
+    if missing:
+        raise TrilightError(
+            f"{path}: no {', '.join(missing)}; expected a file of reference outputs."
+        )
+    parameters = {
+        name.removeprefix(_PARAMETER): tensor
+        for name, tensor in tensors.items()
+        if name.startswith(_PARAMETER)
+    }
+    return Reference(
+        model=from_published(parameters, decode_published(json.loads(metadata["config"]))),
+        batch=_batch(*(tensors[name] for name in inputs)),
+        resolution=int(metadata["resolution"]),
+        expected_BVRR3=tensors[_OUTPUT].float().movedim(2, -1),
+    )
+
+
+def differences(reference: Reference) -> Differences:
+    """Return how far this network is from the published one."""
+    batch, expected = reference.batch, reference.expected_BVRR3
+    alone = [
+        _difference(reference, _scene_alone(batch, scene), expected[[scene]])
+        for scene in range(len(expected))
+    ]
+    return Differences(
+        padded=_difference(reference, batch, expected).item(),
+        unpadded=torch.stack(alone).max().item(),
+        output_std=expected.std().item(),
+    )
+
+
+def _batch(
+    triangles: Tensor, normals: Tensor, material13: Tensor, mask: Tensor, c2w: Tensor, fov: Tensor
+) -> SceneBatch:
+    """Return the batch; padding is zeroed, the tangent normal left out, emission encoded."""
+    exists = mask.bool()
+    material = material13.float()
+    ten = torch.cat([material[..., :7], torch.log10(1 + material[..., 10:])], dim=-1)
+    return SceneBatch(
+        triangles_BT33=triangles.float().where(exists[..., None, None], 0),
+        normals_BT33=normals.float().where(exists[..., None, None], 0),
+        material_BT10=ten.where(exists[..., None], 0),
+        c2w_BV44=c2w.float(),
+        fov_deg_BV=fov.float()[..., 0],
+        is_triangle_BT=exists,
+    )
+
+
+def _scene_alone(batch: SceneBatch, scene: int) -> SceneBatch:
+    assert batch.is_triangle_BT is not None
+    exists = batch.is_triangle_BT[scene]
+    return SceneBatch(
+        triangles_BT33=batch.triangles_BT33[[scene]][:, exists],
+        normals_BT33=batch.normals_BT33[[scene]][:, exists],
+        material_BT10=batch.material_BT10[[scene]][:, exists],
+        c2w_BV44=batch.c2w_BV44[[scene]],
+        fov_deg_BV=batch.fov_deg_BV[[scene]],
+        is_triangle_BT=None,
+    )
+
+
+@torch.no_grad()
+def _difference(reference: Reference, batch: SceneBatch, expected_BVRR3: Tensor) -> Tensor:
+    got = elu(reference.model(batch, reference.resolution), alpha=ELU_ALPHA)
+    return (got - expected_BVRR3).abs().max()
+
+
+def main(arguments: list[str]) -> int:
+    """Run the comparison on one file; returns the exit status."""
+    if len(arguments) != 1:
+        sys.stderr.write("usage: python -m model.check_reference FILE.safetensors\n")
+        return 2
+    try:
+        found = differences(read_reference(Path(arguments[0])))
+    except TrilightError as mistake:
+        sys.stderr.write(f"check_reference: {mistake}\n")
+        return 1
+    for name, value in (("padded", found.padded), ("unpadded", found.unpadded)):
+        share = value / found.output_std
+        sys.stdout.write(
+            f"{name:<9} max difference {value:.3g} ({share:.3g} of the output's std)\n"
+        )
+    sys.stdout.write(f"{'passes' if found.accepted else 'FAILS'}: expected at most {TOLERANCE:g}\n")
+    return 0 if found.accepted else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,116 @@
+"""Opening a network, wherever it comes from: one function, and no pickle anywhere.
+
+our own            model.safetensors of `trilight train`, or the folder that holds one
+published, local   a folder with config.json and model.safetensors
+published, hub     microsoft/renderformer-v1-base, microsoft/renderformer-v1.1-swin-large
+"""
+
+import json
+import re
+from pathlib import Path
+
+from safetensors.torch import save
+
+from model.published.config import PublishedConfig, decode_published, encode_published
+from model.published.convert import from_published, to_published
+from model.renderformer import RenderFormer
+from model.weights import CONFIG_KEY, from_tensors, read_tensors
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+
+WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
+"""What a checkpoint's folder holds; only published ones have the second."""
+
+PUBLISHED = ("microsoft/renderformer-v1-base", "microsoft/renderformer-v1.1-swin-large")
+"""The published checkpoints' names on the Hugging Face hub."""
+
+MAX_CONFIG_BYTES = 1 << 16
+"""A published config.json has about 1 KiB."""
+
+_HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
+_PICKLES = (".pt", ".pth", ".bin", ".ckpt", ".pkl")
+
+
+def open_checkpoint(source: str) -> RenderFormer:
+    """Return the network of a checkpoint, float32, in evaluation mode on the CPU.
+
+    Args:
+        source: a file, a folder, or the name of a repository on the Hugging Face hub.
+
+    Raises:
+        TrilightError: there is no such checkpoint, it holds pickled code, or its tensors are not
+            those of its configuration; names are listed.
+    """
+    path = Path(source)
+    if not path.exists():
+        if path.suffix in _PICKLES or not _HUB_NAME.fullmatch(source):
+            raise TrilightError(
+                f"checkpoint {source}: no such file or folder; expected one, or a published name "
+                f"such as {PUBLISHED[0]}."
+            )
+        path = _download(source)
+    weights = path / WEIGHTS_NAME if path.is_dir() else path
+    if weights.suffix in _PICKLES or not weights.exists():
+        raise TrilightError(
+            f"checkpoint {source}: expected {WEIGHTS_NAME}; pickled weights could run code and are "
+            "not read. Convert them with the tool that wrote them."
+        )
+    tensors, metadata = read_tensors(weights)
+    if CONFIG_KEY in metadata:
+        return from_tensors(tensors, metadata)
+    return from_published(tensors, _read_config(weights.parent / CONFIG_NAME))
+
+
+def save_published(model: RenderFormer, folder: Path) -> None:
+    """Write a network as a published checkpoint: config.json and model.safetensors.
+
+    Its texture input is as wide as that of its family, so that their loader feeds it as it does
+    theirs. A network that was trained here has its registers at the exact mean of the triangles;
+    their code puts them 1e-5 / T nearer to the origin.
+
+    Raises:
+        TrilightError: the network is of neither published family, or the folder cannot be written.
+    """
+    texture_patch = 1 if model.config.window_bundles else 32
+    config = PublishedConfig(model=model.config, texture_patch=texture_patch)
+    text = json.dumps(encode_published(config), indent=2)
+    tensors = {name: x.contiguous() for name, x in to_published(model, texture_patch).items()}
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / WEIGHTS_NAME, save(tensors, metadata={"format": "pt"}))
+    write_atomically(folder / CONFIG_NAME, text.encode())
+
+
+def _read_config(path: Path) -> PublishedConfig:
+    try:
+        with path.open("rb") as file:
+            fields = json.loads(file.read(MAX_CONFIG_BYTES))
+    except OSError as error:
+        raise TrilightError(
+            f"{path}: cannot be read ({error.strerror}); weights that carry no configuration of "
+            "ours need the published one beside them."
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise TrilightError(f"{path}: not JSON ({error}).") from error
+    if not isinstance(fields, dict):
+        raise TrilightError(f"{path}: expected a JSON object.")
+    return decode_published(fields)
+
+
+def _download(name: str) -> Path:
+    """Return the local folder of a repository on the hub, fetched if it is not there yet."""
+    try:
+        from huggingface_hub import hf_hub_download
+    except ModuleNotFoundError as error:
+        raise TrilightError(
+            f"checkpoint {name}: no such file or folder, and huggingface_hub, which would fetch "
+            "it, is not installed. Run `make setup-all`, or name a local folder."
+        ) from error
+    try:
+        hf_hub_download(name, CONFIG_NAME)
+        return Path(hf_hub_download(name, WEIGHTS_NAME)).parent
+    except (OSError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise TrilightError(
+            f"checkpoint {name}: not on this machine, and the hub did not give it ({reason}). "
+            "Check the name and the network, or name a local folder."
+        ) from error

@@ -1,0 +1,129 @@
+"""What a network costs, from its configuration alone: parameters, FLOPs, bytes.
+
+A multiplication and an addition count as two. Counted are matrix products, attention and
+convolutions, as torch's FlopCounterMode counts them, against which this is tested; norms,
+rotations and activations are left out (1 % of the time at 205 M parameters).
+
+    d width   f hidden width   n registers + triangles   q ray bundles of a view
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+from model.config import VERTEX_COORDINATES, ModelConfig
+from model.image_head import LAST_CHANNELS
+from model.positions import encoded_normal_width
+from model.precision import PRECISIONS, rounded_parts
+from model.renderformer import RenderFormer, count_parameters
+from model.windows import cut_windows
+from storage.conventions import MATERIAL_WIDTH
+
+TRAINING_BYTES = 16
+"""Per parameter while training in float32: weight, gradient, and AdamW's two memories."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workload:
+    """What is to be rendered."""
+
+    triangles: int
+    """In the scene."""
+    views: int
+    """Of that scene."""
+    resolution: int
+    """Pixels across each view."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Costs:
+    """What a network costs, and a workload with it."""
+
+    parameters: dict[str, int]
+    """By part of the network."""
+    flops: dict[str, int]
+    """By part of the computation, for the whole workload."""
+    weight_bytes: dict[str, int]
+    """By precision."""
+    scene_bytes: dict[str, int]
+    """Keys and values that are kept of an encoded scene, by precision."""
+    training_bytes: int
+    """Weights, gradients and AdamW's memories in float32, without activations."""
+
+
+def costs(config: ModelConfig, workload: Workload) -> Costs:
+    """Return the costs of a configuration; no weight is made."""
+    with torch.device("meta"):
+        model = RenderFormer(config)
+    rounded = sum(count_parameters(part) for part in rounded_parts(model))
+    total = count_parameters(model)
+    head = count_parameters(model.decoder.head)
+    tokens = config.num_registers + workload.triangles
+    kept = 2 * config.decoder_layers * tokens * config.width
+    sizes = {name: precision.dtype.itemsize for name, precision in PRECISIONS.items()}
+    return Costs(
+        parameters={
+            "triangle encoder": count_parameters(model.encoder),
+            "view decoder": count_parameters(model.decoder) - head,
+            f"{config.head} head": head,
+        },
+        flops=flops(config, workload),
+        weight_bytes={name: size * rounded + 4 * (total - rounded) for name, size in sizes.items()},
+        scene_bytes={name: size * kept for name, size in sizes.items()},
+        training_bytes=TRAINING_BYTES * total,
+    )
+
+
+def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
+    """Return the FLOPs of each part of a forward pass."""
+    d, f = config.width, config.hidden_width
+    n = config.num_registers + workload.triangles
+    per_side = workload.resolution // config.patch_px
+    q, views = per_side**2, workload.views
+    token_inputs = MATERIAL_WIDTH + encoded_normal_width(config.normal_octaves)
+    layers = {
+        "cross-attention": 4 * q * d * d + 4 * q * n * d,
+        "bundle self-attention": 8 * q * d * d + 4 * d * _pairs(config, per_side),
+        "view feed-forward": 6 * q * d * f,
+    }
+    # nine coordinates of each token, turned into each camera's space by a 3 x 3 matrix
+    to_camera = 2 * 3 * VERTEX_COORDINATES * n
+    return {
+        "triangle tokens": 2 * workload.triangles * token_inputs * d,
+        "triangle self-attention": config.encoder_layers * (8 * n * d * d + 4 * n * n * d),
+        "triangle feed-forward": config.encoder_layers * 6 * n * d * f,
+        "keys and values": config.decoder_layers * 4 * n * d * d,
+        "bundle tokens": views * (2 * q * 3 * config.patch_px**2 * d + to_camera),
+        **{name: views * config.decoder_layers * count for name, count in layers.items()},
+        "head": views * _head(config, per_side),
+    }
+
+
+def _pairs(config: ModelConfig, per_side: int) -> int:
+    """Return how many (query, key) pairs of bundles there are, as the mean over the layers."""
+    if not config.window_bundles:
+        return per_side**4
+    pairs = []
+    for layer in range(config.decoder_layers):
+        cut = cut_windows(
+            per_side, config.window_bundles, shifted=layer % 2 == 1, device=torch.device("cpu")
+        )
+        pairs.append(sum(count * size**2 for count, size in cut.groups))
+    return sum(pairs) // len(pairs)
+
+
+def _head(config: ModelConfig, per_side: int) -> int:
+    if config.head == "linear":
+        return 2 * per_side**2 * config.width * 3 * config.patch_px**2
+    features, half = config.dpt_features, (per_side + 1) // 2
+    grids = (4 * per_side, 2 * per_side, per_side, half)
+    total = 0
+    for level, (wide, side) in enumerate(zip(config.dpt_channels, grids, strict=True)):
+        resize = (16, 4, 0, 9)[level] * wide * wide * (half if level == 3 else per_side) ** 2
+        blocks = 1 if level == 3 else 2
+        refine = (9 * wide * features + blocks * 2 * 9 * features**2) * side**2
+        total += config.width * wide * per_side**2 + resize + refine + features**2 * side**2
+    full = (8 * per_side) ** 2
+    halve = 9 * features * (features // 2) * full
+    last = (9 * (features // 2) * LAST_CHANNELS + 3 * LAST_CHANNELS) * full
+    return 2 * (total + halve + last)

@@ -1,0 +1,53 @@
+"""What remains of a scene after the view-independent stage: all that any view of it needs."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+KeysValues = tuple[Tensor, Tensor]
+"""Keys, not yet rotated into a camera, and values of one layer; [B, H, N, D] each."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TokenPlaces:
+    """Where the tokens of scenes stand: registers first, then triangles."""
+
+    positions_BN33: Tensor
+    """Three vertices each, world space; a register stands at the mean vertex, three times over."""
+    scale_BN11: Tensor
+    """Factor of the positions in whatever frame they are asked for: 1 but for published registers,
+    whose mean divides by a little more than the number of triangles."""
+    is_key_BN: Tensor | None
+    """bool, False in the padding; None where nothing is padded."""
+    num_registers: int
+    """How many come first."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EncodedScene:
+    """A batch of scenes, ready to be seen from anywhere.
+
+    Keys are kept before their rotation, since that carries the camera: rotated ones would be wrong
+    for the next view.
+    """
+
+    places: TokenPlaces
+    """Of the tokens."""
+    keys_values: tuple[KeysValues, ...]
+    """For each layer of the view stage."""
+
+    def only(self, index: int) -> "EncodedScene":
+        """Return one scene of the batch, without the padding that its company brought."""
+        places = self.places
+        exists = slice(None) if places.is_key_BN is None else places.is_key_BN[index]
+        return EncodedScene(
+            places=TokenPlaces(
+                positions_BN33=places.positions_BN33[[index]][:, exists],
+                scale_BN11=places.scale_BN11[[index]][:, exists],
+                is_key_BN=None,
+                num_registers=places.num_registers,
+            ),
+            keys_values=tuple(
+                (k[[index]][:, :, exists], v[[index]][:, :, exists]) for k, v in self.keys_values
+            ),
+        )

@@ -1,0 +1,91 @@
+"""In how many bits the network computes: a choice made at run time, not part of a checkpoint.
+
+The layers of both stages and the head may be rounded. Always float32, whatever is chosen:
+positions and rotary angles with their sines, the rotation itself, ray directions and their layer,
+normals and their octaves, materials, the learned tokens, and a head's last layers, whose rounding
+would be seen as bands. All of that is a hundredth of the work. `trilight model NAME --errors`
+measures what is left, layer by layer.
+
+Weights are rounded once, when the network is made ready, and not at every use (autocast): equally
+fast, half the memory. Training in few bits is another matter and needs float32 weights.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import nn
+
+from storage.errors import TrilightError
+
+if TYPE_CHECKING:
+    from model.renderformer import RenderFormer
+
+
+@dataclass(frozen=True, kw_only=True)
+class Precision:
+    """One choice."""
+
+    dtype: torch.dtype
+    """Of the weights and activations of the layers and the head."""
+    tf32: bool = False
+    """Whether a GPU may multiply float32 matrices with 10 bits of mantissa."""
+    needs_cuda: bool = False
+    """Whether it is refused on a CPU, which has no fast path for it."""
+
+
+PRECISIONS = {
+    "float32": Precision(dtype=torch.float32),
+    "bfloat16": Precision(dtype=torch.bfloat16),
+    "tf32": Precision(dtype=torch.float32, tf32=True, needs_cuda=True),
+    "float16": Precision(dtype=torch.float16, needs_cuda=True),
+}
+"""Every choice by name. Errors and speeds of each: DECISIONS.md."""
+
+
+def rounded_parts(model: "RenderFormer") -> list[nn.Module]:
+    """Return the parts of a network that a precision rounds; the others stay float32."""
+    return [model.encoder.layers, model.decoder.layers, *model.decoder.head.rounded_parts()]
+
+
+def set_precision(model: "RenderFormer", name: str) -> "RenderFormer":
+    """Round a network for inference, in place, and return it.
+
+    Going back to float32 does not bring back what rounding took; open the checkpoint again.
+
+    Raises:
+        TrilightError: there is no such precision, or not on the network's device.
+    """
+    if name not in PRECISIONS:
+        raise TrilightError(f"precision {name!r}: expected one of {', '.join(PRECISIONS)}.")
+    precision = PRECISIONS[name]
+    device = model.encoder.registers_NW.device
+    if precision.needs_cuda and device.type != "cuda":
+        raise TrilightError(
+            f"precision {name}: the network is on {device.type}, which has no fast path for it; "
+            "expected a CUDA device. Take bfloat16."
+        )
+    for part in rounded_parts(model):
+        part.to(precision.dtype)
+    model.tf32 = precision.tf32
+    return model
+
+
+@contextmanager
+def tf32(allowed: bool) -> Iterator[None]:
+    """Say whether CUDA's float32 products and convolutions may be TF32; a CPU does not care.
+
+    Torch allows TF32 to convolutions unasked, so float32 has to be asked for too.
+    """
+    convolution = torch.backends.cudnn.conv  # type: ignore[attr-defined]
+    switches = (torch.backends.cuda.matmul, convolution)
+    before = [switch.fp32_precision for switch in switches]
+    try:
+        for switch in switches:
+            switch.fp32_precision = "tf32" if allowed else "ieee"
+        yield
+    finally:
+        for switch, setting in zip(switches, before, strict=True):
+            switch.fp32_precision = setting

@@ -1,0 +1,192 @@
+"""The published configuration: its JSON to ours and back.
+
+Of what it could describe, one architecture was published, in two families: V1-Base, and V1.1-Large
+with Swin windows. A field that asks for anything else is refused by name.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from model.config import NUM_TAPS, ModelConfig
+from storage.errors import TrilightError
+
+REGISTER_EPS = 1e-5
+"""In the published registers' mean position."""
+
+WINDOW_BUNDLES = 8
+"""Width of the published Swin windows."""
+
+_FIXED: dict[str, Any] = {
+    "dropout": 0.0,
+    "activation": "swiglu",
+    "norm_type": "rms_norm",
+    "norm_first": True,
+    "view_indep_qk_norm": True,
+    "qk_norm": True,
+    "bias": False,
+    "pe_type": "rope",
+    "rope_type": "triangle",
+    "use_vn_encoder": True,
+    "vn_encoder_norm_type": "rms_norm",
+    "texture_channels": 13,
+    "texture_encoder_norm_type": "rms_norm",
+    "view_transformer_include_self_attn": True,
+    "vdir_pe_type": "nerf",
+    "vdir_num_freqs": 0,
+    "include_alpha": False,
+    "use_dpt_decoder": True,
+    "turn_to_cam_coord": True,
+    "use_ldr": False,
+}
+"""Fields with one published value, which is also their default there."""
+
+_DEFAULTS: dict[str, Any] = {
+    "latent_dim": 768,
+    "num_layers": 12,
+    "num_heads": 6,
+    "dim_feedforward": 3072,
+    "num_register_tokens": 16,
+    "rope_double_max_freq": False,
+    "vertex_pe_num_freqs": 12,
+    "vn_pe_num_freqs": 6,
+    "texture_encode_patch_size": 32,
+    "view_transformer_latent_dim": 768,
+    "view_transformer_ffn_hidden_dim": 3072,
+    "view_transformer_n_heads": 6,
+    "view_transformer_n_layers": 6,
+    "view_transformer_use_swin_attn": False,
+    "patch_size": 8,
+    "dpt_features": 128,
+    "dpt_out_channels": [96, 192, 384, 768],
+    "dpt_out_layers": None,
+}
+"""The other fields and their published defaults, which a configuration may leave out."""
+
+_EQUAL = (
+    ("view_transformer_latent_dim", "latent_dim"),
+    ("view_transformer_ffn_hidden_dim", "dim_feedforward"),
+    ("view_transformer_n_heads", "num_heads"),
+)
+"""Fields of the view stage that equal those of the other in both families, and here always."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedConfig:
+    """What a published configuration says."""
+
+    model: ModelConfig
+    """The network."""
+    texture_patch: int
+    """Width P of its texture input in cells."""
+
+
+def decode_published(fields: Mapping[str, Any]) -> PublishedConfig:
+    """Return what a published config.json says.
+
+    Raises:
+        TrilightError: a field is unknown or asks for what was never published; all are named.
+    """
+    _require_known(fields)
+    got = _DEFAULTS | dict(fields)
+    num_freqs = got["vertex_pe_num_freqs"] // 2
+    layers = got["view_transformer_n_layers"]
+    taps = got["dpt_out_layers"] or range(layers - NUM_TAPS, layers)
+    model = ModelConfig(
+        width=got["latent_dim"],
+        num_heads=got["num_heads"],
+        encoder_layers=got["num_layers"],
+        decoder_layers=layers,
+        hidden_width=got["dim_feedforward"],
+        num_registers=got["num_register_tokens"],
+        rope_num_freqs=num_freqs,
+        rope_max_freq=float(_max_freq(num_freqs, doubled=got["rope_double_max_freq"])),
+        register_eps=REGISTER_EPS,
+        normal_octaves=got["vn_pe_num_freqs"],
+        patch_px=got["patch_size"],
+        window_bundles=WINDOW_BUNDLES if got["view_transformer_use_swin_attn"] else 0,
+        head="dpt",
+        dpt_features=got["dpt_features"],
+        dpt_channels=tuple(got["dpt_out_channels"]),
+        dpt_taps=tuple(taps),
+    )
+    return PublishedConfig(model=model, texture_patch=got["texture_encode_patch_size"])
+
+
+def encode_published(config: PublishedConfig) -> dict[str, Any]:
+    """Return the config.json of a network, with every field spelled out.
+
+    Raises:
+        TrilightError: the network is none of the two families: a linear head, windows of another
+            width, or rotary frequencies that their code does not build.
+    """
+    model = config.model
+    doubled = model.rope_max_freq == _max_freq(model.rope_num_freqs, doubled=True)
+    if model.head != "dpt":
+        _unpublished("head linear", "dpt")
+    if model.window_bundles not in (0, WINDOW_BUNDLES):
+        _unpublished(f"window_bundles {model.window_bundles}", f"0 or {WINDOW_BUNDLES}")
+    if not doubled and model.rope_max_freq != _max_freq(model.rope_num_freqs, doubled=False):
+        _unpublished(
+            f"rope_max_freq {model.rope_max_freq} of {model.rope_num_freqs} frequencies",
+            "one less than their number, or than twice their number",
+        )
+    return _FIXED | {
+        "latent_dim": model.width,
+        "num_layers": model.encoder_layers,
+        "num_heads": model.num_heads,
+        "dim_feedforward": model.hidden_width,
+        "num_register_tokens": model.num_registers,
+        "rope_double_max_freq": doubled,
+        "vertex_pe_num_freqs": 2 * model.rope_num_freqs,
+        "vn_pe_num_freqs": model.normal_octaves,
+        "texture_encode_patch_size": config.texture_patch,
+        "view_transformer_latent_dim": model.width,
+        "view_transformer_ffn_hidden_dim": model.hidden_width,
+        "view_transformer_n_heads": model.num_heads,
+        "view_transformer_n_layers": model.decoder_layers,
+        "view_transformer_use_swin_attn": bool(model.window_bundles),
+        "patch_size": model.patch_px,
+        "dpt_features": model.dpt_features,
+        "dpt_out_channels": list(model.dpt_channels),
+        "dpt_out_layers": list(model.dpt_taps),
+    }
+
+
+def _max_freq(num_freqs: int, *, doubled: bool) -> int:
+    """Return the highest frequency as their code derives it."""
+    return 2 * num_freqs - 1 if doubled else num_freqs - 1
+
+
+def _require_known(fields: Mapping[str, Any]) -> None:
+    got = _FIXED | _DEFAULTS | dict(fields)
+    wrong = [
+        f"{name} (unknown)" for name in sorted(fields.keys() - _FIXED.keys() - _DEFAULTS.keys())
+    ]
+    wrong += [
+        f"{name} {got[name]!r}, expected {expected!r}"
+        for name, expected in _FIXED.items()
+        if got[name] != expected
+    ]
+    wrong += [
+        f"{name} {got[name]!r}, expected {other} {got[other]!r}"
+        for name, other in _EQUAL
+        if got[name] != got[other]
+    ]
+    wrong += [
+        f"{name} {got[name]!r}, expected {type(default).__name__}"
+        for name, default in _DEFAULTS.items()
+        if default is not None and not isinstance(got[name], type(default))
+    ]
+    if wrong:
+        raise TrilightError(
+            f"published config: {'; '.join(wrong)}. Only the V1-Base and V1.1-Large families "
+            "are read."
+        )
+
+
+def _unpublished(got: str, expected: str) -> None:
+    raise TrilightError(
+        f"export: {got}; the published code builds {expected} only. Keep our own file, which "
+        "`trilight` reads."
+    )

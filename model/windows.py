@@ -1,0 +1,57 @@
+"""Shifted windows of ray bundles (Swin, Liu et al. 2021): who sees whom, without a mask.
+
+A picture's bundles are cut into square windows, and attend within their own. Every second layer
+cuts half a window further on. The published code rolls the picture there and masks what the roll
+brought together; the same cut, made without a roll, leaves smaller windows at the borders and
+nothing to mask. Windows of equal size are attended together.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from model.attention import attend
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Windows:
+    """One cut of a square picture."""
+
+    order_Q: Tensor
+    """Bundles, window by window."""
+    back_Q: Tensor
+    """Puts such a sequence into the picture's order again."""
+    groups: tuple[tuple[int, int], ...]
+    """(windows, bundles in each), as they follow each other in `order_Q`."""
+
+
+def cut_windows(per_side: int, width: int, *, shifted: bool, device: torch.device) -> Windows:
+    """Return the cut of per_side x per_side bundles into windows of width x width.
+
+    A shifted cut has its lines at width / 2, 3 width / 2, ...; per_side is a multiple of width.
+    """
+    offset = width // 2 if shifted else 0
+    cell_S = (torch.arange(per_side, device=device) + offset) // width
+    window_Q = (cell_S[:, None] * per_side + cell_S).flatten()
+    _, window_Q, sizes_K = window_Q.unique(return_inverse=True, return_counts=True)
+    large_first_Q = -sizes_K[window_Q] * len(window_Q) + window_Q
+    order_Q = large_first_Q.argsort(stable=True)
+    sizes, counts = sizes_K.unique(return_counts=True)
+    groups = sorted(zip(counts.tolist(), sizes.tolist(), strict=True), key=lambda group: -group[1])
+    return Windows(order_Q=order_Q, back_Q=order_Q.argsort(), groups=tuple(groups))
+
+
+def attend_in_windows(q_MHQD: Tensor, k_MHQD: Tensor, v_MHQD: Tensor, windows: Windows) -> Tensor:
+    """Return the attention [M, H, Q, D] of each window to itself; all in `windows.order_Q`."""
+    parts, start = [], 0
+    for count, size in windows.groups:
+        inside = slice(start, start + count * size)
+        q, k, v = (
+            x_MHQD[:, :, inside].unflatten(2, (count, size)).transpose(1, 2).flatten(0, 1)
+            for x_MHQD in (q_MHQD, k_MHQD, v_MHQD)
+        )
+        attended = attend(q, k, v, None).unflatten(0, (-1, count))
+        parts.append(attended.transpose(1, 2).flatten(2, 3))
+        start = inside.stop
+    return torch.cat(parts, dim=2)

@@ -1,0 +1,196 @@
+"""The network at the ends of what it may be given, and in few bits."""
+
+import dataclasses
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from model.attention import attend
+from model.attention_reference import attend_reference
+from model.config import SIZES
+from model.layer_errors import layer_errors, probe_batch, random_network
+from model.layers import LAYER_NORM_EPS, Norm
+from model.positions import TriangleRotary
+from model.renderformer import RenderFormer, radiance
+from model.scene_tensors import MAX_POSITION_M, SceneBatch, batch_scenes, scene_tensors
+from storage.errors import TrilightError
+from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
+from tests.train.toy import toy_scene
+
+HALF_MAX = 65504.0
+"""The largest float16."""
+
+EMISSIONS = [0.0, 1e-6, 1.0, 1e6]
+
+
+@pytest.fixture(scope="module")
+def tiny() -> RenderFormer:
+    return random_network(SIZES["tiny"]())
+
+
+def lit(emission: float) -> SceneBatch:
+    """Return a scene all of whose triangles emit so much, and the brightest other materials."""
+    scene = random_scene(20, num_views=1, dtype=torch.float32)
+    material = torch.ones_like(scene.material_T10)
+    material[:, 7:] = math.log10(1 + emission)
+    return batch_scenes([dataclasses.replace(scene, material_T10=material)])
+
+
+@pytest.mark.parametrize("emission", EMISSIONS)
+def test_no_matrix_product_comes_near_the_end_of_float16(
+    emission: float, tiny: RenderFormer
+) -> None:
+    """Of every linear layer and convolution, so of every type with fewer digits after it."""
+    peaks: dict[str, float] = {}
+
+    def keep(name: str) -> object:
+        def hook(module: nn.Module, inputs: object, output: Tensor) -> None:
+            peaks[name] = output.abs().max().item()
+
+        return hook
+
+    handles = [
+        module.register_forward_hook(keep(name))  # type: ignore[arg-type]
+        for name, module in tiny.named_modules()
+        if isinstance(module, nn.Linear | nn.Conv2d | nn.ConvTranspose2d)
+    ]
+    with torch.no_grad():
+        tiny(lit(emission), 64)
+    for handle in handles:
+        handle.remove()
+    assert len(peaks) > 80
+    # norms keep every sum near its inputs' size; a hundredth of the range leaves room for training
+    assert max(peaks.values()) < HALF_MAX / 100, max(peaks, key=lambda name: peaks[name])
+
+
+@pytest.mark.parametrize(
+    ("precision", "bound"),
+    # half an ulp (6e-8, 2e-3), through two roundings in each of some ten layers
+    [("float32", 5e-6), ("bfloat16", 4e-2)],
+)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_float64_twin_bounds_every_layer(family: str, precision: str, bound: float) -> None:
+    model = random_network(tiny_config(family))
+    errors = layer_errors(model, probe_batch(), 64, precision)
+    assert errors[0].layer == "encoder.tokens"
+    assert len(errors) == 2 + model.config.encoder_layers + model.config.decoder_layers
+    for error in errors:
+        assert 0 < error.relative_error < bound, error
+    # what makes tokens is never rounded
+    assert errors[0].relative_error < 5e-6
+
+
+def test_emission_is_read_from_darkness_to_a_million() -> None:
+    scene = toy_scene(0)
+    for emission in EMISSIONS:
+        materials = scene.materials.copy()
+        materials[-1, 7:] = emission
+        tensors = scene_tensors(dataclasses.replace(scene, materials=materials))
+        read = 10 ** tensors.material_T10[-1, 7].double().item() - 1
+        # float32 of a logarithm up to 6: 3e-7 of it, times ln 10
+        assert read == pytest.approx(emission, rel=2e-6, abs=1e-7)
+
+
+@pytest.mark.parametrize("emission", EMISSIONS)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_pictures_and_gradients_are_finite(family: str, emission: float) -> None:
+    model = awake(tiny_config(family), torch.float32)
+    picture = model(lit(emission), 32)
+    (picture - 6.0).abs().mean().backward()
+    assert torch.isfinite(picture).all()
+    for name, weight in model.named_parameters():
+        assert weight.grad is not None and torch.isfinite(weight.grad).all(), name
+
+
+def test_radiance_is_finite_wherever_training_data_is() -> None:
+    log10 = torch.tensor([-1e30, -1.0, 0.0, 6.0, 38.0])
+    linear = radiance(log10)
+    assert torch.isfinite(linear).all()
+    assert linear[3].item() == pytest.approx(1e6 - 1, rel=1e-5)  # float32 power
+
+
+@pytest.mark.parametrize("distance", [1.0, 30.0, MAX_POSITION_M])
+def test_angles_keep_their_digits_to_the_farthest_position(distance: float) -> None:
+    rotary = TriangleRotary(num_freqs=6, max_freq=11.0, head_width=128)
+    exact = TriangleRotary(num_freqs=6, max_freq=11.0, head_width=128).double()
+    positions = distance * torch.linspace(-1, 1, 9 * 64).reshape(64, 3, 3)
+    for got, expected in zip(rotary(positions), exact(positions.double()), strict=True):
+        # half an ulp of the angle, distance x 11, and one of the sine
+        bound = distance * 11 * 2.0**-24 + 1.2e-7
+        assert (got - expected).abs().max() < bound
+
+
+def test_a_vertex_beyond_is_refused_with_its_distance() -> None:
+    scene = toy_scene(0)
+    positions = scene.vertex_positions.copy()
+    positions[0, 0] = np.nextafter(np.float32(MAX_POSITION_M), np.float32(np.inf))
+    at_the_end = positions.copy()
+    at_the_end[0, 0] = -MAX_POSITION_M
+    scene_tensors(dataclasses.replace(scene, vertex_positions=at_the_end))
+    with pytest.raises(TrilightError, match="a vertex stands 1000 m from the origin"):
+        scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
+
+
+@pytest.mark.parametrize("keys", [1, 16384])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"),
+    # a mean over all keys, in each type's own rounding of numbers of size 1
+    [(torch.float32, 1e-6), (torch.bfloat16, 1e-2)],
+)
+def test_attention_over_one_and_over_16384_keys(
+    keys: int, dtype: torch.dtype, tolerance: float
+) -> None:
+    generator = torch.Generator().manual_seed(keys)
+    q = torch.randn(1, 2, 3, 16, generator=generator).to(dtype)
+    k, v = (torch.randn(1, 2, keys, 16, generator=generator).to(dtype) for _ in range(2))
+    expected = attend_reference(q.double(), k.double(), v.double(), None)
+    got = attend(q, k, v, None)
+    assert got.dtype == dtype
+    torch.testing.assert_close(got.double(), expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_saturated_softmax_picks_one_key(dtype: torch.dtype) -> None:
+    """Scores apart by far more than a type's exponent range in exp()."""
+    q = torch.full((1, 1, 2, 4), 300.0, dtype=dtype)
+    k = torch.stack([torch.full((4,), x) for x in (-300.0, 0.0, 300.0)])[None, None].to(dtype)
+    v = torch.eye(3)[None, None].to(dtype)
+    q.requires_grad_()
+    got = attend(q, k, v, None)
+    got.float().square().sum().backward()
+    assert got[0, 0].tolist() == [[0, 0, 1], [0, 0, 1]]
+    assert q.grad is not None and torch.isfinite(q.grad).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+def test_norms_of_nothing_and_of_the_largest_are_finite(dtype: torch.dtype) -> None:
+    norm = Norm(64, eps=LAYER_NORM_EPS)
+    for size in (0.0, 1e-7, 1.0, 1e4):
+        x = torch.full((2, 64), size, dtype=dtype, requires_grad=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # torch warns where it leaves its fused kernel
+            got = norm(x)
+        got.float().sum().backward()
+        assert got.dtype == dtype, "the type of the input, whatever that of the weight"
+        assert torch.isfinite(got).all()
+        assert x.grad is not None and torch.isfinite(x.grad).all()
+    assert torch.all(norm(torch.zeros(2, 64, dtype=dtype)) == 0)
+
+
+@pytest.mark.parametrize("fov_deg", [0.1, 179.9])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_one_triangle_and_the_widest_and_narrowest_cameras(family: str, fov_deg: float) -> None:
+    model = awake(tiny_config(family), torch.float32)
+    scene = random_scene(1, num_views=1, dtype=torch.float32)
+    batch = batch_scenes([dataclasses.replace(scene, fov_deg_V=torch.tensor([fov_deg]))])
+    with torch.no_grad():
+        encoded = model.encode(batch)
+        assert torch.isfinite(model.decode(encoded, batch.cameras, 32)).all()
+        if family != "swin":
+            assert torch.isfinite(
+                model.decode(encoded, batch.cameras, 32, skip_empty_bundles=True)
+            ).all()

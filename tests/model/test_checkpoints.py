@@ -1,0 +1,132 @@
+"""One function opens every checkpoint, and says what is wrong with every other file."""
+
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from model.checkpoints import CONFIG_NAME, PUBLISHED, WEIGHTS_NAME, open_checkpoint, save_published
+from model.renderformer import RenderFormer
+from model.weights import encode_weights
+from storage.errors import TrilightError
+from tests.model.kit import awake, tiny_config
+from tests.model.test_published import publishable
+
+
+@pytest.fixture
+def ours(tmp_path: Path) -> Path:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    model = awake(tiny_config(), torch.float32)
+    (folder / WEIGHTS_NAME).write_bytes(encode_weights(model))
+    return folder
+
+
+@pytest.fixture
+def published(tmp_path: Path) -> Path:
+    save_published(awake(publishable("swin"), torch.float32), tmp_path / "hub")
+    return tmp_path / "hub"
+
+
+def same(a: RenderFormer, b: RenderFormer) -> bool:
+    pairs = zip(a.state_dict().items(), b.state_dict().items(), strict=True)
+    return a.config == b.config and all(n == m and torch.equal(x, y) for (n, x), (m, y) in pairs)
+
+
+def test_ours_opens_as_file_and_as_folder(ours: Path) -> None:
+    expected = awake(tiny_config(), torch.float32)
+    for source in (ours, ours / WEIGHTS_NAME):
+        model = open_checkpoint(str(source))
+        assert same(model, expected)
+        assert not model.training
+        assert all(weight.requires_grad for weight in model.parameters())
+
+
+def test_published_opens_as_folder_and_as_file(published: Path) -> None:
+    expected = awake(publishable("swin"), torch.float32)
+    assert same(open_checkpoint(str(published)), expected)
+    assert same(open_checkpoint(str(published / WEIGHTS_NAME)), expected)
+
+
+def test_a_published_name_is_fetched_from_the_hub(
+    published: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def download(repo_id: str, filename: str) -> str:
+        asked.append((repo_id, filename))
+        return str(published / filename)
+
+    hub = ModuleType("huggingface_hub")
+    hub.hf_hub_download = download  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    assert same(open_checkpoint(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
+    assert asked == [(PUBLISHED[1], CONFIG_NAME), (PUBLISHED[1], WEIGHTS_NAME)]
+
+
+def test_a_hub_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def download(repo_id: str, filename: str) -> str:
+        raise OSError("no route to host\nand a page of advice")
+
+    hub = ModuleType("huggingface_hub")
+    hub.hf_hub_download = download  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    with pytest.raises(TrilightError, match=r"the hub did not give it \(no route to host\)") as got:
+        open_checkpoint(PUBLISHED[0])
+    assert "\n" not in str(got.value)
+
+
+def test_without_the_hub_library_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(TrilightError, match="huggingface_hub, which would fetch it, is not"):
+        open_checkpoint(PUBLISHED[0])
+
+
+@pytest.mark.parametrize("source", ["nowhere/at/all", "/nowhere", "weights.pt", "a/weights.bin"])
+def test_a_missing_file_is_not_asked_of_the_hub(source: str) -> None:
+    with pytest.raises(TrilightError, match="no such file or folder"):
+        open_checkpoint(source)
+
+
+@pytest.mark.parametrize("name", ["pytorch_model.bin", "weights.pt", "renamed.safetensors"])
+def test_pickled_code_is_refused_unread(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    torch.save({"weight": torch.zeros(2)}, path)
+    with pytest.raises(TrilightError, match="pickled"):
+        open_checkpoint(str(path))
+
+
+def test_a_folder_of_pickles_is_refused(tmp_path: Path) -> None:
+    torch.save({"weight": torch.zeros(2)}, tmp_path / "pytorch_model.bin")
+    with pytest.raises(TrilightError, match=f"expected {WEIGHTS_NAME}; pickled"):
+        open_checkpoint(str(tmp_path))
+
+
+def test_weights_without_their_config_are_refused(published: Path) -> None:
+    (published / CONFIG_NAME).unlink()
+    with pytest.raises(TrilightError, match=r"config.json: cannot be read .* need the published"):
+        open_checkpoint(str(published))
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "{", "[" * 50_000])
+def test_a_config_that_is_none_is_refused(published: Path, text: str) -> None:
+    (published / CONFIG_NAME).write_text(text)
+    with pytest.raises(TrilightError, match="config.json"):
+        open_checkpoint(str(published))
+
+
+@pytest.mark.parametrize("size", [0, 7, 8, 1000])
+def test_a_truncated_file_is_refused(ours: Path, size: int) -> None:
+    path = ours / WEIGHTS_NAME
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(TrilightError, match="model.safetensors"):
+        open_checkpoint(str(path))
+
+
+def test_a_header_that_claims_the_memory_is_refused(ours: Path) -> None:
+    path = ours / WEIGHTS_NAME
+    path.write_bytes((1 << 40).to_bytes(8, "little") + path.read_bytes()[8:])
+    with pytest.raises(TrilightError, match="the header claims 1099511627776 bytes"):
+        open_checkpoint(str(path))

@@ -1,0 +1,151 @@
+"""Published checkpoints go in and out without loss, and nothing else goes in."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from model.config import SIZES, ModelConfig
+from model.published.config import PublishedConfig, decode_published, encode_published
+from model.published.convert import from_published, to_published
+from model.weights import read_tensors
+from storage.errors import TrilightError
+from tests.model.kit import awake, tiny_config
+
+SWIN_LARGE: dict[str, Any] = {
+    "latent_dim": 1024, "num_layers": 12, "num_heads": 8, "dim_feedforward": 4096,
+    "num_register_tokens": 32, "rope_double_max_freq": True, "texture_encode_patch_size": 1,
+    "view_transformer_latent_dim": 1024, "view_transformer_ffn_hidden_dim": 4096,
+    "view_transformer_n_heads": 8, "view_transformer_n_layers": 12,
+    "view_transformer_use_swin_attn": True, "dpt_features": 256,
+    "dpt_out_channels": [256, 512, 1024, 1024], "dpt_out_layers": [2, 5, 8, 11],
+}  # fmt: skip
+"""V1.1-Large as described; what is left out has V1-Base's value."""
+
+
+def publishable(family: str) -> ModelConfig:
+    """Return a tiny configuration of a published family."""
+    wide = {"width": 144, "num_heads": 2, "rope_num_freqs": 3}
+    if family == "dpt":
+        return tiny_config("dpt", **wide, rope_max_freq=2.0, register_eps=1e-5)
+    return tiny_config("swin", **wide, rope_max_freq=5.0, window_bundles=8, register_eps=1e-5)
+
+
+def test_the_published_sizes_are_the_named_ones() -> None:
+    for fields, name, patch in (({}, "base", 32), (SWIN_LARGE, "large", 1)):
+        got = decode_published(fields)
+        assert dataclasses.replace(got.model, register_eps=0.0) == SIZES[name]()
+        assert got.model.register_eps == 1e-5
+        assert got.texture_patch == patch
+
+
+@pytest.mark.parametrize("family", ["dpt", "swin"])
+@pytest.mark.parametrize("patch", [1, 8])
+def test_export_and_import_give_the_same_network(family: str, patch: int) -> None:
+    config = PublishedConfig(model=publishable(family), texture_patch=patch)
+    assert decode_published(json.loads(json.dumps(encode_published(config)))) == config
+    model = awake(config.model, torch.float32)
+    again = from_published(to_published(model, patch), config)
+    assert again.state_dict().keys() == model.state_dict().keys()
+    for name, tensor in again.state_dict().items():
+        assert torch.equal(tensor, model.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("name", ["base_tiny", "swin_tiny"])
+def test_export_gives_back_what_was_published(shared: Path, name: str) -> None:
+    """All but the texture encoder bit by bit; that one as a function, by the test above."""
+    path = shared / "renderformer_reference" / f"{name}.safetensors"
+    if not path.exists():
+        pytest.skip(f"{path} is missing")
+    _, metadata = read_tensors(path)
+    config = decode_published(json.loads(metadata["config"]))
+    published = {
+        key.removeprefix("param."): tensor.float()
+        for key, tensor in load_file(path).items()
+        if key.startswith("param.")
+    }
+    exported = to_published(from_published(published, config), config.texture_patch)
+    assert exported.keys() == published.keys()
+    for key, tensor in exported.items():
+        assert tensor.shape == published[key].shape, key
+        if not key.startswith("texture_encoder."):
+            assert torch.equal(tensor, published[key]), key
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"activation": "gelu"}, "activation 'gelu', expected 'swiglu'"),
+        ({"use_dpt_decoder": False}, "use_dpt_decoder False, expected True"),
+        ({"num_frequencies": 3}, r"num_frequencies \(unknown\)"),
+        ({"latent_dim": 1536}, "view_transformer_latent_dim 768, expected latent_dim 1536"),
+        ({"num_layers": "12"}, "num_layers '12', expected int"),
+        ({"dpt_out_channels": 3}, "dpt_out_channels 3, expected list"),
+        ({"dpt_out_layers": [0, 1, 2, 99]}, "dpt_taps"),
+    ],
+)
+def test_what_was_never_published_is_refused_by_name(fields: dict, message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        decode_published(fields)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"head": "linear", "dpt_features": 0, "dpt_channels": (), "dpt_taps": ()}, "head linear"),
+        ({"window_bundles": 4}, "window_bundles 4"),
+        ({"rope_max_freq": 3.0}, "rope_max_freq 3.0 of 3 frequencies"),
+    ],
+)
+def test_what_their_code_cannot_build_is_not_exported(changes: dict, message: str) -> None:
+    model = dataclasses.replace(publishable("dpt"), **changes)
+    with pytest.raises(TrilightError, match=message):
+        encode_published(PublishedConfig(model=model, texture_patch=1))
+
+
+def without_one(tensors: dict[str, Tensor]) -> str:
+    del tensors["vn_encoding_proj.bias"]
+    return r"vn_encoding_proj.bias is missing, expected \(144,\)"
+
+
+def with_another_shape(tensors: dict[str, Tensor]) -> str:
+    tensors["reg_tokens"] = torch.zeros(1, 3, 144)
+    return r"reg_tokens is \(1, 3, 144\), expected \(1, 2, 144\)"
+
+
+def with_a_stranger(tensors: dict[str, Tensor]) -> str:
+    tensors["stranger.weight"] = torch.zeros(2)
+    return r"stranger.weight is \(2,\), expected no such tensor"
+
+
+def with_another_patch(tensors: dict[str, Tensor]) -> str:
+    tensors["texture_encoder.weight"] = torch.zeros(144, 13 * 16)
+    return r"texture_encoder.weight is \(144, 208\), expected \(144, 13\)"
+
+
+def with_other_frequencies(tensors: dict[str, Tensor]) -> str:
+    tensors["view_transformer.transformer.rope_emb.freqs"] *= 1.01
+    return "view_transformer.transformer.rope_emb.freqs is .* the configuration means"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        without_one,
+        with_another_shape,
+        with_a_stranger,
+        with_another_patch,
+        with_other_frequencies,
+    ],
+)
+def test_wrong_tensors_are_listed(change: Any) -> None:
+    config = PublishedConfig(model=publishable("dpt"), texture_patch=1)
+    tensors = to_published(awake(config.model, torch.float32), 1)
+    message = change(tensors)
+    with pytest.raises(TrilightError, match=message):
+        from_published(tensors, config)

@@ -1,0 +1,89 @@
+"""Windows cut without a roll see exactly what the published rolled and masked ones see.
+
+In value and gradient.
+"""
+
+import pytest
+import torch
+from torch import Tensor
+
+from model.attention_reference import attend_reference
+from model.layers import SelfAttention
+from model.windows import attend_in_windows, cut_windows
+
+CPU = torch.device("cpu")
+
+
+def rolled_and_masked(q: Tensor, k: Tensor, v: Tensor, width: int, shifted: bool) -> Tensor:
+    """Return Swin attention as Liu et al. 2021, section 3.2, describe it, window by window."""
+    side = round(q.shape[2] ** 0.5)
+    shift = width // 2 if shifted else 0
+    grids = [x.unflatten(2, (side, side)).roll((-shift, -shift), dims=(2, 3)) for x in (q, k, v)]
+    # regions that a roll brings together but that do not touch in the picture
+    line = torch.zeros(side, dtype=torch.long)
+    if shift:
+        line[side - width : side - shift] = 1
+        line[side - shift :] = 2
+    region = 3 * line[:, None] + line
+    result = torch.zeros_like(grids[0])
+    for row in range(0, side, width):
+        for column in range(0, side, width):
+            rows, columns = slice(row, row + width), slice(column, column + width)
+            q1, k1, v1 = (grid[:, :, rows, columns].flatten(2, 3) for grid in grids)
+            label = region[rows, columns].flatten()
+            for member in label.unique():
+                inside = label == member
+                q2, k2, v2 = (x[:, :, inside] for x in (q1, k1, v1))
+                window = result[:, :, rows, columns].flatten(2, 3)
+                window[:, :, inside] = attend_reference(q2, k2, v2, None)
+                result[:, :, rows, columns] = window.unflatten(2, (width, width))
+    return result.roll((shift, shift), dims=(2, 3)).flatten(2, 3)
+
+
+@pytest.mark.parametrize("shifted", [False, True])
+@pytest.mark.parametrize(("side", "width"), [(8, 8), (16, 8), (24, 8), (4, 2), (2, 2)])
+def test_windows_are_those_of_the_roll(side: int, width: int, shifted: bool) -> None:
+    generator = torch.Generator().manual_seed(side)
+    shape = (2, 3, side**2, 4)
+    q, k, v = (torch.randn(shape, generator=generator, dtype=torch.float64) for _ in range(3))
+    upstream = torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    def ours(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        windows = cut_windows(side, width, shifted=shifted, device=CPU)
+        q, k, v = (x[:, :, windows.order_Q] for x in (q, k, v))
+        return attend_in_windows(q, k, v, windows)[:, :, windows.back_Q]
+
+    def theirs(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        return rolled_and_masked(q, k, v, width, shifted)
+
+    results = []
+    for function in (ours, theirs):
+        inputs = [x.clone().requires_grad_() for x in (q, k, v)]
+        output = function(inputs[0], inputs[1], inputs[2])
+        results.append([output, *torch.autograd.grad(output, inputs, upstream)])
+    for got, expected in zip(*results, strict=True):
+        # float64 softmax over at most 64 keys
+        torch.testing.assert_close(got, expected, rtol=0, atol=1e-13)
+
+
+def test_a_shifted_cut_has_whole_windows_strips_and_corners() -> None:
+    windows = cut_windows(24, 8, shifted=True, device=CPU)
+    assert windows.groups == ((4, 64), (8, 32), (4, 16))
+    assert cut_windows(24, 8, shifted=False, device=CPU).groups == ((9, 64),)
+    assert torch.equal(windows.order_Q[windows.back_Q], torch.arange(24**2))
+
+
+@pytest.mark.parametrize("shifted", [False, True])
+def test_a_bundle_reaches_its_own_window_only(shifted: bool) -> None:
+    layer = SelfAttention(8, 2).double()
+    windows = cut_windows(8, 4, shifted=shifted, device=CPU)
+    x = torch.randn(1, 64, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    moved = x.clone()
+    moved[0, 0] += 1
+    with torch.no_grad():
+        change = (layer(moved, windows=windows) - layer(x, windows=windows)).abs().amax(dim=-1)
+    reached = change.unflatten(1, (8, 8))[0] > 0
+    width = 2 if shifted else 4
+    expected = torch.zeros(8, 8, dtype=torch.bool)
+    expected[:width, :width] = True
+    assert torch.equal(reached, expected)
