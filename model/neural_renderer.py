@@ -3,7 +3,7 @@
 renderer = NeuralRenderer.load("runs/smoke/model.safetensors")
 picture = renderer.render(read_scene_file("scene.safetensors"), resolution=512)
 
-All of the network that is used here is in `_open`, `_encode` and `_decode`.
+All of the network that is used here is in `_encode` and `_decode`.
 """
 
 import dataclasses
@@ -18,27 +18,26 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from model.checkpoints import WEIGHTS_NAME, open_checkpoint
+from model.encoded_scene import EncodedScene
 from model.light_groups import light_groups
+from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import SceneBatch, batch_scenes, scene_tensors
+from model.scene_tensors import Cameras, batch_scenes, scene_tensors
 from model.trained_range import MAX_LIGHTS, PUBLISHED, TrainedRange, trained_range
-from model.weights import CONFIG_KEY, decode_weights, encode_config
+from model.weights import CONFIG_KEY, encode_config
 from storage.errors import TrilightError
 from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
 from storage.scene import Scene
 
 _FLOAT_BYTES = 4
-_WEIGHTS_NAME = "model.safetensors"
-
-_Encoded = tuple[Tensor, SceneBatch]
-"""What the view-independent stage made of one scene."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PreparedScene:
     """A scene that is ready for any number of cameras."""
 
-    groups: tuple[tuple[_Encoded, float], ...]
+    groups: tuple[tuple[EncodedScene, float], ...]
     """Each group of lights and its share of the picture (model.light_groups)."""
     notes: tuple[str, ...]
     """What a person should know of this scene and this network."""
@@ -58,20 +57,27 @@ class NeuralRenderer:
         self._trained = trained
 
     @classmethod
-    def load(cls, checkpoint: str | Path, *, device: str | None = None) -> "NeuralRenderer":
+    def load(
+        cls,
+        checkpoint: str | Path,
+        *,
+        device: str | None = None,
+        precision: str = "float32",
+    ) -> "NeuralRenderer":
         """Read a checkpoint.
 
         Args:
-            checkpoint: the `model.safetensors` of a run, or its folder.
+            checkpoint: as `model.checkpoints.open_checkpoint`.
             device: of torch; by default the graphics card where there is one.
+            precision: a name of model.precision.PRECISIONS.
 
         Raises:
             TrilightError: no such file, or no network.
         """
         source = str(checkpoint)
-        model = _open(source)
+        model = open_checkpoint(source)
         place = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        return cls(model.to(place), _trained_range(source))
+        return cls(set_precision(model.to(place), precision), _trained_range(source))
 
     @property
     def device(self) -> torch.device:
@@ -158,11 +164,11 @@ class NeuralRenderer:
 
     def require_resolution(self, resolution: int) -> None:
         """Raise TrilightError unless pictures of this width can be made."""
-        step = self._model.config.patch_px
+        step = self._model.config.picture_px
         if resolution < step or resolution % step:
             raise TrilightError(
-                f"resolution is {resolution}; expected a positive multiple of {step}, the width of "
-                "this network's ray bundles."
+                f"resolution is {resolution}; expected a positive multiple of {step}, as "
+                "this network's ray bundles and windows need."
             )
 
     def _notes(self, scene: Scene, num_groups: int) -> tuple[str, ...]:
@@ -191,40 +197,24 @@ class NeuralRenderer:
             )
 
 
-def _open(source: str) -> RenderFormer:
-    """Return the network of a checkpoint, on the CPU."""
-    path = _weights_file(source)
-    if not path.is_file():
-        raise TrilightError(
-            f"checkpoint {source}: no such file; expected the {_WEIGHTS_NAME} of a run."
-        )
-    try:
-        return decode_weights(path.read_bytes())
-    except (OSError, TrilightError) as error:
-        raise TrilightError(f"checkpoint {source}: {error}") from error
-
-
-def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> _Encoded:
+def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> EncodedScene:
+    """Return one scene after the view-independent stage."""
     batch = batch_scenes([scene_tensors(scene)])
-    moved = SceneBatch(
+    moved = dataclasses.replace(
+        batch,
         triangles_BT33=batch.triangles_BT33.to(device),
         normals_BT33=batch.normals_BT33.to(device),
         material_BT10=batch.material_BT10.to(device),
-        c2w_BV44=batch.c2w_BV44.to(device),
-        fov_deg_BV=batch.fov_deg_BV.to(device),
-        is_triangle_BT=None,
     )
-    return model.encoder(moved), moved
+    return model.encode(moved)
 
 
 def _decode(
-    model: RenderFormer, encoded: _Encoded, c2w_44: Tensor, fov_deg: Tensor, resolution: int
+    model: RenderFormer, encoded: EncodedScene, c2w_44: Tensor, fov_deg: Tensor, resolution: int
 ) -> Tensor:
     """Return log10(1 + radiance) [R, R, 3] from one camera."""
-    context, batch = encoded
-    seen = dataclasses.replace(batch, c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
-    pictures: Tensor = model.decoder(context, seen, resolution)
-    return pictures[0, 0]
+    camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
+    return model.decode(encoded, camera, resolution)[0, 0]
 
 
 def _trained_range(source: str) -> TrainedRange | None:
@@ -240,7 +230,7 @@ def _trained_range(source: str) -> TrainedRange | None:
 
 def _weights_file(source: str) -> Path:
     path = Path(source)
-    return path / _WEIGHTS_NAME if path.is_dir() else path
+    return path / WEIGHTS_NAME if path.is_dir() else path
 
 
 def _free_bytes(device: torch.device) -> int | None:

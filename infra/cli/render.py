@@ -53,6 +53,9 @@ def render(
     tone_map: Annotated[
         str, typer.Option(help="of PNG and video: plain, or filmic (ACES 2.0)")
     ] = "plain",
+    precision: Annotated[
+        str, typer.Option(help="neural: float32, bfloat16; on CUDA also tf32, float16")
+    ] = "float32",
     lights_per_pass: Annotated[
         int, typer.Option(help="neural: most emitting triangles at once; groups are added up")
     ] = 8,
@@ -80,6 +83,7 @@ def render(
         cameras=cameras,
         fps=fps,
         tone_map=tone_map,
+        precision=precision,
         lights_per_pass=lights_per_pass,
         seed=seed,
         threads=threads,

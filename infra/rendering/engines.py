@@ -80,13 +80,20 @@ class NeuralEngine:
     name = "neural"
 
     def __init__(
-        self, renderer: "NeuralRenderer", *, checkpoint: str, resolution: int, lights_per_pass: int
+        self,
+        renderer: "NeuralRenderer",
+        *,
+        checkpoint: str,
+        precision: str,
+        resolution: int,
+        lights_per_pass: int,
     ) -> None:
         """Take a network.
 
         Args:
             renderer: the network.
             checkpoint: where it came from; only its last part is published.
+            precision: in which it was loaded (model.precision).
             resolution: width of pictures.
             lights_per_pass: most emitting triangles of a group (model.light_groups).
 
@@ -101,7 +108,11 @@ class NeuralEngine:
         self.identity: Mapping[str, Any] = {
             "checkpoint": Path(checkpoint).name,
             "network_sha256": renderer.digest,
-            "settings": {"resolution": resolution, "lights_per_pass": lights_per_pass},
+            "settings": {
+                "precision": precision,
+                "resolution": resolution,
+                "lights_per_pass": lights_per_pass,
+            },
             "environment": {"torch": torch.__version__, "device": renderer.device.type},
         }
 

@@ -60,6 +60,8 @@ class Asked:
     """Pictures a second of a video."""
     tone_map: str
     """A name of infra.rendering.tone_maps."""
+    precision: str
+    """A name of model.precision."""
     lights_per_pass: int
     """Most emitting triangles of a group (model.light_groups)."""
     seed: int
@@ -211,8 +213,9 @@ def _neural(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
         torch.set_num_threads(asked.threads)
     assert asked.checkpoint is not None
     return NeuralEngine(
-        NeuralRenderer.load(asked.checkpoint),
+        NeuralRenderer.load(asked.checkpoint, precision=asked.precision),
         checkpoint=asked.checkpoint,
+        precision=asked.precision,
         resolution=settings.resolution,
         lights_per_pass=asked.lights_per_pass,
     )

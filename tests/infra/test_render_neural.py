@@ -78,7 +78,11 @@ def test_the_picture_names_its_network(network: Path, scene: Path, tmp_path: Pat
     assert header["trilight.checkpoint"] == "model.safetensors"
     assert header["trilight.network_sha256"] == NeuralRenderer.load(network).digest
     assert header["trilight.scene_sha256"] == scene_digest(tiny_scene())
-    assert json.loads(header["trilight.settings"]) == {"lights_per_pass": 8, "resolution": 16}
+    assert json.loads(header["trilight.settings"]) == {
+        "lights_per_pass": 8,
+        "precision": "float32",
+        "resolution": 16,
+    }
     assert str(tmp_path) not in str(header)
     neural(scene, out, network)
     assert out.read_bytes() == first
@@ -135,6 +139,10 @@ def test_mistakes_are_one_line(network: Path, scene: Path, tmp_path: Path) -> No
         ),
         (("--engine", "neural", "--checkpoint", scene), str(tmp_path)),
         (("--engine", "neural", "--checkpoint", network, "--resolution", "20"), "resolution is 20"),
+        (
+            ("--engine", "neural", "--checkpoint", network, "--precision", "half"),
+            "precision 'half'",
+        ),
         (("--engine", "both", "--checkpoint", network, "--view", "2"), "--view is 2"),
     ):
         assert message in mistake(scene, "--out", out, *words)
