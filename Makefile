@@ -25,7 +25,7 @@ test-slow: setup-all  ## the others
 	python -m pytest -m slow
 
 train: setup-all  ## the smoke model on what `make dataset` made
-	trilight train smoke --data data/smoke --out runs/smoke $(if $(wildcard runs/smoke/checkpoint.safetensors),--resume)
+	trilight train smoke --data data/smoke --out runs/smoke $(if $(wildcard runs/smoke/checkpoints/*),--resume)
 
 lint: setup-all  ## format, style, types, layers
 	ruff format --check .

@@ -86,9 +86,11 @@ def to_camera(points_BT33: Tensor, c2w_BV44: Tensor) -> Tensor:
 
     The origin is subtracted before the rotation, so that a scene far from the world's origin loses
     no more digits than its coordinates already have. c2w must hold a rotation (Scene.check).
+    Written as a sum, because autocast would round the operands of a matrix product to bfloat16.
     """
     relative_BVT33 = points_BT33[:, None] - c2w_BV44[:, :, None, None, :3, 3]
-    return relative_BVT33 @ c2w_BV44[:, :, None, :3, :3]
+    rotation_BV1133 = c2w_BV44[:, :, None, None, :3, :3]
+    return (relative_BVT33[..., None] * rotation_BV1133).sum(dim=-2)
 
 
 def register_position(triangles_BT33: Tensor, is_triangle_BT: Tensor | None) -> Tensor:

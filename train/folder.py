@@ -12,9 +12,9 @@ class RunFolder:
     """The folder that users name."""
 
     @property
-    def checkpoint(self) -> Path:
-        """All that resuming needs (loop.checkpoint); the newest only."""
-        return self.root / "checkpoint.safetensors"
+    def checkpoints(self) -> Path:
+        """Folder of all that resuming needs (loop.checkpoints), one file per step."""
+        return self.root / "checkpoints"
 
     @property
     def weights(self) -> Path:
@@ -35,6 +35,11 @@ class RunFolder:
     def sheet(self) -> Path:
         """Target, prediction and error of validation scenes."""
         return self.root / "validation_sheet.png"
+
+    @property
+    def tensorboard(self) -> Path:
+        """What TensorBoard shows: the log's numbers as curves, and the sheets."""
+        return self.root / "tensorboard"
 
     @property
     def summary(self) -> Path:

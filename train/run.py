@@ -1,7 +1,6 @@
 """One training run, from a dataset to weights, figures and a sheet: joins the parts, no more."""
 
 import dataclasses
-import json
 import platform
 import time
 from collections.abc import Sequence
@@ -11,66 +10,46 @@ from pathlib import Path
 
 import torch
 
-from model.renderformer import count_parameters
-from model.trained_range import TrainedRange
-from model.weights import encode_weights
+from model.renderformer import RenderFormer, count_parameters
+from model.weights import decode_config, encode_weights
 from storage.atomic import write_atomically
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.training_data import TrainingData, open_training_data
-from train.data.order import Share
 from train.data.scenes import training_scene
 from train.data.splits import first_samples
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable
-from train.evaluation.judge import Judge, Judgement, median_picture
-from train.evaluation.sheet import SheetView, write_sheet
+from train.evaluation.judge import Judge, median_picture
 from train.folder import RunFolder
-from train.loop.checkpoint import load_checkpoint
-from train.loop.metrics_log import read_rows
+from train.loop.checkpoint import Checkpoint, read_checkpoint, resumed_state
+from train.loop.checkpoints import newest_checkpoint, saved_steps
+from train.loop.crew import Crew
+from train.loop.recorder import Recorder
 from train.loop.state import TrainState, new_state
 from train.loop.trainer import Trainer
+from train.loss.lpips_weights import load_lpips
+from train.loss.objective import Objective
+from train.networks import open_network
 from train.progress import Progress, Silent
+from train.result import TrainResult, finished, pretty_json
 from train.settings import TrainSettings, settings_record
 
 MEDIAN_SCENES = 256
 """Training scenes of which the median picture is taken; more would not move it."""
 
-LOSS_SHARE = 20
-"""The loss at start and end is the mean over the first and last 1 / LOSS_SHARE of the log."""
-
-SHEET_SCENES = 8
-"""Scenes on the sheet, one view each."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class TrainResult:
-    """What a finished run has to show."""
+class Start:
+    """How a run begins or goes on."""
 
-    folder: RunFolder
-    """Where everything is."""
-    num_parameters: int
-    """Of the network."""
-    num_steps: int
-    """Steps done, including skipped ones."""
-    skipped_steps: int
-    """Steps that were not finite and changed nothing."""
-    loss_at_start: float
-    """Mean training loss over the first twentieth of the run."""
-    loss_at_end: float
-    """The same over the last twentieth."""
-    scores: dict[str, float]
-    """The network on the validation split (evaluation.judge)."""
-    median_scores: dict[str, float]
-    """The median picture of the training views on the same split."""
-    unusable: tuple[str, ...]
-    """What was wrong with data that was left out in this call."""
-    seconds: float
-    """Wall time of this call, from opening the data to writing the sheet."""
-
-    @property
-    def beats_median(self) -> bool:
-        """Whether the network's log_l1 is below that of the median picture."""
-        return self.scores["log_l1"] < self.median_scores["log_l1"]
+    resume: bool = False
+    """Go on from the folder's newest checkpoint; the weights come out the same to the bit on the
+    CPU, for the same number of threads and processes. A finished run is judged again."""
+    begin_with: str | None = None
+    """Network whose weights and configuration a run with `from_weights` takes over."""
+    lpips: str | None = None
+    """Where LPIPS' weights are (loss.lpips_weights)."""
 
 
 def train_run(
@@ -78,66 +57,79 @@ def train_run(
     *,
     data: Sequence[str],
     out: Path,
-    resume: bool = False,
+    start: Start | None = None,
+    crew: Crew | None = None,
     workers: int = 1,
     progress: Progress | None = None,
-) -> TrainResult:
+) -> TrainResult | None:
     """Train a network and judge it.
 
     Args:
-        settings: the run; `train.settings.named_run` returns those that have a name.
+        settings: the run; `train.runs.named_run` returns those that have a name.
         data: root of a dataset with a train and a validation split, or a list of shards
             (storage.training_data).
-        out: folder of the run (train.folder), new unless `resume`.
-        resume: go on from the folder's checkpoint; the weights come out the same to the bit on the
-            CPU, for the same number of threads. A finished run is judged again.
+        out: folder of the run (train.folder), new unless it resumes.
+        start: how it begins; anew unless said.
+        crew: the processes that train together (loop.crew.join_crew); this one unless said.
         workers: threads that read and decode samples; the weights do not depend on them.
-        progress: is told how it goes.
+        progress: is told how it goes, by the first process.
+
+    Returns:
+        What the run has to show; None in all processes but the first.
 
     Raises:
         TrilightError: no dataset, an empty split, a damaged shard, a bad target, a resolution or
             number of views that the data does not have, a folder that already holds a run, a
-            checkpoint that is missing or of another run, or a signal that asked to stop.
+            checkpoint that is missing or of another run, LPIPS without its weights, a start that
+            went dead, or a signal that asked to stop.
     """
     began = time.monotonic()
-    progress = progress or Silent()
+    start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
+    progress = progress if progress is not None and crew.is_first else Silent()
     opened, folder = open_training_data(data), RunFolder(out)
     for note in opened.notes:
         progress.noted(note)
+    objective = Objective(settings.loss, load_lpips(start.lpips))
     _check_data(opened, settings)
-    state = _begin(settings, folder, opened, resume)
-    judge = _make_judge(opened, settings, state.unusable)
-    progress.begin(
-        step=state.step,
-        num_steps=settings.num_steps,
-        num_parameters=count_parameters(state.model),
-        median_scores=judge.median_scores,
-    )
+    settings, state = _begin(settings, folder, opened, start, crew, progress)
+    judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
+    recorder = _recorder(state, settings, folder, judge, progress)
     trainer = Trainer(
         state=state,
         settings=settings,
+        objective=objective,
+        crew=crew,
         folder=folder,
         data_digest=opened.digest,
-        judge=judge,
-        progress=progress,
+        recorder=recorder,
     )
     batches = stream_batches(
         opened.split("train"),
-        StreamSettings(
-            seed=settings.seed,
-            window=settings.shuffle_shards,
-            batch_size=settings.scenes_per_step,
-            resolution=settings.resolution,
-            views_per_scene=settings.views_per_scene,
-        ),
+        stream_settings(settings),
         state.step,
-        share=Share(),
+        share=crew.share,
         workers=workers,
         unusable=state.unusable,
     )
     with closing(batches):
         trainer.run(batches)
-    return _finish(state, settings, folder, opened, judge, began)
+    if recorder is None or judge is None:
+        return None
+    recorder.close()
+    return finished(state, settings, folder, opened, judge, time.monotonic() - began)
+
+
+def stream_settings(settings: TrainSettings) -> StreamSettings:
+    """Return what a run asks of the stream of its scenes."""
+    return StreamSettings(
+        seed=settings.seed,
+        window=settings.shuffle_shards,
+        batch_size=settings.scenes_per_step,
+        resolution=settings.resolution,
+        views_per_scene=settings.views_per_scene,
+        most_triangles=settings.most_triangles,
+        augmentation=settings.augmentation,
+    )
 
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:
@@ -145,9 +137,11 @@ def _check_data(data: TrainingData, settings: TrainSettings) -> None:
     for split in ("train", "validation"):
         data.split(split)
     num_views = data.num_views
-    if num_views is None:
+    lights_apart = settings.augmentation.light_mix > 1
+    if num_views is None or lights_apart:
         (sample,) = first_samples(data.split("train"), 1, Unusable(settings.most_unusable))
         num_views = sample.scene.num_views
+        training_scene(sample, settings.resolution, lights_apart=lights_apart)
     if settings.views_per_scene > num_views:
         raise TrilightError(
             f"views_per_scene is {settings.views_per_scene}, but scenes of {data.shown} "
@@ -156,23 +150,63 @@ def _check_data(data: TrainingData, settings: TrainSettings) -> None:
 
 
 def _begin(
-    settings: TrainSettings, folder: RunFolder, data: TrainingData, resume: bool
-) -> TrainState:
-    if resume:
-        return load_checkpoint(folder.checkpoint, settings, data.digest)
-    if folder.checkpoint.exists():
+    settings: TrainSettings,
+    folder: RunFolder,
+    data: TrainingData,
+    start: Start,
+    crew: Crew,
+    progress: Progress,
+) -> tuple[TrainSettings, TrainState]:
+    """Return the state that the run begins or goes on with, and the settings with its network."""
+    if start.resume:
+        checkpoint = read_checkpoint(newest_checkpoint(folder.checkpoints))
+        if settings.from_weights:
+            config = decode_config(checkpoint.header["model"])
+            settings = dataclasses.replace(settings, model=config)
+        _note_other_crew(checkpoint, crew, progress)
+        return settings, resumed_state(checkpoint, settings, data.digest, crew.device)
+    if saved_steps(folder.checkpoints):
         raise TrilightError(
             f"{folder.root}: holds a run already; add --resume to go on with it, or choose "
             "another --out."
         )
-    record = {
-        "settings": settings_record(settings),
-        "data_digest": data.digest,
-        "versions": {"torch": torch.__version__, "python": platform.python_version()},
-        "threads": torch.get_num_threads(),
-    }
-    write_atomically(folder.settings, _pretty_json(record))
-    return new_state(settings)
+    network = _network_to_begin_with(settings, start)
+    if network is not None:
+        settings = dataclasses.replace(settings, model=network.config)
+    if crew.is_first:
+        record = {
+            "settings": settings_record(settings),
+            "begun_with_sha256": sha256_hex(encode_weights(network)) if network else None,
+            "data_digest": data.digest,
+            "versions": {"torch": torch.__version__, "python": platform.python_version()},
+            "threads": torch.get_num_threads(),
+            "processes": crew.world_size,
+        }
+        write_atomically(folder.settings, pretty_json(record))
+    return settings, new_state(settings, crew.device, network)
+
+
+def _network_to_begin_with(settings: TrainSettings, start: Start) -> RenderFormer | None:
+    if settings.from_weights and start.begin_with is None:
+        raise TrilightError(
+            f"run {settings.run}: begins with a trained network; name one with --from, or say "
+            "--set from_weights=false to begin with random weights."
+        )
+    if start.begin_with is not None and not settings.from_weights:
+        raise TrilightError(
+            f"run {settings.run}: begins with random weights, but --from names "
+            f"{start.begin_with}; add --set from_weights=true to begin with those."
+        )
+    return None if start.begin_with is None else open_network(start.begin_with)
+
+
+def _note_other_crew(checkpoint: Checkpoint, crew: Crew, progress: Progress) -> None:
+    before = checkpoint.header["world_size"]
+    if before != crew.world_size:
+        progress.noted(
+            f"the run goes on with {crew.world_size} processes instead of {before}: the same to "
+            "rounding, not to the bit"
+        )
 
 
 def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable) -> Judge:
@@ -185,72 +219,19 @@ def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable)
     return Judge(samples, settings.resolution, median_picture(training))
 
 
-def _finish(
+def _recorder(
     state: TrainState,
     settings: TrainSettings,
     folder: RunFolder,
-    data: TrainingData,
-    judge: Judge,
-    began: float,
-) -> TrainResult:
-    most = data.max_triangles
-    trained = None if most is None else TrainedRange(max_triangles=most)
-    write_atomically(folder.weights, encode_weights(state.model, trained))
-    judgement = judge.judge(state.model)
-    loss_at_start, loss_at_end = _losses(folder, settings)
-    _write_sheet(folder, settings, judge, judgement)
-    result = TrainResult(
-        folder=folder,
+    judge: Judge | None,
+    progress: Progress,
+) -> Recorder | None:
+    if judge is None:
+        return None
+    progress.begin(
+        step=state.step,
+        num_steps=settings.num_steps,
         num_parameters=count_parameters(state.model),
-        num_steps=state.step,
-        skipped_steps=state.skipped_steps,
-        loss_at_start=loss_at_start,
-        loss_at_end=loss_at_end,
-        scores=judgement.scores,
         median_scores=judge.median_scores,
-        unusable=tuple(state.unusable.messages),
-        seconds=time.monotonic() - began,
     )
-    record = dataclasses.asdict(result) | {"beats_median": result.beats_median}
-    del record["folder"]
-    write_atomically(folder.summary, _pretty_json(record))
-    return result
-
-
-def _losses(folder: RunFolder, settings: TrainSettings) -> tuple[float, float]:
-    """Return the mean training loss of the first and of the last rows of the log."""
-    rows = [row["loss"] for row in read_rows(folder.metrics) if row.get("loss") is not None]
-    count = max(len(rows) // LOSS_SHARE, 1)
-    return sum(rows[:count]) / count, sum(rows[-count:]) / count
-
-
-def _write_sheet(
-    folder: RunFolder, settings: TrainSettings, judge: Judge, judgement: Judgement
-) -> None:
-    views, at = [], 0
-    for judged, pictures in zip(judge.scenes, judgement.pictures, strict=True):
-        score, median = judgement.views[at], judge.median_views[at]
-        at += len(pictures)
-        views.append(
-            SheetView(
-                name=f"scene {judged.scene.key}, view 0",
-                scores=(
-                    f"log L1 {score.log_l1:.4f} (median picture {median.log_l1:.4f}), "
-                    f"{score.psnr_log_db:.1f} dB log, {score.psnr_linear_db:.1f} dB linear"
-                ),
-                target_rgb=judged.target_VRR3[0],
-                predicted_rgb=pictures[0],
-            )
-        )
-    title = (
-        f"run {settings.run}, {settings.num_steps} steps, {settings.resolution} pixels: "
-        f"validation scenes, never trained on",
-        f"log L1 {judgement.scores['log_l1']:.4f}, median picture of the training views "
-        f"{judge.median_scores['log_l1']:.4f}, "
-        f"{judgement.scores['better_than_median']:.0%} of views better than it",
-    )
-    write_sheet(folder.sheet, views[:SHEET_SCENES], title)
-
-
-def _pretty_json(record: object) -> bytes:
-    return json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"
+    return Recorder(folder, settings, judge, progress, first_step=state.step)

@@ -1,18 +1,25 @@
-"""Training runs: one frozen description, and one function per named run.
+"""Training runs: one frozen description of everything that decides the weights.
 
-A run is a Python function that returns the whole description; the command line only picks one and
-may replace fields. What is not here cannot be changed.
+A run is a Python function that returns the whole description (train.runs); the command line picks
+one and may replace fields. What is not here cannot be changed.
 """
 
 import dataclasses
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import torch
 
 from model.config import ModelConfig
-from model.config import smoke as smoke_model
 from storage.errors import TrilightError
+from train.data.augmentation import AugmentationSettings
+from train.loss.settings import LossSettings
+
+PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+Precision = Literal["float32", "bfloat16"]
+"""Of the network's products. Positions, losses, weights and AdamW's memories stay float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,16 +30,28 @@ class TrainSettings:
     """Name of the run."""
     model: ModelConfig
     """The network."""
+    from_weights: bool = False
+    """Whether the run begins with given weights (`--from`) instead of random ones."""
     resolution: int
     """Pixels across the training pictures: a divisor of the data's, a multiple of the bundle's."""
+    most_triangles: int = 0
+    """Scenes with more triangles are unusable; 0: none is."""
     seed: int = 0
     """Of initial weights, order and augmentation."""
+    loss: LossSettings
+    """What is minimised."""
+    augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
+    """Symmetries under which scenes are shown."""
     num_steps: int
     """Updates of the weights; the learning rate ends its cosine at the last one."""
     scenes_per_step: int
     """Scenes whose gradients are averaged into one update."""
     views_per_scene: int
     """Views of each, drawn anew at every visit; at most as many as the data holds."""
+    scenes_per_pass: int = 16
+    """Most scenes that go through the network at once; gradients of the passes of a step add up."""
+    precision: Precision = "float32"
+    """Of the network's products."""
     learning_rate: float
     """Peak learning rate of AdamW."""
     warmup_steps: int
@@ -45,6 +64,8 @@ class TrainSettings:
     """AdamW's memories."""
     grad_clip: float = 1.0
     """Longest gradient that is followed; a longer one is shortened to this."""
+    ema_decay: float = 0.0
+    """Of the running mean of the weights, which is then what is judged and kept; 0: no mean."""
     recompute_activations: bool = False
     """Trade a third more time for memory: see RenderFormer.recompute_activations."""
     shuffle_shards: int = 4
@@ -57,6 +78,10 @@ class TrainSettings:
     """Steps between validations."""
     checkpoint_every: int
     """Steps between checkpoints."""
+    checkpoints_kept: int = 2
+    """Newest checkpoints that stay; older ones are deleted."""
+    keep_every: int = 0
+    """Checkpoints at multiples of so many steps stay for good; 0: none does."""
     validation_scenes: int = 64
     """Most scenes of the validation split that are judged."""
 
@@ -64,16 +89,7 @@ class TrainSettings:
         patch_px = self.model.patch_px
         if self.resolution < patch_px or self.resolution % patch_px:
             _wrong("resolution", self.resolution, f"a multiple of {patch_px}")
-        for name in (
-            "num_steps",
-            "scenes_per_step",
-            "views_per_scene",
-            "shuffle_shards",
-            "log_every",
-            "validate_every",
-            "checkpoint_every",
-            "validation_scenes",
-        ):
+        for name in _AT_LEAST_ONE:
             if getattr(self, name) < 1:
                 _wrong(name, getattr(self, name), "at least 1")
         for name in ("validate_every", "checkpoint_every"):
@@ -84,39 +100,32 @@ class TrainSettings:
         for name in ("learning_rate", "grad_clip"):
             if not getattr(self, name) > 0:
                 _wrong(name, getattr(self, name), "above 0")
-        if self.most_unusable < 0:
-            _wrong("most_unusable", self.most_unusable, "at least 0")
-        if not self.weight_decay >= 0:
-            _wrong("weight_decay", self.weight_decay, "at least 0")
+        for name in ("most_unusable", "most_triangles", "keep_every", "weight_decay"):
+            if not getattr(self, name) >= 0:
+                _wrong(name, getattr(self, name), "at least 0")
+        self._check_shares()
+        if self.precision not in get_args(Precision):
+            _wrong("precision", self.precision, " or ".join(get_args(Precision)))
+
+    def _check_shares(self) -> None:
+        shares = {"ema_decay": (self.ema_decay,), "final_rate_share": (self.final_rate_share,)}
+        for name, parts in {**shares, "betas": self.betas}.items():
+            if not all(0 <= part <= 1 for part in parts):
+                _wrong(name, getattr(self, name), "0 to 1")
 
 
-def smoke() -> TrainSettings:
-    """Return the run that shows, within five minutes on two CPU cores, that learning happens."""
-    return TrainSettings(
-        run="smoke",
-        model=smoke_model(),
-        resolution=64,
-        num_steps=360,
-        scenes_per_step=4,
-        views_per_scene=4,
-        learning_rate=1.5e-3,
-        warmup_steps=50,
-        validate_every=60,
-        checkpoint_every=60,
-    )
-
-
-RUNS: dict[str, Callable[[], TrainSettings]] = {"smoke": smoke}
-"""Every named run."""
-
-
-def named_run(name: str) -> TrainSettings:
-    """Return the settings of a run; raises TrilightError for an unknown name."""
-    if name not in RUNS:
-        raise TrilightError(
-            f"run {name!r}: no such run; expected one of {', '.join(sorted(RUNS))}."
-        )
-    return RUNS[name]()
+_AT_LEAST_ONE = (
+    "num_steps",
+    "scenes_per_step",
+    "scenes_per_pass",
+    "views_per_scene",
+    "shuffle_shards",
+    "log_every",
+    "validate_every",
+    "checkpoint_every",
+    "checkpoints_kept",
+    "validation_scenes",
+)
 
 
 def settings_record(settings: TrainSettings) -> dict[str, Any]:
@@ -130,12 +139,17 @@ def completed_record(record: dict[str, Any]) -> dict[str, Any]:
 
     A field came with a default that is what was done before.
     """
-    return _defaults(TrainSettings) | record | {"model": _defaults(ModelConfig) | record["model"]}
+    groups = {"model": ModelConfig, "loss": LossSettings, "augmentation": AugmentationSettings}
+    completed = {name: _defaults(kind) | record.get(name, {}) for name, kind in groups.items()}
+    return _defaults(TrainSettings) | record | completed
 
 
 def _defaults(settings: type) -> dict[str, Any]:
-    known = {f.name: f.default for f in dataclasses.fields(settings)}
-    given = {name: value for name, value in known.items() if value is not dataclasses.MISSING}
+    given = {
+        field.name: field.default
+        for field in dataclasses.fields(settings)
+        if field.default is not dataclasses.MISSING and not dataclasses.is_dataclass(field.default)
+    }
     record: dict[str, Any] = json.loads(json.dumps(given))
     return record
 

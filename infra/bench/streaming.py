@@ -235,7 +235,9 @@ def _parts(members: list[dict[str, bytes]]) -> Figures:
     """Return processor time of one thread by what it is spent on, per sample."""
     from train.data.augment import augmented
     from train.data.scenes import training_scene
+    from train.runs import smoke
 
+    augmentation = smoke().augmentation
     spent = dict.fromkeys(("arrays_ms", "pictures_ms", "tensors_ms", "augment_ms"), 0.0)
     for number, packed in enumerate(members):
         marks = [time.thread_time()]
@@ -246,7 +248,7 @@ def _parts(members: list[dict[str, bytes]]) -> Figures:
         marks.append(time.thread_time())
         scene = training_scene(sample, RESOLUTION)
         marks.append(time.thread_time())
-        augmented(scene, rng_for(0, "visit", number))
+        augmented(scene, augmentation, rng_for(0, "visit", number))
         marks.append(time.thread_time())
         for name, began, ended in zip(spent, marks, marks[1:], strict=False):
             spent[name] += 1000 * (ended - began) / len(members)

@@ -13,6 +13,7 @@ from infra.cli import (
     bench,
     convert,
     doctor,
+    evaluate,
     generate,
     inspect,
     model,
@@ -39,6 +40,7 @@ app.command("verify")(verify.verify)
 app.command("inspect")(inspect.inspect)
 app.command("model")(model.model)
 app.command("train")(train.train)
+app.command("evaluate")(evaluate.evaluate)
 app.command("bench")(bench.bench)
 app.add_typer(shards.app, name="shards")
 

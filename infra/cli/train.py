@@ -1,20 +1,24 @@
-"""`trilight train`: a named run on the shards of a dataset."""
+"""`trilight train`: a named run on the shards of a dataset, alone or under torchrun."""
 
 import dataclasses
+import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
 from rich.text import Text
 
+from infra.cli.changes import parse_changes
 from infra.cli.console import console, print_rows, progress_bars
+from storage.changes import changed
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
-    from train.run import TrainResult
+    from train.result import TrainResult
+    from train.settings import TrainSettings
 
 
 class _BarProgress:
@@ -62,41 +66,78 @@ def train(
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="folder of the run [runs/RUN]")] = None,
-    resume: Annotated[bool, typer.Option(help="go on from the last checkpoint")] = False,
+    resume: Annotated[bool, typer.Option(help="go on from the newest checkpoint")] = False,
+    from_: Annotated[
+        str | None,
+        typer.Option("--from", help="finetune runs: run folder or checkpoint to begin with"),
+    ] = None,
+    lpips: Annotated[
+        str | None,
+        typer.Option(
+            help="folder with vgg16-397923af.pth and vgg.pth, or hub to download them "
+            "[$TRILIGHT_LPIPS]"
+        ),
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="cpu or cuda [cuda where there is one]")
+    ] = None,
     steps: Annotated[int | None, typer.Option(help="replace the run's number of steps")] = None,
     workers: Annotated[int, typer.Option(min=1, help="threads that decode samples")] = 1,
     skip_unusable: Annotated[
         int | None, typer.Option(min=0, help="replace up to so many damaged samples [stop at one]")
     ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="any other setting by its name in settings.json, with its value in JSON, such as "
+            "loss.perceptual=none or model.width=256; may be repeated",
+        ),
+    ] = None,
     json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
 ) -> None:
-    """Train a model; writes checkpoints, metrics.jsonl and a sheet of validation pictures."""
+    """Train a model; writes checkpoints, metrics.jsonl, TensorBoard curves and a sheet.
+
+    For several processes, on one machine or many: torchrun -m infra.cli.app train ...
+    """
     try:
-        from train.run import train_run
-        from train.settings import named_run
+        from train.loop.crew import join_crew
+        from train.run import Start, train_run
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
         raise TrilightError("train: torch is not installed; run `make setup-all`.") from error
-    settings = named_run(run)
+    settings = _settings(run, steps, skip_unusable, parse_changes(set_ or ()))
+    start = Start(resume=resume, begin_with=from_, lpips=lpips)
+    with join_crew(device) as crew, progress_bars() as bars:
+        result = train_run(
+            settings,
+            data=data,
+            out=out or Path("runs") / run,
+            start=start,
+            crew=crew,
+            workers=workers,
+            progress=_BarProgress(bars),
+        )
+    if result is None:
+        return
+    if json:
+        sys.stdout.write(result.folder.summary.read_text())
+    else:
+        _report(result)
+
+
+def _settings(
+    run: str, steps: int | None, skip_unusable: int | None, changes: Mapping[str, Any]
+) -> "TrainSettings":
+    from train.runs import named_run
+
+    settings = changed(named_run(run), changes)
     if steps is not None:
         settings = dataclasses.replace(settings, num_steps=steps)
     if skip_unusable is not None:
         settings = dataclasses.replace(settings, most_unusable=skip_unusable)
-    folder = out or Path("runs") / run
-    with progress_bars() as bars:
-        result = train_run(
-            settings,
-            data=data,
-            out=folder,
-            resume=resume,
-            workers=workers,
-            progress=_BarProgress(bars),
-        )
-    if json:
-        console.file.write(result.folder.summary.read_text())
-    else:
-        _report(result)
+    return settings
 
 
 def _report(result: "TrainResult") -> None:

@@ -1,8 +1,15 @@
 """A run that takes seconds."""
 
 import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from model.config import ModelConfig
+from train.data.augmentation import AugmentationSettings
+from train.loss.settings import LossSettings
+from train.result import TrainResult
+from train.run import Start, train_run
 from train.settings import TrainSettings
 
 TINY_MODEL = ModelConfig(
@@ -23,6 +30,8 @@ def tiny_run(**changes: object) -> TrainSettings:
         run="tiny",
         model=TINY_MODEL,
         resolution=16,
+        loss=LossSettings(perceptual="none"),
+        augmentation=AugmentationSettings(mirror=True, channels=True, vertex_order=True),
         num_steps=12,
         scenes_per_step=3,
         views_per_scene=2,
@@ -33,3 +42,12 @@ def tiny_run(**changes: object) -> TrainSettings:
         checkpoint_every=4,
     )
     return dataclasses.replace(settings, **changes)  # type: ignore[arg-type]
+
+
+def trained(
+    settings: TrainSettings, data: Sequence[str], out: Path, *, resume: bool = False, **rest: Any
+) -> TrainResult:
+    """Run to the end in this process."""
+    result = train_run(settings, data=data, out=out, start=Start(resume=resume), **rest)
+    assert result is not None
+    return result

@@ -14,10 +14,28 @@ import torch
 from storage.scene import Scene
 from storage.seeds import rng_for
 from tests.train.toy import toy_picture, toy_sample
-from train.data.augment import augmented, mirrored, with_channels, with_vertices_turned, with_views
+from train.data.augment import (
+    augmented,
+    mirrored,
+    moved,
+    rotation_rand,
+    with_channels,
+    with_vertices_turned,
+    with_views,
+)
+from train.data.augmentation import AugmentationSettings
 from train.data.scenes import TrainingScene, training_scene
 
 RESOLUTION = 32
+
+# the toy's light has one strength: what scales light is tested by path tracing
+EVERYTHING = AugmentationSettings(
+    rotation="uniform",
+    translation=0.25,
+    mirror=True,
+    channels=True,
+    vertex_order=True,
+)
 
 Symmetry = Callable[[TrainingScene], TrainingScene]
 
@@ -28,7 +46,10 @@ SYMMETRIES: dict[str, Symmetry] = {
         scene, np.arange(scene.tensors.num_triangles) % 3
     ),
     "views": lambda scene: with_views(scene, np.array([1])),
-    "all at random": lambda scene: augmented(scene, rng_for(0, "augment")),
+    "motion": lambda scene: moved(
+        scene, rotation_rand("uniform", rng_for(0, "turn")), torch.tensor([3.0, -1.0, 0.5])
+    ),
+    "all at random": lambda scene: augmented(scene, EVERYTHING, rng_for(0, "augment")),
 }
 
 
@@ -99,6 +120,30 @@ def test_the_original_is_left_alone() -> None:
     scene = training_scene(toy_sample(2), 16)
     copies = {name: value.clone() for name, value in vars(scene.tensors).items()}
     target = scene.target_VRR3.clone()
-    augmented(scene, rng_for(1, "augment"))
+    stronger = dataclasses.replace(EVERYTHING, light_scale=3.0)
+    augmented(scene, stronger, rng_for(1, "augment"))
     assert torch.equal(scene.target_VRR3, target)
     assert all(torch.equal(getattr(scene.tensors, name), copies[name]) for name in copies)
+
+
+def test_uniform_rotations_favour_no_direction_and_the_recipe_favours_none_at_all() -> None:
+    """Of a rotation uniform on SO(3) the trace has mean 0 and variance 1; small turns raise it."""
+    rng = rng_for(0, "rotations")
+    traces = {
+        kind: np.array([float(rotation_rand(kind, rng).trace()) for _ in range(4000)])
+        for kind in ("uniform", "recipe")
+    }
+    # five standard errors of 4000 draws: 5 / sqrt(4000) = 0.08
+    assert abs(traces["uniform"].mean()) < 0.08
+    assert abs(traces["uniform"].var() - 1) < 0.15  # fourth moment 3: 5 sqrt(2 / 4000) = 0.11
+    assert traces["recipe"].mean() > 0.3
+    turned = rotation_rand("uniform", rng)
+    torch.testing.assert_close(turned @ turned.T, torch.eye(3).double())
+    assert turned.det().item() == pytest.approx(1)
+    assert torch.equal(rotation_rand("none", rng), torch.eye(3).double())
+
+
+def test_what_is_left_out_changes_nothing() -> None:
+    scene = training_scene(toy_sample(2), 16)
+    same = augmented(scene, AugmentationSettings(), rng_for(1, "augment"))
+    assert same is scene

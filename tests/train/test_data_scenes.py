@@ -4,11 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from storage.errors import TrilightError
 from storage.seeds import rng_for
 from tests.train.toy import toy_sample
-from train.data.buckets import LONGEST_TO_SHORTEST, bucket_scenes
+from train.data.augment import with_views
+from train.data.buckets import MOST_WASTE, bucket_scenes
 from train.data.resolution import block_mean
 from train.data.scenes import training_scene
 
@@ -54,16 +56,41 @@ def test_targets_are_log10_of_one_plus_radiance() -> None:
     np.testing.assert_allclose(10.0**target - 1, sample.radiance_rgb, atol=1e-6)  # float32 log
 
 
-def test_buckets_hold_each_scene_once_and_pad_little() -> None:
+def cost(num_triangles: int) -> float:
+    """Mostly what the pictures cost, as in a small network."""
+    return 300.0 + num_triangles
+
+
+@pytest.mark.parametrize("most", [2, 16])
+def test_buckets_hold_each_scene_once_and_waste_little(most: int) -> None:
     scenes = [training_scene(toy_sample(index), 8) for index in range(12)]
-    batches = bucket_scenes(scenes)
+    batches = bucket_scenes(scenes, cost, most)
     lengths: list[int] = []
     for batch in batches:
         longest = batch.scenes.triangles_BT33.shape[1]
         mask = batch.scenes.is_triangle_BT
         own = mask.sum(1).tolist() if mask is not None else [longest] * len(batch.target_BVRR3)
-        assert longest == max(own) <= LONGEST_TO_SHORTEST * min(own)
-        assert len(batch.target_BVRR3) == len(own)
+        assert longest == max(own)
+        assert len(own) * cost(longest) <= (1 + MOST_WASTE) * sum(cost(one) for one in own)
+        assert len(batch.target_BVRR3) == len(batch.noise_BV) == len(own) <= most
         lengths += own
     assert sorted(lengths) == sorted(scene.tensors.num_triangles for scene in scenes)
-    assert len(batches) > 1
+    assert 1 < len(batches) < len(scenes)
+
+
+def test_a_view_takes_its_target_and_its_noise_along() -> None:
+    sample = toy_sample(4, resolution=16)
+    floors = (dataclasses.replace(sample.views[0], noise_floor_db=40.0), sample.views[1])
+    scene = training_scene(dataclasses.replace(sample, views=floors), 16)
+    torch.testing.assert_close(scene.noise_V, torch.tensor([1e-2, 1e-5]))
+    assert with_views(scene, np.array([1])).noise_V.tolist() == scene.noise_V[1:].tolist()
+
+
+def test_what_a_run_does_not_take_is_refused() -> None:
+    sample = toy_sample(4, resolution=16)
+    most = sample.scene.num_triangles
+    assert training_scene(sample, 16, most_triangles=most).tensors.num_triangles == most
+    with pytest.raises(TrilightError, match=f"{most} triangles; the run takes at most {most - 1}"):
+        training_scene(sample, 16, most_triangles=most - 1)
+    with pytest.raises(TrilightError, match=r"not kept apart, which light_mix needs.*per_light"):
+        training_scene(sample, 16, lights_apart=True)

@@ -13,13 +13,21 @@ from storage.dataset import Dataset
 from storage.errors import TrilightError
 from storage.training_data import TrainingData, open_training_data
 from tests.train.toy import write_toy_dataset
+from train.data.augmentation import AugmentationSettings
 from train.data.order import Share
 from train.data.scenes import TrainingScene
 from train.data.splits import first_samples
 from train.data.stream import StreamSettings, prefetched, stream_batches
 from train.data.unusable import Unusable
 
-SETTINGS = StreamSettings(seed=1, window=2, batch_size=6, resolution=16, views_per_scene=1)
+SETTINGS = StreamSettings(
+    seed=1,
+    window=2,
+    batch_size=6,
+    resolution=16,
+    views_per_scene=1,
+    augmentation=AugmentationSettings(mirror=True, channels=True, vertex_order=True),
+)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,15 @@ from train.data.scenes import training_scene
 from train.evaluation.hits import CHUNK, hit_masks
 from train.evaluation.judge import median_picture
 from train.evaluation.scores import ViewScore, score_view, share_better, summarise
-from train.evaluation.sheet import ERROR_WHITE, SheetView, error_picture, write_sheet
+from train.evaluation.sheet import (
+    ERROR_WHITE,
+    NOISE_WHITE,
+    SheetView,
+    drawn_sheet,
+    error_picture,
+    noise_picture,
+    write_picture,
+)
 
 
 def hits_one_by_one(scene: Scene, view: int, resolution: int) -> np.ndarray:
@@ -118,13 +126,29 @@ def test_the_error_picture_is_black_without_error_and_white_at_its_limit() -> No
 def test_the_sheet_shows_every_view(tmp_path: Path) -> None:
     target = np.full((8, 8, 3), 0.2)
     views = [
-        SheetView(name=f"view {row}", scores="", target_rgb=target, predicted_rgb=target * row)
+        SheetView(
+            name=f"view {row}", scores="", target_rgb=target, predicted_rgb=target * row, noise=0.01
+        )
         for row in range(3)
     ]
     for name in ("a.png", "b.png"):
-        write_sheet(tmp_path / name, views, ("one line", "and another"))
+        write_picture(tmp_path / name, drawn_sheet(views, ("one line", "and another")))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     with Image.open(tmp_path / "a.png") as sheet:
         pixels = np.asarray(sheet.convert("RGB"))
     assert pixels.shape[1] > 1000
     assert (pixels == 0).all(axis=-1).any(), "the black prediction of the first view"
+
+
+def test_the_noise_picture_is_black_at_the_noise_and_white_at_its_limit() -> None:
+    target = np.full((2, 2, 3), 0.5)
+
+    def view(error: float) -> SheetView:
+        predicted = 1.5 * 10**error - 1
+        return SheetView(
+            name="", scores="", target_rgb=target, predicted_rgb=target * 0 + predicted, noise=0.01
+        )
+
+    assert noise_picture(view(0.0099)).max() == 0
+    assert 0 < noise_picture(view(0.02)).mean() < 255
+    assert noise_picture(view(0.0101 * NOISE_WHITE)).min() == 255

@@ -12,12 +12,16 @@ from safetensors.torch import load_file, save_file
 from storage.errors import TrilightError
 from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
-from train.data.buckets import make_batch
+from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
-from train.loop.checkpoint import HEADER_KEY, load_checkpoint, save_checkpoint
+from train.loop.checkpoint import HEADER_KEY, read_checkpoint, resumed_state, save_checkpoint
+from train.loop.checkpoints import newest_checkpoint
+from train.loop.crew import Crew
 from train.loop.metrics_log import MetricsLog, read_rows
 from train.loop.state import TrainState, new_state
-from train.loop.step import train_step
+from train.loop.step import Stepper
+from train.loss.objective import Objective
+from train.settings import TrainSettings
 
 DIGEST = "d" * 64
 
@@ -30,24 +34,27 @@ def trained(steps: int = 3) -> TrainState:
     return state
 
 
-def one_step(state: TrainState, batch: object) -> None:
-    train_step(
-        state.model,
-        state.optimizer,
-        [batch],  # type: ignore[list-item]
-        resolution=16,
-        learning_rate=1e-3,
-        grad_clip=1.0,
-    )
+def one_step(state: TrainState, batch: TrainingBatch) -> None:
+    settings = tiny_run()
+    crew = Crew(device=torch.device("cpu"))
+    Stepper(state, settings, Objective(settings.loss, None), crew).step([batch], 1e-3)
     state.step += 1
+
+
+def save(path: Path, state: TrainState, settings: TrainSettings | None = None) -> None:
+    save_checkpoint(path, state, settings or tiny_run(), data_digest=DIGEST, world_size=1)
+
+
+def load(path: Path, settings: TrainSettings | None = None, digest: str = DIGEST) -> TrainState:
+    return resumed_state(read_checkpoint(path), settings or tiny_run(), digest)
 
 
 @pytest.mark.parametrize("steps", [0, 3])
 def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
     state = trained(steps)
     path = tmp_path / "checkpoint"
-    save_checkpoint(path, state, tiny_run(), DIGEST)
-    loaded = load_checkpoint(path, tiny_run(), DIGEST)
+    save(path, state)
+    loaded = load(path)
     assert (loaded.step, loaded.skipped_steps) == (state.step, state.skipped_steps)
     batch = make_batch([training_scene(toy_sample(1), 16)])
     for each in (state, loaded):
@@ -58,7 +65,7 @@ def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
 
 def test_equal_states_give_equal_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        save_checkpoint(tmp_path / name, trained(), tiny_run(), DIGEST)
+        save(tmp_path / name, trained())
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -68,8 +75,8 @@ def test_damage_that_was_met_is_not_forgotten(tmp_path: Path) -> None:
     error = TrilightError("x")
     for name in ("b", "a"):
         state.unusable.add(name, 1, error)
-    save_checkpoint(tmp_path / "c", state, settings, DIGEST)
-    loaded = load_checkpoint(tmp_path / "c", settings, DIGEST).unusable
+    save(tmp_path / "c", state, settings)
+    loaded = load(tmp_path / "c", settings).unusable
     assert loaded.met == state.unusable.met and loaded.messages == ()
     loaded.add("a", 1, error)
     loaded.add("c", 1, error)
@@ -80,8 +87,8 @@ def test_damage_that_was_met_is_not_forgotten(tmp_path: Path) -> None:
 def test_skipped_steps_do_not_count_as_updates(tmp_path: Path) -> None:
     state = trained(2)
     state.step, state.skipped_steps = 5, 3
-    save_checkpoint(tmp_path / "c", state, tiny_run(), DIGEST)
-    loaded = load_checkpoint(tmp_path / "c", tiny_run(), DIGEST)
+    save(tmp_path / "c", state)
+    loaded = load(tmp_path / "c")
     assert {float(memory["step"]) for memory in loaded.optimizer.state.values()} == {2.0}
 
 
@@ -101,35 +108,35 @@ def test_skipped_steps_do_not_count_as_updates(tmp_path: Path) -> None:
 def test_another_run_or_other_data_is_refused_by_field(
     tmp_path: Path, changes: dict[str, object], digest: str, message: str
 ) -> None:
-    save_checkpoint(tmp_path / "c", new_state(tiny_run()), tiny_run(), DIGEST)
+    save(tmp_path / "c", new_state(tiny_run()))
     with pytest.raises(TrilightError, match=message):
-        load_checkpoint(tmp_path / "c", tiny_run(**changes), digest)
+        load(tmp_path / "c", tiny_run(**changes), digest)
 
 
 def test_a_checkpoint_from_before_a_setting_existed_resumes(tmp_path: Path) -> None:
     """With the setting's default, which is what was done then; and with no other value."""
     path = tmp_path / "c"
-    save_checkpoint(path, new_state(tiny_run()), tiny_run(), DIGEST)
+    save(path, new_state(tiny_run()))
     tensors = load_file(path)
     with safe_open(path, "pt") as file:
         header = json.loads(file.metadata()[HEADER_KEY])
     del header["settings"]["recompute_activations"]
     del header["settings"]["model"]["window_bundles"]
     save_file(tensors, path, metadata={HEADER_KEY: json.dumps(header)})
-    assert load_checkpoint(path, tiny_run(), DIGEST).step == 0
+    assert load(path).step == 0
     with pytest.raises(TrilightError, match="recompute_activations is True, .* made with False"):
-        load_checkpoint(path, tiny_run(recompute_activations=True), DIGEST)
+        load(path, tiny_run(recompute_activations=True))
 
 
 def test_a_missing_or_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
-        load_checkpoint(tmp_path / "c", tiny_run(), DIGEST)
-    save_checkpoint(tmp_path / "c", new_state(tiny_run()), tiny_run(), DIGEST)
+        newest_checkpoint(tmp_path / "checkpoints")
+    save(tmp_path / "c", new_state(tiny_run()))
     data = (tmp_path / "c").read_bytes()
     for damaged in (b"", data[:100], data[:-1], b"PK\x03\x04" + data):
         (tmp_path / "c").write_bytes(damaged)
         with pytest.raises(TrilightError):
-            load_checkpoint(tmp_path / "c", tiny_run(), DIGEST)
+            load(tmp_path / "c")
 
 
 def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:

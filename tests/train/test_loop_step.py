@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -12,26 +13,33 @@ from tests.train.kit import tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, bucket_scenes, make_batch
 from train.data.scenes import training_scene
+from train.loop.crew import Crew
 from train.loop.optim import learning_rate
 from train.loop.state import TrainState, new_state
-from train.loop.step import StepReport, train_step, view_losses
+from train.loop.step import Stepper, StepReport, predicted
+from train.loss.objective import Objective, view_l1
+from train.settings import Precision, TrainSettings
 
 RESOLUTION = 16
+CPU = torch.device("cpu")
 
 
 def scenes(count: int = 5) -> list:
     return [training_scene(toy_sample(index), RESOLUTION) for index in range(count)]
 
 
+def cost(num_triangles: int) -> float:
+    return 100.0 + num_triangles
+
+
+def stepper(state: TrainState, settings: TrainSettings) -> Stepper:
+    return Stepper(state, settings, Objective(settings.loss, None), Crew(device=CPU))
+
+
 def step(state: TrainState, batches: list[TrainingBatch], grad_clip: float = 1.0) -> StepReport:
-    return train_step(
-        state.model,
-        state.optimizer,
-        batches,
-        resolution=RESOLUTION,
-        learning_rate=3e-3,
-        grad_clip=grad_clip,
-    )
+    report = stepper(state, tiny_run(grad_clip=grad_clip)).step(batches, 3e-3)
+    state.step += 1
+    return report
 
 
 def gradients(batches: list[TrainingBatch]) -> tuple[float, list[Tensor]]:
@@ -42,7 +50,7 @@ def gradients(batches: list[TrainingBatch]) -> tuple[float, list[Tensor]]:
 
 def test_buckets_of_any_size_give_the_gradient_of_one_batch() -> None:
     drawn = scenes()
-    buckets = bucket_scenes(drawn)
+    buckets = bucket_scenes(drawn, cost, 16)
     sizes = {len(batch.target_BVRR3) for batch in buckets}
     assert len(sizes) > 1, "equal buckets could not tell a mean over views from one over batches"
     loss, cut = gradients(buckets)
@@ -58,7 +66,7 @@ def test_the_loss_is_the_mean_absolute_error_of_each_view() -> None:
     target = torch.zeros(1, 2, 4, 4, 3)
     target[0, 1] = 2.0
     # negative predictions count in full: the ELU is not part of it
-    assert view_losses(prediction, target).tolist() == [[1.0, 3.0]]
+    assert view_l1(prediction, target).tolist() == [[1.0, 3.0]]
 
 
 def ruin_target(state: TrainState, batch: TrainingBatch) -> None:
@@ -79,10 +87,12 @@ def ruin_gradient(state: TrainState, batch: TrainingBatch) -> None:
 def test_a_step_that_is_not_finite_changes_nothing(
     ruin: Callable[[TrainState, TrainingBatch], None],
 ) -> None:
-    state = new_state(tiny_run())
+    state = new_state(tiny_run(ema_decay=0.5))
     batch = make_batch(scenes(2))
     assert step(state, [batch]).applied
     ruin(state, batch)
+    assert state.mean_model is not None
+    mean = copy.deepcopy(state.mean_model.state_dict())
     weights = copy.deepcopy(state.model.state_dict())
     memories = copy.deepcopy(state.optimizer.state_dict()["state"])
     report = step(state, [batch])
@@ -92,6 +102,72 @@ def test_a_step_that_is_not_finite_changes_nothing(
     for row, memory in state.optimizer.state_dict()["state"].items():
         for name, value in memory.items():
             assert torch.equal(value, memories[row][name]), name
+    for name, weight in state.mean_model.state_dict().items():
+        assert torch.equal(weight, mean[name]), name
+
+
+def test_the_mean_follows_the_weights_faster_at_first() -> None:
+    settings = tiny_run(ema_decay=0.7)
+    state = new_state(settings)
+    assert state.mean_model is not None and state.shown is state.mean_model
+    batch = make_batch(scenes(2))
+    by_hand = state.model.decoder.rays.weight.detach().clone()
+    for updates in range(30):
+        stepper(state, settings).step([batch], 3e-3)
+        state.step += 1
+        decay = min(0.7, (1 + updates) / (10 + updates))
+        by_hand = decay * by_hand + (1 - decay) * state.model.decoder.rays.weight.detach()
+    # float32, 30 updates
+    torch.testing.assert_close(state.mean_model.decoder.rays.weight, by_hand, rtol=0, atol=1e-6)
+    assert (by_hand - state.model.decoder.rays.weight).abs().max() > 1e-4
+    assert new_state(tiny_run()).shown is not None and new_state(tiny_run()).mean_model is None
+
+
+def test_bfloat16_rounds_products_but_no_position() -> None:
+    """The published training rounds positions too, to a grid of up to 0.004 m."""
+    model = new_state(tiny_run()).model
+    batch = make_batch(scenes(2))
+    seen: dict[str, list[Tensor]] = {}
+
+    def note(precision: Precision) -> Tensor:
+        hook = model.encoder.rotary.register_forward_pre_hook(
+            lambda _, given: seen.setdefault(precision, []).append(given[0].clone())
+        )
+        with torch.no_grad():
+            model.decoder.head.last.weight.fill_(0.01)  # or all pictures are black alike
+            prediction = predicted(model, batch, RESOLUTION, precision)
+        hook.remove()
+        return prediction
+
+    exact, rounded = note("float32"), note("bfloat16")
+    assert rounded.dtype == torch.float32
+    assert 0 < (rounded - exact).abs().max() < 0.05
+    for ours, theirs in zip(seen["bfloat16"], seen["float32"], strict=True):
+        assert ours.dtype == torch.float32 and torch.equal(ours, theirs)
+
+
+def test_a_step_asks_no_generator() -> None:
+    """What does not exist need not be saved: a resumed run is the same whatever the state here."""
+    state = new_state(tiny_run())
+    before = torch.get_rng_state(), np.random.get_state(legacy=True)[1].copy()  # type: ignore[index] # noqa: NPY002
+    step(state, [make_batch(scenes(2))])
+    assert torch.equal(torch.get_rng_state(), before[0])
+    assert np.array_equal(np.random.get_state(legacy=True)[1], before[1])  # type: ignore[index] # noqa: NPY002
+
+
+def test_the_report_says_how_bright_the_pictures_are() -> None:
+    batch = make_batch(scenes(2))
+    state = new_state(tiny_run())
+    report = step(state, [batch])
+    mean = batch.target_BVRR3.mean().item()
+    assert report.l1 == report.loss == pytest.approx(mean, rel=1e-4), "a black start"
+    assert report.brightness == 0
+    with torch.no_grad():
+        last = state.model.decoder.head.last
+        last.load_state_dict(
+            {"weight": torch.zeros_like(last.weight), "bias": torch.full((192,), mean / 2)}
+        )
+    assert step(state, [batch]).brightness == pytest.approx(0.5, rel=1e-4)  # float32 sums
 
 
 def test_a_long_gradient_is_shortened() -> None:
@@ -129,7 +205,7 @@ def test_a_fresh_network_learns_eight_pictures() -> None:
     drawn = scenes(4)
     targets = torch.cat([scene.target_VRR3 for scene in drawn])
     median_error = (targets - targets.median(dim=0).values).abs().mean().item()
-    reports = [step(state, bucket_scenes(drawn), grad_clip=1.0) for _ in range(150)]
+    reports = [step(state, bucket_scenes(drawn, cost, 16), grad_clip=1.0) for _ in range(150)]
     assert reports[0].loss == pytest.approx(targets.mean().item(), rel=1e-4)  # a black start
     assert reports[-1].loss < 0.7 * median_error  # measured: 0.53
     assert min(report.grad_norm for report in reports) > 0.01

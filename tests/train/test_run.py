@@ -16,14 +16,14 @@ from model.weights import decode_weights
 from storage.dataset import Dataset
 from storage.errors import TrilightError
 from storage.safe_read import safetensors_header
-from tests.train.kit import tiny_run
+from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.loop.metrics_log import read_rows
 from train.progress import Silent
-from train.run import TrainResult, train_run
+from train.result import TrainResult
 from train.settings import TrainSettings
 
-TIMINGS = {"views_per_s", "data_wait_share"}
+TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share"}
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +44,7 @@ def run(
     resume: bool = False,
     progress: Silent | None = None,
 ) -> TrainResult:
-    return train_run(
-        settings, data=[str(dataset.folder.root)], out=out, resume=resume, progress=progress
-    )
+    return trained(settings, [str(dataset.folder.root)], out, resume=resume, progress=progress)
 
 
 class SignalAt(Silent):
@@ -75,7 +73,8 @@ class KillAt(Silent):
 
 
 def same_as_uninterrupted(out: Path, whole: TrainResult) -> None:
-    for name in ("model.safetensors", "checkpoint.safetensors", "validation_sheet.png"):
+    last = f"checkpoints/step-{whole.num_steps:09d}.safetensors"
+    for name in ("model.safetensors", last, "validation_sheet.png"):
         assert (out / name).read_bytes() == (whole.folder.root / name).read_bytes(), name
 
 
@@ -168,7 +167,7 @@ def test_progress_hears_of_every_step(dataset: Dataset, tmp_path: Path) -> None:
 
 def test_mistakes_are_named(dataset: Dataset, whole: TrainResult, tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match=r"no manifest\.json here"):
-        train_run(tiny_run(), data=[str(tmp_path / "nowhere")], out=tmp_path / "a")
+        trained(tiny_run(), [str(tmp_path / "nowhere")], tmp_path / "a")
     with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):
         run(tiny_run(resolution=24), dataset, tmp_path / "b")
     with pytest.raises(TrilightError, match="views_per_scene is 3, .* have 2 views"):

@@ -10,10 +10,9 @@ from storage.errors import TrilightError
 from storage.remote import tries
 from storage.training_data import NO_MANIFEST
 from tests.http_server import Fault, Site, serve
-from tests.train.kit import tiny_run
+from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.progress import Silent
-from train.run import train_run
 
 pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
 
@@ -30,9 +29,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def weights(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The weights of the run from the folder, uninterrupted."""
     out = tmp_path_factory.mktemp("whole")
-    return train_run(
-        tiny_run(), data=[str(dataset.folder.root)], out=out
-    ).folder.weights.read_bytes()
+    return trained(tiny_run(), [str(dataset.folder.root)], out).folder.weights.read_bytes()
 
 
 @pytest.fixture
@@ -63,10 +60,10 @@ def test_a_run_begun_in_a_folder_goes_on_from_a_server(
     """In the middle of an epoch, over a bad line, with another number of threads."""
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        train_run(tiny_run(), data=[str(dataset.folder.root)], out=out, progress=StopAt(7))
+        trained(tiny_run(), [str(dataset.folder.root)], out, progress=StopAt(7))
     faults = [Fault(status=503), Fault(cut_after=5000), Fault(flip=True)]
     server.faults = {f"/train-{number:06d}.tar": list(faults) for number in range(3)}
-    result = train_run(tiny_run(), data=[server.url], out=out, resume=True, workers=3)
+    result = trained(tiny_run(), [server.url], out, resume=True, workers=3)
     assert result.folder.weights.read_bytes() == weights
     assert result.unusable == ()
 
@@ -76,11 +73,11 @@ def test_a_list_gives_the_same_weights_and_says_what_it_lacks(
 ) -> None:
     listener = StopAt(99)
     pattern = f"{server.url}/{{train-000000,train-000001,train-000002,validation-000000}}.tar"
-    result = train_run(tiny_run(), data=[pattern], out=tmp_path / "out", progress=listener)
+    result = trained(tiny_run(), [pattern], tmp_path / "out", progress=listener)
     assert result.folder.weights.read_bytes() == weights
     assert listener.notes == [NO_MANIFEST]
     with pytest.raises(TrilightError, match=r"resume: data\.digest is"):
-        train_run(tiny_run(), data=[str(dataset.folder.root)], out=tmp_path / "out", resume=True)
+        trained(tiny_run(), [str(dataset.folder.root)], tmp_path / "out", resume=True)
 
 
 def test_damaged_data_is_left_out_when_it_is_allowed(dataset: Dataset, tmp_path: Path) -> None:
@@ -91,8 +88,8 @@ def test_damaged_data_is_left_out_when_it_is_allowed(dataset: Dataset, tmp_path:
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     with pytest.raises(TrilightError, match=r"train-000002\.tar.*sha256"):
-        train_run(tiny_run(), data=[str(root)], out=tmp_path / "a")
-    result = train_run(tiny_run(most_unusable=1), data=[str(root)], out=tmp_path / "b")
+        trained(tiny_run(), [str(root)], tmp_path / "a")
+    result = trained(tiny_run(most_unusable=1), [str(root)], tmp_path / "b")
     (message,) = result.unusable
     assert "train-000002.tar" in message
     assert message in result.folder.summary.read_text().replace("\\n", "\n")
@@ -115,11 +112,11 @@ def test_the_budget_of_damage_is_the_run_s_and_not_the_process_s(
     settings = tiny_run(most_unusable=3)
     damage(first)
     with pytest.raises(KeyboardInterrupt):
-        train_run(settings, data=[str(root)], out=out, progress=StopAt(7))
+        trained(settings, [str(root)], out, progress=StopAt(7))
     copied.folder.shard(first).write_bytes(whole[first])
     damage(second)
     with pytest.raises(TrilightError, match="6 samples are unusable; expected at most 3"):
-        train_run(settings, data=[str(root)], out=out, resume=True)
+        trained(settings, [str(root)], out, resume=True)
     copied.folder.shard(second).write_bytes(whole[second])
     damage(first)
-    assert len(train_run(settings, data=[str(root)], out=out, resume=True).unusable) == 1
+    assert len(trained(settings, [str(root)], out, resume=True).unusable) == 1

@@ -4,9 +4,11 @@ import json
 
 import pytest
 
+from storage.changes import changed
 from storage.errors import TrilightError
 from tests.train.kit import tiny_run
-from train.settings import RUNS, named_run, settings_record
+from train.runs import RUNS, named_run
+from train.settings import settings_record
 
 
 @pytest.mark.parametrize("name", sorted(RUNS))
@@ -19,7 +21,7 @@ def test_named_runs_carry_their_name_and_survive_json(name: str) -> None:
 
 
 def test_an_unknown_run_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(TrilightError, match="run 'smoek': no such run; expected one of smoke"):
+    with pytest.raises(TrilightError, match="run 'smoek': no such run; expected one of finetune"):
         named_run("smoek")
 
 
@@ -37,8 +39,56 @@ def test_an_unknown_run_is_refused_with_the_known_ones() -> None:
         ({"weight_decay": -0.1}, "weight_decay is -0.1"),
         ({"validate_every": 5}, "validate_every is 5; expected a multiple of log_every, 2"),
         ({"checkpoint_every": 3}, "checkpoint_every is 3"),
+        ({"checkpoints_kept": 0}, "checkpoints_kept is 0"),
+        ({"scenes_per_pass": 0}, "scenes_per_pass is 0"),
+        ({"keep_every": -1}, "keep_every is -1"),
+        ({"ema_decay": 1.5}, "ema_decay is 1.5; expected 0 to 1"),
+        ({"ema_decay": float("nan")}, "ema_decay is nan"),
+        ({"betas": (0.9, 2.0)}, "betas is .*expected 0 to 1"),
+        ({"precision": "float16"}, "precision is float16; expected float32 or bfloat16"),
     ],
 )
 def test_contradictory_settings_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(TrilightError, match=message):
         tiny_run(**changes)
+
+
+def test_the_paper_runs_are_the_papers() -> None:
+    """Zeng et al. 2025, section 4, and the published configuration."""
+    first, second = named_run("paper-pretrain"), named_run("paper-finetune")
+    assert (first.resolution, first.most_triangles, first.num_steps) == (256, 1536, 500_000)
+    assert (first.scenes_per_step, first.views_per_scene) == (128, 2)
+    assert (first.warmup_steps, first.learning_rate) == (8_000, 1e-4)
+    assert (second.resolution, second.most_triangles, second.num_steps) == (512, 4096, 100_000)
+    for run in (first, second):
+        assert (run.loss.perceptual, run.loss.perceptual_weight) == ("lpips", 0.05)
+        assert (run.betas, run.weight_decay, run.grad_clip) == ((0.9, 0.999), 0.01, 1.0)
+        assert (run.augmentation.rotation, run.augmentation.translation) == ("recipe", 0.25)
+        assert run.ema_decay == 0 and not run.augmentation.mirror
+    assert second.from_weights and not first.from_weights
+
+
+def test_any_field_can_be_replaced_by_name() -> None:
+    changes = {
+        "loss.perceptual": "none",
+        "augmentation.rotation": "uniform",
+        "model.hidden_width": 72,
+        "betas": [0.9, 0.95],
+        "ema_decay": 0.5,
+    }
+    settings = changed(named_run("smoke"), changes)
+    assert settings.loss.perceptual == "none" and settings.augmentation.rotation == "uniform"
+    assert (settings.model.hidden_width, settings.betas, settings.ema_decay) == (
+        72,
+        (0.9, 0.95),
+        0.5,
+    )
+    for name, value, message in (
+        ("loss.perceptual", "vgg", "expected lpips, ms_ssim or none"),
+        ("augmentation.rotation", "full", "expected none, recipe or uniform"),
+        ("augmentation.light_mix", 0.5, "light_mix is 0.5; expected at least 1"),
+        ("augmentation.translation", -1.0, "translation is -1.0"),
+        ("lossy", 1, "setting 'lossy' does not exist"),
+    ):
+        with pytest.raises(TrilightError, match=message):
+            changed(named_run("smoke"), {name: value})

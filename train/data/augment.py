@@ -10,20 +10,66 @@ every decoding thread, and they wait for cores in loops that took four times the
 import dataclasses
 
 import numpy as np
+import roma
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from storage.conventions import DIFFUSE, EMISSION, SPECULAR
+from train.data.augmentation import AugmentationSettings, Rotation
+from train.data.relight import with_light_scaled, with_lights_mixed
 from train.data.scenes import TrainingScene
 
 
-def augmented(scene: TrainingScene, rng: np.random.Generator) -> TrainingScene:
-    """Return the scene under random symmetries, uniform over their group."""
-    if rng.random() < 0.5:
+def augmented(
+    scene: TrainingScene, settings: AugmentationSettings, rng: np.random.Generator
+) -> TrainingScene:
+    """Return the scene under random symmetries; those that settings leave out draw nothing."""
+    if settings.light_mix > 1:
+        assert scene.lights_VLRR3 is not None
+        exponent_L = rng.uniform(-1, 1, scene.lights_VLRR3.shape[1])
+        factor_L = torch.from_numpy(settings.light_mix**exponent_L).float()
+        scene = with_lights_mixed(scene, factor_L)
+    if settings.light_scale > 1:
+        scene = with_light_scaled(scene, float(settings.light_scale ** rng.uniform(-1, 1)))
+    if settings.mirror and rng.random() < 0.5:
         scene = mirrored(scene)
-    scene = with_channels(scene, rng.permutation(3))
-    return with_vertices_turned(scene, rng.integers(3, size=scene.tensors.num_triangles))
+    if settings.channels:
+        scene = with_channels(scene, rng.permutation(3))
+    if settings.vertex_order:
+        turn_T = rng.integers(3, size=scene.tensors.num_triangles)
+        scene = with_vertices_turned(scene, turn_T)
+    if settings.rotation != "none" or settings.translation:
+        shift = rng.normal(0, settings.translation, 3)
+        scene = moved(scene, rotation_rand(settings.rotation, rng), torch.from_numpy(shift))
+    return scene
+
+
+def rotation_rand(kind: Rotation, rng: np.random.Generator) -> Tensor:
+    """Return a random rotation matrix [3, 3], float64; the unit matrix for `none`."""
+    if kind == "recipe":
+        return roma.rotvec_to_rotmat(torch.from_numpy(rng.normal(0, 1, 3)))
+    if kind == "uniform":
+        # four normal numbers point in a uniform direction, and unit quaternions cover SO(3) evenly
+        return roma.unitquat_to_rotmat(roma.quat_normalize(torch.from_numpy(rng.normal(size=4))))
+    return torch.eye(3, dtype=torch.float64)
+
+
+def moved(scene: TrainingScene, rotation_33: Tensor, shift_3: Tensor) -> TrainingScene:
+    """Return the scene and its cameras after one rigid motion x -> R x + t; pictures stay.
+
+    The products are taken in float64, so that poses stay rotations to the rounding of float32.
+    """
+    old = scene.tensors
+    motion_44 = torch.eye(4, dtype=torch.float64)
+    motion_44[:3, :3], motion_44[:3, 3] = rotation_33, shift_3
+    tensors = dataclasses.replace(
+        old,
+        triangles_T33=(old.triangles_T33.double() @ rotation_33.T + shift_3).float(),
+        normals_T33=(old.normals_T33.double() @ rotation_33.T).float(),
+        c2w_V44=(motion_44 @ old.c2w_V44.double()).float(),
+    )
+    return dataclasses.replace(scene, tensors=tensors)
 
 
 def mirrored(scene: TrainingScene) -> TrainingScene:
@@ -31,6 +77,7 @@ def mirrored(scene: TrainingScene) -> TrainingScene:
 
     Four things change together: positions and normals, the order of vertices (which keeps the
     winding), the poses (whose own x axis turns too, so that they stay rotations), and the pictures.
+    Lights apart are let go.
     """
     old = scene.tensors
     sides_3 = np.array([-1, 1, 1], np.float32)
@@ -43,11 +90,11 @@ def mirrored(scene: TrainingScene) -> TrainingScene:
         c2w_V44=_tensor(sides_4[:, None] * old.c2w_V44.numpy() * sides_4),
     )
     target_VRR3 = _tensor(scene.target_VRR3.numpy()[:, :, ::-1])
-    return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3)
+    return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3, lights_VLRR3=None)
 
 
 def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
-    """Return the scene with its colour channels in another order, materials and pictures alike."""
+    """Return the scene with its colour channels in another order; lights apart are let go."""
     columns = np.arange(scene.tensors.material_T10.shape[1])
     for channels in (DIFFUSE, SPECULAR, EMISSION):
         columns[channels] = columns[channels][order]
@@ -56,6 +103,7 @@ def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
         scene,
         tensors=dataclasses.replace(scene.tensors, material_T10=material_T10),
         target_VRR3=_tensor(scene.target_VRR3.numpy()[..., order]),
+        lights_VLRR3=None,
     )
 
 
@@ -83,8 +131,14 @@ def with_views(scene: TrainingScene, views: np.ndarray) -> TrainingScene:
         c2w_V44=_tensor(old.c2w_V44.numpy()[views]),
         fov_deg_V=_tensor(old.fov_deg_V.numpy()[views]),
     )
-    target_VRR3 = _tensor(scene.target_VRR3.numpy()[views])
-    return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3)
+    lights = scene.lights_VLRR3
+    return dataclasses.replace(
+        scene,
+        tensors=tensors,
+        target_VRR3=_tensor(scene.target_VRR3.numpy()[views]),
+        noise_V=_tensor(scene.noise_V.numpy()[views]),
+        lights_VLRR3=None if lights is None else _tensor(lights.numpy()[views]),
+    )
 
 
 def _take_vertices(values_T33: Tensor, order_T3: NDArray[np.int64]) -> Tensor:

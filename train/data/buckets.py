@@ -1,11 +1,12 @@
-"""Scenes of one step -> batches of about one length, so that little is spent on padding.
+"""Scenes of one step -> batches of about one length, so that next to nothing is spent on padding.
 
 A step's scenes are drawn at random, whatever their size; only then are they cut by length. Every
 gradient is therefore of a fair mixture, and the loss is a mean over all views of the step, not over
 its batches.
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,8 +15,8 @@ from torch import Tensor
 from model.scene_tensors import SceneBatch, batch_scenes
 from train.data.scenes import TrainingScene
 
-LONGEST_TO_SHORTEST = 1.5
-"""Within one batch. 1 would pad nothing, but make many small products; 3 buckets are typical."""
+MOST_WASTE = 0.05
+"""Largest share of what a batch's scenes cost alone that its padding may add."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -26,18 +27,43 @@ class TrainingBatch:
     """What the network reads."""
     target_BVRR3: Tensor
     """log10(1 + radiance)."""
+    noise_BV: Tensor
+    """Root mean square noise of the targets."""
+
+    def to(self, device: torch.device) -> "TrainingBatch":
+        """Return the batch on a device."""
+        if device.type == "cpu":
+            return self
+        return TrainingBatch(
+            scenes=_fields_to(self.scenes, device),
+            target_BVRR3=self.target_BVRR3.to(device, non_blocking=True),
+            noise_BV=self.noise_BV.to(device, non_blocking=True),
+        )
 
 
-def bucket_scenes(scenes: Sequence[TrainingScene]) -> list[TrainingBatch]:
-    """Return batches, shortest first, that hold each scene once."""
+def bucket_scenes(
+    scenes: Sequence[TrainingScene], cost: Callable[[int], float], most: int
+) -> list[TrainingBatch]:
+    """Return batches, shortest first, that hold each scene once.
+
+    Args:
+        scenes: of equal view count.
+        cost: what a scene of so many triangles costs (train.loop.flops); it grows with them.
+        most: scenes of a batch.
+    """
     by_length = sorted(scenes, key=lambda scene: scene.tensors.num_triangles)
     buckets: list[list[TrainingScene]] = []
+    alone = 0.0
     for scene in by_length:
-        limit = LONGEST_TO_SHORTEST * buckets[-1][0].tensors.num_triangles if buckets else 0
-        if scene.tensors.num_triangles <= limit:
-            buckets[-1].append(scene)
-        else:
-            buckets.append([scene])
+        of_scene = cost(scene.tensors.num_triangles)
+        if buckets and len(buckets[-1]) < most:
+            together = (len(buckets[-1]) + 1) * of_scene
+            if together <= (1 + MOST_WASTE) * (alone + of_scene):
+                buckets[-1].append(scene)
+                alone += of_scene
+                continue
+        buckets.append([scene])
+        alone = of_scene
     return [make_batch(bucket) for bucket in buckets]
 
 
@@ -46,4 +72,14 @@ def make_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
     return TrainingBatch(
         scenes=batch_scenes([scene.tensors for scene in scenes]),
         target_BVRR3=torch.stack([scene.target_VRR3 for scene in scenes]),
+        noise_BV=torch.stack([scene.noise_V for scene in scenes]),
     )
+
+
+def _fields_to(batch: SceneBatch, device: torch.device) -> SceneBatch:
+    tensors = {
+        field.name: tensor.to(device, non_blocking=True)
+        for field in dataclasses.fields(batch)
+        if (tensor := getattr(batch, field.name)) is not None
+    }
+    return dataclasses.replace(batch, **tensors)

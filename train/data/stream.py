@@ -10,15 +10,17 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 
 from storage.errors import TrilightError
+from storage.sample import Sample
 from storage.seeds import rng_for
 from storage.shard_set import ShardSet
 from train.data.augment import augmented, with_views
+from train.data.augmentation import AugmentationSettings
 from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
@@ -54,6 +56,10 @@ class StreamSettings:
     """Pixels across the pictures."""
     views_per_scene: int
     """Views that are drawn of each scene."""
+    most_triangles: int = 0
+    """Samples with more are unusable; 0: none is."""
+    augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
+    """Symmetries that are drawn at each visit."""
 
     @property
     def order(self) -> OrderSettings:
@@ -159,7 +165,7 @@ class _SceneMaker:
         scene = self._usable(place)
         rng = rng_for(settings.seed, "visit", place.position)
         views = rng.permutation(len(scene.target_VRR3))[: settings.views_per_scene]
-        return augmented(with_views(scene, np.sort(views)), rng)
+        return augmented(with_views(scene, np.sort(views)), settings.augmentation, rng)
 
     def _usable(self, place: Place) -> TrainingScene:
         shard, row = place.shard, place.row
@@ -189,8 +195,7 @@ class _SceneMaker:
             if not keys:
                 raise TrilightError(f"{shard.name}: holds no sample; expected at least one.")
             try:
-                sample = shard.sample(row % len(keys))
-                return training_scene(sample, self._settings.resolution), len(keys)
+                return self._made(shard.sample(row % len(keys))), len(keys)
             except TrilightError as error:
                 key = keys[row % len(keys)]
                 self._unusable.add(f"{shard.name}: sample {key}", 1, _named(shard.name, error))
@@ -198,6 +203,15 @@ class _SceneMaker:
         finally:
             if not planned:
                 shard.close()
+
+    def _made(self, sample: Sample) -> TrainingScene:
+        settings = self._settings
+        return training_scene(
+            sample,
+            settings.resolution,
+            most_triangles=settings.most_triangles,
+            lights_apart=settings.augmentation.light_mix > 1,
+        )
 
 
 def _named(shard: str, error: TrilightError) -> TrilightError:

@@ -70,9 +70,14 @@ def judged_scene(sample: Sample, resolution: int) -> JudgedScene:
 
 @torch.no_grad()
 def predict(model: RenderFormer, scene: TrainingScene) -> NDArray[np.float64]:
-    """Return the finished pictures of one scene, linear radiance [V, R, R, 3] of at least 0."""
-    log10_VRR3 = model(make_batch([scene]).scenes, scene.target_VRR3.shape[1])[0]
-    return np.maximum(radiance(log10_VRR3.double()).numpy(), 0)
+    """Return the finished pictures of one scene, linear radiance [V, R, R, 3] of at least 0.
+
+    In float32, wherever the network is.
+    """
+    device = next(model.parameters()).device
+    batch = make_batch([scene]).to(device)
+    log10_VRR3 = model(batch.scenes, scene.target_VRR3.shape[1])[0]
+    return np.maximum(radiance(log10_VRR3.double()).cpu().numpy(), 0)
 
 
 def score_pictures(pictures: Sequence[NDArray], judged: Sequence[JudgedScene]) -> list[ViewScore]:

@@ -1,5 +1,6 @@
-"""The sheet that a person looks at: target, prediction and error of validation scenes."""
+"""The sheet that a person looks at: target, prediction, error, and error against the noise."""
 
+import dataclasses
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from storage.atomic import write_atomically
 from storage.conventions import log10_radiance, preview_srgb8
 
-TILE_PX = 192
+TILE_PX = 160
 """Width of a tile, where a whole multiple of the pictures fits."""
 
 CAPTION_PX = 20
@@ -23,6 +24,10 @@ BLOCKS_PER_LINE = 2
 
 ERROR_WHITE = 0.5
 """|log10(1 + a) - log10(1 + b)| that the error picture shows as white."""
+
+NOISE_WHITE = 16.0
+"""Multiple of the target's own noise that the last picture shows as white; at the noise it is
+black."""
 
 INK, PAPER = (30, 30, 30), (250, 250, 248)
 
@@ -39,10 +44,12 @@ class SheetView:
     """[R, R, 3] linear radiance."""
     predicted_rgb: NDArray
     """[R, R, 3] linear radiance."""
+    noise: float
+    """Root mean square noise of the target's log10(1 + radiance)."""
 
 
-def write_sheet(path: Path, views: Sequence[SheetView], title: Sequence[str]) -> None:
-    """Draw and write the sheet as PNG; `title` is one or more lines."""
+def drawn_sheet(views: Sequence[SheetView], title: Sequence[str]) -> Image.Image:
+    """Return the sheet; `title` is one or more lines."""
     blocks = [_block(view) for view in views]
     height, width = blocks[0].height + GAP_PX, blocks[0].width + 2 * GAP_PX
     top = len(title) * CAPTION_PX + 2 * GAP_PX
@@ -53,24 +60,50 @@ def write_sheet(path: Path, views: Sequence[SheetView], title: Sequence[str]) ->
     for index, block in enumerate(blocks):
         line, column = divmod(index, BLOCKS_PER_LINE)
         sheet.paste(block, (GAP_PX + column * width, top + line * height))
+    return sheet
+
+
+def write_picture(path: Path, picture: Image.Image) -> None:
+    """Write a picture as PNG, whole or not at all."""
     data = io.BytesIO()
-    sheet.save(data, "PNG")
+    picture.save(data, "PNG")
     write_atomically(path, data.getvalue())
 
 
 def error_picture(predicted_rgb: NDArray, target_rgb: NDArray) -> NDArray[np.uint8]:
     """Return [R, R, 3]: the channels' mean error of log10(1 + radiance), black to red to white."""
-    difference = np.abs(log10_radiance(predicted_rgb) - log10_radiance(target_rgb))
-    level = np.clip(difference.mean(axis=-1) / ERROR_WHITE, 0, 1)[..., None]
-    ramp = np.clip(3 * level - np.array([0, 1, 2]), 0, 1)
+    return _ramp(_mean_error(predicted_rgb, target_rgb) / ERROR_WHITE)
+
+
+def noise_picture(view: SheetView) -> NDArray[np.uint8]:
+    """Return [R, R, 3]: how often the error holds the view's noise, black at once, by doublings.
+
+    The noise is one number for the whole view, its noise floor.
+    """
+    error = _mean_error(view.predicted_rgb, view.target_rgb)
+    times = np.maximum(error / max(view.noise, 1e-6), 1.0)
+    return _ramp(np.log(times) / np.log(NOISE_WHITE))
+
+
+def _mean_error(predicted_rgb: NDArray, target_rgb: NDArray) -> NDArray:
+    return np.abs(log10_radiance(predicted_rgb) - log10_radiance(target_rgb)).mean(axis=-1)
+
+
+def _ramp(level_RR: NDArray) -> NDArray[np.uint8]:
+    """Return 0 to 1 as black to red to yellow to white."""
+    ramp = np.clip(3 * level_RR[..., None] - np.array([0, 1, 2]), 0, 1)
     return np.round(255 * ramp).astype(np.uint8)
 
 
 def _block(view: SheetView) -> Image.Image:
+    # a network that is lost predicts NaN: it shows as white, in the error too
+    predicted = np.nan_to_num(view.predicted_rgb, nan=1e6, posinf=1e6)
+    view = dataclasses.replace(view, predicted_rgb=predicted)
     pictures = {
         "target": preview_srgb8(view.target_rgb),
         "prediction": preview_srgb8(view.predicted_rgb),
         f"error (white: {ERROR_WHITE})": error_picture(view.predicted_rgb, view.target_rgb),
+        f"error / noise (white: {NOISE_WHITE:.0f})": noise_picture(view),
     }
     scale = max(TILE_PX // view.target_rgb.shape[0], 1)
     tile = scale * view.target_rgb.shape[0]

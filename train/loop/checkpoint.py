@@ -6,6 +6,7 @@ settings and the data, because going on with others would be neither the old run
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 from torch import Tensor
 
-from model.weights import load_tensors
+from model.renderformer import RenderFormer
+from model.weights import decode_config, encode_config, load_tensors
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 from storage.safe_read import read_safetensors
@@ -23,14 +25,14 @@ from train.loop.state import TrainState, new_state
 from train.settings import TrainSettings, completed_record, settings_record
 
 HEADER_KEY = "trilight_checkpoint"
-"""Metadata entry with counters, damage met, settings and the digest of the data."""
+"""Metadata entry with counters, damage met, settings, digest of the data, number of processes."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """AdamW's memories per weight; its step count is the same for all."""
 
 
 def save_checkpoint(
-    path: Path, state: TrainState, settings: TrainSettings, data_digest: str
+    path: Path, state: TrainState, settings: TrainSettings, *, data_digest: str, world_size: int
 ) -> None:
     """Write the checkpoint; raises TrilightError where the folder is full or cannot be written."""
     tensors: dict[str, Tensor] = {}
@@ -38,43 +40,79 @@ def save_checkpoint(
         tensors[f"model/{name}"] = weight.detach()
         for moment in MOMENTS if state.optimizer.state else ():
             tensors[f"{moment}/{name}"] = state.optimizer.state[weight][moment]
+    if state.mean_model is not None:
+        for name, weight in state.mean_model.named_parameters():
+            tensors[f"mean/{name}"] = weight
     header = {
         "step": state.step,
         "skipped_steps": state.skipped_steps,
         "unusable": dict(state.unusable.met),
         "settings": settings_record(settings),
+        "model": encode_config(settings.model),
         "data_digest": data_digest,
+        "world_size": world_size,
     }
-    contiguous = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    contiguous = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
     write_atomically(path, save(contiguous, metadata={HEADER_KEY: json.dumps(header)}))
 
 
-def load_checkpoint(path: Path, settings: TrainSettings, data_digest: str) -> TrainState:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Checkpoint:
+    """A checkpoint as it was read."""
+
+    header: Mapping[str, Any]
+    """Step, settings, digest of the data, number of processes."""
+    arrays: Mapping[str, NDArray]
+    """Tensors by part and name."""
+
+    def network(self) -> RenderFormer:
+        """Return the network that was judged at that step: the running mean where there is one."""
+        model = RenderFormer(decode_config(self.header["model"]))
+        load_tensors(model, _part(self.arrays, "mean") or _part(self.arrays, "model"))
+        return model.eval()
+
+
+def is_checkpoint(metadata: Mapping[str, str]) -> bool:
+    """Return whether a safetensors file with these entries is a checkpoint of a run."""
+    return HEADER_KEY in metadata
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint; raises TrilightError where it is damaged or none."""
+    arrays, metadata = read_safetensors(path.read_bytes())
+    if not is_checkpoint(metadata):
+        raise TrilightError(f"{path}: not a checkpoint of a run; expected one that train wrote.")
+    return Checkpoint(header=json.loads(metadata[HEADER_KEY]), arrays=arrays)
+
+
+def resumed_state(
+    checkpoint: Checkpoint,
+    settings: TrainSettings,
+    data_digest: str,
+    device: torch.device | None = None,
+) -> TrainState:
     """Return the state of a run, ready for its next step.
 
     Raises:
-        TrilightError: there is no checkpoint, it is damaged, or it belongs to other settings or
-            other data; the first field that differs is named.
+        TrilightError: the checkpoint belongs to other settings or other data; the first field that
+            differs is named.
     """
-    if not path.exists():
-        raise TrilightError(
-            f"{path.parent}: no checkpoint here to resume from; start the run without --resume."
-        )
-    arrays, metadata = read_safetensors(path.read_bytes())
-    if HEADER_KEY not in metadata:
-        raise TrilightError(f"{path}: not a checkpoint of a run; expected one that train wrote.")
-    header = json.loads(metadata[HEADER_KEY])
+    header = checkpoint.header
     _require_same("settings", completed_record(header["settings"]), settings_record(settings))
     _require_same("data", {"digest": header["data_digest"]}, {"digest": data_digest})
-    state = new_state(settings)
+    state = new_state(settings, device)
     state.step, state.skipped_steps = header["step"], header["skipped_steps"]
     state.unusable = Unusable(settings.most_unusable, header["unusable"])
-    load_tensors(state.model, _part(arrays, "model"))
-    _load_moments(state, arrays)
+    load_tensors(state.model, _part(checkpoint.arrays, "model"))
+    if state.mean_model is not None:
+        load_tensors(state.mean_model, _part(checkpoint.arrays, "mean"))
+    _load_moments(state, checkpoint.arrays, device)
     return state
 
 
-def _load_moments(state: TrainState, arrays: Mapping[str, NDArray]) -> None:
+def _load_moments(
+    state: TrainState, arrays: Mapping[str, NDArray], device: torch.device | None
+) -> None:
     updates = state.step - state.skipped_steps
     if updates == 0:
         return
@@ -82,7 +120,7 @@ def _load_moments(state: TrainState, arrays: Mapping[str, NDArray]) -> None:
     for name, weight in state.model.named_parameters():
         state.optimizer.state[weight] = {
             "step": torch.tensor(float(updates)),
-            **{moment: parts[moment][name] for moment in MOMENTS},
+            **{moment: parts[moment][name].to(device) for moment in MOMENTS},
         }
 
 

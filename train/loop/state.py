@@ -1,8 +1,10 @@
-"""What changes while a run goes on: weights, AdamW's memories, two counters, and damage met.
+"""What changes while a run goes on: weights, their mean, AdamW's memories, counters, damage met.
 
-Everything else (order, augmentation, learning rate) is a function of the settings and the step.
+Everything else (order, augmentation, learning rate) is a function of the settings and the step;
+nothing asks a generator that would have to be remembered.
 """
 
+import copy
 from dataclasses import dataclass
 
 import torch
@@ -24,20 +26,59 @@ class TrainState:
     """Over the weights of `model`."""
     unusable: Unusable
     """The damaged data that was met so far, and how much there may be."""
+    mean_model: RenderFormer | None = None
+    """The exponential running mean of its weights (EMA), where the run keeps one."""
     step: int = 0
     """Steps done, including skipped ones; also the position in the data."""
     skipped_steps: int = 0
     """Steps that were not finite and changed nothing."""
 
+    @property
+    def shown(self) -> RenderFormer:
+        """The network that is judged and kept: the mean where there is one."""
+        return self.mean_model or self.model
 
-def new_state(settings: TrainSettings) -> TrainState:
-    """Return the state before the first step, which depends on nothing but the settings."""
+    @torch.no_grad()
+    def follow_with_mean(self, decay: float) -> None:
+        """Move the mean towards the weights after an update.
+
+        At first it follows faster, by (1 + n) / (10 + n) after n updates, so that it does not
+        remember the random start.
+        """
+        if self.mean_model is None:
+            return
+        updates = self.step - self.skipped_steps
+        decay = min(decay, (1 + updates) / (10 + updates))
+        pairs = zip(self.mean_model.parameters(), self.model.parameters(), strict=True)
+        for mean, weight in pairs:
+            mean.lerp_(weight, 1 - decay)
+
+
+def new_state(
+    settings: TrainSettings,
+    device: torch.device | None = None,
+    begin_with: RenderFormer | None = None,
+) -> TrainState:
+    """Return the state before the first step.
+
+    Args:
+        settings: of the run; they alone decide the random weights.
+        device: where it is to be; the CPU unless said.
+        begin_with: a network of the same configuration whose weights take their place.
+    """
     model = RenderFormer(settings.model)
-    generator = torch.Generator().manual_seed(seed_for(settings.seed, "weights"))
-    model.initialise(generator)
+    if begin_with is None:
+        model.initialise(torch.Generator().manual_seed(seed_for(settings.seed, "weights")))
+    else:
+        model.load_state_dict(begin_with.state_dict())
     model.recompute_activations(settings.recompute_activations)
+    model.to(device)
+    mean_model = None
+    if settings.ema_decay:
+        mean_model = copy.deepcopy(model).requires_grad_(False)
     return TrainState(
         model=model,
         optimizer=make_optimizer(model, settings),
         unusable=Unusable(settings.most_unusable),
+        mean_model=mean_model,
     )

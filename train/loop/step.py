@@ -1,59 +1,112 @@
 """One update of the weights, or none: a step that is not finite changes nothing."""
 
-from collections.abc import Sequence
+import contextlib
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
-from model.renderformer import RenderFormer
 from train.data.buckets import TrainingBatch
+from train.loop.crew import Crew
+from train.loop.state import TrainState
+from train.loss.objective import Objective
+from train.settings import Precision, TrainSettings
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepReport:
-    """What one step did."""
+    """What one step did, over all processes."""
 
     loss: float
-    """Mean over the views of the step."""
+    """Mean over the views of the step of all that is minimised."""
+    l1: float
+    """Its first term alone, unweighed."""
+    brightness: float
+    """Mean log10(1 + radiance) of the predicted pictures, as a share of the targets'."""
     grad_norm: float
     """Length of the gradient before it was clipped."""
     applied: bool
     """False where loss or gradient was not finite and the weights stayed as they were."""
 
 
-def view_losses(prediction_BVRR3: Tensor, target_BVRR3: Tensor) -> Tensor:
-    """Return the L1 error [B, V] of log10(1 + radiance), taken before the output's ELU.
+class Stepper:
+    """Follows the gradient of a state's network, together with the other processes."""
 
-    Zeng et al. 2025, section 4, first term. Before the ELU because its slope is a thousandth for
-    negative values: a network that once predicts below 0 would hardly come back. Targets are at
-    least 0, so the best prediction is the same.
+    def __init__(
+        self, state: TrainState, settings: TrainSettings, objective: Objective, crew: Crew
+    ) -> None:
+        self._state = state
+        self._settings = settings
+        self._objective = objective
+        self._crew = crew
+        self._net: nn.Module = state.model
+        if crew.world_size > 1:
+            # Every weight is used. Told so, torch would regroup the gradients after the first step,
+            # sum them in another order from then on, and a resumed run would differ by a bit.
+            self._net = DistributedDataParallel(
+                state.model, broadcast_buffers=False, find_unused_parameters=True
+            )
+
+    def step(self, batches: Sequence[TrainingBatch], learning_rate: float) -> StepReport:
+        """Average the gradient over all views of this process's `batches`, and of all processes.
+
+        Every process must hold equally many views.
+        """
+        state = self._state
+        state.optimizer.zero_grad(set_to_none=True)
+        num_views = sum(batch.noise_BV.numel() for batch in batches)
+        sums = torch.zeros(4, dtype=torch.float64)
+        for index, batch in enumerate(batches):
+            last = index == len(batches) - 1
+            with contextlib.nullcontext() if last else self._apart():
+                sums += self._add_gradient(batch.to(self._crew.device), num_views)
+        loss, l1, shown, wanted = self._crew.mean((sums / num_views).tolist())
+        grad_norm = nn.utils.clip_grad_norm_(state.model.parameters(), self._settings.grad_clip)
+        applied = bool(torch.isfinite(grad_norm)) and math.isfinite(loss)
+        if applied:
+            for group in state.optimizer.param_groups:
+                group["lr"] = learning_rate
+            state.optimizer.step()
+            state.follow_with_mean(self._settings.ema_decay)
+        return StepReport(
+            loss=loss,
+            l1=l1,
+            brightness=shown / wanted if wanted > 0 else 1.0,
+            grad_norm=float(grad_norm),
+            applied=applied,
+        )
+
+    def _add_gradient(self, batch: TrainingBatch, num_views: int) -> Tensor:
+        """Add one batch's part of the gradient; return its sums of loss, L1, shown and wanted."""
+        resolution = batch.target_BVRR3.shape[2]
+        prediction = predicted(self._net, batch, resolution, self._settings.precision)
+        losses = self._objective(prediction, batch.target_BVRR3, batch.noise_BV)
+        (losses.total_BV.sum() / num_views).backward()
+        shown_BV = prediction.detach().clamp(min=0).mean(dim=(2, 3, 4))
+        wanted_BV = batch.target_BVRR3.mean(dim=(2, 3, 4))
+        parts = [losses.total_BV.detach(), losses.l1_BV, shown_BV, wanted_BV]
+        return torch.stack([part.sum() for part in parts]).cpu().double()
+
+    def _apart(self) -> contextlib.AbstractContextManager[Any]:
+        """Return what keeps the processes from exchanging a gradient that is not complete."""
+        if isinstance(self._net, DistributedDataParallel):
+            context: contextlib.AbstractContextManager[Any] = self._net.no_sync()
+            return context
+        return contextlib.nullcontext()
+
+
+def predicted(
+    net: Callable[..., Tensor], batch: TrainingBatch, resolution: int, precision: Precision
+) -> Tensor:
+    """Return log10(1 + radiance) [B, V, R, R, 3] before the ELU, float32.
+
+    With bfloat16 the products of the network are rounded to it, positions are not.
     """
-    return (prediction_BVRR3 - target_BVRR3).abs().mean(dim=(2, 3, 4))
-
-
-def train_step(
-    model: RenderFormer,
-    optimizer: torch.optim.Optimizer,
-    batches: Sequence[TrainingBatch],
-    *,
-    resolution: int,
-    learning_rate: float,
-    grad_clip: float,
-) -> StepReport:
-    """Average the gradient over all views of `batches` and follow it once."""
-    num_views = sum(batch.target_BVRR3.shape[:2].numel() for batch in batches)
-    optimizer.zero_grad(set_to_none=True)
-    loss = 0.0
-    for batch in batches:
-        prediction = model(batch.scenes, resolution)
-        share = view_losses(prediction, batch.target_BVRR3).sum() / num_views
-        share.backward()
-        loss += share.item()
-    grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), grad_clip)
-    applied = bool(torch.isfinite(grad_norm)) and loss - loss == 0
-    if applied:
-        for group in optimizer.param_groups:
-            group["lr"] = learning_rate
-        optimizer.step()
-    return StepReport(loss=loss, grad_norm=float(grad_norm), applied=applied)
+    reduced = precision == "bfloat16"
+    with torch.autocast(batch.noise_BV.device.type, torch.bfloat16, enabled=reduced):
+        prediction = net(batch.scenes, resolution)
+    return prediction.float()

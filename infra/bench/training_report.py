@@ -1,0 +1,70 @@
+"""What the table of small trainings says: means over seeds, changes against ours, power laws."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from infra.bench.power_law import fit_power_law
+from infra.bench.training_jobs import BASELINE
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def report_lines(rows: Rows) -> list[str]:
+    """Return the report as Markdown lines; a change that does not help is there like any other."""
+    if not rows:
+        return ["No result yet."]
+    lines = ["Held-out log L1, mean over seeds (half the range), and its ratio to `ours`.", ""]
+    scenes = sorted({row["scenes"] for row in rows})
+    lines += [
+        f"| network | change | {' | '.join(f'{count} scenes' for count in scenes)} | exponent |",
+        f"|{'---|' * (len(scenes) + 3)}",
+    ]
+    for plan, size, change in _kinds(rows):
+        own = [_errors(rows, plan, size, change, count) for count in scenes]
+        base = [_errors(rows, plan, size, BASELINE, count) for count in scenes]
+        cells = [_cell(mine, ours) for mine, ours in zip(own, base, strict=True)]
+        law = law_text(scenes, own)
+        lines.append(f"| {plan} {size} | {change} | {' | '.join(cells)} | {law} |")
+    rivals = {(row["data_digest"][:8], row["median_scores"]["log_l1"]) for row in rows}
+    lines += ["", "The median picture of the training views scores, by its training set:"]
+    lines += [f"- data {digest}: {score:.4f}" for digest, score in sorted(rivals)]
+    return lines
+
+
+def law_text(scenes: Sequence[int], errors: Sequence[Sequence[float]]) -> str:
+    """Return the exponent of error = a N^-b with its 95 % interval, where it can be fitted."""
+    pairs = [(count, error) for count, found in zip(scenes, errors, strict=True) for error in found]
+    if len({count for count, _ in pairs}) < 2:
+        return "n/a"
+    law = fit_power_law([count for count, _ in pairs], [error for _, error in pairs])
+    if math.isnan(law.exponent_low):
+        return f"{law.exponent:.3f} (no interval)"
+    return f"{law.exponent:.3f} ({law.exponent_low:.3f} to {law.exponent_high:.3f})"
+
+
+def _kinds(rows: Rows) -> list[tuple[str, str, str]]:
+    """Return every (plan, network, change) once, `ours` first."""
+    kinds = {(row["plan"], row["size"], row["change"]) for row in rows}
+    return sorted(kinds, key=lambda kind: (kind[0], kind[1], kind[2] != BASELINE, kind[2]))
+
+
+def _errors(rows: Rows, plan: str, size: str, change: str, scenes: int) -> list[float]:
+    return [
+        row["scores"]["log_l1"]
+        for row in rows
+        if (row["plan"], row["size"], row["change"], row["scenes"]) == (plan, size, change, scenes)
+    ]
+
+
+def _cell(own: Sequence[float], base: Sequence[float]) -> str:
+    if not own:
+        return ""
+    text = f"{np.mean(own):.4f}"
+    if len(own) > 1:
+        text += f" ({np.ptp(own) / 2:.4f})"
+    if base and list(base) != list(own):
+        text += f", x{np.mean(own) / np.mean(base):.3f}"
+    return text

@@ -1,0 +1,149 @@
+"""`trilight evaluate`: a trained network against the pictures of a dataset."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from infra.cli.console import console, print_json, print_rows, progress_bars
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+
+if TYPE_CHECKING:
+    from storage.training_data import TrainingData
+    from train.evaluation.evaluate import Contest
+    from train.evaluation.judged_view import JudgedView
+
+
+def evaluate(
+    checkpoint: Annotated[str, typer.Argument(help="run folder, model.safetensors or checkpoint")],
+    data: Annotated[
+        list[str], typer.Option(help="root of a dataset, or shards by name or pattern; repeatable")
+    ],
+    split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
+    train_data: Annotated[
+        list[str] | None,
+        typer.Option(help="data of the rivals' training pictures [the same, if it has any]"),
+    ] = None,
+    resolution: Annotated[
+        int | None,
+        typer.Option(help="pixels across [the run's if known, else the data's]"),
+    ] = None,
+    most_scenes: Annotated[int, typer.Option(min=1, help="judge the first so many scenes")] = 10**6,
+    lpips: Annotated[
+        str | None,
+        typer.Option(help="folder of LPIPS' weights, or hub [$TRILIGHT_LPIPS; else LPIPS is n/a]"),
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="cpu or cuda [cuda where there is one]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="folder of the report")] = Path("evaluation"),
+    json: Annotated[bool, typer.Option(help="print the summary as JSON")] = False,
+) -> None:
+    """Judge a network; writes evaluation.json, evaluation.md and sheets of pictures."""
+    try:
+        from storage.training_data import open_training_data
+        from train.evaluation.evaluate import judged_views
+        from train.evaluation.report import markdown, record
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise TrilightError("evaluate: torch is not installed; run `make setup-all`.") from error
+    opened = open_training_data(data)
+    rivals = opened if train_data is None else open_training_data(train_data)
+    contest = _contest(
+        checkpoint,
+        opened,
+        rivals,
+        split=split,
+        resolution=resolution,
+        most_scenes=most_scenes,
+        lpips=lpips,
+        device=device,
+    )
+    with progress_bars() as bars:
+        task = bars.add_task("scenes", total=None, note="")
+        views = judged_views(contest, lambda: bars.advance(task))
+    about = {
+        "network": Path(checkpoint).name,
+        "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],  # no path of this machine
+        "data digest": opened.digest,
+        "split": split,
+        "resolution": contest.resolution,
+        "scenes": len({view.key for view in views}),
+    }
+    found = record(views, about)
+    write_atomically(out / "evaluation.json", _encoded(found))
+    write_atomically(out / "evaluation.md", markdown(found).encode())
+    _write_pictures(out, contest, views)
+    if json:
+        print_json({name: found[name] for name in ("about", "contestants")})
+    else:
+        _report(found, out)
+
+
+def _contest(
+    checkpoint: str,
+    opened: "TrainingData",
+    rivals: "TrainingData",
+    *,
+    split: str,
+    resolution: int | None,
+    most_scenes: int,
+    lpips: str | None,
+    device: str | None,
+) -> "Contest":
+    from train.evaluation.evaluate import Contest, make_rivals, stored_resolution
+    from train.loop.crew import choose_device
+    from train.loss.lpips_weights import load_lpips
+    from train.networks import open_network, trained_resolution
+
+    network = open_network(checkpoint)
+    shards = opened.split(split)
+    chosen = resolution or trained_resolution(checkpoint) or stored_resolution(shards)
+    network.to(choose_device(device))
+    return Contest(
+        network=network,
+        shards=shards,
+        resolution=chosen,
+        rivals=make_rivals(rivals.split("train"), chosen) if "train" in rivals.splits else None,
+        lpips=load_lpips(lpips),
+        most_scenes=most_scenes,
+    )
+
+
+def _write_pictures(out: Path, contest: "Contest", views: "list[JudgedView]") -> None:
+    from infra.excursion_plots import plot_excursions
+    from train.evaluation.evaluate import sheet_views, worst_and_median, worst_of_each_excursion
+    from train.evaluation.sheet import drawn_sheet, write_picture
+
+    chosen = worst_and_median(views)
+    if excursions := worst_of_each_excursion(views):
+        chosen["worst of each axis"] = excursions
+        plot_excursions(out / "excursions.png", views)
+    shown = iter(sheet_views(contest, [row for rows in chosen.values() for row in rows]))
+    for name, rows in chosen.items():
+        title = (f"{name}, of {len(views)} views at {contest.resolution} pixels, by psnr_log_db",)
+        sheet = drawn_sheet([next(shown) for _ in rows], title)
+        write_picture(out / f"{name.replace(' ', '_')}.png", sheet)
+
+
+def _encoded(found: dict[str, Any]) -> bytes:
+    from train.result import pretty_json
+
+    return pretty_json(found)
+
+
+def _report(found: dict[str, Any], out: Path) -> None:
+    from train.evaluation.picture_scores import DECIMALS
+
+    names = list(found["contestants"])
+    rows = [("median over views", ", ".join(names))]
+    for metric, places in DECIMALS.items():
+        medians = [found["contestants"][name][metric]["median"] for name in names]
+        shown = ["n/a" if value is None else f"{value:.{places}f}" for value in medians]
+        rows.append((metric, ", ".join(shown)))
+    near = found["contestants"][names[0]]["near_floor"]
+    rows.append(("within 3 dB of the noise", f"{near:.1%} of {len(found['views'])} views"))
+    print_rows("Evaluation", rows)
+    console.print(f"\nRead {out / 'evaluation.md'}, look at {out / 'worst.png'}", style="bold")

@@ -1,0 +1,97 @@
+"""The table of small trainings: what is done stays done, budgets hold, and the fit is honest."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from infra.bench import training_jobs, training_table
+from infra.bench.power_law import fit_power_law
+from infra.bench.training_jobs import BASELINE, CHANGES, SCENES, SEEDS, Job, Plan, all_jobs
+from infra.bench.training_report import report_lines
+from infra.bench.training_table import read_table, run_jobs
+from storage.errors import TrilightError
+from storage.seeds import rng_for
+from tests.train.kit import TINY_MODEL
+from tests.train.toy import write_toy_dataset
+from train.settings import settings_record
+
+
+def job(**changes: object) -> Job:
+    base = Job(plan="cpu", scenes=6, size="small", change=BASELINE, seed=0)
+    return dataclasses.replace(base, **changes)  # type: ignore[arg-type]
+
+
+def test_every_change_changes_something_and_only_that() -> None:
+    jobs = all_jobs("cpu")
+    assert len(jobs) == len(CHANGES) * len(SEEDS) * 2 * len(SCENES)
+    assert len({one.name for one in jobs}) == len(jobs)
+    assert len({one.digest() for one in jobs}) == len(CHANGES) * len(SEEDS) * 2
+    base = settings_record(job().settings())
+    for change in list(CHANGES)[1:]:
+        record = settings_record(job(change=change).settings())
+        differing = {name for name in base if record[name] != base[name]}
+        assert differing, change
+        assert len(differing) == 1 or change == "paper-schedule"
+    with pytest.raises(TrilightError, match="plan 'tpu': no such plan; expected cpu or gpu"):
+        all_jobs("tpu")
+
+
+def test_a_power_law_is_found_again() -> None:
+    counts = [60, 60, 240, 240, 960, 960]
+    exact = fit_power_law(counts, [0.1 * n**-0.3 for n in counts])
+    assert (exact.exponent, exact.factor) == (pytest.approx(0.3), pytest.approx(0.1))
+    assert exact.exponent_low == pytest.approx(0.3) == pytest.approx(exact.exponent_high)
+    assert exact.at(9600) == pytest.approx(0.1 * 9600**-0.3)
+    with pytest.raises(ValueError, match="beyond 10 times the largest measured, 960"):
+        exact.at(9601)
+    with pytest.raises(ValueError, match="two different N"):
+        fit_power_law([60, 60], [0.1, 0.2])
+    assert math.isnan(fit_power_law([60, 240], [0.2, 0.1]).exponent_low)
+
+
+def test_its_interval_holds_the_truth_as_often_as_it_says() -> None:
+    counts = np.repeat([60.0, 240.0, 960.0], 2)
+    rng = rng_for(0, "law")
+    held = 0
+    for _ in range(1000):
+        errors = 0.1 * counts**-0.2 * np.exp(rng.normal(0, 0.05, 6))
+        law = fit_power_law(list(counts), list(errors))
+        held += law.exponent_low <= 0.2 <= law.exponent_high
+    assert 920 < held < 980  # 950 expected, standard deviation 7: four of them
+
+
+@pytest.mark.slow
+def test_jobs_are_run_once_and_within_the_budget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = Plan(sizes={"small": TINY_MODEL}, resolution=16, num_steps=100, scenes_per_step=3)
+    monkeypatch.setitem(training_jobs.PLANS, "cpu", plan)
+    dataset = write_toy_dataset(tmp_path / "data", train=12, validation=2, per_shard=3)
+    table, work = tmp_path / "table.jsonl", tmp_path / "work"
+    jobs = [job(), job(seed=1), job(scenes=12), job(scenes=12, seed=1), job(change="ema")]
+    assert run_jobs(jobs, dataset, work, table, minutes=-1) == 0
+    assert run_jobs(jobs[:1], dataset, work, table, minutes=9) == 1
+    assert run_jobs(jobs, dataset, work, table, minutes=9) == 4
+    assert run_jobs(jobs, dataset, work, table, minutes=9) == 0
+    rows = read_table(table)
+    assert [row["job"] for row in rows] == [one.name for one in jobs]
+    assert [row["scenes"] for row in rows] == [6, 6, 12, 12, 6]
+    assert rows[0]["scores"] != rows[1]["scores"] != rows[2]["scores"]
+    lines = report_lines(rows)
+    (ours,) = [line for line in lines if f"| {BASELINE} |" in line]
+    assert "6 scenes" in lines[2] and ours.count("(") == 3
+    (ema,) = [line for line in lines if "| ema |" in line]
+    assert ", x" in ema and "n/a" in ema
+    with pytest.raises(TrilightError, match="12 training scenes; expected at least 60"):
+        run_jobs([job(scenes=60)], dataset, work, table, minutes=9)
+    assert json.loads(table.read_text().splitlines()[0])["machine"]["cores"]
+
+
+def test_a_table_without_results_says_so(tmp_path: Path) -> None:
+    assert report_lines(read_table(training_table.TABLE.with_name("none.jsonl"))) == [
+        "No result yet."
+    ]

@@ -1,0 +1,107 @@
+"""Which checkpoints stay, and that a kill while one is saved leaves the one before it whole."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from model.weights import encode_weights
+from storage.errors import TrilightError
+from tests.conftest import ROOT
+from tests.train.kit import tiny_run
+from train.folder import RunFolder
+from train.loop.checkpoint import read_checkpoint, resumed_state
+from train.loop.checkpoints import checkpoint_path, keep_checkpoint, newest_checkpoint, saved_steps
+from train.loop.state import new_state
+from train.networks import open_network
+
+CHILD = """
+import os, signal, sys
+from pathlib import Path
+from tests.train.kit import tiny_run
+from train.loop.checkpoints import keep_checkpoint
+from train.loop.state import new_state
+
+settings, state, folder = tiny_run(), new_state(tiny_run()), Path(sys.argv[1])
+
+def keep(step):
+    state.step = state.skipped_steps = step
+    keep_checkpoint(folder, state, settings, data_digest="d", world_size=1)
+
+keep(1)
+name = sys.argv[2]
+original = getattr(os, name)
+
+def die(*arguments, **options):
+    if sys.argv[3] == "after":
+        original(*arguments, **options)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+setattr(os, name, die)
+keep(2)
+"""
+
+
+def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
+    settings = tiny_run(checkpoints_kept=2, keep_every=10)
+    state = new_state(settings)
+    for step in (4, 8, 10, 12, 16, 20, 24):
+        state.step = step
+        keep_checkpoint(tmp_path, state, settings, data_digest="d", world_size=1)
+    assert saved_steps(tmp_path) == [10, 20, 24]
+    assert newest_checkpoint(tmp_path) == checkpoint_path(tmp_path, 24)
+    (tmp_path / "step-notes.safetensors").write_bytes(b"")
+    assert saved_steps(tmp_path) == [10, 20, 24]
+
+
+@pytest.mark.parametrize(
+    ("call", "when"),
+    [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")],
+)
+def test_killed_while_saving_leaves_a_whole_one(tmp_path: Path, call: str, when: str) -> None:
+    killed = subprocess.run(
+        [sys.executable, "-c", CHILD, str(tmp_path), call, when], cwd=ROOT, check=False
+    )
+    assert killed.returncode == -signal.SIGKILL
+    newest = newest_checkpoint(tmp_path)
+    step = resumed_state(read_checkpoint(newest), tiny_run(), "d").step
+    assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
+    state = new_state(tiny_run())
+    state.step = state.skipped_steps = 3
+    keep_checkpoint(tmp_path, state, tiny_run(), data_digest="d", world_size=1)
+    assert not list(tmp_path.glob("*.part")), "what the killed one left is cleared away"
+
+
+def test_a_full_disk_leaves_the_older_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings, state = tiny_run(checkpoints_kept=1), new_state(tiny_run())
+    keep_checkpoint(tmp_path, state, settings, data_digest="d", world_size=1)
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    state.step = 5
+    with pytest.raises(TrilightError, match="the disk is full"):
+        keep_checkpoint(tmp_path, state, settings, data_digest="d", world_size=1)
+    assert saved_steps(tmp_path) == [0]
+
+
+def test_a_network_is_found_in_folder_checkpoint_and_file(tmp_path: Path) -> None:
+    settings = dataclasses.replace(tiny_run(), ema_decay=0.9)
+    state, folder = new_state(settings), RunFolder(tmp_path)
+    assert state.mean_model is not None
+    with torch.no_grad():
+        state.mean_model.decoder.token_W.fill_(0.25)
+    with pytest.raises(TrilightError, match="no checkpoint here"):
+        open_network(tmp_path)
+    keep_checkpoint(folder.checkpoints, state, settings, data_digest="d", world_size=1)
+    for place in (tmp_path, newest_checkpoint(folder.checkpoints)):
+        assert (open_network(place).decoder.token_W == 0.25).all(), "the mean is what is shown"
+    folder.weights.write_bytes(encode_weights(state.model))
+    for place in (tmp_path, folder.weights):
+        assert torch.equal(open_network(place).decoder.token_W, state.model.decoder.token_W)

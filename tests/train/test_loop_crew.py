@@ -1,0 +1,25 @@
+"""Who trains where: alone without torchrun, and a device that exists."""
+
+import pytest
+import torch
+
+from storage.errors import TrilightError
+from train.loop.crew import choose_device, join_crew
+
+
+def test_without_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    with join_crew("cpu") as crew:
+        assert (crew.rank, crew.world_size, crew.is_first) == (0, 1, True)
+        assert crew.mean([1.0, 2.0]) == [1.0, 2.0]
+        assert crew.any(True) and not crew.any(False)
+        assert (crew.share.rank, crew.share.world_size) == (0, 1)
+
+
+def test_a_device_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert choose_device("cpu").type == "cpu"
+    with pytest.raises(TrilightError, match="device 'tpu'; expected cpu or cuda"):
+        choose_device("tpu")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(TrilightError, match="process 2 of this machine finds 2 cards"):
+        choose_device("cuda", 2)

@@ -1,0 +1,97 @@
+"""How runs begin: from given weights, with the term that was asked for, and not dead."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from storage.dataset import Dataset
+from storage.errors import TrilightError
+from tests.train.kit import TINY_MODEL, tiny_run, trained
+from tests.train.toy import write_toy_dataset
+from train.loop.checkpoints import saved_steps
+from train.loss.settings import LossSettings
+from train.networks import open_network
+from train.run import Start, train_run
+from train.settings import TrainSettings
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=7, validation=2, per_shard=3)
+
+
+def run(settings: TrainSettings, dataset: Dataset, out: Path, start: Start) -> None:
+    train_run(settings, data=[str(dataset.folder.root)], out=out, start=start)
+
+
+def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) -> None:
+    """With its configuration, whatever the run's own says, and resumes without naming it."""
+    first = dataclasses.replace(TINY_MODEL, hidden_width=64)
+    run(tiny_run(model=first), dataset, tmp_path / "first", Start())
+    second = tiny_run(from_weights=True, learning_rate=1e-12, warmup_steps=0)
+    place = str(tmp_path / "first")
+    run(second, dataset, tmp_path / "second", Start(begin_with=place))
+    before, after = (open_network(tmp_path / name) for name in ("first", "second"))
+    assert after.config == first
+    for name, weight in after.state_dict().items():
+        # a learning rate of 1e-12 moves nothing that float32 shows but numbers near 0
+        torch.testing.assert_close(weight, before.state_dict()[name], rtol=1e-6, atol=1e-10)
+    run(second, dataset, tmp_path / "second", Start(resume=True))
+    with pytest.raises(TrilightError, match="begins with a trained network; name one with --from"):
+        run(second, dataset, tmp_path / "third", Start())
+    with pytest.raises(TrilightError, match="add --set from_weights=true"):
+        run(tiny_run(), dataset, tmp_path / "third", Start(begin_with=place))
+    with pytest.raises(TrilightError, match="no checkpoint here"):
+        run(second, dataset, tmp_path / "third", Start(begin_with=str(tmp_path / "none")))
+
+
+def test_a_run_without_the_weights_it_asks_for_does_not_begin(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("TRILIGHT_LPIPS", raising=False)
+    with pytest.raises(TrilightError, match="--set loss.perceptual=ms_ssim or none"):
+        run(tiny_run(loss=LossSettings(perceptual="lpips")), dataset, tmp_path, Start())
+    assert not list(tmp_path.iterdir())
+    other = tiny_run(loss=LossSettings(perceptual="ms_ssim"), num_steps=4)
+    run(other, dataset, tmp_path, Start())
+
+
+def test_a_dead_start_is_said_early_and_once(dataset: Dataset, tmp_path: Path) -> None:
+    """A learning rate of nearly nothing leaves the black start black."""
+    dead = tiny_run(num_steps=60, warmup_steps=2, learning_rate=1e-12, checkpoint_every=60)
+    with pytest.raises(TrilightError, match=r"the start went dead: after 52 steps .*--resume"):
+        run(dead, dataset, tmp_path / "dead", Start())
+    assert saved_steps((tmp_path / "dead") / "checkpoints") == [52]
+    run(dead, dataset, tmp_path / "dead", Start(resume=True))
+    alive = tiny_run(num_steps=60, warmup_steps=2, checkpoint_every=60)
+    run(alive, dataset, tmp_path / "alive", Start())
+
+
+def test_resumed_after_every_step_is_uninterrupted(dataset: Dataset, tmp_path: Path) -> None:
+    """With a running mean, every symmetry that toy scenes have, and a perceptual term."""
+    settings = tiny_run(
+        num_steps=6,
+        ema_decay=0.9,
+        loss=LossSettings(perceptual="ms_ssim", noise_half=0.01),
+        log_every=1,
+        validate_every=6,
+        checkpoint_every=1,
+        checkpoints_kept=9,
+    )
+    whole = trained(settings, [str(dataset.folder.root)], tmp_path / "whole")
+    weights = whole.folder.weights.read_bytes()
+    for step in range(1, 6):
+        out = tmp_path / str(step)
+        (out / "checkpoints").mkdir(parents=True)
+        name = f"step-{step:09d}.safetensors"
+        (out / "checkpoints" / name).write_bytes((whole.folder.checkpoints / name).read_bytes())
+        again = trained(settings, [str(dataset.folder.root)], out, resume=True)
+        assert again.folder.weights.read_bytes() == weights, step
+
+
+def test_lights_that_are_not_apart_cannot_be_mixed(dataset: Dataset, tmp_path: Path) -> None:
+    mixing = dataclasses.replace(tiny_run().augmentation, light_mix=4.0)
+    with pytest.raises(TrilightError, match="its lights are not kept apart"):
+        run(tiny_run(augmentation=mixing), dataset, tmp_path, Start())

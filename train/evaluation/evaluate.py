@@ -1,0 +1,146 @@
+"""A network against every view of a split, beside what knows nothing about scenes."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.renderformer import RenderFormer
+from storage.conventions import radiance_from_log10
+from storage.errors import TrilightError
+from storage.sample import Sample
+from storage.shard_set import ShardSet
+from train.data.scenes import TrainingScene, training_scene
+from train.data.splits import first_samples
+from train.data.unusable import Unusable
+from train.evaluation.judge import JudgedScene, judged_scene, predict
+from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
+from train.evaluation.picture_scores import floors_of, picture_scores
+from train.evaluation.rivals import Rivals
+from train.evaluation.sheet import SheetView
+from train.loss.lpips import Lpips
+
+RIVAL_SCENES = 256
+"""Training scenes that rivals are taken from."""
+
+SHEET_VIEWS = 8
+"""Views on a sheet."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contest:
+    """Who is judged, on what, and by what."""
+
+    network: RenderFormer
+    """On the device where it is to run."""
+    shards: ShardSet
+    """The split."""
+    resolution: int
+    """Pixels across, a divisor of the data's."""
+    rivals: Rivals | None
+    """None where no training data is at hand."""
+    lpips: Lpips | None
+    """None where its weights are not at hand: LPIPS is then n/a."""
+    most_scenes: int
+    """The first so many scenes of the split are judged."""
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield the samples; one that is damaged ends it, since it would be another set."""
+        return first_samples(self.shards, self.most_scenes, Unusable(0))
+
+
+def make_rivals(shards: ShardSet, resolution: int) -> Rivals:
+    """Return the rivals that the first scenes of a training split make."""
+    samples = first_samples(shards, RIVAL_SCENES, Unusable(0))
+    return Rivals(training_scene(sample, resolution) for sample in samples)
+
+
+def stored_resolution(shards: ShardSet) -> int:
+    """Return the pixels across of the first sample."""
+    (sample,) = first_samples(shards, 1, Unusable(0))
+    return int(sample.radiance_rgb.shape[1])
+
+
+def judged_views(contest: Contest, scene_done: Callable[[], None]) -> list[JudgedView]:
+    """Return a row for every view, in the order of the shards.
+
+    Raises:
+        TrilightError: damaged data, a resolution that the data or the network do not have, or no
+            scene at all.
+    """
+    rows: list[JudgedView] = []
+    for sample in contest.samples():
+        judged = judged_scene(sample, contest.resolution)
+        pictures = predict(contest.network, judged.scene)
+        rows += [
+            _judged(contest, sample, judged, view, picture) for view, picture in enumerate(pictures)
+        ]
+        scene_done()
+    if not rows:
+        raise TrilightError("evaluate: the split holds no scene; expected at least one.")
+    return rows
+
+
+def _judged(
+    contest: Contest, sample: Sample, judged: JudgedScene, view: int, picture: NDArray[np.float64]
+) -> JudgedView:
+    target, hits = judged.target_VRR3[view], judged.hits_VRR[view]
+    pictures = {NETWORK: picture}
+    if contest.rivals is not None:
+        pictures |= contest.rivals.pictures(target)
+    return JudgedView(
+        **facts_of(sample),
+        view=view,
+        floors=floors_of(dataclasses.asdict(sample.views[view])),
+        scores={
+            name: picture_scores(shown, target, hits, contest.lpips)
+            for name, shown in pictures.items()
+        },
+    )
+
+
+def sheet_views(contest: Contest, chosen: Sequence[JudgedView]) -> list[SheetView]:
+    """Return pictures of some rows, in their order; the scenes are read and computed again."""
+    rows_of: dict[str, list[JudgedView]] = {}
+    for row in chosen:
+        rows_of.setdefault(row.key, []).append(row)
+    found: dict[tuple[str, int], SheetView] = {}
+    for sample in contest.samples():
+        if rows := rows_of.get(sample.key):
+            scene = training_scene(sample, contest.resolution)
+            pictures = predict(contest.network, scene)
+            for row in rows:
+                found[row.key, row.view] = _sheet_view(row, scene, pictures[row.view])
+    return [found[row.key, row.view] for row in chosen]
+
+
+def worst_and_median(rows: Sequence[JudgedView]) -> dict[str, list[JudgedView]]:
+    """Return the rows of the lowest psnr_log_db and those around the middle, worse ones first."""
+    ranked = sorted(rows, key=lambda row: row.scores[NETWORK]["psnr_log_db"] or 0.0)
+    start = max((len(ranked) - SHEET_VIEWS) // 2, 0)
+    return {"worst": ranked[:SHEET_VIEWS], "median": ranked[start : start + SHEET_VIEWS]}
+
+
+def worst_of_each_excursion(rows: Sequence[JudgedView]) -> list[JudgedView]:
+    """Return the worst row of each axis that leaves the usual range, by the name of the axis."""
+    worst: dict[str, JudgedView] = {}
+    for row in sorted(rows, key=lambda row: row.scores[NETWORK]["psnr_log_db"] or 0.0):
+        if row.excursion is not None:
+            worst.setdefault(row.excursion[0], row)
+    return [worst[axis] for axis in sorted(worst)]
+
+
+def _sheet_view(row: JudgedView, scene: TrainingScene, picture: NDArray[np.float64]) -> SheetView:
+    scores = row.scores[NETWORK]
+    excursion = "" if row.excursion is None else f", {row.excursion[0]} {row.excursion[1]:g}"
+    return SheetView(
+        name=f"scene {row.key}, view {row.view}: {row.template}, {row.num_triangles} triangles, "
+        f"lights: {row.num_lights}{excursion}",
+        scores=f"{scores['psnr_log_db']:.1f} dB log (noise {row.floors['psnr_log_db']:.1f}), "
+        f"{scores['psnr_linear_db']:.1f} dB linear, SSIM {scores['ssim']:.3f}",
+        target_rgb=radiance_from_log10(scene.target_VRR3[row.view].double().numpy()),
+        predicted_rgb=picture,
+        noise=float(scene.noise_V[row.view]),
+    )

@@ -1,0 +1,73 @@
+"""Views split by what they show, and each part summed up without hiding the bad ones."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from train.evaluation.judged_view import NETWORK, JudgedView
+from train.evaluation.picture_scores import HIGHER_IS_BETTER
+
+NEAR_DB = 3.0
+"""Views whose psnr_log_db is within so much of their floor count as `near_floor`."""
+
+TRIANGLES = (256, 512, 1024, 1536, 4096)
+LIGHTS = (1, 2, 4, 8)
+ROUGHNESSES = (0.1, 0.25, 0.5)
+"""Upper ends of the parts; one more holds what is above."""
+
+SPLITS: Mapping[str, Callable[[JudgedView], str]] = {
+    "template": lambda view: view.template,
+    "triangles": lambda view: _part(view.num_triangles, TRIANGLES),
+    "lights": lambda view: _part(view.num_lights, LIGHTS),
+    "smoothest roughness": lambda view: _part(view.roughness, ROUGHNESSES),
+}
+"""What is split by, and which part a view belongs to."""
+
+
+def by_group(views: Sequence[JudgedView]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return the network's summary of every part of every split, in the order of the parts."""
+    groups: dict[str, dict[str, dict[str, Any]]] = {}
+    for name, part_of in SPLITS.items():
+        parts: dict[str, list[JudgedView]] = {}
+        for view in views:
+            parts.setdefault(part_of(view), []).append(view)
+        ordered = sorted(parts.items(), key=lambda part: _order(part[0]))
+        groups[name] = {part: summary(members) for part, members in ordered}
+    return groups
+
+
+def summary(views: Sequence[JudgedView], contestant: str = NETWORK) -> dict[str, Any]:
+    """Return median, mean and worse 5th percentile of every metric, and how far the noise is off.
+
+    A metric that is n/a for any view is None as a whole: a mean over the others would be of another
+    set. `near_floor` is the share of views within NEAR_DB of their floor.
+    """
+    result: dict[str, Any] = {"views": len(views)}
+    for metric, higher in HIGHER_IS_BETTER.items():
+        values = [view.scores[contestant][metric] for view in views]
+        known = [value for value in values if value is not None]
+        gaps = [gap for view in views if (gap := view.gap(metric, contestant)) is not None]
+        whole = len(known) == len(values)
+        result[metric] = {
+            "median": float(np.median(known)) if whole else None,
+            "mean": float(np.mean(known)) if whole else None,
+            "worse_5_percent": float(np.percentile(known, 5 if higher else 95)) if whole else None,
+            "median_worse_than_noise": float(np.median(gaps)) if gaps else None,
+        }
+    log_gaps = [view.gap("psnr_log_db", contestant) for view in views]
+    result["near_floor"] = float(np.mean([gap is not None and gap <= NEAR_DB for gap in log_gaps]))
+    return result
+
+
+def _part(value: float, ends: Sequence[float]) -> str:
+    for start, end in zip((None, *ends), ends, strict=False):
+        if value <= end:
+            return f"up to {end:g}" if start is None else f"over {start:g}, up to {end:g}"
+    return f"over {ends[-1]:g}"
+
+
+def _order(part: str) -> tuple[float, str]:
+    """Sort parts by where they begin, and names by themselves."""
+    word, _, rest = part.partition(" ")
+    return (float(rest.split(",")[0]), part) if word == "over" else (-1.0, part)

@@ -1,0 +1,103 @@
+"""An evaluation as JSON for programs and as Markdown for people."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from train.evaluation.groups import NEAR_DB, by_group, summary
+from train.evaluation.judged_view import NETWORK, JudgedView
+from train.evaluation.picture_scores import DECIMALS, HIGHER_IS_BETTER, MEANING
+
+NOT_AVAILABLE = "n/a"
+
+
+def record(views: Sequence[JudgedView], about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return everything that was measured, as JSON values.
+
+    Args:
+        views: the rows.
+        about: network, data, split, resolution, as they are to be told.
+    """
+    return {
+        "about": dict(about),
+        "metrics": MEANING,
+        "contestants": {name: summary(views, name) for name in views[0].scores},
+        "groups": by_group(views),
+        "views": [dataclasses.asdict(view) for view in views],
+    }
+
+
+def markdown(found: Mapping[str, Any]) -> str:
+    """Return a record as a page: one table of contestants, one for each split."""
+    lines = ["# Evaluation", ""]
+    lines += [f"- {name}: {_escaped(str(value))}" for name, value in found["about"].items()]
+    lines += ["", "Median over all views; in brackets the worse 5 %.", ""]
+    lines += _contestants(found["contestants"])
+    network = found["contestants"][NETWORK]
+    lines += ["", *_against_noise(network)]
+    for split, parts in found["groups"].items():
+        lines += ["", f"## By {split}", "", *_parts(parts)]
+    lines += ["", "## What the figures are", ""]
+    lines += [f"- `{name}`: {meaning}" for name, meaning in found["metrics"].items()]
+    return "\n".join(lines) + "\n"
+
+
+def _contestants(contestants: Mapping[str, Any]) -> list[str]:
+    names = list(contestants)
+    rows = []
+    for metric, higher in HIGHER_IS_BETTER.items():
+        cells = [_with_tail(metric, contestants[name][metric]) for name in names]
+        rows.append([f"{metric} ({'higher' if higher else 'lower'} is better)", *cells])
+    return _table(["metric", *names], rows)
+
+
+def _against_noise(network: Mapping[str, Any]) -> list[str]:
+    rows = []
+    for metric in HIGHER_IS_BETTER:
+        gap = network[metric]["median_worse_than_noise"]
+        rows.append([metric, _shown(metric, gap)])
+    return [
+        "Median of how much worse the network's picture is than the noise of its own target (n/a: "
+        "the noise was not measured in that metric; log_l1 against an upper bound):",
+        "",
+        *_table(["metric", "worse than noise"], rows),
+        "",
+        f"{network['near_floor']:.1%} of {network['views']} views are within {NEAR_DB:g} dB of "
+        "their floor.",
+    ]
+
+
+def _parts(parts: Mapping[str, Any]) -> list[str]:
+    rows = [
+        [_escaped(name), str(part["views"])]
+        + [_shown(metric, part[metric]["median"]) for metric in HIGHER_IS_BETTER]
+        + [_shown("psnr_log_db", part["psnr_log_db"]["median_worse_than_noise"])]
+        for name, part in parts.items()
+    ]
+    return _table(["part", "views", *HIGHER_IS_BETTER, "dB below noise floor"], rows)
+
+
+def _with_tail(metric: str, figures: Mapping[str, Any]) -> str:
+    if figures["median"] is None:
+        return NOT_AVAILABLE
+    tail = _shown(metric, figures["worse_5_percent"])
+    return f"{_shown(metric, figures['median'])} ({tail})"
+
+
+def _shown(metric: str, value: float | None) -> str:
+    return NOT_AVAILABLE if value is None else f"{value:.{DECIMALS[metric]}f}"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    return [
+        f"| {' | '.join(head)} |",
+        f"|{'---|' * len(head)}",
+        *(f"| {' | '.join(row)} |" for row in rows),
+    ]
+
+
+def _escaped(text: str) -> str:
+    """Return text from outside so that Markdown shows it as it is."""
+    for character in "\\|<>[]`*_":
+        text = text.replace(character, f"\\{character}")
+    return text.replace("\n", " ")

@@ -1,0 +1,49 @@
+"""What knows nothing about scenes and still makes a picture: who does not beat it has not learned.
+
+The nearest training view knows the answer: it is the training picture closest to the target. No way
+of looking up a training picture by the scene can do better.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.conventions import log10_radiance, radiance_from_log10
+from train.data.scenes import TrainingScene
+
+MEDIAN, NEAREST = "median picture", "nearest training view"
+
+COMPARED_PX = 32
+"""Pictures are compared at no more than so many pixels across."""
+
+
+class Rivals:
+    """The pictures of some training scenes."""
+
+    def __init__(self, scenes: Iterable[TrainingScene]) -> None:
+        # half floats: a rival that is off by a thousandth is as good, and takes half the memory
+        found = [scene.target_VRR3.numpy().astype(np.float16) for scene in scenes]
+        self._log10_MRR3 = np.concatenate(found)
+        self._small_MRR3 = _small(self._log10_MRR3)
+        self.median_RR3 = radiance_from_log10(
+            np.median(self._log10_MRR3, axis=0).astype(np.float64)
+        )
+
+    def pictures(self, target_rgb: NDArray) -> dict[str, NDArray[np.float64]]:
+        """Return what each rival shows in place of a target [R, R, 3], linear radiance."""
+        small = _small(log10_radiance(target_rgb)[None])
+        nearest = int(np.abs(self._small_MRR3 - small).mean(axis=(1, 2, 3)).argmin())
+        return {
+            MEDIAN: self.median_RR3,
+            NEAREST: radiance_from_log10(self._log10_MRR3[nearest].astype(np.float64)),
+        }
+
+
+def _small(log10_MRR3: NDArray) -> NDArray[np.float32]:
+    count, resolution = log10_MRR3.shape[:2]
+    factor = max(resolution // COMPARED_PX, 1)
+    kept = resolution // factor * factor
+    cut = log10_MRR3[:, :kept, :kept].astype(np.float32)
+    blocks = cut.reshape(count, kept // factor, factor, kept // factor, factor, 3)
+    return blocks.mean(axis=(2, 4))

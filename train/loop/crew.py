@@ -1,0 +1,91 @@
+"""The processes that train together: one, or as many as torchrun started.
+
+Each takes its part of every batch (train.data.order.Share); gradients are averaged by torch's
+DistributedDataParallel over nccl or gloo. The first process alone logs, judges and saves.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+import torch.distributed as dist
+
+from storage.errors import TrilightError
+from train.data.order import Share
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crew:
+    """This process, and how many there are."""
+
+    device: torch.device
+    """Where its network is."""
+    rank: int = 0
+    """Its number, from 0."""
+    world_size: int = 1
+    """How many train together."""
+
+    @property
+    def is_first(self) -> bool:
+        """Whether it is the one that logs, judges and saves."""
+        return self.rank == 0
+
+    @property
+    def share(self) -> Share:
+        """Its part of every batch."""
+        return Share(rank=self.rank, world_size=self.world_size)
+
+    def mean(self, values: Sequence[float]) -> list[float]:
+        """Return the means over all processes, alike on each; all must call it."""
+        if self.world_size == 1:
+            return list(values)
+        # float32, because nccl and gloo both have it everywhere
+        total = torch.tensor(values, dtype=torch.float32, device=self.device)
+        dist.all_reduce(total)
+        return [float(value) / self.world_size for value in total]
+
+    def any(self, flag: bool) -> bool:
+        """Return whether the flag is set in any process, alike on each; all must call it."""
+        return self.mean([float(flag)])[0] > 0
+
+
+@contextmanager
+def join_crew(device: str | None = None) -> Iterator[Crew]:
+    """Join the processes that torchrun started, or be alone where it did not.
+
+    Args:
+        device: `cpu` or `cuda`, or None for CUDA where there is any. With CUDA each process takes
+            the card of its LOCAL_RANK.
+
+    Raises:
+        TrilightError: CUDA was asked for and there is none, or too few cards.
+    """
+    world_size = int(os.environ.get("WORLD_SIZE", "1"))
+    chosen = choose_device(device, int(os.environ.get("LOCAL_RANK", "0")))
+    if world_size == 1:
+        yield Crew(device=chosen)
+        return
+    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
+    try:
+        yield Crew(device=chosen, rank=dist.get_rank(), world_size=world_size)
+    finally:
+        dist.destroy_process_group()
+
+
+def choose_device(wanted: str | None, local_rank: int = 0) -> torch.device:
+    """Return the device of a process; see `join_crew`."""
+    kind = wanted or ("cuda" if torch.cuda.is_available() else "cpu")
+    if kind not in ("cpu", "cuda"):
+        raise TrilightError(f"device {kind!r}; expected cpu or cuda.")
+    if kind == "cpu":
+        return torch.device("cpu")
+    if local_rank >= torch.cuda.device_count():
+        raise TrilightError(
+            f"device cuda: process {local_rank} of this machine finds "
+            f"{torch.cuda.device_count()} cards; expected one for each. Start fewer processes, or "
+            "say --device cpu."
+        )
+    torch.cuda.set_device(local_rank)
+    return torch.device("cuda", local_rank)

@@ -1,0 +1,79 @@
+"""What happened since the last row of the log: losses, speed, and what the time went to."""
+
+import math
+import time
+from collections.abc import Iterable
+from typing import Any
+
+from train.loop.step import StepReport
+
+
+class Window:
+    """Collects steps until a row is written."""
+
+    def __init__(self) -> None:
+        self._reports: list[StepReport] = []
+        self._began = time.monotonic()
+        self._views = 0
+        self._waited_s = 0.0
+        self._flops = 0.0
+
+    def add(self, report: StepReport, *, views: int, waited_s: float, flops: float) -> None:
+        """Count one step.
+
+        Args:
+            report: what it did.
+            views: of all processes.
+            waited_s: time in which the network waited for data.
+            flops: what this process's scenes need, without padding.
+        """
+        self._reports.append(report)
+        self._views += views
+        self._waited_s += waited_s
+        self._flops += flops
+
+    def pause(self) -> "Pause":
+        """Return a context whose time does not count, for validation and checkpoints."""
+        return Pause(self)
+
+    @property
+    def views_per_s(self) -> float:
+        """Views of all processes per second so far."""
+        return self._views / self._seconds()
+
+    def row(self, peak_flops_per_s: float) -> dict[str, Any]:
+        """Return what the log says about these steps; None where no step was finite."""
+        return {
+            "loss": _finite_mean(report.loss for report in self._reports),
+            "l1": _finite_mean(report.l1 for report in self._reports),
+            "grad_norm": _finite_mean(report.grad_norm for report in self._reports),
+            "views_per_s": self.views_per_s,
+            "data_wait_share": self._waited_s / self._seconds(),
+            "flops_per_s": self._flops / self._seconds(),
+            "peak_share": self._flops / self._seconds() / peak_flops_per_s,
+        }
+
+    def _seconds(self) -> float:
+        return max(time.monotonic() - self._began, 1e-9)
+
+    def leave_out(self, seconds: float) -> None:
+        """Forget so much time."""
+        self._began += seconds
+
+
+class Pause:
+    """Time that a window does not count."""
+
+    def __init__(self, window: Window) -> None:
+        self._window = window
+
+    def __enter__(self) -> None:
+        self._began = time.monotonic()
+
+    def __exit__(self, *_: object) -> None:
+        self._window.leave_out(time.monotonic() - self._began)
+
+
+def _finite_mean(values: Iterable[float]) -> float | None:
+    finite = [value for value in values if math.isfinite(value)]
+    return sum(finite) / len(finite) if finite else None

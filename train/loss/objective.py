@@ -1,0 +1,87 @@
+"""The loss of a run: L1 on log10(1 + radiance), a perceptual term, and the weight of each view."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from storage.errors import TrilightError
+from train.loss.lpips import Lpips
+from train.loss.lpips_weights import LINEAR_FILE, VGG16_FILE
+from train.loss.ms_ssim import ms_ssim
+from train.loss.settings import LossSettings
+from train.loss.tone_map import tone_mapped
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewLosses:
+    """What the views of a batch cost."""
+
+    total_BV: Tensor
+    """What is minimised, summed over terms and weighed."""
+    l1_BV: Tensor
+    """The first term alone, neither weighed nor part of any gradient."""
+
+
+class Objective:
+    """Compares pictures as a run's settings say."""
+
+    def __init__(self, settings: LossSettings, lpips: Lpips | None) -> None:
+        """Take the settings, and LPIPS where they ask for it.
+
+        Raises:
+            TrilightError: they ask for LPIPS and its weights are not here. No other term takes its
+                place by itself.
+        """
+        self.settings = settings
+        self._dissimilarity = _dissimilarity(settings, lpips)
+
+    def __call__(
+        self, prediction_BVRR3: Tensor, target_BVRR3: Tensor, noise_BV: Tensor
+    ) -> ViewLosses:
+        """Return the losses of each view.
+
+        Args:
+            prediction_BVRR3: log10(1 + radiance) before the ELU, float32.
+            target_BVRR3: log10(1 + radiance).
+            noise_BV: root mean square noise of the targets in the same space.
+        """
+        l1_BV = view_l1(prediction_BVRR3, target_BVRR3)
+        total_BV = l1_BV
+        if self._dissimilarity is not None:
+            pictures = [
+                tone_mapped(log10_BVRR3).flatten(0, 1).movedim(-1, 1)
+                for log10_BVRR3 in (prediction_BVRR3, target_BVRR3)
+            ]
+            unlike_BV = self._dissimilarity(*pictures).reshape(l1_BV.shape)
+            total_BV = total_BV + self.settings.perceptual_weight * unlike_BV
+        half = self.settings.noise_half
+        if half:
+            total_BV = total_BV * (half / (half + noise_BV))
+        return ViewLosses(total_BV=total_BV, l1_BV=l1_BV.detach())
+
+
+def view_l1(prediction_BVRR3: Tensor, target_BVRR3: Tensor) -> Tensor:
+    """Return the L1 error [B, V] of log10(1 + radiance), taken before the output's ELU.
+
+    Zeng et al. 2025, section 4, first term. Before the ELU because its slope is a thousandth for
+    negative values: a network that once predicts below 0 would hardly come back. Targets are at
+    least 0, so the best prediction is the same.
+    """
+    return (prediction_BVRR3 - target_BVRR3).abs().mean(dim=(2, 3, 4))
+
+
+def _dissimilarity(
+    settings: LossSettings, lpips: Lpips | None
+) -> Callable[[Tensor, Tensor], Tensor] | None:
+    if settings.perceptual == "none" or settings.perceptual_weight == 0:
+        return None
+    if settings.perceptual == "ms_ssim":
+        return lambda a_M3RR, b_M3RR: 1 - ms_ssim(a_M3RR, b_M3RR)
+    if lpips is None:
+        raise TrilightError(
+            f"loss.perceptual is lpips, but no weights were named; give --lpips FOLDER with "
+            f"{VGG16_FILE} and {LINEAR_FILE}, --lpips hub to download them, or another term: "
+            "--set loss.perceptual=ms_ssim or none."
+        )
+    return lpips

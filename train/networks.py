@@ -1,0 +1,51 @@
+"""What a person may name where a trained network is wanted."""
+
+import json
+from pathlib import Path
+
+from model.checkpoints import open_checkpoint
+from model.renderformer import RenderFormer
+from storage.safe_read import read_safetensors
+from train.folder import RunFolder
+from train.loop.checkpoint import is_checkpoint, read_checkpoint
+from train.loop.checkpoints import checkpoint_path, saved_steps
+
+
+def open_network(place: str | Path) -> RenderFormer:
+    """Return a network on the CPU, in evaluation mode.
+
+    Args:
+        place: the folder of a run (its finished network, or that of its newest checkpoint), a
+            checkpoint of a run, or what model.checkpoints.open_checkpoint opens.
+
+    Raises:
+        TrilightError: there is none, or it is damaged.
+    """
+    path = _run_file(Path(place))
+    if path.suffix == ".safetensors" and path.is_file():
+        _, metadata = read_safetensors(path.read_bytes())
+        if is_checkpoint(metadata):
+            return read_checkpoint(path).network()
+    return open_checkpoint(str(path))
+
+
+def trained_resolution(place: str | Path) -> int | None:
+    """Return the pixels across that a network was trained at, where what is named tells."""
+    path = Path(place)
+    if path.is_dir() and RunFolder(path).settings.is_file():
+        record = json.loads(RunFolder(path).settings.read_text())
+        return int(record["settings"]["resolution"])
+    if path.is_file():
+        _, metadata = read_safetensors(path.read_bytes())
+        if is_checkpoint(metadata):
+            return int(read_checkpoint(path).header["settings"]["resolution"])
+    return None
+
+
+def _run_file(path: Path) -> Path:
+    """Return the finished weights or the newest checkpoint of a run's folder; else the path."""
+    folder = RunFolder(path)
+    if path.is_dir() and not folder.weights.is_file():
+        if steps := saved_steps(folder.checkpoints):
+            return checkpoint_path(folder.checkpoints, steps[-1])
+    return path

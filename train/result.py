@@ -1,0 +1,97 @@
+"""What a finished run has to show, and how it is written down."""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+
+from model.renderformer import count_parameters
+from model.trained_range import TrainedRange
+from model.weights import encode_weights
+from storage.atomic import write_atomically
+from storage.training_data import TrainingData
+from train.evaluation.judge import Judge
+from train.evaluation.sheet import write_picture
+from train.evaluation.validation_sheet import drawn_validation_sheet
+from train.folder import RunFolder
+from train.loop.metrics_log import read_rows
+from train.loop.state import TrainState
+from train.settings import TrainSettings
+
+LOSS_SHARE = 20
+"""The loss at start and end is the mean over the first and last 1 / LOSS_SHARE of the log."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainResult:
+    """What a finished run has to show."""
+
+    folder: RunFolder
+    """Where everything is."""
+    num_parameters: int
+    """Of the network."""
+    num_steps: int
+    """Steps done, including skipped ones."""
+    skipped_steps: int
+    """Steps that were not finite and changed nothing."""
+    loss_at_start: float
+    """Mean training loss over the first twentieth of the run."""
+    loss_at_end: float
+    """The same over the last twentieth."""
+    scores: dict[str, float]
+    """The network on the validation split (evaluation.judge)."""
+    median_scores: dict[str, float]
+    """The median picture of the training views on the same split."""
+    unusable: tuple[str, ...]
+    """What was wrong with data that was left out in this call."""
+    seconds: float
+    """Wall time of this call, from opening the data to writing the sheet."""
+
+    @property
+    def beats_median(self) -> bool:
+        """Whether the network's log_l1 is below that of the median picture."""
+        return self.scores["log_l1"] < self.median_scores["log_l1"]
+
+
+def finished(
+    state: TrainState,
+    settings: TrainSettings,
+    folder: RunFolder,
+    data: TrainingData,
+    judge: Judge,
+    seconds_before: float,
+) -> TrainResult:
+    """Judge the finished network, write weights, sheet and summary, and return the result."""
+    most = data.max_triangles
+    trained = None if most is None else TrainedRange(max_triangles=most)
+    write_atomically(folder.weights, encode_weights(state.shown, trained))
+    judgement = judge.judge(state.shown)
+    loss_at_start, loss_at_end = _losses(folder)
+    write_picture(folder.sheet, drawn_validation_sheet(settings, judge, judgement, state.step))
+    result = TrainResult(
+        folder=folder,
+        num_parameters=count_parameters(state.model),
+        num_steps=state.step,
+        skipped_steps=state.skipped_steps,
+        loss_at_start=loss_at_start,
+        loss_at_end=loss_at_end,
+        scores=judgement.scores,
+        median_scores=judge.median_scores,
+        unusable=tuple(state.unusable.messages),
+        seconds=seconds_before,
+    )
+    record = dataclasses.asdict(result) | {"beats_median": result.beats_median}
+    del record["folder"]
+    write_atomically(folder.summary, pretty_json(record))
+    return result
+
+
+def pretty_json(record: object) -> bytes:
+    """Return JSON for people: indented, sorted, with a newline at its end."""
+    return json.dumps(record, indent=1, sort_keys=True).encode() + b"\n"
+
+
+def _losses(folder: RunFolder) -> tuple[float, float]:
+    """Return the mean training loss of the first and of the last rows of the log."""
+    rows = [row["loss"] for row in read_rows(folder.metrics) if row.get("loss") is not None]
+    count = max(len(rows) // LOSS_SHARE, 1)
+    return sum(rows[:count]) / count, sum(rows[-count:]) / count

@@ -1,0 +1,136 @@
+"""The named runs. Any field can be replaced on the command line: `--set loss.perceptual=none`.
+
+`paper-*` are the recipe of RenderFormer (Zeng et al. 2025, and its published training code): two
+stages, AdamW, one cosine, random rigid motions. What we hold to be mistakes in the code is not
+repeated: positions rounded to bfloat16, a learning rate that starts again, samples drawn with
+replacement, and the loss behind the ELU. `pretrain` and `finetune` are ours.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+from model.config import base as base_model
+from model.config import smoke as smoke_model
+from storage.errors import TrilightError
+from train.data.augmentation import AugmentationSettings
+from train.loss.settings import LossSettings
+from train.settings import TrainSettings
+
+
+def smoke() -> TrainSettings:
+    """Return the run that shows, within five minutes on two CPU cores, that learning happens."""
+    return TrainSettings(
+        run="smoke",
+        model=smoke_model(),
+        resolution=64,
+        loss=LossSettings(perceptual="none"),
+        augmentation=AugmentationSettings(mirror=True, channels=True, vertex_order=True),
+        num_steps=360,
+        scenes_per_step=4,
+        views_per_scene=4,
+        learning_rate=1.5e-3,
+        warmup_steps=50,
+        validate_every=60,
+        checkpoint_every=60,
+    )
+
+
+def paper_pretrain() -> TrainSettings:
+    """Return the first stage of the paper: 256 pixels, up to 1536 triangles."""
+    return TrainSettings(
+        run="paper-pretrain",
+        model=base_model(),
+        resolution=256,
+        most_triangles=1536,
+        loss=LossSettings(perceptual="lpips", perceptual_weight=0.05),
+        augmentation=AugmentationSettings(rotation="recipe", translation=0.25),
+        num_steps=500_000,
+        scenes_per_step=128,
+        views_per_scene=2,
+        scenes_per_pass=16,
+        precision="bfloat16",
+        recompute_activations=True,
+        learning_rate=1e-4,
+        warmup_steps=8_000,
+        final_rate_share=0.01,
+        betas=(0.9, 0.999),
+        shuffle_shards=16,
+        log_every=20,
+        validate_every=5_000,
+        checkpoint_every=1_000,
+        keep_every=50_000,
+        validation_scenes=256,
+    )
+
+
+def paper_finetune() -> TrainSettings:
+    """Return the second stage of the paper, from the first: 512 pixels, up to 4096 triangles."""
+    return dataclasses.replace(
+        paper_pretrain(),
+        run="paper-finetune",
+        from_weights=True,
+        resolution=512,
+        most_triangles=4096,
+        num_steps=100_000,
+        scenes_per_step=64,
+        scenes_per_pass=4,
+        learning_rate=5e-5,
+        keep_every=20_000,
+    )
+
+
+def pretrain() -> TrainSettings:
+    """Return our first stage: half the paper's steps, every symmetry, less said by noisy views.
+
+    Which of these choices helps is for `infra.bench.training_table` to measure; at this size none
+    has been.
+    """
+    return dataclasses.replace(
+        paper_pretrain(),
+        run="pretrain",
+        loss=LossSettings(perceptual="lpips", perceptual_weight=0.05, noise_half=0.03),
+        augmentation=AugmentationSettings(
+            rotation="uniform", mirror=True, channels=True, vertex_order=True, light_scale=2.0
+        ),
+        num_steps=250_000,
+        learning_rate=3e-4,
+        warmup_steps=2_000,
+        final_rate_share=0.02,
+        betas=(0.9, 0.99),
+        ema_decay=0.9995,
+    )
+
+
+def finetune() -> TrainSettings:
+    """Return our second stage: as the paper's is to its first."""
+    return dataclasses.replace(
+        pretrain(),
+        run="finetune",
+        from_weights=True,
+        resolution=512,
+        most_triangles=4096,
+        num_steps=50_000,
+        scenes_per_step=64,
+        scenes_per_pass=4,
+        learning_rate=1e-4,
+        keep_every=10_000,
+    )
+
+
+RUNS: dict[str, Callable[[], TrainSettings]] = {
+    "smoke": smoke,
+    "pretrain": pretrain,
+    "finetune": finetune,
+    "paper-pretrain": paper_pretrain,
+    "paper-finetune": paper_finetune,
+}
+"""Every named run."""
+
+
+def named_run(name: str) -> TrainSettings:
+    """Return the settings of a run; raises TrilightError for an unknown name."""
+    if name not in RUNS:
+        raise TrilightError(
+            f"run {name!r}: no such run; expected one of {', '.join(sorted(RUNS))}."
+        )
+    return RUNS[name]()
