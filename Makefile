@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: setup setup-all dataset test test-slow train lint lock third-party clean
+.PHONY: setup setup-all dataset test test-slow train serve stop lint lock third-party clean
 
 setup: $(VENV)/.dataset-ready  ## what making data needs
 
@@ -26,6 +26,12 @@ test-slow: setup-all  ## the others
 
 train: setup-all  ## the smoke model on what `make dataset` made
 	trilight train smoke --data data/smoke --out runs/smoke $(if $(wildcard runs/smoke/checkpoints/*),--resume)
+
+serve: setup  ## Prefect's server, a pool, a worker and the flows as deployments, on this machine
+	python -m infra.serving.local start
+
+stop:  ## end exactly what `make serve` started
+	python -m infra.serving.local stop
 
 lint: setup-all  ## format, style, types, layers
 	ruff format --check .

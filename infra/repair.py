@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.flows.builds import named_build
-from pipeline.flows.prefect_server import prefect_server, quiet_prefect
+from pipeline.flows.dataset_run import make_dataset
+from pipeline.flows.order import DatasetOrder
+from pipeline.flows.runners import ThreadRunner
 from pipeline.flows.settings import differences
 from pipeline.objects.licences import BY_USER
 from storage.dataset import Dataset, open_dataset
@@ -50,23 +52,20 @@ def repair(
     manifest = opened.manifest
     _require_generated(manifest, scenes_from)
     changes, licence = _changes(manifest), _stated_licence(opened)
-    quiet_prefect()
     for name in bad_shards:
         if (root / name).exists():
             (root / name).replace(root / f"{name}{ASIDE}")
-    with prefect_server():
-        from pipeline.flows.generate_scenes import generate_scenes  # after Prefect is quiet
-
-        outcome = generate_scenes(
-            build=manifest.build,
-            objects=objects,
-            out=str(root),
-            scenes=None if scenes_from else manifest.num_scenes,
-            licence=licence,
-            scenes_from=scenes_from,
-            views=manifest.num_views if scenes_from else None,
-            changes=changes,
-        )
+    order = DatasetOrder(
+        build=manifest.build,
+        objects=objects,
+        out=str(root),
+        scenes=None if scenes_from else manifest.num_scenes,
+        licence=licence,
+        scenes_from=scenes_from,
+        views=manifest.num_views if scenes_from else None,
+        changes=changes,
+    )
+    outcome = make_dataset(order, ThreadRunner())
     if outcome.digest != manifest.dataset_digest:
         raise TrilightError(
             f"{root}: the shards were made again, but the dataset digest is {outcome.digest}; "

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from storage.errors import Rejected, TrilightError
+from storage.errors import EnvironmentFailure, Rejected, TrilightError
 
 Result = TypeVar("Result")
 
@@ -133,8 +133,10 @@ class IsolatedChild:
         try:
             self._exchange(self._setup, _START_UP_S)
         except ChildFailed as failure:
+            if self._closed:
+                raise ChildClosed from failure
             # no item is to blame, and another child would fail as this one did
-            raise TrilightError(
+            raise EnvironmentFailure(
                 f"a child process cannot be set up ({failure}); see `trilight doctor`."
             ) from failure
 

@@ -7,30 +7,40 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
 
 TEMPORARY_SUFFIX = ".part"
+_MAY_PASS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE, errno.ENOMEM, errno.EMFILE)
+_NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 
 
 @contextlib.contextmanager
-def atomic_writer(path: Path) -> Iterator[BinaryIO]:
+def atomic_writer(path: Path, *, replace: bool = True) -> Iterator[BinaryIO]:
     """Open a file that appears under its name only when the block ends without an error.
 
-    A process that is killed inside the block leaves at most a `.part` file, which the next writer
-    of the same name in the same process id, or `remove_leftovers`, clears away. Two writers of the
-    same name do no harm: each has a temporary name of its own, and the last rename wins.
+    A process that is killed inside the block leaves at most a `.part` file, which
+    `remove_leftovers` clears away. Two writers of the same name do no harm, on one machine or on
+    two: each has a temporary name of its own.
+
+    Args:
+        path: the final name.
+        replace: the last writer wins; otherwise the first, and the others' bytes are dropped.
 
     Raises:
-        TrilightError: the disk is full, or the place cannot be written.
+        TrilightError: the disk is full (an EnvironmentFailure), or the place cannot be written.
     """
-    temporary = path.with_name(f"{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
+    own = f"{os.getpid()}-{os.urandom(4).hex()}"  # containers give all their processes number 1
+    temporary = path.with_name(f"{path.name}.{own}{TEMPORARY_SUFFIX}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, path)
+        if replace:
+            os.replace(temporary, path)
+        else:
+            _appear_first(temporary, path)
         _sync_folder(path.parent)
     except OSError as error:
         raise write_error(path, error) from error
@@ -54,14 +64,28 @@ def remove_leftovers(folder: Path) -> None:
 def write_error(path: Path, error: OSError) -> TrilightError:
     """Return the user's view of a failed write."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return TrilightError(
+        return EnvironmentFailure(
             f"{path.parent}: the disk is full. What was finished is safe: free some space and run "
             "the same command again."
         )
-    return TrilightError(
+    kind = EnvironmentFailure if error.errno in _MAY_PASS else TrilightError
+    return kind(
         f"{path.parent}: cannot write {path.name} ({error.strerror}). What was finished is safe: "
         "choose a writable folder or mend its permissions, and run the same command again."
     )
+
+
+def _appear_first(temporary: Path, path: Path) -> None:
+    """Give a file its final name unless that is taken."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        pass
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        if not path.exists():  # a file system without links: nearly as good
+            os.replace(temporary, path)
 
 
 def _sync_folder(folder: Path) -> None:

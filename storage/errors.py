@@ -1,4 +1,4 @@
-"""The two ways in which something can be wrong: a user's mistake, and an item that is unusable."""
+"""The ways in which something can be wrong: a user's mistake, the machine, an unusable item."""
 
 
 class TrilightError(ValueError):
@@ -6,6 +6,13 @@ class TrilightError(ValueError):
 
     The message is one line that names the thing, the value got, the value expected and the next
     step. The command line prints it without a traceback and exits with a non-zero status.
+    """
+
+
+class EnvironmentFailure(TrilightError):
+    """Something outside of us that may pass: a full disk, a lack of memory, a server away.
+
+    The same call may succeed later, so a scheduler tries it again; any other TrilightError stays.
     """
 
 

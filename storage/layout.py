@@ -1,4 +1,4 @@
-"""Where things are in a dataset folder, and the lock that keeps two makers out of it.
+"""Where things are in a dataset folder, and how several makers of it stay out of each other's way.
 
 What stands beside the shards is the dataset. `.staging` holds what is not finished; it may be
 deleted at any time, and then it is made again.
@@ -15,7 +15,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.atomic import write_error
+from storage.atomic import remove_leftovers, write_error
+from storage.claims import claimed
 from storage.errors import TrilightError
 
 FILES_PER_FOLDER = 4096
@@ -99,9 +100,19 @@ class DatasetFolder:
         """Rejections of shards that are packed but not yet in the manifest."""
         return self.staging / "failures"
 
+    @property
+    def staged_entries(self) -> Path:
+        """What the manifest will say of shards that are packed but not yet in it."""
+        return self.staging / "entries"
+
+    @property
+    def staged_samples(self) -> Path:
+        """Finished samples of unfinished shards, in a folder for each shard."""
+        return self.staging / "samples"
+
     def staged_shard(self, name: str) -> Path:
         """Folder of the finished samples of an unfinished shard."""
-        return self.staging / "samples" / name
+        return self.staged_samples / name
 
     def shard(self, name: str) -> Path:
         """Path of a shard; its name is relative to the folder and may begin with a part of it."""
@@ -118,12 +129,7 @@ class DatasetFolder:
         Raises:
             TrilightError: the folder cannot be written, or another process is at work in it.
         """
-        lock = self.staging / "lock"
-        try:
-            self.staging.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise write_error(lock, error) from error
+        descriptor = self._open_lock()
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -135,3 +141,34 @@ class DatasetFolder:
             yield
         finally:
             os.close(descriptor)
+
+    @contextlib.contextmanager
+    def joined(self) -> Iterator[None]:
+        """Take part in the making, with any number of others.
+
+        Whoever is alone at first clears away what killed writers have left.
+
+        Raises:
+            TrilightError: the folder cannot be written.
+        """
+        descriptor = self._open_lock()
+        try:
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                remove_leftovers(self.root)
+            fcntl.flock(descriptor, fcntl.LOCK_SH)
+            yield
+        finally:
+            os.close(descriptor)
+
+    def turn(self, what: str) -> "contextlib.AbstractContextManager[bool]":
+        """Wait for one's turn at what one maker does at a time, such as `manifest`."""
+        return claimed(self.staging / "turns" / what, wait=True)
+
+    def _open_lock(self) -> int:
+        lock = self.staging / "lock"
+        try:
+            self.staging.mkdir(parents=True, exist_ok=True)
+            return os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise write_error(lock, error) from error

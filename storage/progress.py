@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically
+from storage.derived import derivation_of
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
-from storage.manifest import read_manifest
+from storage.manifest import Manifest, read_manifest
+from storage.splits import SplitSettings, scenes_of_shard, shard_name, shards_for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,11 +51,10 @@ def read_progress(folder: DatasetFolder) -> Progress:
     """Count files; cheap enough to be called twice a second."""
     try:
         manifest = read_manifest(folder.manifest)
-        scenes_planned, in_shards = manifest.num_scenes, manifest.num_samples
+        scenes_planned, scenes_done = manifest.num_scenes, num_scenes_done(folder, manifest)
     except TrilightError:
-        scenes_planned = in_shards = 0
+        scenes_planned = scenes_done = 0
     plan = json.loads(_plan(folder).read_bytes()) if _plan(folder).exists() else {"objects": 0}
-    staged = sum(path.is_file() for path in (folder.staging / "samples").rglob("*.tar"))
     done, total = (
         json.loads(_downloads(folder).read_bytes()) if _downloads(folder).exists() else (0, 0)
     )
@@ -62,9 +63,33 @@ def read_progress(folder: DatasetFolder) -> Progress:
         downloads_planned=total,
         objects_done=_done(folder).stat().st_size if _done(folder).exists() else 0,
         objects_planned=plan["objects"],
-        scenes_done=in_shards + staged,
+        scenes_done=scenes_done,
         scenes_planned=scenes_planned,
     )
+
+
+def planned_shards(manifest: Manifest) -> dict[str, int]:
+    """Return the names of the shards of the finished dataset, with their numbers of scenes."""
+    if derivation_of(manifest.settings):
+        return {entry.name: entry.num_samples for entry in manifest.shards}
+    splits = SplitSettings(**manifest.settings["splits"])
+    return {
+        shard_name(index, splits): len(scenes_of_shard(index, splits))
+        for index in range(shards_for(manifest.num_scenes, splits))
+    }
+
+
+def shards_there(folder: DatasetFolder) -> set[str]:
+    """Return the names of the shards that are there under their final names, listed or not."""
+    return {path.relative_to(folder.root).as_posix() for path in folder.shard_files()}
+
+
+def num_scenes_done(folder: DatasetFolder, manifest: Manifest) -> int:
+    """Return how many scenes are in shards, listed or not, or wait for theirs."""
+    planned = planned_shards(manifest)
+    there = shards_there(folder) & planned.keys()
+    unpacked = sum(path.is_file() for path in folder.staged_samples.rglob("*.tar"))
+    return sum(planned[name] for name in there) + unpacked
 
 
 def _plan(folder: DatasetFolder) -> Path:

@@ -10,12 +10,13 @@ from storage.atomic import atomic_writer
 def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
     """Write samples, given as (key, members by suffix) in order of keys, as one tar file.
 
-    Equal samples give equal bytes. The file appears under its name only when it is complete.
+    Equal samples give equal bytes. The file appears under its name only when it is complete, and
+    never in the place of another: the first writer of a shard wins.
 
     Raises:
         TrilightError: the disk is full or the folder cannot be written.
     """
-    with atomic_writer(path) as stream:
+    with atomic_writer(path, replace=False) as stream:
         write_tar(stream, samples)
 
 

@@ -211,7 +211,7 @@ def _stage(
     records: list[ObjectRecord], settings: AssetSettings, workers: int
 ) -> Callable[[], Mapping[str, float]]:
     def measure() -> Mapping[str, float]:
-        pool = ChildPool(asset_child, workers)
+        pool = ChildPool(lambda _: asset_child(), workers)
         with tempfile.TemporaryDirectory() as store, contextlib.closing(pool):
             prepared, failures = prepare_assets(
                 records,

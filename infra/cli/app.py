@@ -17,8 +17,10 @@ from infra.cli import (
     generate,
     inspect,
     model,
+    plan,
     render,
     shards,
+    status,
     train,
     verify,
 )
@@ -34,11 +36,13 @@ app = typer.Typer(
 app.command("doctor")(doctor.doctor)
 app.command("assets")(assets.assets)
 app.command("generate")(generate.generate)
+app.command("plan")(plan.plan)
 app.command("render")(render.render)
 app.command("convert")(convert.convert)
 app.command("verify")(verify.verify)
 app.command("inspect")(inspect.inspect)
 app.command("model")(model.model)
+app.command("status")(status.status)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
 app.command("bench")(bench.bench)

@@ -14,7 +14,7 @@ from storage.errors import TrilightError
 if TYPE_CHECKING:
     from infra.bench.harness import Options, Result
 
-_NAMES = ("assets", "exchange", "render", "scenes", "shards", "streaming")
+_NAMES = ("assets", "exchange", "orchestration", "render", "scenes", "shards", "streaming")
 
 _Measured = TypeVar("_Measured", bound="Result")
 
@@ -114,6 +114,10 @@ def _named(name: str) -> list[_Benchmark[Any]]:
         from infra.bench import exchange
 
         return [_whole(exchange, exchange)]
+    if name == "orchestration":
+        from infra.bench import orchestration
+
+        return [_whole(orchestration, orchestration)]
     if name == "render":
         return _render_parts()
     if name == "scenes":

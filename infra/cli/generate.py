@@ -3,32 +3,27 @@
 import contextlib
 import threading
 import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import Progress as Bars
-from rich.text import Text
 
 from infra.cli.changes import parse_changes
-from infra.cli.console import console, print_json, print_rows, progress_bars
+from infra.cli.console import console, progress_bars
+from infra.cli.generate_report import report
+from pipeline.flows.order import DatasetOrder
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-from pipeline.objects.licences import USER_PROVIDED
 from pipeline.renders.variant import choose_variant
-from storage.failures import count_by_reason, read_failures
+from storage.errors import TrilightError
 from storage.layout import DatasetFolder
-from storage.objects_lock import read_objects_lock
 from storage.progress import read_progress
 
 if TYPE_CHECKING:
-    from pipeline.flows.generate_scenes import Outcome
+    from pipeline.flows.dataset_run import Outcome
 
 _POLL_S = 0.5
-
-_MAX_NOTES = 20
-"""Most notes that are printed."""
 
 
 def generate(
@@ -52,7 +47,20 @@ def generate(
     licence: Annotated[
         str | None, typer.Option(help="licence of files that state none [yours to use]")
     ] = None,
-    workers: Annotated[int, typer.Option(help="render processes that share the cores")] = 1,
+    workers: Annotated[
+        int | None,
+        typer.Option(help="render processes that share the cores [1, or 1 for each graphics card]"),
+    ] = None,
+    shards: Annotated[
+        str | None,
+        typer.Option(
+            help="make only shards A up to but not B, given as A:B; who makes the last one finishes"
+        ),
+    ] = None,
+    runner: Annotated[str, typer.Option(help="threads, of this process; or dask")] = "threads",
+    address: Annotated[
+        str | None, typer.Option(help="with --runner dask: scheduler, such as tcp://host:8786")
+    ] = None,
     failure_budget: Annotated[
         float, typer.Option(help="share of scenes that may be given up")
     ] = 0.1,
@@ -81,34 +89,56 @@ def generate(
     json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
 ) -> None:
     """Turn objects into a verified, resumable dataset; run it again to go on after any stop."""
-    changes = parse_changes(set_ or ())
-    quiet_prefect()
-    folder = DatasetFolder(out)
-    started = time.monotonic()
+    order = DatasetOrder(
+        build=build,
+        objects=objects,
+        out=str(out),
+        scenes=scenes,
+        seed=seed,
+        resolution=resolution,
+        noise_floor_db=noise_floor,
+        allow_licences=tuple(allow_licence or ()),
+        licence=licence,
+        workers=workers,
+        failure_budget=failure_budget,
+        accept_environment=accept_environment,
+        scenes_from=None if scenes_from is None else str(scenes_from),
+        views=views,
+        shards=shards,
+        changes=parse_changes(set_ or ()),
+    )
+    make = _runner(runner, address)
+    folder, started = DatasetFolder(out), time.monotonic()
     if note := choose_variant().note:
         console.print(f"Note: {note}; see trilight doctor.", style="yellow")
-    with prefect_server():
-        from pipeline.flows.generate_scenes import generate_scenes  # after Prefect is quiet
+    with _progress(folder):
+        outcome = make(order)
+    report(folder, outcome, time.monotonic() - started, as_json=json)
 
-        with _progress(folder):
-            outcome = generate_scenes(
-                build=build,
-                objects=objects,
-                out=str(out),
-                scenes=scenes,
-                seed=seed,
-                resolution=resolution,
-                noise_floor_db=noise_floor,
-                allow_licences=allow_licence,
-                licence=licence,
-                workers=workers,
-                failure_budget=failure_budget,
-                accept_environment=accept_environment,
-                scenes_from=None if scenes_from is None else str(scenes_from),
-                views=views,
-                changes=changes,
-            )
-    _report(folder, outcome, time.monotonic() - started, as_json=json)
+
+def _runner(name: str, address: str | None) -> "Callable[[DatasetOrder], Outcome]":
+    """Return what makes an order; imports are slow, since they bring every stage."""
+    if name not in ("threads", "dask"):
+        raise TrilightError(f"--runner is {name!r}; expected threads or dask.")
+    if (name == "dask") != (address is not None):
+        raise TrilightError(
+            f"--runner is {name} and --address is {address}; expected an address with --runner "
+            "dask, and only then."
+        )
+    if address is None:
+        from pipeline.flows.dataset_run import make_dataset
+        from pipeline.flows.runners import ThreadRunner
+
+        return lambda order: make_dataset(order, ThreadRunner())
+    quiet_prefect()
+
+    def on_cluster(order: DatasetOrder) -> "Outcome":
+        with prefect_server():
+            from pipeline.flows.served.on_dask import make_on_dask
+
+            return make_on_dask(order, address)
+
+    return on_cluster
 
 
 @contextlib.contextmanager
@@ -155,55 +185,3 @@ def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event) -> None:
             )
             if now.objects_done >= now.objects_planned > 0 or last:
                 bars.start_task(scenes) if not bars.tasks[scenes].started else None
-
-
-def _report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json: bool) -> None:
-    rejected = count_by_reason(read_failures(folder.failures))
-    statistics = outcome.statistics
-    if as_json:
-        print_json(
-            {
-                "out": str(folder.root),
-                "dataset_digest": outcome.digest,
-                "objects_found": outcome.num_objects_found,
-                "objects_used": outcome.num_objects_used,
-                "scenes": statistics.num_scenes,
-                "views": statistics.num_views,
-                "bytes": statistics.num_bytes,
-                "notes": list(outcome.notes),
-                "scenes_given_up": outcome.num_scenes_given_up,
-                "rejections": [list(row) for row in rejected],
-                "seconds": round(seconds, 1),
-            }
-        )
-        return
-    used = f"{outcome.num_objects_used} of {outcome.num_objects_found}"
-    rows = [("objects used", used), ("licences", _licences(folder)), *statistics.lines()]
-    if outcome.num_scenes_given_up:
-        rows.append(("scenes given up", str(outcome.num_scenes_given_up)))
-    rows += [("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in rejected]
-    rows += [
-        ("dataset digest", outcome.digest),
-        ("wall time", f"{seconds:.0f} s"),
-        ("look at", f"{folder.contact_sheet}, {folder.report}, {folder.card}"),
-        ("shards, manifest", str(folder.root)),
-        ("why rejected", str(folder.failures)),
-    ]
-    _print_notes(outcome.notes)
-    print_rows("Dataset finished", rows)
-    console.print(f"\nNext: trilight verify {folder.root}", style="bold")
-    if statistics.scenes_by_split.get("train"):
-        console.print(f"      trilight train smoke --data {folder.root}", style="bold")
-
-
-def _print_notes(notes: Sequence[str]) -> None:
-    for note in notes[:_MAX_NOTES]:
-        console.print(Text(f"Note: {note}.", style="yellow"))
-    if len(notes) > _MAX_NOTES:
-        console.print(f"Note: {len(notes) - _MAX_NOTES} more; --json has all.", style="yellow")
-
-
-def _licences(folder: DatasetFolder) -> str:
-    counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))
-    shown = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
-    return shown.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")

@@ -29,8 +29,6 @@ def settings_for_files(
         TrilightError: a file has fewer cameras than `views`, or there are no files.
     """
     if folder is None:
-        if views is not None:
-            raise TrilightError(f"--views is {views}; expected it only with --scenes-from.")
         return settings
     return dataclasses.replace(
         settings,

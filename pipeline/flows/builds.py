@@ -12,6 +12,7 @@ from pipeline.objects.generated import BENCHMARK
 from pipeline.objects.generated import PREFIX as BUILTIN
 from storage.changes import changed
 from storage.errors import TrilightError
+from storage.safe_url import safe_url
 from storage.statistics import Statistics
 
 BUILDS: Mapping[str, NamedBuild] = {**TRAINING_BUILDS, **RENDERFORMER_BUILDS, **JUDGING_BUILDS}
@@ -60,10 +61,10 @@ def object_source(settings: BuildSettings, objects: str | None) -> str:
     if settings.source is None:
         # Who is judged may have learnt from the built-in objects of everybody.
         return objects or (BENCHMARK if settings.splits.one_split else BUILTIN)
-    if objects not in (None, settings.source):
+    if objects is not None and objects != settings.source:
         raise TrilightError(
-            f"--objects is {objects!r}; expected {settings.source!r}, which {settings.build} is "
-            "frozen with: leave --objects away, or choose another build."
+            f"--objects is {safe_url(objects)!r}; expected {settings.source!r}, which "
+            f"{settings.build} is frozen with: leave --objects away, or choose another build."
         )
     return settings.source
 

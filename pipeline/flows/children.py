@@ -10,8 +10,14 @@ from pipeline.isolation import IsolatedChild
 class ChildPool:
     """At most `size` children, each with its compiled kernels warm for the next task."""
 
-    def __init__(self, make_child: Callable[[], IsolatedChild], size: int) -> None:
-        self._children = [make_child() for _ in range(size)]
+    def __init__(self, make_child: Callable[[int], IsolatedChild], size: int) -> None:
+        """Make the children.
+
+        Args:
+            make_child: called with the number of each child, from 0.
+            size: how many there are.
+        """
+        self._children = [make_child(number) for number in range(size)]
         self._free: queue.SimpleQueue[IsolatedChild] = queue.SimpleQueue()
         for child in self._children:
             self._free.put(child)
@@ -24,6 +30,10 @@ class ChildPool:
             yield child
         finally:
             self._free.put(child)
+
+    def is_idle(self) -> bool:
+        """Return whether no child is lent."""
+        return self._free.qsize() == len(self._children)
 
     def close(self) -> None:
         """End all children at once."""

@@ -1,5 +1,6 @@
 """One attempt at one scene, inside a render child: compose or read it, render its views."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,8 @@ class SceneSource:
     """What Mitsuba runs on."""
     threads: int
     """Threads of this child."""
+    gpu: str | None = None
+    """Graphics card of this child, as CUDA_VISIBLE_DEVICES names it; None where none is used."""
     objects: tuple[tuple[LockedObject, Path], ...]
     """Every locked object with its asset file."""
     files: SceneFiles | None = None
@@ -63,7 +66,9 @@ _state = _ChildState()
 
 
 def set_up_child(source: SceneSource) -> None:
-    """Prepare a render child: Mitsuba's variant, its threads, and the assets."""
+    """Prepare a render child: its graphics card, Mitsuba's variant, its threads, and the assets."""
+    if source.gpu is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = source.gpu
     activate(source.variant)
     set_threads(source.threads)
     _state.source = source

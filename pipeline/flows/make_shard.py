@@ -1,48 +1,97 @@
-"""All scenes of one shard, each with its attempts, in a borrowed render child; then the shard."""
+"""Scenes of a shard, each with its attempts, in a borrowed render child; then the shard."""
 
-import json
-import os
-import socket
+import logging
 import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 from pipeline.flows.make_scene import MAX_ATTEMPTS, SceneAttempt, attempt_scene
+from pipeline.flows.pieces import Piece
+from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.shards.pack import pack_shard
-from storage.layout import DatasetFolder
+from storage.claims import claimed
+from storage.layout import DatasetFolder, numbered
 from storage.manifest import ShardEntry
-from storage.profiles import Profile
 from storage.records import Failure
 from storage.sample import Sample, sample_key
 from storage.splits import SplitSettings, scenes_of_shard, shard_name, split_of_shard
 from storage.staging import is_staged, stage_scene
 
+log = logging.getLogger("trilight.scenes")
 
-def make_shard(
+
+def make_piece(
     folder: DatasetFolder,
-    splits: SplitSettings,
-    profile: Profile,
-    shard_index: int,
+    settings: BuildSettings,
+    piece: Piece,
     child: IsolatedChild,
-) -> ShardEntry:
-    """Make what is missing of a shard and pack it.
+    scene_done: Callable[[int, float, list[Failure]], None],
+) -> ShardEntry | None:
+    """Make what is missing of a piece, and pack its shard if that is whole then.
+
+    Scenes that somebody else is making are left to them; whoever stages the last one packs.
+
+    Args:
+        folder: the dataset.
+        settings: of the build.
+        piece: the scenes to make.
+        child: where they are rendered.
+        scene_done: called after each scene that was made here, with its index, its seconds, and
+            what was rejected on the way.
+
+    Returns:
+        The shard, where this call packed it.
 
     Raises:
         TrilightError: the output cannot be written. A scene that cannot be made is not an error:
             its rejections are recorded and the shard goes without it.
     """
-    name = shard_name(shard_index, splits)
-    staged = folder.staged_shard(name)
-    for scene_index in scenes_of_shard(shard_index, splits):
-        if is_staged(staged, scene_index):
+    name = shard_name(piece.shard_index, settings.splits)
+    for scene_index in range(piece.first, piece.last):
+        if _is_done(folder, name, scene_index):
             continue
-        started = time.monotonic()
-        split, attempts = split_of_shard(shard_index, splits), _attempts(splits)
-        sample, failures = _make_scene(split, scene_index, attempts, child)
-        stage_scene(staged, scene_index, sample, failures, profile)
-        _log(folder.logs / f"{name}.jsonl", scene_index, time.monotonic() - started, failures)
-    return pack_shard(folder, name, scenes_of_shard(shard_index, splits))
+        claim = numbered(scene_index, f"{sample_key(scene_index)}.claim")
+        with claimed(folder.staged_shard(name) / claim) as ours:
+            if ours and not _is_done(folder, name, scene_index):  # nor in the meantime
+                scene_done(
+                    scene_index,
+                    *_make_and_stage(folder, settings, piece.shard_index, scene_index, child),
+                )
+    return _packed(folder, name, scenes_of_shard(piece.shard_index, settings.splits))
+
+
+def _is_done(folder: DatasetFolder, name: str, scene_index: int) -> bool:
+    return folder.shard(name).exists() or is_staged(folder.staged_shard(name), scene_index)
+
+
+def _packed(folder: DatasetFolder, name: str, scenes: range) -> ShardEntry | None:
+    """Pack a shard whose scenes are all staged, unless somebody else does."""
+    staged = folder.staged_shard(name)
+    if folder.shard(name).exists() or not all(is_staged(staged, index) for index in scenes):
+        return None
+    with claimed(staged / "pack.claim") as ours:
+        if not ours or folder.shard(name).exists():
+            return None
+        shard = pack_shard(folder, name, scenes)
+    log.info("%s: packed, %d scenes, %d bytes", name, shard.num_samples, shard.num_bytes)
+    return shard
+
+
+def _make_and_stage(
+    folder: DatasetFolder,
+    settings: BuildSettings,
+    shard_index: int,
+    scene_index: int,
+    child: IsolatedChild,
+) -> tuple[float, list[Failure]]:
+    splits, started = settings.splits, time.monotonic()
+    name, split = shard_name(shard_index, splits), split_of_shard(shard_index, splits)
+    sample, failures = _make_scene(split, scene_index, _attempts(splits), child)
+    stage_scene(folder.staged_shard(name), scene_index, sample, failures, settings.storage.profile)
+    seconds = time.monotonic() - started
+    outcome = "made" if sample else "given up"
+    log.info("%s: scene %s %s in %.1f s", name, sample_key(scene_index), outcome, seconds)
+    return seconds, failures
 
 
 def _attempts(splits: SplitSettings) -> int:
@@ -74,24 +123,3 @@ def _attempt(split: str, scene_index: int, attempt: int, child: IsolatedChild) -
             attempt=attempt,
         )
         return SceneAttempt(sample=None, failures=[skipped])
-
-
-def _log(path: Path, scene_index: int, seconds: float, failures: list[Failure]) -> None:
-    """Append what must not be in the dataset: times, hosts, retries."""
-    row = {
-        "scene": sample_key(scene_index),
-        "seconds": round(seconds, 3),
-        "rejected_attempts": len(failures),
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-        "finished_unix_s": round(time.time(), 1),
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as stream:
-        stream.write(json.dumps(row) + "\n")
-
-
-def finished_shards(folder: DatasetFolder, splits: SplitSettings, count: int) -> Iterator[str]:
-    """Yield the names of the first `count` shards that are there under their final names."""
-    names = (shard_name(index, splits) for index in range(count))
-    return (name for name in names if folder.shard(name).exists())

@@ -66,7 +66,7 @@ def prefect_server() -> Iterator[str]:
         )
         url = f"http://127.0.0.1:{port}/api"
         try:
-            _wait_until_healthy(url, server, home / _LOG_NAME)
+            wait_until_healthy(url, server, home / _LOG_NAME)
             fcntl.flock(lock, fcntl.LOCK_UN)
             os.environ["PREFECT_API_URL"] = url
             yield url
@@ -76,7 +76,8 @@ def prefect_server() -> Iterator[str]:
             server.wait()
 
 
-def _wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -> None:
+def wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -> None:
+    """Return when a server answers; raises TrilightError where it ends, or takes too long."""
     deadline = time.monotonic() + _START_UP_S
     while time.monotonic() < deadline and server.poll() is None:
         with contextlib.suppress(urllib.error.URLError, OSError):

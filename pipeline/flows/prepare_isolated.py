@@ -35,7 +35,7 @@ def prepare_isolated(
     done: Callable[[], None],
 ) -> tuple[list[PreparedAsset], list[Failure]]:
     """Prepare objects in `workers` children; arguments and errors as `prepare_assets`."""
-    pool = ChildPool(asset_child, workers)
+    pool = ChildPool(lambda _: asset_child(), workers)
     try:
         return prepare_assets(
             records,

@@ -1,17 +1,19 @@
 """The manifest of a dataset in the making: begun, compared, and extended shard by shard."""
 
+import contextlib
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from pipeline.flows.settings import BuildSettings, differences
+from pipeline.shards.notes import forget_note, note_shard, noted_shard
 from pipeline.shards.pack import rejections_of_shard
 from storage.derived import derivation_of
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.failures import read_failures, write_failures
 from storage.layout import DatasetFolder
-from storage.manifest import Manifest, ShardEntry, index_shard, read_manifest, write_manifest
+from storage.manifest import Manifest, ShardEntry, read_manifest, write_manifest
 from storage.objects_lock import encode_objects_lock, write_objects_lock
 from storage.records import Failure, LockedObject
 from storage.splits import (
@@ -24,12 +26,19 @@ from storage.splits import (
 
 
 class Publication:
-    """What is public of a dataset; every change reaches the disk before the call returns."""
+    """What is public of a dataset, shared by all who make it.
+
+    Every change of the manifest is made in turn, to what is on the disk then, and reaches the disk
+    before the call returns. A finished shard is noted beside the staged scenes, and the manifest
+    takes such notes up whenever they are a tenth of what it lists: its size times the number of
+    shards would otherwise be written in all.
+    """
 
     def __init__(self, folder: DatasetFolder, manifest: Manifest, splits: SplitSettings) -> None:
         self.folder = folder
         self.manifest = manifest
         self._splits = splits
+        self._noted: dict[str, ShardEntry] = {}
 
     @property
     def num_shards(self) -> int:
@@ -40,49 +49,92 @@ class Publication:
         """Freeze the objects of the dataset."""
         write_objects_lock(self.folder.objects_lock, objects)
         digest = sha256_hex(encode_objects_lock(objects))
-        self._publish(objects_lock_sha256=digest)
+        with self._turn():
+            self._write(objects_lock_sha256=digest)
 
     def add_shard(self, shard: ShardEntry) -> None:
-        """Publish a finished shard and its rejections."""
-        self.add_failures(read_failures(rejections_of_shard(self.folder, shard.name)))
-        others = [entry for entry in self.manifest.shards if entry.name != shard.name]
-        by_index = sorted([*others, shard], key=lambda entry: entry.name.rsplit("-")[-1])
-        self._publish(shards=tuple(by_index))
+        """Note a finished shard; the manifest lists it soon, at the latest after `publish`."""
+        note_shard(self.folder, shard)
+        self._noted[shard.name] = shard
+        if 10 * len(self._noted) >= len(self.manifest.shards):
+            self.publish()
+
+    def publish(self) -> None:
+        """List every shard that is there, whoever made it, and its rejections."""
+        with self._turn():
+            listed = {entry.name: entry for entry in self.manifest.shards}
+            names = [shard_name(index, self._splits) for index in range(self.num_shards)]
+            found = {
+                name: noted_shard(self.folder, name)
+                for name in names
+                if name not in listed and self.folder.shard(name).exists()
+            }
+            found |= self._noted
+            self._add_failures(
+                failure
+                for name in found
+                for failure in read_failures(rejections_of_shard(self.folder, name))
+            )
+            entries = sorted((listed | found).values(), key=_number)
+            self._write(shards=tuple(entries))
+            self._noted.clear()
+        for name in found:
+            forget_note(self.folder, name)
 
     def add_failures(self, failures: Iterable[Failure]) -> None:
         """Add rows to `failures.jsonl`; a row that is there already stays single."""
-        known = read_failures(self.folder.failures)
-        write_failures(self.folder.failures, [*known, *failures])
+        with self._turn():
+            self._add_failures(failures)
 
     def missing_shards(self) -> list[int]:
         """Return the shards still to make, publishing those that are whole but not yet listed.
 
-        A run that was killed between a shard's last rename and the manifest's leaves such a shard.
+        Other makers leave such shards, and so does a kill between a shard's last rename and the
+        manifest's.
         """
         listed = {entry.name for entry in self.manifest.shards}
-        missing = []
-        for index in range(self.num_shards):
-            name = shard_name(index, self._splits)
-            path = self.folder.shard(name)
-            if not path.exists():
-                missing.append(index)
-            elif name not in listed:
-                self.add_shard(index_shard(path))
-        return missing
+        names = [shard_name(index, self._splits) for index in range(self.num_shards)]
+        there = [self.folder.shard(name).exists() for name in names]
+        if any(exists and name not in listed for name, exists in zip(names, there, strict=True)):
+            self.publish()
+        return [index for index, exists in enumerate(there) if not exists]
+
+    def num_shards_finished(self) -> int:
+        """Return how many shards are there, as far as this maker knows."""
+        return len(self._known())
+
+    def num_scenes_finished(self) -> int:
+        """Return for how many scenes the finished shards stand, given-up ones included."""
+        return sum(len(scenes_of_shard(_number(entry), self._splits)) for entry in self._known())
 
     def num_given_up(self) -> int:
         """Return how many scenes of the finished shards could not be made."""
-        listed = {entry.name for entry in self.manifest.shards}
-        wanted = sum(
-            len(scenes_of_shard(index, self._splits))
-            for index in range(self.num_shards)
-            if shard_name(index, self._splits) in listed
-        )
-        return wanted - self.manifest.num_samples
+        return self.num_scenes_finished() - sum(entry.num_samples for entry in self._known())
 
-    def _publish(self, **changes: Any) -> None:
+    def _known(self) -> list[ShardEntry]:
+        return list(({entry.name: entry for entry in self.manifest.shards} | self._noted).values())
+
+    def refresh(self) -> None:
+        """Read what other makers have written."""
+        self.manifest = read_manifest(self.folder.manifest)
+
+    @contextlib.contextmanager
+    def _turn(self) -> Iterator[None]:
+        with self.folder.turn("manifest"):
+            self.refresh()
+            yield
+
+    def _add_failures(self, failures: Iterable[Failure]) -> None:
+        known = read_failures(self.folder.failures)
+        write_failures(self.folder.failures, [*known, *failures])
+
+    def _write(self, **changes: Any) -> None:
         self.manifest = dataclasses.replace(self.manifest, **changes)
         write_manifest(self.folder.manifest, self.manifest)
+
+
+def _number(entry: ShardEntry) -> int:
+    return int(entry.name.removesuffix(".tar").rpartition("-")[2])
 
 
 def begin(
@@ -104,36 +156,45 @@ def begin(
     if num_scenes < 1:
         raise TrilightError(f"scenes is {num_scenes}; expected at least 1.")
     whole = planned_scenes(num_scenes, settings.splits)
-    if folder.manifest.exists():
-        manifest = read_manifest(folder.manifest)
-        _require_generated(folder, manifest)
-        _require_same(
-            folder, "setting", manifest.settings, settings.as_json(), "choose another --out"
-        )
-        if not accept_environment:
-            _require_same(
-                folder,
-                "environment",
-                manifest.environment,
-                environment,
-                "choose another --out, or accept pictures that agree only within their noise "
-                "floors with --accept-environment",
+    with folder.turn("manifest"):
+        if folder.manifest.exists():
+            manifest = read_manifest(folder.manifest)
+            _require_same_dataset(folder, manifest, settings, environment, accept_environment)
+            whole = max(whole, manifest.num_scenes)
+        else:
+            _require_free(folder)
+            manifest = Manifest(
+                build=settings.build,
+                settings=settings.as_json(),
+                environment=environment,
+                num_scenes=whole,
+                num_views=settings.scenes.num_views,
+                objects_lock_sha256="",
+                shards=(),
             )
-        whole = max(whole, manifest.num_scenes)
-    else:
-        _require_free(folder)
-        manifest = Manifest(
-            build=settings.build,
-            settings=settings.as_json(),
-            environment=environment,
-            num_scenes=whole,
-            num_views=settings.scenes.num_views,
-            objects_lock_sha256="",
-            shards=(),
-        )
-    manifest = dataclasses.replace(manifest, num_scenes=whole)
-    write_manifest(folder.manifest, manifest)
+        manifest = dataclasses.replace(manifest, num_scenes=whole)
+        write_manifest(folder.manifest, manifest)
     return Publication(folder, manifest, settings.splits)
+
+
+def _require_same_dataset(
+    folder: DatasetFolder,
+    manifest: Manifest,
+    settings: BuildSettings,
+    environment: Mapping[str, Any],
+    accept_environment: bool,
+) -> None:
+    _require_generated(folder, manifest)
+    _require_same(folder, "setting", manifest.settings, settings.as_json(), "choose another --out")
+    if not accept_environment:
+        _require_same(
+            folder,
+            "environment",
+            manifest.environment,
+            environment,
+            "choose another --out, or accept pictures that agree only within their noise "
+            "floors with --accept-environment",
+        )
 
 
 def _require_free(folder: DatasetFolder) -> None:

@@ -3,6 +3,7 @@
 Nothing is loaded here: a record names a file, and the mesh stage finds out whether it is any good.
 """
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -26,6 +27,9 @@ from storage.errors import TrilightError
 from storage.records import Failure, ObjectRecord
 from storage.remote.url import parse_url
 from storage.safe_url import printable, safe_url
+
+ENVIRONMENT = "env:"
+"""Begins a source that names an environment variable: the way for URLs that hold a secret."""
 
 _NOT_HAD = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
 
@@ -68,7 +72,7 @@ def find_objects(
         source: a folder; `http(s)://`, `s3://`, `gs://`, `hf://` or `file://` and a folder;
             `builtin:` or `builtin:N`; `objaverse:` and uids, a file of uids, or categories. Of a
             folder, `objects.jsonl` or `objects.csv` is used where it has one, and its object
-            files otherwise.
+            files otherwise. `env:NAME` is what the environment variable NAME says.
         work_dir: where built-in objects are written; not touched for other sources.
         allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions as they stand.
         licence: of files that come without any statement, as the user states it.
@@ -82,6 +86,7 @@ def find_objects(
     """
     check_allowed(allowed_licences)
     stated_licence(licence)
+    source = _from_environment(source)
     listing = _list(source, work_dir, licence, allowed_licences)
     shown = printable(safe_url(source))
     if not listing.records and not listing.failures:
@@ -98,6 +103,18 @@ def find_objects(
         records=tuple(sorted(here, key=attrgetter("uid"))),
         failures=tuple(sorted(failures, key=attrgetter("item"))),
     )
+
+
+def _from_environment(source: str) -> str:
+    if not source.startswith(ENVIRONMENT):
+        return source
+    name = source.removeprefix(ENVIRONMENT)
+    if not (found := os.environ.get(name)):
+        raise TrilightError(
+            f"objects {printable(source)!r}: the environment variable {printable(name)!r} is not "
+            "set here; expected it to name a source of objects."
+        )
+    return found
 
 
 def _list(

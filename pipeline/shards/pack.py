@@ -18,6 +18,8 @@ def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardE
     The rejections are written before the shard, so that whoever sees the shard can find them, and
     the staged scenes are deleted after it: a kill in between loses nothing and repeats little.
 
+    Where the shard is there already, it stays: the first writer wins.
+
     Args:
         folder: the dataset.
         name: file name of the shard.
@@ -30,7 +32,12 @@ def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardE
     failures: list[Failure] = []
     samples: list[tuple[str, dict[str, bytes]]] = []
     for index in scene_indices:
-        staged = read_staged_scene(staged_folder, index)
+        try:
+            staged = read_staged_scene(staged_folder, index)
+        except FileNotFoundError:
+            if folder.shard(name).exists():  # another machine was first, beyond the reach of claims
+                return index_shard(folder.shard(name))
+            raise
         failures.extend(staged.failures)
         if staged.members:
             samples.append((sample_key(index), staged.members))

@@ -1,37 +1,25 @@
-"""One Prefect server for all tests of a session, and the command line as a process."""
+"""The command line as a process, and who of its descendants is left over."""
 
 import os
 import subprocess
 import sys
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-
 Trilight = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-@pytest.fixture(scope="session")
-def prefect_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A server with a database of its own, shared to save each test the start."""
-    os.environ["PREFECT_HOME"] = str(tmp_path_factory.mktemp("prefect"))
-    quiet_prefect()
-    with prefect_server() as url:
-        yield url
-
-
 @pytest.fixture
-def trilight(prefect_url: str, tmp_path: Path) -> Trilight:
+def trilight(tmp_path: Path) -> Trilight:
     """Run `trilight` with arguments in an empty folder, as a user does."""
 
     def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
         return subprocess.run(
             command(*arguments),
             cwd=tmp_path,
-            env={**os.environ, "PREFECT_API_URL": prefect_url},
             capture_output=True,
             text=True,
             timeout=600,

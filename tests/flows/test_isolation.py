@@ -123,7 +123,7 @@ def test_closing_frees_a_waiting_caller(child: IsolatedChild) -> None:
     def wait() -> None:
         try:
             child.call(hang)
-        except ChildFailed as failure:
+        except (ChildFailed, ChildClosed) as failure:  # closed in the call, or still starting
             failures.append(failure)
 
     caller = threading.Thread(target=wait)

@@ -52,7 +52,9 @@ def _sample(index: int) -> Sample:
     return dataclasses.replace(tiny_sample(seed=index), key=sample_key(index))
 
 
-def _make_shard(publication: Publication, build: BuildSettings, index: int) -> None:
+def make_tiny_shard(publication: Publication, index: int) -> None:
+    """Make a shard of four tiny scenes, each with one rejection."""
+    build = _build()
     folder, name = publication.folder, shard_name(index, build.splits)
     for scene in scenes_of_shard(index, build.splits):
         failure = Failure(stage="scenes", item=sample_key(scene), reason="no_camera", message="x")
@@ -61,12 +63,17 @@ def _make_shard(publication: Publication, build: BuildSettings, index: int) -> N
     publication.add_shard(pack_shard(folder, name, scenes_of_shard(index, build.splits)))
 
 
+def begin_tiny(root: Path, scenes: int) -> Publication:
+    """Begin a dataset of tiny scenes, four to a shard, two views each."""
+    return _begin(root, _build(), scenes)
+
+
 def _dataset(root: Path, scenes: int = 8) -> Publication:
     build = _build()
     publication = _begin(root, build, scenes)
     publication.lock_objects([_locked()])
     for index in publication.missing_shards():
-        _make_shard(publication, build, index)
+        make_tiny_shard(publication, index)
     return publication
 
 
@@ -85,7 +92,7 @@ def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
     backwards = _begin(tmp_path / "b", build, 8)
     backwards.lock_objects([_locked()])
     for index in (1, 0):
-        _make_shard(backwards, build, index)
+        make_tiny_shard(backwards, index)
     assert backwards.manifest.dataset_digest == forwards.dataset_digest
     assert backwards.manifest == forwards
 
@@ -163,6 +170,7 @@ def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
     for index in range(4):
         again = dataclasses.replace(sample, key=sample_key(index))
         stage_scene(folder, index, again, [], "lossless")
+    publication.folder.shard(name).unlink()  # the first writer of a shard wins
     publication.add_shard(pack_shard(publication.folder, name, range(4)))
     assert "belongs to split test" in verify_dataset(tmp_path).problems[0]
 
@@ -200,6 +208,7 @@ def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None
         objects = (*scene.objects, *used)
         sample = dataclasses.replace(_sample(index), scene=tiny_scene(objects=objects))
         stage_scene(publication.folder.staged_shard(name), index, sample, [], "lossless")
+    publication.folder.shard(name).unlink()  # the first writer of a shard wins
     publication.add_shard(pack_shard(publication.folder, name, range(4)))
     problems = [text for text in verify_dataset(tmp_path).problems if "share-alike" in text]
     assert [problem.split(":")[1] for problem in problems] == [

@@ -1,0 +1,91 @@
+"""What `trilight generate` says when it is done."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rich.text import Text
+
+from infra.cli.console import console, print_json, print_rows
+from pipeline.objects.licences import USER_PROVIDED
+from storage.failures import count_by_reason, read_failures
+from storage.layout import DatasetFolder
+from storage.objects_lock import read_objects_lock
+
+if TYPE_CHECKING:
+    from pipeline.flows.dataset_run import Outcome
+
+_MAX_NOTES = 20
+"""Most notes that are printed."""
+
+
+def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json: bool) -> None:
+    """Print the outcome, and what to do next."""
+    rejected = count_by_reason(read_failures(folder.failures))
+    if as_json:
+        _print_json(folder, outcome, rejected, seconds)
+        return
+    statistics = outcome.statistics
+    used = f"{outcome.num_objects_used} of {outcome.num_objects_found}"
+    rows = [("objects used", used), ("licences", _licences(folder))]
+    rows += statistics.lines() if statistics else []
+    if outcome.num_scenes_given_up:
+        rows.append(("scenes given up", str(outcome.num_scenes_given_up)))
+    rows += [("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in rejected]
+    if statistics:
+        rows.append(("dataset digest", outcome.digest))
+        rows.append(("look at", f"{folder.contact_sheet}, {folder.report}, {folder.card}"))
+    rows += [
+        ("wall time", f"{seconds:.0f} s"),
+        ("shards, manifest", str(folder.root)),
+        ("why rejected", str(folder.failures)),
+    ]
+    _print_notes(outcome.notes)
+    if statistics is None:
+        there = f"{outcome.num_shards} of {outcome.num_shards_planned} shards are there"
+        print_rows(f"Range finished; {there}", rows)
+        console.print(f"\nNext: trilight status {folder.root}", style="bold")
+        return
+    print_rows("Dataset finished", rows)
+    console.print(f"\nNext: trilight verify {folder.root}", style="bold")
+    if statistics.scenes_by_split.get("train"):
+        console.print(f"      trilight train smoke --data {folder.root}", style="bold")
+
+
+def _print_json(
+    folder: DatasetFolder,
+    outcome: "Outcome",
+    rejected: Sequence[tuple[str, str, int]],
+    seconds: float,
+) -> None:
+    statistics = outcome.statistics
+    row: dict[str, object] = {
+        "out": str(folder.root),
+        "dataset_digest": outcome.digest,
+        "finished": statistics is not None,
+        "shards": outcome.num_shards,
+        "shards_planned": outcome.num_shards_planned,
+        "objects_found": outcome.num_objects_found,
+        "objects_used": outcome.num_objects_used,
+        "notes": list(outcome.notes),
+        "scenes_given_up": outcome.num_scenes_given_up,
+        "rejections": [list(row) for row in rejected],
+        "seconds": round(seconds, 1),
+    }
+    if statistics:
+        row["scenes"], row["views"] = statistics.num_scenes, statistics.num_views
+        row["bytes"] = statistics.num_bytes
+    print_json(row)
+
+
+def _print_notes(notes: Sequence[str]) -> None:
+    for note in notes[:_MAX_NOTES]:
+        console.print(Text(f"Note: {note}.", style="yellow"))
+    if len(notes) > _MAX_NOTES:
+        console.print(f"Note: {len(notes) - _MAX_NOTES} more; --json has all.", style="yellow")
+
+
+def _licences(folder: DatasetFolder) -> str:
+    counts = Counter(entry.licence for entry in read_objects_lock(folder.objects_lock))
+    shown = ", ".join(f"{name} ({count})" for name, count in counts.most_common())
+    return shown.replace(USER_PROVIDED, f"{USER_PROVIDED}, taken as yours to use")

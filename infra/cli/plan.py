@@ -1,0 +1,64 @@
+"""`trilight plan`: what a dataset will take, from a few scenes that are measured here."""
+
+import dataclasses
+from typing import Annotated
+
+import typer
+
+from infra.cli.changes import parse_changes
+from infra.cli.console import console, print_json, print_rows, progress_bars
+from pipeline.flows.order import DatasetOrder
+
+
+def plan(
+    build: Annotated[str, typer.Argument(help="named settings, such as pretrain-256")],
+    scenes: Annotated[int | None, typer.Option(help="scenes of the dataset [the build's]")] = None,
+    objects: Annotated[str | None, typer.Option(help="as for generate [builtin:]")] = None,
+    samples: Annotated[int, typer.Option(min=4, help="scenes to measure")] = 12,
+    cores: Annotated[int, typer.Option(min=1, help="cores of the fleet, all of them")] = 64,
+    price: Annotated[float, typer.Option(help="USD per core-hour")] = 0.04,
+    resolution: Annotated[int | None, typer.Option(help="picture width in pixels")] = None,
+    noise_floor: Annotated[
+        float | None, typer.Option("--noise-floor", help="target in dB (psnr_log_db)")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="any other setting, as for generate")
+    ] = None,
+    json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
+) -> None:
+    """Measure a few scenes and predict time, cores, bytes and cost, each with an interval."""
+    from infra.planning import measure_scenes, predict  # slow: every stage
+
+    order = DatasetOrder(
+        build=build,
+        objects=objects,
+        scenes=scenes,
+        resolution=resolution,
+        noise_floor_db=noise_floor,
+        changes=parse_changes(set_ or ()),
+    )
+    with progress_bars() as bars:
+        task = bars.add_task("scenes", total=samples, note="", visible=not json)
+        measured = measure_scenes(order, samples, lambda: bars.advance(task))
+    found = predict(measured, order, cores=cores, usd_per_core_hour=price)
+    if json:
+        print_json(dataclasses.asdict(found))
+        return
+    print_rows(
+        f"{build}, {found.num_scenes} scenes, predicted from {samples} (90 % intervals)",
+        [
+            ("core-hours", found.core_hours.shown("{:,.1f}")),
+            (f"hours on {cores} cores", found.hours.shown("{:,.1f}")),
+            ("USD", found.usd.shown("{:,.2f}")),
+            ("GB", found.gigabytes.shown("{:,.2f}")),
+            ("shards", f"{found.num_shards} of {found.scenes_per_shard} scenes"),
+            ("a shard", found.shard_hours.shown("{:,.2f} core-hours")),
+            ("Prefect's task runs", f"{found.num_tasks} of {found.task_minutes:.1f} minutes"),
+            ("Prefect's database", f"{found.database_mb:.0f} MB"),
+            ("manifest.json", f"{found.manifest_mb:.1f} MB"),
+        ],
+    )
+    for note in found.notes:
+        console.print(f"Note: {note}.", style="yellow")
+    shown = f" --scenes {scenes}" if scenes else ""
+    console.print(f"\nNext: trilight generate {build}{shown} --out data/{build}", style="bold")

@@ -1,0 +1,48 @@
+"""`trilight status`: how far a dataset is, from its files alone."""
+
+import dataclasses
+import time
+from typing import Annotated
+
+import typer
+
+from infra.cli.console import console, print_json, print_rows
+from storage.dataset_status import DatasetStatus, read_status
+
+
+def status(
+    dataset: Annotated[str, typer.Argument(help="the dataset, a folder or a URL")],
+    price: Annotated[float, typer.Option(help="USD per core-hour")] = 0.04,
+    json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
+) -> None:
+    """Say how far a dataset is, when it will be done, and what failed; needs no server."""
+    found = read_status(dataset)
+    cost = None if found.core_hours is None else found.core_hours * price
+    if json:
+        row = {**dataclasses.asdict(found), "next": found.next_command, "cost_usd": cost}
+        print_json(row)
+        return
+    rows = [
+        ("shards", f"{found.shards_done} of {found.shards_planned}"),
+        ("scenes", f"{found.scenes_done} of {found.scenes_planned}"),
+        ("views", f"{found.scenes_done * found.num_views}"),
+        *_speed(found),
+        *(("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in found.failures),
+        ("dataset digest", found.digest if found.finished else "when it is finished"),
+    ]
+    if cost is not None:
+        rows.append(("cost so far", f"{found.core_hours:.2f} core-hours, {cost:.2f} USD"))
+    title = "finished" if found.finished else "in the making"
+    print_rows(f"{found.shown}: {found.build}, {title}", rows)
+    console.print(f"\nNext: {found.next_command}", style="bold", soft_wrap=True)
+
+
+def _speed(found: DatasetStatus) -> list[tuple[str, str]]:
+    rows = []
+    if found.views_per_hour is not None and found.remaining_s is not None:
+        left = f"{found.remaining_s / 3600:.1f} hours left at that rate"
+        rows.append(("rate", f"{found.views_per_hour:.0f} views an hour; {left}"))
+    if found.last_scene_unix_s is not None and not found.finished:
+        ago = max(0.0, time.time() - found.last_scene_unix_s)
+        rows.append(("last scene", f"{ago / 60:.0f} minutes ago"))
+    return rows

@@ -1,0 +1,42 @@
+# Trilight on processors: makes data, serves flows. Build from the checkout:
+#   docker build --file infra/images/cpu.Dockerfile --tag trilight:latest .
+# pymeshlab is GPL-3: an image that is passed on must be offered under terms that the GPL allows.
+# WITHOUT_GPL=1 leaves it out.
+FROM python:3.11.13-slim-bookworm AS build
+ARG WITHOUT_GPL=""
+WORKDIR /opt/trilight
+SHELL ["/bin/bash", "-o", "pipefail", "-c"]
+# meshoptimizer comes as source
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends g++ \
+    && rm -rf /var/lib/apt/lists/*
+COPY requirements/dataset.txt requirements/served.txt requirements/
+COPY infra/setup/without_gpl.sh infra/setup/without_gpl.sh
+RUN python -m venv /opt/venv \
+    && /opt/venv/bin/python -m pip install --no-cache-dir --requirement requirements/dataset.txt \
+    && /opt/venv/bin/python -m pip install --no-cache-dir --requirement requirements/served.txt \
+    && if [ -n "$WITHOUT_GPL" ]; then infra/setup/without_gpl.sh /opt/venv/bin/python; fi
+COPY . .
+RUN /opt/venv/bin/python -m pip install --no-cache-dir --no-deps --editable .
+
+FROM python:3.11.13-slim-bookworm
+ARG WITHOUT_GPL=""
+LABEL org.opencontainers.image.title="trilight" \
+      org.opencontainers.image.description="Makes the data for neural renderers" \
+      org.opencontainers.image.licenses="MIT AND GPL-3.0-only" \
+      trilight.without-gpl="$WITHOUT_GPL"
+# OpenGL for pymeshlab, LLVM and libatomic for Mitsuba
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends libopengl0 libgl1 libatomic1 libllvm19 \
+    && rm -rf /var/lib/apt/lists/* \
+    && useradd --uid 10001 --create-home trilight \
+    && install --directory --owner trilight /data /cache
+COPY --from=build --chown=root:root /opt/venv /opt/venv
+COPY --from=build --chown=root:root /opt/trilight /opt/trilight
+ENV PATH="/opt/venv/bin:$PATH" TRILIGHT_CACHE=/cache DO_NOT_TRACK=1 PYTHONUNBUFFERED=1
+USER 10001
+WORKDIR /opt/trilight
+VOLUME ["/data", "/cache"]
+CMD ["trilight", "doctor"]

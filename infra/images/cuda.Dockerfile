@@ -1,0 +1,36 @@
+# Trilight with torch for graphics cards: trains, and renders where TRILIGHT_VARIANT=cuda_ad_rgb.
+#   docker build --file infra/images/cuda.Dockerfile --tag trilight:cuda .
+# The driver comes from the host (nvidia-container-toolkit); torch brings CUDA's libraries itself.
+FROM python:3.11.13-slim-bookworm AS build
+WORKDIR /opt/trilight
+SHELL ["/bin/bash", "-o", "pipefail", "-c"]
+# meshoptimizer comes as source
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends g++ \
+    && rm -rf /var/lib/apt/lists/*
+COPY requirements/all.txt requirements/served.txt requirements/
+RUN python -m venv /opt/venv \
+    && /opt/venv/bin/python -m pip install --no-cache-dir --requirement requirements/all.txt \
+    && /opt/venv/bin/python -m pip install --no-cache-dir --requirement requirements/served.txt
+COPY . .
+RUN /opt/venv/bin/python -m pip install --no-cache-dir --no-deps --editable .
+
+FROM python:3.11.13-slim-bookworm
+LABEL org.opencontainers.image.title="trilight-cuda" \
+      org.opencontainers.image.description="Makes the data for, trains and judges neural renderers" \
+      org.opencontainers.image.licenses="MIT AND GPL-3.0-only"
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends libopengl0 libgl1 libatomic1 libllvm19 \
+    && rm -rf /var/lib/apt/lists/* \
+    && useradd --uid 10001 --create-home trilight \
+    && install --directory --owner trilight /data /cache
+COPY --from=build --chown=root:root /opt/venv /opt/venv
+COPY --from=build --chown=root:root /opt/trilight /opt/trilight
+ENV PATH="/opt/venv/bin:$PATH" TRILIGHT_CACHE=/cache DO_NOT_TRACK=1 PYTHONUNBUFFERED=1 \
+    NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics
+USER 10001
+WORKDIR /opt/trilight
+VOLUME ["/data", "/cache"]
+CMD ["trilight", "doctor"]

@@ -1,0 +1,209 @@
+"""What a dataset will take: a few scenes measured on this machine, and the arithmetic.
+
+Scenes differ in cost by orders of magnitude (a hard view takes a hundred times the samples of an
+easy one), so a mean of few has a wide interval: it is the bootstrap's, from the measured scenes.
+The scenes are the first ones of the dataset itself, of its own distribution.
+"""
+
+import dataclasses
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.flows.builds import BUILDS, named_build
+from pipeline.flows.dataset_run import prepare_dataset
+from pipeline.flows.machine import cores_owned
+from pipeline.flows.make_task import ShardJob, close_children, make_task
+from pipeline.flows.order import DatasetOrder
+from pipeline.flows.pieces import MOST_TASKS, TASK_S, Piece
+from pipeline.flows.settings import BuildSettings
+from storage.manifest import ShardEntry
+from storage.scene_log import read_scene_logs
+from storage.seeds import rng_for
+from storage.splits import planned_scenes, shards_for
+
+_DRAWS = 2000
+_BYTES_PER_TASK_RUN = 16_000
+"""Of Prefect's database: three states and three events (measured, DECISIONS.md)."""
+_BYTES_PER_MEMBER = 65
+"""Of the manifest: name, offset and size of one member (measured)."""
+_LARGE_MANIFEST_MB = 512
+_LONG_TASK_MINUTES = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """A figure with where it lies in nine cases of ten, as far as few scenes tell."""
+
+    value: float
+    """What to expect."""
+    low: float
+    """5th percentile."""
+    high: float
+    """95th percentile."""
+
+    def shown(self, form: str) -> str:
+        """Return the figure and its interval, each in a format such as `{:.1f}`."""
+        return f"{form.format(self.value)} ({form.format(self.low)} to {form.format(self.high)})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredScenes:
+    """What some scenes took."""
+
+    core_s: tuple[float, ...]
+    """Core-seconds of each."""
+    num_bytes: tuple[int, ...]
+    """Bytes of each."""
+    num_views: int
+    """Views of a scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """What a dataset will take."""
+
+    num_scenes: int
+    """Scenes, of whole shards."""
+    num_shards: int
+    """Shards."""
+    scenes_per_shard: int
+    """Scenes in each."""
+    core_hours: Interval
+    """Cores times hours."""
+    hours: Interval
+    """On the whole fleet, all of whose cores are busy."""
+    usd: Interval
+    """What the cores cost."""
+    gigabytes: Interval
+    """All shards."""
+    shard_hours: Interval
+    """Core-hours of one shard."""
+    num_tasks: int
+    """Task runs of one flow run that makes everything."""
+    task_minutes: float
+    """How long one takes on one of the machines' render processes."""
+    database_mb: float
+    """Rows of those task runs in Prefect's database."""
+    manifest_mb: float
+    """Size of manifest.json when all is done."""
+    notes: tuple[str, ...]
+    """What a person should think of before."""
+
+
+def measure_scenes(
+    order: DatasetOrder, count: int, scene_done: Callable[[], None]
+) -> MeasuredScenes:
+    """Make the first scenes of a dataset in a folder that is then deleted.
+
+    Args:
+        order: the dataset; its folder is not touched.
+        count: scenes to make.
+        scene_done: called after each.
+
+    Raises:
+        TrilightError: as `prepare_dataset`.
+    """
+    alone = {**order.changes, "splits.scenes_per_shard": 1}  # so that each has a size of its own
+    with tempfile.TemporaryDirectory(prefix="trilight-plan-") as place:
+        run = prepare_dataset(dataclasses.replace(order, out=place, scenes=count, changes=alone))
+        job = ShardJob(
+            folder=run.publication.folder,
+            settings=run.settings,
+            environment={},
+            accepted=run.accepted,
+            lock_sha256=run.publication.manifest.objects_lock_sha256,
+            num_at_once=1,
+        )
+        sizes = []
+        try:
+            for scene in range(count):
+                made = make_task(job, (Piece(shard_index=scene, first=scene, last=scene + 1),))
+                sizes += [_tar_bytes(shard) for shard in made.shards]
+                scene_done()
+        finally:
+            close_children()
+        core_s = tuple(row.seconds * row.cores for row in read_scene_logs(job.folder))
+    return MeasuredScenes(
+        core_s=core_s, num_bytes=tuple(sizes), num_views=run.settings.scenes.num_views
+    )
+
+
+def predict(
+    measured: MeasuredScenes, order: DatasetOrder, *, cores: int, usd_per_core_hour: float
+) -> Prediction:
+    """Return what the whole dataset will take, by the means of the measured scenes.
+
+    The first scene of a process also compiles kernels, which a long run does once per 200 scenes;
+    it is left out where there are others. Means are resampled 2000 times (Efron's bootstrap), which
+    is too narrow for very few scenes and cannot know what none of them shows.
+    """
+    splits = _settings(order).splits
+    wanted = BUILDS[order.build].num_scenes if order.scenes is None else order.scenes
+    num_scenes = planned_scenes(wanted, splits)
+    num_shards = shards_for(num_scenes, splits)
+    core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
+    scene_s = core_hours.value * 3600 / num_scenes / cores_owned()
+    num_tasks = min(MOST_TASKS, max(1, math.ceil(num_scenes * scene_s / TASK_S)))
+    members = num_scenes * (measured.num_views + 2)
+    found = Prediction(
+        num_scenes=num_scenes,
+        num_shards=num_shards,
+        scenes_per_shard=splits.scenes_per_shard,
+        core_hours=core_hours,
+        hours=_scaled(core_hours, 1 / cores),
+        usd=_scaled(core_hours, usd_per_core_hour),
+        gigabytes=_total(measured.num_bytes, num_scenes / 1e9),
+        shard_hours=_scaled(core_hours, 1 / num_shards),
+        num_tasks=num_tasks,
+        task_minutes=num_scenes * scene_s / num_tasks / 60,
+        database_mb=num_tasks * _BYTES_PER_TASK_RUN / 1e6,
+        manifest_mb=members * _BYTES_PER_MEMBER / 1e6,
+        notes=(),
+    )
+    return dataclasses.replace(found, notes=tuple(_notes(found)))
+
+
+def _notes(found: Prediction) -> Iterator[str]:
+    if found.manifest_mb > _LARGE_MANIFEST_MB:
+        yield (
+            f"manifest.json will have {found.manifest_mb:.0f} MB, of at most 1024 that are read "
+            "from a server: make several datasets with different seeds, and give all to training"
+        )
+    if found.task_minutes > _LONG_TASK_MINUTES:
+        parts = math.ceil(found.task_minutes / _LONG_TASK_MINUTES)
+        yield (
+            f"one flow run would have tasks of {found.task_minutes:.0f} minutes: let build-dataset "
+            f"make it in at least {parts} flow runs, on as many workers"
+        )
+
+
+def _settings(order: DatasetOrder) -> BuildSettings:
+    return named_build(
+        order.build,
+        resolution=order.resolution,
+        noise_floor_db=order.noise_floor_db,
+        changes=order.changes,
+    )
+
+
+def _tar_bytes(shard: ShardEntry) -> int:
+    """Return what members add to a tar: a header each, and their bytes in blocks of 512."""
+    return sum(512 + -(-num_bytes // 512) * 512 for _, _, num_bytes in shard.members)
+
+
+def _total(each: Sequence[float], times: float) -> Interval:
+    """Return the mean of some scenes times a number, with a bootstrap interval."""
+    values = np.asarray(each, np.float64)
+    rows = rng_for(0, "plan").integers(0, len(values), (_DRAWS, len(values)))
+    means: NDArray[np.float64] = values[rows].mean(axis=1) * times
+    low, high = np.percentile(means, [5, 95])
+    return Interval(value=float(values.mean()) * times, low=float(low), high=float(high))
+
+
+def _scaled(interval: Interval, by: float) -> Interval:
+    return Interval(value=interval.value * by, low=interval.low * by, high=interval.high * by)

@@ -1,0 +1,208 @@
+"""`make serve` and `make stop`: Prefect's server, a pool, a worker and the deployments, here.
+
+Everything binds to loopback and needs a password as soon as it does not. What is started carries a
+mark in its environment, which flow runs and their children inherit, so that `stop` ends exactly
+those, also where a worker was killed, and never a stranger. The database is SQLite, or what
+PREFECT_API_DATABASE_CONNECTION_URL says.
+"""
+
+import contextlib
+import ipaddress
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+
+from pipeline.flows.machine import visible_gpus
+from pipeline.flows.prefect_server import quiet_prefect, wait_until_healthy
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
+from storage.errors import TrilightError
+
+ROOT = Path(__file__).parents[2]
+POOL = "local"
+_DISK_SLOTS = 2
+"""Runs that write documents at the same time: each reads its whole dataset."""
+_MARK = "TRILIGHT_SERVED"
+_END_S = 20.0
+
+
+def start(*, host: str, port: int, workers: int) -> str:
+    """Start everything and return the URL of the API.
+
+    Args:
+        host: address to bind to; anything but loopback needs PREFECT_SERVER_API_AUTH_STRING.
+        port: of the server.
+        workers: workers of the pool; each runs one flow at a time.
+
+    Raises:
+        TrilightError: it runs already, the address is open without a password, or a part does not
+            start; then the other parts are ended again.
+    """
+    if running():
+        raise TrilightError("make serve: it runs already; expected nothing. Try make stop first.")
+    _require_password(host)
+    if shutil.which("prefect") is None:
+        raise TrilightError("make serve: there is no command `prefect`; run make setup.")
+    quiet_prefect()
+    url = f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else host}:{port}/api"
+    write_atomically(_mark_file(), (mark := uuid.uuid4().hex).encode())
+    environment = {
+        **os.environ,
+        _MARK: mark,
+        "PREFECT_API_URL": url,
+        "TRILIGHT_CHECKOUT": str(ROOT),
+        "TRILIGHT_IMAGE": os.environ.get("TRILIGHT_IMAGE", "trilight:latest"),
+        "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
+        "PREFECT_LOGGING_LEVEL": "INFO",
+    }
+    if password := os.environ.get("PREFECT_SERVER_API_AUTH_STRING"):
+        environment.setdefault("PREFECT_API_AUTH_STRING", password)
+    try:
+        server = ["server", "start", "--host", host, "--port", str(port)]
+        process = _launch("server", server, environment)
+        wait_until_healthy(url, process, _log("server"))
+        _prepare(environment)
+        for number in range(workers):
+            worker = [
+                "worker",
+                "start",
+                "--pool",
+                POOL,
+                "--name",
+                f"worker-{number}",
+                "--limit",
+                "1",
+            ]
+            _launch(f"worker-{number}", worker, environment)
+    except BaseException:
+        stop()
+        raise
+    return url
+
+
+def stop() -> int:
+    """End what `start` started, with every flow run and child of theirs; return how many it was."""
+    ours = running()
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        for pid in running():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, number)
+        deadline = time.monotonic() + _END_S
+        while running() and time.monotonic() < deadline:
+            time.sleep(0.1)
+    _mark_file().unlink(missing_ok=True)
+    return len(ours)
+
+
+def running() -> list[int]:
+    """Return the living processes that `start` started, and theirs, by the mark that they carry."""
+    try:
+        mark = f"{_MARK}={_mark_file().read_text()}".encode()
+    except FileNotFoundError:
+        return []
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # ended meanwhile, or of another user
+            alive = (place / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+            if alive and mark in (place / "environ").read_bytes().split(b"\0"):
+                found.append(int(place.name))
+    return found
+
+
+def _prepare(environment: Mapping[str, str]) -> None:
+    """Make pool, limits and deployments; what is there already is replaced."""
+    for arguments in (
+        ["work-pool", "create", POOL, "--type", "process", "--overwrite"],
+        ["deploy", "--name", f"*/{POOL}"],
+    ):
+        _call(arguments, environment)
+    for name, limit in (("trilight-disk", _DISK_SLOTS), ("trilight-gpu", len(visible_gpus()) or 1)):
+        if not _call(["gcl", "inspect", name], environment, check=False):
+            _call(["gcl", "create", name, "--limit", str(limit)], environment)
+
+
+def _call(arguments: list[str], environment: Mapping[str, str], *, check: bool = True) -> bool:
+    done = subprocess.run(
+        ["prefect", "--no-prompt", *arguments],
+        cwd=ROOT,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if check and done.returncode:
+        last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:]
+        raise TrilightError(f"make serve: prefect {' '.join(arguments)} failed: {' '.join(last)}")
+    return done.returncode == 0
+
+
+def _launch(
+    name: str, arguments: list[str], environment: Mapping[str, str]
+) -> "subprocess.Popen[bytes]":
+    with _log(name).open("ab") as log:
+        return subprocess.Popen(
+            [str(shutil.which("prefect")), *arguments],
+            cwd=ROOT,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+
+
+def _require_password(host: str) -> None:
+    loopback = host == "localhost"
+    try:
+        loopback = loopback or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        pass
+    if not loopback and not os.environ.get("PREFECT_SERVER_API_AUTH_STRING"):
+        raise TrilightError(
+            f"make serve: {host} can be reached from other machines; expected a password. Set "
+            "PREFECT_SERVER_API_AUTH_STRING to USER:PASSWORD, and PREFECT_API_AUTH_STRING to the "
+            "same where flows are started."
+        )
+
+
+def state_folder() -> Path:
+    """Return where logs and the list of processes are: TRILIGHT_STATE, or in the cache."""
+    place = os.environ.get("TRILIGHT_STATE")
+    return Path(place) if place else cache_folder("serve")
+
+
+def _mark_file() -> Path:
+    return state_folder() / "mark"
+
+
+def _log(name: str) -> Path:
+    return state_folder() / f"{name}.log"
+
+
+def main(arguments: list[str]) -> None:
+    """Start or stop, as the only argument says; TRILIGHT_HOST, _PORT and _WORKERS say how."""
+    try:
+        if arguments == ["stop"]:
+            print(f"ended: {stop()} processes")  # noqa: T201
+            return
+        url = start(
+            host=os.environ.get("TRILIGHT_HOST", "127.0.0.1"),
+            port=int(os.environ.get("TRILIGHT_PORT", "4200")),
+            workers=int(os.environ.get("TRILIGHT_WORKERS", "1")),
+        )
+        page = url.removesuffix("/api")
+        print(f"Prefect: {page}; logs: {state_folder()}")  # noqa: T201
+        print("Next: prefect deployment run generate-scenes/local --watch")  # noqa: T201
+    except TrilightError as mistake:
+        sys.exit(f"trilight: {mistake}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,227 @@
+"""A run: from an order to a dataset, or to a part of one. Resumable at any moment, by anybody.
+
+Files are the truth. A run looks at what is there, makes what is missing, and leaves each shard as
+it is done; several runs on one folder share the work (storage.claims). Who runs the tasks is not
+known here: `trilight generate` uses threads, the flows Prefect.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.documents.dataset_documents import write_documents
+from pipeline.flows.accept_objects import AcceptedObjects, accept_objects
+from pipeline.flows.accept_scene_files import accept_scene_files, settings_for_files
+from pipeline.flows.builds import BUILDS, frozen_note, named_build, object_source
+from pipeline.flows.environment import environment
+from pipeline.flows.machine import cores_owned, visible_gpus
+from pipeline.flows.make_task import ShardJob, TaskOutcome, close_children
+from pipeline.flows.order import DatasetOrder
+from pipeline.flows.pieces import TaskSizes, cut_tasks
+from pipeline.flows.publication import Publication, begin
+from pipeline.flows.runners import Runner
+from pipeline.flows.scene_files import SceneFolder, find_scene_files
+from pipeline.flows.settings import BuildSettings
+from pipeline.renders.variant import choose_variant
+from storage.dataset import open_dataset
+from storage.errors import TrilightError
+from storage.layout import DatasetFolder
+from storage.statistics import Statistics
+
+_POLL_S = 1.0
+"""Between two looks at what others are making."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """What a run leaves behind."""
+
+    digest: str
+    """The dataset digest, of the shards that are there."""
+    num_objects_found: int
+    """Objects in the source, or the files that scenes are made of."""
+    num_objects_used: int
+    """Objects that scenes may draw from."""
+    num_scenes_given_up: int
+    """Scenes that no attempt could save."""
+    num_shards: int
+    """Shards that are there."""
+    num_shards_planned: int
+    """Shards of the finished dataset."""
+    statistics: Statistics | None
+    """What the dataset holds; None where it is not finished."""
+    notes: tuple[str, ...] = ()
+    """What a person should know: fields of scene files that are unknown, cameras that were not
+    used, and whether a frozen set is the published one."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """An order that is begun: what every step of it needs."""
+
+    order: DatasetOrder
+    """What was asked for."""
+    settings: BuildSettings
+    """The build with the order's changes."""
+    listed: SceneFolder | None
+    """The scene files, where scenes come from files."""
+    publication: Publication
+    """What is public of the dataset."""
+    accepted: AcceptedObjects
+    """What scenes are made of."""
+
+
+Watcher = Callable[[Run, TaskOutcome], None]
+"""Called after each task."""
+
+
+def make_dataset(
+    order: DatasetOrder, runner: Runner, watch: Watcher = lambda run, outcome: None
+) -> Outcome:
+    """Make a dataset, or what is missing of it, or of a range of its shards.
+
+    Raises:
+        TrilightError: what the user can mend; what is finished is safe.
+    """
+    folder = DatasetFolder(Path(order.out).resolve())
+    settings, listed = _settings(order)
+    with folder.joined():
+        run = _begin(order, settings, listed, folder)
+        try:
+            _make_missing(run, runner, watch)
+        finally:
+            close_children()
+        finished = not run.publication.missing_shards()
+        run.publication.publish()
+        statistics = runner.finish(lambda: _documents(folder)) if finished else None
+    return _outcome(run, statistics)
+
+
+def prepare_dataset(order: DatasetOrder) -> Run:
+    """Begin a dataset and freeze its objects, without a picture."""
+    folder = DatasetFolder(Path(order.out).resolve())
+    settings, listed = _settings(order)
+    with folder.joined():
+        return _begin(order, settings, listed, folder)
+
+
+def _settings(order: DatasetOrder) -> tuple[BuildSettings, SceneFolder | None]:
+    settings = named_build(
+        order.build,
+        seed=order.seed,
+        resolution=order.resolution,
+        noise_floor_db=order.noise_floor_db,
+        allow_licences=order.allow_licences,
+        changes=order.changes,
+    )
+    object_source(settings, order.objects)  # refuse before anything is written
+    listed = None if order.scenes_from is None else find_scene_files(order.scenes_from)
+    return settings_for_files(settings, listed, order.views), listed
+
+
+def _begin(
+    order: DatasetOrder, settings: BuildSettings, listed: SceneFolder | None, folder: DatasetFolder
+) -> Run:
+    publication = begin(
+        folder,
+        settings,
+        environment(choose_variant()),
+        BUILDS[order.build].num_scenes if order.scenes is None else order.scenes,
+        accept_environment=order.accept_environment,
+    )
+    _require_shards(order, publication)
+    with folder.turn("objects"):  # one maker prepares, and the others find it done
+        publication.refresh()
+        if listed:
+            accepted = accept_scene_files(listed, order.licence, settings, publication)
+        else:
+            source = object_source(settings, order.objects)
+            accepted = accept_objects(source, order.licence, settings, publication, cores_owned())
+    return Run(
+        order=order, settings=settings, listed=listed, publication=publication, accepted=accepted
+    )
+
+
+def _require_shards(order: DatasetOrder, publication: Publication) -> None:
+    wanted = order.shard_range()
+    if wanted is not None and wanted.start >= publication.num_shards:
+        raise TrilightError(
+            f"shards is {order.shards!r}; expected one that begins below {publication.num_shards}, "
+            f"the shards of {publication.manifest.num_scenes} scenes."
+        )
+
+
+def _make_missing(run: Run, runner: Runner, watch: Watcher) -> None:
+    """Make what is missing, and wait for what others are making, or make that too if they die.
+
+    A range leaves to others what they are at.
+    """
+    order, publication = run.order, run.publication
+    wanted = order.shard_range()
+    sizes = TaskSizes()
+    num_at_once = runner.num_at_once or _workers(order)
+    job = ShardJob(
+        folder=publication.folder,
+        settings=run.settings,
+        environment={} if order.accept_environment else publication.manifest.environment,
+        accepted=run.accepted,
+        lock_sha256=publication.manifest.objects_lock_sha256,
+        num_at_once=num_at_once,
+    )
+    while missing := [
+        index for index in publication.missing_shards() if wanted is None or index in wanted
+    ]:
+        made = 0
+        for outcome in runner.run(cut_tasks(missing, run.settings.splits, sizes), job):
+            made += outcome.scenes + len(outcome.shards)
+            if outcome.scenes:
+                sizes.measured(outcome.scenes, outcome.seconds)
+            for shard in outcome.shards:
+                publication.add_shard(shard)
+            watch(run, outcome)
+            _require_within_budget(publication, order.failure_budget)
+        if made == 0:
+            if wanted is not None:
+                return
+            time.sleep(_POLL_S)
+
+
+def _workers(order: DatasetOrder) -> int:
+    if order.workers is not None:
+        return order.workers
+    return max(1, len(visible_gpus())) if choose_variant().name == "cuda_ad_rgb" else 1
+
+
+def _documents(folder: DatasetFolder) -> Statistics:
+    with folder.turn("documents"):
+        return write_documents(open_dataset(str(folder.root)))
+
+
+def _outcome(run: Run, statistics: Statistics | None) -> Outcome:
+    publication, listed = run.publication, run.listed
+    notes: tuple[str, ...] = ()
+    if listed:
+        notes = listed.notes(run.settings.scenes.num_views)
+    elif statistics:
+        notes = frozen_note(run.order.build, statistics)
+    return Outcome(
+        digest=publication.manifest.dataset_digest,
+        num_objects_found=run.accepted.num_found,
+        num_objects_used=len(run.accepted.objects),
+        num_scenes_given_up=publication.num_given_up(),
+        num_shards=len(publication.manifest.shards),
+        num_shards_planned=publication.num_shards,
+        statistics=statistics,
+        notes=notes,
+    )
+
+
+def _require_within_budget(publication: Publication, failure_budget: float) -> None:
+    given_up = publication.num_given_up()
+    if given_up > failure_budget * publication.manifest.num_scenes:
+        raise TrilightError(
+            f"{publication.folder.root}: {given_up} of {publication.manifest.num_scenes} scenes "
+            f"could not be made, more than the failure budget of {failure_budget:.0%}. The reasons "
+            f"are in {publication.folder.failures.name}; mend them, or raise --failure-budget."
+        )

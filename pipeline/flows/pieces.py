@@ -1,0 +1,79 @@
+"""How work is cut: a task takes one to ten minutes, and a run has at most a thousand of them.
+
+A piece is a range of scenes of one shard; a task is several pieces. Small shards are put together,
+large ones are cut. How long a scene takes is known only as the run goes, so tasks are cut one by
+one, each when it is handed out.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from storage.splits import SplitSettings, scenes_of_shard
+
+MOST_TASKS = 1000
+"""Task runs of one flow run: Prefect's server takes in about 20 a second, of 16 kB each."""
+TASK_S = 240.0
+"""Seconds that a task should take."""
+_FIRST_SCENES = 4
+"""Scenes of a task before anything is measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Piece:
+    """Scenes of one shard that a task makes in turn."""
+
+    shard_index: int
+    """Which shard."""
+    first: int
+    """Its first scene, by its index in the dataset."""
+    last: int
+    """One beyond its last scene."""
+
+
+class TaskSizes:
+    """How many scenes the next task gets, from what the finished ones took."""
+
+    def __init__(self) -> None:
+        self._scenes = 0
+        self._seconds = 0.0
+
+    def measured(self, scenes: int, seconds: float) -> None:
+        """Take the duration of a finished task into account."""
+        self._scenes += scenes
+        self._seconds += seconds
+
+    def next_size(self, scenes_left: int, tasks_left: int) -> int:
+        """Return a number of scenes, at least 1."""
+        wanted: float = _FIRST_SCENES
+        if self._scenes:
+            wanted = TASK_S * self._scenes / max(self._seconds, 1e-3)
+        return max(1, int(wanted), -(-scenes_left // max(1, tasks_left)))
+
+
+def cut_tasks(
+    shards: Sequence[int], splits: SplitSettings, sizes: TaskSizes, *, most: int = MOST_TASKS
+) -> Iterator[tuple[Piece, ...]]:
+    """Yield the tasks that make some shards, each of the size that is right when it is asked for.
+
+    Args:
+        shards: numbers of the shards.
+        splits: how many scenes they have.
+        sizes: what is known of the time that scenes take.
+        most: tasks to yield at most.
+    """
+    scenes_left = sum(len(scenes_of_shard(index, splits)) for index in shards)
+    pieces: list[Piece] = []
+    room, yielded = sizes.next_size(scenes_left, most), 0
+    for index in shards:
+        scenes = scenes_of_shard(index, splits)
+        at = scenes.start
+        while at < scenes.stop:
+            last = min(scenes.stop, at + room)
+            pieces.append(Piece(shard_index=index, first=at, last=last))
+            room, scenes_left, at = room - (last - at), scenes_left - (last - at), last
+            if room == 0:
+                yield tuple(pieces)
+                pieces, yielded = [], yielded + 1
+                room = sizes.next_size(scenes_left, most - yielded)
+    if pieces:
+        yield tuple(pieces)

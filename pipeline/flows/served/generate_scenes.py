@@ -1,0 +1,30 @@
+"""The flow `generate-scenes`: objects, or scenes in files, to shards."""
+
+import logging
+from typing import Any
+
+from prefect import flow
+
+from pipeline.flows.dataset_run import Outcome, make_dataset
+from pipeline.flows.order import DatasetOrder
+from pipeline.flows.served.orders import DATASET_FORMS, dataset_order
+from pipeline.flows.served.runner import PrefectRunner
+from pipeline.flows.served.schema import parameters_of
+from pipeline.flows.served.watching import Watched
+
+
+@flow(name="generate-scenes", persist_result=False)
+@parameters_of(DatasetOrder, **DATASET_FORMS)
+def generate_scenes(**parameters: Any) -> Outcome:
+    """Make a dataset, or what is missing of it, or of a range of its shards."""
+    return make_watched(dataset_order(parameters), PrefectRunner())
+
+
+def make_watched(order: DatasetOrder, runner: PrefectRunner) -> Outcome:
+    """Make a dataset within a flow run, with its artifacts."""
+    # one line per scene; PREFECT_LOGGING_EXTRA_LOGGERS=trilight brings it to the server
+    logging.getLogger("trilight").setLevel(logging.INFO)
+    watched = Watched(order)
+    outcome = make_dataset(order, runner, watched.task_done)
+    watched.finished(outcome)
+    return outcome

@@ -1,0 +1,131 @@
+"""Typed parameters of flows, made of our frozen settings: Prefect's forms show names and docs.
+
+A flow takes the fields of a dataclass as its parameters. Types, defaults and the sentence under
+each field become the schema that Prefect checks before a run exists, and of which it draws a form.
+The groups of a build's settings become forms within the form, where every field may stay empty.
+"""
+
+import ast
+import dataclasses
+import inspect
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, TypeVar, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from pipeline.flows.builds import BUILDS
+from pipeline.flows.settings import BuildSettings
+
+Returned = TypeVar("Returned")
+
+
+def field_docs(settings: type) -> dict[str, str]:
+    """Return the sentence under each field of a dataclass, its bases included, by name."""
+    docs: dict[str, str] = {}
+    for cls in reversed(settings.__mro__[:-1]):
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+        assert isinstance(tree, ast.ClassDef)
+        for field, doc in zip(tree.body, tree.body[1:], strict=False):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(field.target, ast.Name)
+                and isinstance(doc, ast.Expr)
+                and isinstance(doc.value, ast.Constant)
+            ):
+                docs[field.target.id] = " ".join(str(doc.value.value).split())
+    return docs
+
+
+def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
+    """Give a function that takes keywords the signature of a dataclass; for flows.
+
+    Args:
+        settings: the dataclass.
+        annotations: types that take the place of those of some fields.
+    """
+    docs, hints = field_docs(settings), typing.get_type_hints(settings)
+
+    def with_signature(function: Callable[..., Returned]) -> Callable[..., Returned]:
+        parameters, lines = [], []
+        for field in dataclasses.fields(settings):
+            kind = annotations.get(field.name, _form_type(hints[field.name]))
+            default = None if _has_factory(field) else field.default
+            if _has_factory(field):
+                kind = kind | None
+            parameters.append(
+                inspect.Parameter(
+                    field.name,
+                    inspect.Parameter.KEYWORD_ONLY,
+                    default=inspect.Parameter.empty if default is dataclasses.MISSING else default,
+                    annotation=kind,
+                )
+            )
+            lines.append(f"    {field.name}: {docs[field.name]}")
+        function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        text = inspect.getdoc(function) or ""
+        function.__doc__ = "\n".join([text, "", "Args:", *lines])
+        return function
+
+    return with_signature
+
+
+def changes_form(settings: type, example: Any) -> type[BaseModel]:
+    """Return a form of all settings of a dataclass in which every field may stay empty.
+
+    Args:
+        settings: the dataclass, whose fields may be groups, or tuples of groups.
+        example: an instance, which says what the groups within tuples are.
+    """
+    docs, hints = field_docs(settings), typing.get_type_hints(settings)
+    fields: dict[str, Any] = {}
+    for field in dataclasses.fields(settings):
+        value, kind = getattr(example, field.name), _form_type(hints[field.name])
+        first = value[0] if isinstance(value, tuple) and value else value
+        if dataclasses.is_dataclass(first) and not isinstance(first, type):
+            kind = changes_form(type(first), first)
+        fields[field.name] = (kind | None, Field(default=None, description=docs[field.name]))
+    return create_model(
+        f"{settings.__name__}Changes", __config__=ConfigDict(extra="forbid"), **fields
+    )
+
+
+def changed_values(form: BaseModel | None) -> dict[str, Any]:
+    """Return what was filled in, by dotted name, as `storage.changes` takes it."""
+    values: dict[str, Any] = {}
+    for name in form.model_fields_set if form else ():
+        value = getattr(form, name)
+        if isinstance(value, BaseModel):
+            values |= {f"{name}.{below}": entry for below, entry in changed_values(value).items()}
+        elif value is not None:
+            values[name] = value
+    return values
+
+
+def _has_factory(field: "dataclasses.Field[Any]") -> bool:
+    return field.default_factory is not dataclasses.MISSING
+
+
+def _form_type(hint: Any) -> Any:
+    """Return a type as JSON has it: tuples of one kind are lists, mappings are objects."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return typing.Union[tuple(_form_type(arg) for arg in args)]  # noqa: UP007
+    if origin is tuple:
+        return list[_form_type(args[0])] if args[1:] == (...,) else list[Any]  # type: ignore[misc]
+    if origin in (Mapping, dict):
+        return dict[str, Any]
+    return hint
+
+
+_NO_SECRET = r"^(?:(?:env|builtin|objaverse):[^@?]*|[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|[^:]*)$"
+"""URLs without a user, a password or a query: whoever may see the server would see them too."""
+
+PublicUrl = Annotated[str, Field(pattern=_NO_SECRET)]
+"""A path or URL that may be seen by everybody who sees the server."""
+BuildName = typing.Literal[tuple(BUILDS)]  # type: ignore[valid-type]
+"""A list to choose from."""
+BuildChanges = changes_form(BuildSettings, BUILDS["smoke"].settings())
+"""Every setting of a build."""

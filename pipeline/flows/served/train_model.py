@@ -1,0 +1,93 @@
+"""The flow `train-model`: a training run as a process, or as several by torchrun.
+
+Making and learning meet only through files, so nothing of `train` is imported here.
+"""
+
+import contextlib
+import subprocess
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+from prefect import flow
+from prefect.concurrency.sync import concurrency
+from prefect.logging import get_run_logger
+
+from pipeline.flows.machine import visible_gpus
+from pipeline.flows.served.runner import GPU_LIMIT
+from pipeline.flows.served.schema import PublicUrl, parameters_of
+from pipeline.isolation import die_with_parent
+from storage.errors import TrilightError
+from storage.safe_url import safe_text
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOrder:
+    """What a person says of a training run."""
+
+    run: str = "smoke"
+    """Named run, such as smoke or pretrain."""
+    data: tuple[str, ...] = ("data/smoke",)
+    """Root of a dataset, or shards by name or pattern; folders or URLs."""
+    out: str = "runs/smoke"
+    """Folder of the run, as the worker sees it."""
+    resume: bool = False
+    """Go on from the last checkpoint."""
+    steps: int | None = None
+    """Replaces the run's number of steps."""
+    workers: int = 1
+    """Threads that decode samples."""
+    processes: int = 1
+    """Processes on this machine, started by torchrun; one for each graphics card."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "workers", "processes"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise TrilightError(f"{name} is {value}; expected at least 1.")
+        if not self.data:
+            raise TrilightError("data is empty; expected at least one dataset.")
+
+    def command(self) -> list[str]:
+        """Return the command line that trains."""
+        launch = ["-m", "infra.cli.app"]
+        if self.processes > 1:
+            several = f"--nproc-per-node={self.processes}"
+            launch = ["-m", "torch.distributed.run", "--standalone", several, *launch]
+        options = ["--out", self.out, "--workers", str(self.workers)]
+        options += [part for place in self.data for part in ("--data", place)]
+        options += ["--resume"] if self.resume else []
+        options += [] if self.steps is None else ["--steps", str(self.steps)]
+        return [sys.executable, *launch, "train", self.run, *options]
+
+
+@flow(name="train-model", persist_result=False)
+@parameters_of(TrainOrder, data=list[PublicUrl])
+def train_model(**parameters: Any) -> None:
+    """Train a model on a dataset, in processes of its own."""
+    order = TrainOrder(**{**parameters, "data": tuple(parameters["data"])})
+    last, log = "", get_run_logger()
+    cards = len(visible_gpus())
+    limit = (
+        concurrency(GPU_LIMIT, occupy=min(order.processes, cards), strict=False)
+        if cards
+        else contextlib.nullcontext()
+    )
+    with (
+        limit,
+        subprocess.Popen(
+            order.command(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            preexec_fn=die_with_parent,
+        ) as process,
+    ):
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.strip():
+                last = safe_text(line.strip())
+                log.info("%s", last)
+    if process.returncode:
+        raise TrilightError(f"train {order.run} ended with status {process.returncode}: {last}")

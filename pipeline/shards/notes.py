@@ -1,0 +1,40 @@
+"""Notes on packed shards until the manifest lists them, so that none has to be read again."""
+
+import dataclasses
+import json
+
+from storage.atomic import write_atomically
+from storage.layout import DatasetFolder
+from storage.manifest import ShardEntry, index_shard
+
+
+def note_shard(folder: DatasetFolder, shard: ShardEntry) -> None:
+    """Write down what the manifest will say of a shard; safe to repeat."""
+    path = folder.staged_entries / f"{shard.name}.json"
+    write_atomically(path, json.dumps(dataclasses.asdict(shard)).encode())
+
+
+def noted_shard(folder: DatasetFolder, name: str) -> ShardEntry:
+    """Return the entry of a shard that is there: its note, or else by reading the shard.
+
+    A note that is older than the shard, or of another size, was of a shard before it.
+
+    Raises:
+        TrilightError: the file is not a whole shard.
+    """
+    path, shard = folder.staged_entries / f"{name}.json", folder.shard(name)
+    try:
+        row = json.loads(path.read_bytes())
+        row["members"] = tuple((key, at, size) for key, at, size in row["members"])
+        entry = ShardEntry(**row)
+        facts = shard.stat()
+        if entry.num_bytes == facts.st_size and path.stat().st_mtime_ns >= facts.st_mtime_ns:
+            return entry
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # killed before the note
+    return index_shard(shard)
+
+
+def forget_note(folder: DatasetFolder, name: str) -> None:
+    """Delete the note of a shard that the manifest lists."""
+    (folder.staged_entries / f"{name}.json").unlink(missing_ok=True)

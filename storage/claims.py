@@ -1,0 +1,61 @@
+"""Claims: who is at work on what, among processes that share a folder.
+
+A claim is a lock on a small file. It ends with the process that holds it, whatever ends that, so
+nothing has to be cleaned up after a kill. Claims spare work; they are not what keeps files right.
+Where a file system does not carry locks between machines, two of them may make the same scene, of
+the same bytes, and the first writer of a shard wins (storage.atomic).
+"""
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from storage.atomic import write_error
+
+
+@contextlib.contextmanager
+def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
+    """Hold a claim for the block, and say whether it is ours.
+
+    Args:
+        path: the file of the claim; it is made, and may be deleted by whoever holds it.
+        wait: until the claim is free, so that it always becomes ours.
+
+    Raises:
+        TrilightError: the folder cannot be written.
+    """
+    descriptor = _locked(path, wait)
+    try:
+        yield descriptor is not None
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _locked(path: Path, wait: bool) -> int | None:
+    """Return the descriptor that holds the lock, or None where somebody else holds it."""
+    while True:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        except FileNotFoundError:  # the folder went between the two calls: its owner was done
+            continue
+        except OSError as error:
+            raise write_error(path, error) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            os.close(descriptor)
+            return None
+        if _is(path, descriptor):
+            return descriptor
+        os.close(descriptor)  # its last owner deleted it while we waited
+
+
+def _is(path: Path, descriptor: int) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,110 @@
+"""How far a dataset is and when it will be done, from its files alone: here, or on a server."""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from storage.dataset import Dataset, open_dataset
+from storage.dataset_files import LocalFiles
+from storage.failures import count_by_reason, decode_failures
+from storage.layout import DatasetFolder
+from storage.manifest import Manifest
+from storage.progress import num_scenes_done, planned_shards, shards_there
+from storage.scene_log import SceneLog, read_scene_logs
+
+_RATE_SCENES = 200
+"""The rate is that of the last so many scenes, whoever made them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetStatus:
+    """What can be said of a dataset in the making, or of a finished one."""
+
+    shown: str
+    """Where it is, without secrets."""
+    build: str
+    """Name of its build."""
+    shards_done: int
+    """Shards that are there."""
+    shards_planned: int
+    """Shards of the finished dataset."""
+    scenes_done: int
+    """Scenes in shards or waiting for theirs; given-up ones count."""
+    scenes_planned: int
+    """Scenes of the finished dataset."""
+    num_views: int
+    """Views of a scene."""
+    finished: bool
+    """Every shard is listed, and the documents are there."""
+    views_per_hour: float | None
+    """Of the last scenes; None where the logs say too little, as for a dataset on a server."""
+    remaining_s: float | None
+    """Until all scenes are made at that rate."""
+    core_hours: float | None
+    """Spent on scenes so far, those of killed makers not counted."""
+    last_scene_unix_s: float | None
+    """When the last scene was made."""
+    failures: Sequence[tuple[str, str, int]]
+    """Stage, reason and number of rejections, the most frequent first."""
+    digest: str
+    """The dataset digest, of the listed shards."""
+
+    @property
+    def next_command(self) -> str:
+        """What to do next."""
+        place = shlex.quote(self.shown)
+        if self.finished:
+            return f"trilight verify {place}"
+        return (
+            f"trilight generate {self.build} --out {place} --scenes {self.scenes_planned}, with "
+            "the same other options as before, goes on"
+        )
+
+
+def read_status(url: str) -> DatasetStatus:
+    """Return the status of a dataset.
+
+    Raises:
+        TrilightError: there is no readable manifest, or the URL is refused.
+    """
+    dataset = open_dataset(url)
+    manifest = dataset.manifest
+    local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
+    planned = planned_shards(manifest)
+    names = shards_there(local) if local else {entry.name for entry in manifest.shards}
+    names &= planned.keys()
+    done = num_scenes_done(local, manifest) if local else sum(planned[name] for name in names)
+    logs = list(read_scene_logs(local)) if local else []
+    views_per_hour, remaining_s = _rate(logs, manifest, manifest.num_scenes - done)
+    return DatasetStatus(
+        shown=dataset.shown,
+        build=manifest.build,
+        shards_done=len(names),
+        shards_planned=len(planned),
+        scenes_done=done,
+        scenes_planned=manifest.num_scenes,
+        num_views=manifest.num_views,
+        finished=len(manifest.shards) >= len(planned) and _has_card(dataset),
+        views_per_hour=views_per_hour,
+        remaining_s=remaining_s,
+        core_hours=sum(row.seconds * row.cores for row in logs) / 3600 if local else None,
+        last_scene_unix_s=max((row.finished_unix_s for row in logs), default=None),
+        failures=count_by_reason(decode_failures(dataset.files.read("failures.jsonl") or b"")),
+        digest=dataset.digest,
+    )
+
+
+def _rate(
+    logs: Sequence[SceneLog], manifest: Manifest, left: int
+) -> tuple[float | None, float | None]:
+    last = sorted(logs, key=lambda row: row.finished_unix_s)[-_RATE_SCENES:]
+    if left <= 0 or len(last) < 2:
+        return None, 0.0 if left <= 0 else None
+    # from the start of the first to the end of the last, over all who worked at the same time
+    span_s = last[-1].finished_unix_s - (last[0].finished_unix_s - last[0].seconds)
+    per_s = len(last) / max(span_s, 1e-3)
+    return 3600 * per_s * manifest.num_views, left / per_s
+
+
+def _has_card(dataset: Dataset) -> bool:
+    return dataset.files.read("README.md") is not None

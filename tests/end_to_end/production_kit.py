@@ -1,0 +1,180 @@
+"""The production path, private to a test: PostgreSQL, what `make serve` starts, a Dask cluster."""
+
+import contextlib
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+START_S = 300
+"""A server that makes its database on two busy cores took 137 s."""
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Postgres:
+    """A PostgreSQL of the distribution's packages in a folder of its own; it refuses to be root."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.port = free_port()
+        self._user = "postgres" if os.geteuid() == 0 else None
+        if self._user:
+            shutil.chown(folder, self._user)
+        self._run("initdb", "--pgdata", str(folder / "db"), "--auth", "trust", "--username", "me")
+        self.start()
+        self._run(
+            "createdb",
+            "--host",
+            "127.0.0.1",
+            "--port",
+            str(self.port),
+            "--username",
+            "me",
+            "prefect",
+        )
+
+    @property
+    def url(self) -> str:
+        return f"postgresql+asyncpg://me@127.0.0.1:{self.port}/prefect"
+
+    def start(self) -> None:
+        options = f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories="
+        log = str(self.folder / "log")
+        self._run(
+            "pg_ctl",
+            "start",
+            "--wait",
+            "--pgdata",
+            str(self.folder / "db"),
+            "--log",
+            log,
+            "--options",
+            options,
+        )
+
+    def stop(self) -> None:
+        self._run("pg_ctl", "stop", "--mode", "immediate", "--pgdata", str(self.folder / "db"))
+
+    def _run(self, *arguments: str) -> None:
+        tool = next(iter(_tools(arguments[0])), arguments[0])
+        subprocess.run(
+            [tool, *arguments[1:]], user=self._user, cwd="/", check=True, timeout=START_S,
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+
+
+def _tools(name: str) -> list[str]:
+    found = shutil.which(name)
+    return [found] if found else [str(p) for p in Path("/usr/lib/postgresql").glob(f"*/bin/{name}")]
+
+
+@contextlib.contextmanager
+def postgres() -> Iterator[Postgres]:
+    """A running PostgreSQL; skips where the packages are not installed."""
+    if not _tools("initdb"):
+        pytest.skip("PostgreSQL is not installed: apt-get install postgresql")
+    with tempfile.TemporaryDirectory(prefix="trilight-pg-") as folder:
+        Path(folder).chmod(0o755)
+        database = Postgres(Path(folder))
+        try:
+            yield database
+        finally:
+            database.stop()
+
+
+@contextlib.contextmanager
+def served(
+    tmp_path: Path, database_url: str, workers: int, base: Mapping[str, str] = os.environ
+) -> Iterator[dict[str, str]]:
+    """What `make serve` starts, with state and port of its own; gives a client's environment."""
+    port = str(free_port())
+    environment = {
+        **base,
+        "TRILIGHT_STATE": str(tmp_path / "state"),
+        "TRILIGHT_PORT": port,
+        "TRILIGHT_WORKERS": str(workers),
+        "PREFECT_HOME": str(tmp_path / "prefect"),
+        "PREFECT_API_URL": f"http://127.0.0.1:{port}/api",
+        "PREFECT_API_DATABASE_CONNECTION_URL": database_url,
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+    }
+    try:
+        start_served(environment)
+        yield environment
+    finally:
+        stop_served(environment)
+
+
+def start_served(environment: Mapping[str, str]) -> None:
+    """Run what `make serve` runs."""
+    call(["-m", "infra.serving.local", "start"], environment, timeout=2 * START_S)
+
+
+def stop_served(environment: Mapping[str, str]) -> None:
+    """Run what `make stop` runs."""
+    call(["-m", "infra.serving.local", "stop"], environment, timeout=120)
+
+
+def call(arguments: list[str], environment: Mapping[str, str], timeout: float) -> str:
+    """Run Python in the checkout and return what it says; a failure shows all of it."""
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, env=environment, text=True, timeout=timeout,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+@contextlib.contextmanager
+def dask_cluster(folder: Path, workers: int) -> Iterator[str]:
+    """A scheduler and worker processes of one thread each; gives the address."""
+    pytest.importorskip("prefect_dask", reason="make setup-all brings prefect-dask")
+    address = f"tcp://127.0.0.1:{free_port()}"
+    run = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1"]
+    run += ["--no-nanny", "--no-dashboard", "--local-directory", str(folder)]
+    port = address.rpartition(":")[2]
+    scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--no-dashboard"]
+    commands = [[*scheduler, "--host", "127.0.0.1", "--port", port], *([run] * workers)]
+    environment = {**os.environ, "TRILIGHT_CORES": "1", "PYTHONPATH": str(ROOT)}
+    processes: list[subprocess.Popen[bytes]] = []
+    try:
+        for command in commands:
+            log = (folder / f"dask-{len(processes)}.log").open("wb")
+            processes.append(
+                subprocess.Popen(command, env=environment, cwd=ROOT, stdout=log, stderr=log)
+            )
+        _wait_for_workers(address, workers)
+        yield address
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def _wait_for_workers(address: str, workers: int) -> None:
+    from distributed import Client
+
+    deadline = time.monotonic() + START_S
+    while time.monotonic() < deadline:
+        with (
+            contextlib.suppress(OSError),
+            Client(address, timeout=20, set_as_default=False) as client,
+        ):
+            client.wait_for_workers(workers, timeout=START_S)
+            return
+    raise AssertionError("the Dask cluster did not start")

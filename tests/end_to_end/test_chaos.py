@@ -1,0 +1,129 @@
+"""Seeded kills of everything that takes part, and a database that goes away: still one digest."""
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from storage.dataset import open_dataset
+from storage.verify import verify_dataset
+from tests.end_to_end.conftest import marked_environment, processes_with
+from tests.end_to_end.production_kit import call, postgres, served, start_served, stop_served
+
+KILLS = 30
+SCENES = 48
+WORDS = {
+    "flow": "prefect.engine",
+    "child": "multiprocessing.forkserver",
+    "worker": "worker start",
+    "server": "server start",
+}
+"""By what a process is known among those that carry the test's mark."""
+SHARES = {"child": 0.5, "flow": 0.3, "worker": 0.1, "server": 0.1}
+"""A worker or server takes half a minute to come back."""
+RUN_S = 600
+
+
+def _parameters(out: Path) -> list[str]:
+    parameters = {
+        "objects": "builtin:", "scenes": SCENES, "resolution": 32, "noise_floor_db": 20, "out": out,
+    }  # fmt: skip
+    return [word for key, value in parameters.items() for word in ("-p", f"{key}={value}")]
+
+
+def _kill_one(kind: str, mark: str, rng: np.random.Generator) -> bool:
+    """Kill one process of a kind, if there is any."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            carries = mark.encode() in (folder / "environ").read_bytes()
+            line = (folder / "cmdline").read_bytes().replace(b"\0", b" ")
+            if carries and WORDS[kind].encode() in line:
+                found.append(int(folder.name))
+    if not found:
+        return False
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(int(rng.choice(sorted(found))), signal.SIGKILL)
+    return True
+
+
+@contextlib.contextmanager
+def _watched(out: Path, whole: Path) -> Iterator[list[str]]:
+    """Compare what is visible under a final name with what it must be, all the time."""
+    wrong: list[str] = []
+    ended = threading.Event()
+
+    def look() -> None:
+        while not ended.wait(0.2):
+            wrong.extend(
+                shard.name
+                for shard in out.glob("*.tar")
+                if shard.read_bytes() != (whole / shard.name).read_bytes()
+            )
+
+    watcher = threading.Thread(target=look)
+    watcher.start()
+    try:
+        yield wrong
+    finally:
+        ended.set()
+        watcher.join()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_thirty_kills_end_in_the_same_digest(tmp_path: Path) -> None:
+    size = ["--scenes", str(SCENES), "--resolution", "32", "--noise-floor", "20"]
+    plain = ["-m", "infra.cli.app", "generate", "smoke", "--objects", "builtin:", *size]
+    call([*plain, "--out", str(tmp_path / "whole")], dict(os.environ), RUN_S)
+    expected = open_dataset(str(tmp_path / "whole")).digest
+    rng, out = np.random.default_rng(0), tmp_path / "set"
+    mark, marked = marked_environment()
+    run = ["-m", "prefect", "deployment", "run", "generate-scenes/local", *_parameters(out)]
+    with (
+        postgres() as database,
+        _watched(out, tmp_path / "whole") as wrong,
+        served(tmp_path, database.url, 1, marked) as environment,
+    ):
+        killed = 0
+        while killed < KILLS:
+            call(run, environment, RUN_S)
+            deadline = time.monotonic() + 60  # then what was killed may not have been the flow
+            while killed < KILLS and time.monotonic() < deadline:
+                time.sleep(rng.uniform(0.5, 6.0))
+                kind = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+                if not _kill_one(kind, mark, rng):
+                    continue
+                killed += 1
+                if killed == KILLS // 2:
+                    database.stop()
+                    time.sleep(rng.uniform(1.0, 5.0))
+                    database.start()
+                if kind in ("worker", "server"):
+                    stop_served(environment)
+                    start_served(environment)
+                if kind != "child":
+                    break
+        # a fresh start, and one run that nobody disturbs
+        stop_served(environment)
+        start_served(environment)
+        call([*run, "--watch"], environment, RUN_S)
+    assert not wrong
+    assert open_dataset(str(out)).digest == expected
+    assert verify_dataset(out).problems == []
+    rows = [line for path in (out / "logs").iterdir() for line in path.open()]
+    assert SCENES <= len(rows) <= SCENES + KILLS  # one scene in flight at each kill, at most
+    _wait_until_nobody_is_left(mark)
+
+
+def _wait_until_nobody_is_left(mark: str) -> None:
+    deadline = time.monotonic() + 30
+    while (left := processes_with(mark)) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not left

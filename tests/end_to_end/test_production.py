@@ -1,0 +1,82 @@
+"""The README's production path, literally: one dataset by four ways has one digest."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from storage.dataset import open_dataset
+from storage.verify import verify_dataset
+from tests.end_to_end.production_kit import call, dask_cluster, postgres, served
+
+SMALL = {"objects": "builtin:", "scenes": "12", "resolution": "32", "noise_floor_db": "20"}
+"""Three shards of four tiny scenes."""
+OPTIONS = ("--objects", "builtin:", "--scenes", "12", "--resolution", "32", "--noise-floor", "20")
+CANARY = "CANARY-51b2"
+RUN_S = 900
+"""A run takes half a minute; on busy machines many times that."""
+
+
+def _run_deployment(name: str, out: Path, environment: dict[str, str], **more: str) -> str:
+    parameters = {**SMALL, "out": str(out), **more}
+    words = [word for key, value in parameters.items() for word in ("-p", f"{key}={value}")]
+    prefect = ["-m", "prefect", "deployment", "run", name, "--watch", *words]
+    return call(prefect, environment, RUN_S)
+
+
+def _generate(out: Path, *more: str) -> None:
+    call(["-m", "infra.cli.app", "generate", "smoke", *OPTIONS, "--out", str(out), *more],
+         dict(os.environ), RUN_S)  # fmt: skip
+
+
+def _verified(out: Path) -> str:
+    assert verify_dataset(out).problems == []
+    assert (out / "report.html").exists()
+    return open_dataset(str(out)).digest
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_four_ways_one_digest(tmp_path: Path) -> None:
+    _generate(tmp_path / "plain")
+    digests = {"plain": _verified(tmp_path / "plain")}
+    with postgres() as database, served(tmp_path, database.url, workers=2) as environment:
+        _run_deployment("generate-scenes/local", tmp_path / "one", environment)
+        digests["one worker"] = _verified(tmp_path / "one")
+        _run_deployment("build-dataset/local", tmp_path / "two", environment, flow_runs="2")
+        digests["two workers"] = _verified(tmp_path / "two")
+        _refuses_secrets(tmp_path, environment)
+    with dask_cluster(tmp_path, 2) as address:
+        _generate(tmp_path / "dask", "--runner", "dask", "--address", address)
+        digests["dask"] = _verified(tmp_path / "dask")
+    assert len(set(digests.values())) == 1, digests
+
+
+def _refuses_secrets(tmp_path: Path, environment: dict[str, str]) -> None:
+    """Neither the database's log nor ours ever sees what was refused, and the rest names it."""
+    with pytest.raises(AssertionError, match="Validation failed for field 'objects'"):
+        _run_deployment(
+            "generate-scenes/local", tmp_path / "no", environment,
+            objects=f"https://me:{CANARY}@host/folder",
+        )  # fmt: skip
+    for place in (tmp_path / "state", tmp_path / "prefect"):
+        for path in place.rglob("*"):
+            assert not path.is_file() or CANARY.encode() not in path.read_bytes(), path
+
+
+@pytest.mark.slow
+def test_ranges_at_the_same_time_and_who_is_last_finishes(tmp_path: Path) -> None:
+    import subprocess
+
+    command = [sys.executable, "-m", "infra.cli.app", "generate", "smoke", *OPTIONS]
+    runs = [
+        subprocess.Popen([*command, "--out", str(tmp_path / "set"), "--shards", shards])
+        for shards in ("0:2", "1:3")
+    ]
+    assert [run.wait(RUN_S) for run in runs] == [0, 0]
+    _generate(tmp_path / "plain")
+    assert _verified(tmp_path / "set") == _verified(tmp_path / "plain")
+    # nothing was made twice
+    rows = [line for path in (tmp_path / "set" / "logs").iterdir() for line in path.open()]
+    assert len(rows) == 12

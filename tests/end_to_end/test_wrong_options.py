@@ -1,0 +1,24 @@
+"""Options of `generate` that do not go together, or name nothing, are one clear line each."""
+
+import pytest
+
+from tests.end_to_end.conftest import Trilight
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--runner", "ray"), "--runner is 'ray'"),
+        (("--runner", "dask"), "--address is None"),
+        (("--address", "tcp://127.0.0.1:9"), "--runner is threads"),
+        (("--shards", "7"), "shards is '7'"),
+        (("--scenes", "8", "--shards", "2:4"), "expected one that begins below 2"),
+        (("--objects", "env:TRILIGHT_NOWHERE"), "'TRILIGHT_NOWHERE' is not set"),
+    ],
+)
+def test_wrong_options_are_named(
+    trilight: Trilight, arguments: tuple[str, ...], message: str
+) -> None:
+    result = trilight("generate", "smoke", "--out", "set", *arguments)
+    assert result.returncode == 1
+    assert message in result.stderr.strip().splitlines()[-1]

@@ -1,0 +1,106 @@
+"""Pieces of shards by several makers: every scene once, one packer, nothing taken from others."""
+
+import dataclasses
+import threading
+from collections import Counter
+from pathlib import Path
+from typing import Any, cast
+
+from pipeline.flows.builds import named_build
+from pipeline.flows.make_scene import SceneAttempt
+from pipeline.flows.make_shard import make_piece
+from pipeline.flows.pieces import Piece
+from pipeline.flows.settings import BuildSettings
+from pipeline.isolation import ChildFailed, IsolatedChild
+from pipeline.shards.notes import note_shard, noted_shard
+from storage.claims import claimed
+from storage.layout import DatasetFolder
+from storage.manifest import ShardEntry, index_shard
+from storage.sample import sample_key
+from storage.shard_writer import write_shard
+from storage.staging import read_staged_scene
+from tests.scenes_by_hand import tiny_sample
+
+NAME = "train-000000.tar"
+
+
+class FakeChild:
+    """Makes tiny samples at once, and counts."""
+
+    def __init__(self, made: "Counter[int]", broken: int = -1) -> None:
+        self._made = made
+        self._broken = broken
+
+    def call(self, function: Any, split: str, scene_index: int, attempt: int) -> SceneAttempt:
+        if scene_index == self._broken and attempt == 0:
+            raise ChildFailed("crashed_signal_11", "native code ended by SIGSEGV")
+        self._made[scene_index] += 1
+        sample = dataclasses.replace(tiny_sample(seed=scene_index), key=sample_key(scene_index))
+        return SceneAttempt(sample=sample, failures=[])
+
+
+def _build() -> BuildSettings:
+    build = named_build("smoke", resolution=16)
+    return dataclasses.replace(build, scenes=dataclasses.replace(build.scenes, num_views=2))
+
+
+def _make(root: Path, first: int, last: int, made: "Counter[int]", broken: int = -1) -> Any:
+    child = cast(IsolatedChild, FakeChild(made, broken))
+    piece = Piece(shard_index=0, first=first, last=last)
+    return make_piece(DatasetFolder(root), _build(), piece, child, lambda *scene: None)
+
+
+def test_many_makers_of_one_shard_make_every_scene_once(tmp_path: Path) -> None:
+    made: Counter[int] = Counter()
+    packed: list[ShardEntry | None] = []
+    threads = [
+        threading.Thread(target=lambda: packed.append(_make(tmp_path, 0, 4, made)))
+        for _ in range(6)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert made == {0: 1, 1: 1, 2: 1, 3: 1}
+    (shard,) = [entry for entry in packed if entry]
+    assert shard == index_shard(tmp_path / NAME)
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_whoever_makes_the_last_piece_packs(tmp_path: Path) -> None:
+    made: Counter[int] = Counter()
+    assert _make(tmp_path, 2, 4, made) is None
+    shard = _make(tmp_path, 0, 2, made)
+    assert shard is not None
+    assert shard.num_samples == 4
+    assert _make(tmp_path, 0, 4, made) is None  # there is nothing left to do
+    assert made.total() == 4
+
+
+def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:
+    made: Counter[int] = Counter()
+    claim = DatasetFolder(tmp_path).staged_shard(NAME) / f"{sample_key(1)}.claim"
+    with claimed(claim):
+        assert _make(tmp_path, 0, 4, made) is None
+    assert made == {0: 1, 2: 1, 3: 1}
+    assert _make(tmp_path, 0, 4, made) is not None  # they died; now it is free
+
+
+def test_a_scene_that_crashes_its_child_costs_an_attempt(tmp_path: Path) -> None:
+    made: Counter[int] = Counter()
+    assert _make(tmp_path, 0, 2, made, broken=1) is None
+    staged = DatasetFolder(tmp_path).staged_shard(NAME)
+    (failure,) = read_staged_scene(staged, 1).failures
+    assert (failure.reason, failure.attempt) == ("environmental_skip", 0)
+    assert "SIGSEGV" in failure.message
+
+
+def test_a_note_of_an_earlier_shard_is_not_believed(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    write_shard(tmp_path / NAME, [(sample_key(0), {"json": b"{}"})])
+    before = index_shard(tmp_path / NAME)
+    note_shard(folder, before)
+    assert noted_shard(folder, NAME) == before
+    (tmp_path / NAME).unlink()
+    write_shard(tmp_path / NAME, [(sample_key(0), {"json": b"[]"})])  # of the same size
+    assert noted_shard(folder, NAME) == index_shard(tmp_path / NAME) != before

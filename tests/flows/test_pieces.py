@@ -1,0 +1,82 @@
+"""How work is cut: every scene once, few enough tasks, sizes that follow what was measured."""
+
+import dataclasses
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.flows.order import DatasetOrder
+from pipeline.flows.pieces import MOST_TASKS, TASK_S, Piece, TaskSizes, cut_tasks
+from storage.errors import TrilightError
+from storage.splits import SplitSettings, scenes_of_shard
+
+
+def _scenes(tasks: list[tuple[Piece, ...]]) -> list[int]:
+    return [scene for task in tasks for piece in task for scene in range(piece.first, piece.last)]
+
+
+@given(
+    shards=st.lists(st.integers(0, 5000), unique=True, max_size=60).map(sorted),
+    per_shard=st.integers(1, 300),
+    seconds=st.floats(0.01, 2000),
+    most=st.integers(1, 50),
+)
+def test_every_scene_is_in_one_task(
+    shards: list[int], per_shard: int, seconds: float, most: int
+) -> None:
+    splits, sizes = SplitSettings(scenes_per_shard=per_shard), TaskSizes()
+    sizes.measured(1, seconds)
+    tasks = list(cut_tasks(shards, splits, sizes, most=most))
+    expected = [scene for shard in shards for scene in scenes_of_shard(shard, splits)]
+    assert _scenes(tasks) == expected
+    assert len(tasks) <= most
+    for task in tasks:
+        for piece in task:
+            scenes = scenes_of_shard(piece.shard_index, splits)
+            assert scenes.start <= piece.first < piece.last <= scenes.stop
+
+
+def test_a_task_takes_the_time_that_it_should() -> None:
+    """At 10 s a scene 24 of them: half a shard of 48, or six of 4."""
+    sizes = TaskSizes()
+    sizes.measured(3, 30.0)
+    for per_shard, pieces in ((48, 1), (4, 6)):
+        tasks = list(cut_tasks(range(24), SplitSettings(scenes_per_shard=per_shard), sizes))
+        assert len(_scenes(tasks[:1])) == TASK_S / 10
+        assert len(tasks[0]) == pieces
+
+
+def test_sizes_follow_what_is_measured_on_the_way() -> None:
+    sizes = TaskSizes()
+    tasks = cut_tasks(range(100), SplitSettings(scenes_per_shard=4), sizes)
+    assert len(_scenes([next(tasks)])) == 4
+    next(tasks)  # was cut when the first was handed out
+    sizes.measured(4, 4.0)
+    assert len(_scenes([next(tasks)])) == TASK_S
+
+
+def test_two_million_slow_scenes_are_at_most_a_thousand_tasks() -> None:
+    sizes = TaskSizes()
+    sizes.measured(1, 100.0)
+    splits = SplitSettings(scenes_per_shard=256)
+    assert sum(1 for _ in cut_tasks(range(2_000_000 // 256), splits, sizes)) <= MOST_TASKS
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"build": "nonsense"}, "build 'nonsense'"),
+        ({"scenes": 0}, "scenes is 0"),
+        ({"workers": 0}, "workers is 0"),
+        ({"failure_budget": 1.5}, "failure_budget is 1.5"),
+        ({"shards": "4"}, "shards is '4'"),
+        ({"shards": "4:4"}, "shards is '4:4'"),
+        ({"views": 2}, "--views is 2"),
+        ({"scenes_from": "a", "scenes": 3}, "expected neither"),
+    ],
+)
+def test_wrong_orders_are_named(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        dataclasses.replace(DatasetOrder(), **changes)  # type: ignore[arg-type]
+    assert DatasetOrder(shards="4:7").shard_range() == range(4, 7)

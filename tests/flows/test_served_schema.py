@@ -1,0 +1,123 @@
+"""Forms of the flows: every setting with its sentence, wrong values refused by name, no secrets."""
+
+import dataclasses
+from typing import Any
+
+import pytest
+from prefect.exceptions import ParameterTypeError
+
+from pipeline.flows.order import DatasetOrder
+from pipeline.flows.served.build_dataset import build_dataset
+from pipeline.flows.served.generate_scenes import generate_scenes
+from pipeline.flows.served.orders import dataset_order
+from pipeline.flows.served.prepare_assets import prepare_assets
+from pipeline.flows.served.runner import may_pass
+from pipeline.flows.served.schema import BuildChanges, changed_values, field_docs
+from pipeline.flows.served.train_model import TrainOrder, train_model
+from pipeline.flows.settings import BuildSettings
+from storage.errors import EnvironmentFailure, TrilightError
+
+CANARY = "CANARY-7f3a"
+FLOWS = {
+    "prepare-assets": prepare_assets,
+    "generate-scenes": generate_scenes,
+    "build-dataset": build_dataset,
+    "train-model": train_model,
+}
+
+
+def _defaults(**given: Any) -> dict[str, Any]:
+    plain = {field.name: field.default for field in dataclasses.fields(DatasetOrder)}
+    return {**plain, "changes": None, **given}
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_every_parameter_has_a_sentence_and_a_default(name: str) -> None:
+    flow = FLOWS[name]
+    assert flow.name == name
+    assert flow.parameters.properties
+    for parameter, schema in flow.parameters.properties.items():
+        assert len(schema["description"]) > 10, parameter
+        assert "default" in schema, parameter
+    assert not flow.parameters.required
+
+
+def test_the_forms_within_have_every_setting_of_a_build() -> None:
+    schema = generate_scenes.parameters.model_dump()
+    groups = schema["definitions"]
+    renders = groups["RenderSettingsChanges"]["properties"]
+    assert renders["max_spp"]["description"].startswith("The cap")
+    assert renders["denoiser"]["anyOf"][0]["enum"] == ["high", "fast", "off"]
+    assert set(groups["BuildSettingsChanges"]["properties"]) == set(field_docs(BuildSettings))
+
+
+def test_changes_become_dotted_names() -> None:
+    form = BuildChanges(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
+    expected = {"renders.max_spp": 64, "storage.profile": "lossless"}
+    assert changed_values(form) == expected
+    order = dataset_order(_defaults(scenes=3, changes=form))
+    assert order == DatasetOrder(scenes=3, changes=expected)
+    assert dataset_order(_defaults()) == DatasetOrder()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"build": "nonsense"}, "build"),
+        ({"scenes": "many"}, "scenes"),
+        ({"changes": {"renders": {"most_spp": 4}}}, "changes.renders.most_spp"),
+        ({"changes": {"renders": {"denoiser": "best"}}}, "changes.renders.denoiser"),
+    ],
+)
+def test_wrong_values_are_refused_by_name(parameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(ParameterTypeError, match=message):
+        generate_scenes.validate_parameters(parameters)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [f"https://user:{CANARY}@host/folder", f"https://host/folder?token={CANARY}"],
+)
+def test_secrets_are_refused_before_a_run_exists(source: str) -> None:
+    """The server checks the same schema when a run is made, so that it never stores one."""
+    with pytest.raises(ParameterTypeError, match="objects"):
+        generate_scenes.validate_parameters({"objects": source})
+    with pytest.raises(ParameterTypeError, match="data"):
+        train_model.validate_parameters({"data": [source]})
+    for harmless in ("builtin:500", "https://host/folder", "s3://b/f", "env:SOURCE", "a/b c", None):
+        generate_scenes.validate_parameters({"objects": harmless})
+
+
+def test_only_what_can_pass_is_tried_again() -> None:
+    class Failed:
+        def __init__(self, error: Exception) -> None:
+            self._error = error
+
+        def result(self) -> None:
+            raise self._error
+
+    outcomes = {
+        error: may_pass(None, None, Failed(error))  # type: ignore[arg-type]
+        for error in (
+            EnvironmentFailure("disk"),
+            OSError("gone"),
+            TrilightError("wrong"),
+            KeyError(),
+        )
+    }
+    assert list(outcomes.values()) == [True, True, False, False]
+
+
+def test_training_is_launched_by_torchrun_where_there_are_several_processes() -> None:
+    one = TrainOrder(data=("a", "b"), resume=True, steps=5).command()
+    assert (
+        one[1:]
+        == (
+            "-m infra.cli.app train smoke --out runs/smoke --workers 1 --data a --data b --resume "
+            "--steps 5"
+        ).split()
+    )
+    two = TrainOrder(processes=2).command()
+    assert two[1:5] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    with pytest.raises(TrilightError, match="processes is 0"):
+        TrainOrder(processes=0)

@@ -1,0 +1,98 @@
+"""Claims: one holder at a time, free again when the holder ends, and the first writer wins."""
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from storage.atomic import atomic_writer, write_error
+from storage.claims import claimed
+from storage.errors import EnvironmentFailure
+from storage.layout import DatasetFolder
+from tests.conftest import ROOT
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from storage.claims import claimed
+with claimed(Path(sys.argv[1])) as ours:
+    print(ours, flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_claim_has_one_holder(tmp_path: Path) -> None:
+    path = tmp_path / "folder" / "a.claim"
+    with claimed(path) as first, claimed(path) as second:
+        assert first
+        assert not second
+    with claimed(path) as third:
+        assert third
+
+
+def test_a_claim_ends_with_its_process(tmp_path: Path) -> None:
+    path = tmp_path / "a.claim"
+    command = [sys.executable, "-c", HOLD, str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "True\n"
+        with claimed(path) as ours:
+            assert not ours
+        holder.send_signal(signal.SIGKILL)
+    with claimed(path, wait=True) as ours:
+        assert ours
+
+
+def test_a_claim_that_its_holder_deleted_is_not_shared(tmp_path: Path) -> None:
+    """Who waited for the old file must not hold it while another holds a new one of that name."""
+    path, waited = tmp_path / "samples" / "a.claim", threading.Event()
+    held_together: list[bool] = []
+
+    def wait() -> None:
+        with claimed(path, wait=True), claimed(path) as again:
+            held_together.append(again)
+        waited.set()
+
+    with claimed(path):
+        waiter = threading.Thread(target=wait)
+        waiter.start()
+        shutil.rmtree(path.parent)
+    assert waited.wait(20)  # far more than the milliseconds that it takes; a hang fails
+    assert held_together == [False]
+
+
+def test_the_first_writer_wins_where_asked(tmp_path: Path) -> None:
+    path = tmp_path / "a.tar"
+    with atomic_writer(path, replace=False) as second:
+        with atomic_writer(path, replace=False) as first:
+            first.write(b"first")
+        second.write(b"second")
+    assert path.read_bytes() == b"first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_leftovers_are_cleared_only_where_nobody_works(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    with folder.joined():
+        leftover = tmp_path / "a.tar.1-00.part"
+        leftover.write_bytes(b"")
+        with folder.joined():
+            assert leftover.exists()
+    with folder.joined():
+        assert not leftover.exists()
+
+
+@pytest.mark.parametrize(
+    ("number", "passes"),
+    [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EIO, True), (errno.EACCES, False)],
+)
+def test_what_may_pass_is_told_from_what_will_not(number: int, passes: bool) -> None:
+    """A scheduler tries the first kind again."""
+    error = write_error(Path("a/b"), OSError(number, os.strerror(number)))
+    assert isinstance(error, EnvironmentFailure) == passes
