@@ -57,7 +57,7 @@ def repair(
             (root / name).replace(root / f"{name}{ASIDE}")
     order = DatasetOrder(
         build=manifest.build,
-        objects=objects,
+        objects=None if scenes_from else objects,
         out=str(root),
         scenes=None if scenes_from else manifest.num_scenes,
         licence=licence,

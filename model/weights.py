@@ -29,7 +29,17 @@ def encode_weights(model: RenderFormer, trained: TrainedRange | None = None) -> 
     """
     tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
     known = {} if trained is None else trained.as_metadata()
-    return save(tensors, metadata={CONFIG_KEY: encode_config(model.config), **known})
+    return _in_order(save(tensors, metadata={CONFIG_KEY: encode_config(model.config), **known}))
+
+
+def _in_order(data: bytes) -> bytes:
+    """Sort the metadata of a safetensors file, whose writer shuffles it from process to process."""
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    assert len(text) <= end - 8  # as compact as it was written, and padded with spaces alike
+    return data[:8] + text.ljust(end - 8) + data[end:]
 
 
 def decode_weights(data: bytes) -> RenderFormer:

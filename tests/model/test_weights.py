@@ -7,8 +7,10 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
+from model.trained_range import TrainedRange
 from model.weights import CONFIG_KEY, decode_weights, encode_config, encode_weights
 from storage.errors import TrilightError
+from storage.safe_read import safetensors_header
 from tests.model.kit import awake, tiny_config
 
 
@@ -68,3 +70,12 @@ def test_wrong_tensors_are_listed(
 def test_other_files_are_refused(data: bytes) -> None:
     with pytest.raises(TrilightError):
         decode_weights(data)
+
+
+def test_equal_networks_give_equal_bytes_in_any_process() -> None:
+    """Ten writings: the library shuffles two entries of metadata, half of the times."""
+    model = awake(tiny_config("linear"), torch.float32)
+    files = {encode_weights(model, TrainedRange(max_triangles=7)) for _ in range(10)}
+    assert len(files) == 1
+    header = safetensors_header(files.pop())["__metadata__"]
+    assert list(header) == sorted(header) and len(header) == 2
