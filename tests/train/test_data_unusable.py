@@ -35,6 +35,7 @@ def spoil_sample(dataset: Dataset) -> None:
         for sample in (toy_sample(i, resolution=8) for i in (2, 3))
     ]
     samples[0][1]["0.exr"] = b"no picture"
+    dataset.folder.shard(name).unlink()  # a shard is never written over
     write_shard(dataset.folder.shard(name), samples)
     shards = [
         index_shard(dataset.folder.shard(name)) if shard.name == name else shard

@@ -41,12 +41,9 @@ def make_on_dask(order: DatasetOrder, address: str) -> Outcome:
     def on_dask() -> Outcome:
         return make_watched(order, runner)
 
-    run = flow(
-        name="generate-scenes",
-        persist_result=False,
-        task_runner=DaskTaskRunner(address=address),
-    )(on_dask)
-    return run()
+    # its declared type lacks the results' own, which Prefect's signature names
+    cluster: Any = DaskTaskRunner(address=address)
+    return flow(name="generate-scenes", persist_result=False, task_runner=cluster)(on_dask)()
 
 
 def _threads(address: str) -> list[int]:
