@@ -50,6 +50,11 @@ def open_checkpoint(source: str) -> RenderFormer:
             )
         path = _download(source)
     weights = path / WEIGHTS_NAME if path.is_dir() else path
+    if path.is_dir() and not weights.exists() and not _has_pickles(path):
+        raise TrilightError(
+            f"checkpoint {source}: no checkpoint here; expected {WEIGHTS_NAME}, as `trilight "
+            "train` writes it and published folders hold it."
+        )
     if weights.suffix in _PICKLES or not weights.exists():
         raise TrilightError(
             f"checkpoint {source}: expected {WEIGHTS_NAME}; pickled weights could run code and are "
@@ -59,6 +64,10 @@ def open_checkpoint(source: str) -> RenderFormer:
     if CONFIG_KEY in metadata:
         return from_tensors(tensors, metadata)
     return from_published(tensors, _read_config(weights.parent / CONFIG_NAME))
+
+
+def _has_pickles(folder: Path) -> bool:
+    return any(path.suffix in _PICKLES for path in folder.iterdir())
 
 
 def save_published(model: RenderFormer, folder: Path) -> None:

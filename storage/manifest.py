@@ -132,13 +132,18 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
 def write_manifest(path: Path, manifest: Manifest) -> None:
     """Write the manifest atomically; equal manifests give equal bytes."""
     record = _fields(manifest)
-    record["shards"] = [{**_fields(s), "members": list(s.members)} for s in manifest.shards]
+    record["shards"] = [shard_row(shard) for shard in manifest.shards]
     record["totals"] = {"samples": manifest.num_samples, "bytes": manifest.num_bytes}
     record["dataset_digest"] = manifest.dataset_digest
     with atomic_writer(path) as stream:  # bit by bit: the whole text has many small ones
         for text in json.JSONEncoder(indent=1, sort_keys=True).iterencode(record):
             stream.write(text.encode())
         stream.write(b"\n")
+
+
+def shard_row(shard: ShardEntry) -> dict[str, Any]:
+    """Return the JSON values of an entry."""
+    return {**_fields(shard), "members": list(shard.members)}
 
 
 def _fields(record: Manifest | ShardEntry) -> dict[str, Any]:
@@ -184,7 +189,7 @@ def decode_manifest(
     try:
         for name, value in entries(stream):
             if name == "shards":
-                shards.append(shard_read(_shard(value)))
+                shards.append(shard_read(shard_of_row(value)))
                 continue
             if name == "schema_version":  # it comes before the shards, which it explains
                 require_readable(value, place)
@@ -198,12 +203,17 @@ def decode_manifest(
         raise TrilightError(f"{place}: not a readable manifest ({error}).") from error
 
 
-def _shard(row: dict[str, Any]) -> ShardEntry:
+def shard_of_row(row: dict[str, Any]) -> ShardEntry:
+    """Return the entry of what `shard_row` gave.
+
+    Raises:
+        KeyError, TypeError, ValueError: it was something else.
+    """
     if not SHARD_NAME.fullmatch(row["name"]):
         raise ValueError(f"shard name {row['name']!r}")
-    members = [(str(name), int(at), int(size)) for name, at, size in row.pop("members")]
+    members = [(str(name), int(at), int(size)) for name, at, size in row["members"]]
     for name, at, size in members:
         placed = 0 <= at < _MOST_BYTES and 0 <= size <= MAX_MEMBER_BYTES
         if not (MEMBER_NAME.fullmatch(name) and placed):
             raise ValueError(f"member {name!r} of {size} bytes at {at}")
-    return ShardEntry(**row, members=MemberTable(members))
+    return ShardEntry(**{**row, "members": MemberTable(members)})

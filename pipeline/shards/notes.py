@@ -1,17 +1,16 @@
 """Notes on packed shards until the manifest lists them, so that none has to be read again."""
 
-import dataclasses
 import json
 
 from storage.atomic import write_atomically
 from storage.layout import DatasetFolder
-from storage.manifest import ShardEntry, index_shard
+from storage.manifest import ShardEntry, index_shard, shard_of_row, shard_row
 
 
 def note_shard(folder: DatasetFolder, shard: ShardEntry) -> None:
     """Write down what the manifest will say of a shard; safe to repeat."""
     path = folder.staged_entries / f"{shard.name}.json"
-    write_atomically(path, json.dumps(dataclasses.asdict(shard)).encode())
+    write_atomically(path, json.dumps(shard_row(shard)).encode())
 
 
 def noted_shard(folder: DatasetFolder, name: str) -> ShardEntry:
@@ -24,9 +23,7 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardEntry:
     """
     path, shard = folder.staged_entries / f"{name}.json", folder.shard(name)
     try:
-        row = json.loads(path.read_bytes())
-        row["members"] = tuple((key, at, size) for key, at, size in row["members"])
-        entry = ShardEntry(**row)
+        entry = shard_of_row(json.loads(path.read_bytes()))
         facts = shard.stat()
         if entry.num_bytes == facts.st_size and path.stat().st_mtime_ns >= facts.st_mtime_ns:
             return entry

@@ -16,6 +16,7 @@ from pipeline.flows.accept_scene_files import (
     settings_for_files,
 )
 from pipeline.flows.builds import named_build
+from pipeline.flows.order import DatasetOrder
 from pipeline.flows.prepare_isolated import asset_child
 from pipeline.flows.publication import begin
 from pipeline.flows.scene_files import SceneFiles, build_scene, find_scene_files
@@ -180,7 +181,7 @@ def test_without_wish_there_are_as_many_views_as_every_file_has(folder: Path) ->
     with pytest.raises(TrilightError, match="--views is 0"):
         _settings(folder, views=0)
     with pytest.raises(TrilightError, match="only with --scenes-from"):
-        settings_for_files(named_build("smoke"), None, 1)
+        DatasetOrder(views=1)
 
 
 def test_unknown_fields_become_notes(folder: Path) -> None:

@@ -206,6 +206,6 @@ def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) 
             assert min(sheet.size) > 200
     missing = CliRunner().invoke(app, ["evaluate", str(tmp_path / "no"), *data])
     assert isinstance(missing.exception, TrilightError)
-    assert "no checkpoint here" in str(missing.exception)
+    assert "no such file or folder" in str(missing.exception)
     empty = CliRunner().invoke(app, ["evaluate", str(weights), *data])
     assert "the test split holds no scene" in str(empty.exception)

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import load
 
 from storage.dataset import Dataset
 from storage.errors import TrilightError
@@ -74,7 +76,9 @@ def test_a_list_gives_the_same_weights_and_says_what_it_lacks(
     listener = StopAt(99)
     pattern = f"{server.url}/{{train-000000,train-000001,train-000002,validation-000000}}.tar"
     result = trained(tiny_run(), [pattern], tmp_path / "out", progress=listener)
-    assert result.folder.weights.read_bytes() == weights
+    # the header alone differs: without a manifest nobody knows how large the scenes may be
+    ours, theirs = load(result.folder.weights.read_bytes()), load(weights)
+    assert ours.keys() == theirs.keys() and all(torch.equal(ours[n], theirs[n]) for n in ours)
     assert listener.notes == [NO_MANIFEST]
     with pytest.raises(TrilightError, match=r"resume: data\.digest is"):
         trained(tiny_run(), [str(dataset.folder.root)], tmp_path / "out", resume=True)

@@ -43,7 +43,7 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
         run(second, dataset, tmp_path / "third", Start())
     with pytest.raises(TrilightError, match="add --set from_weights=true"):
         run(tiny_run(), dataset, tmp_path / "third", Start(begin_with=place))
-    with pytest.raises(TrilightError, match="no checkpoint here"):
+    with pytest.raises(TrilightError, match="no such file or folder"):
         run(second, dataset, tmp_path / "third", Start(begin_with=str(tmp_path / "none")))
 
 
