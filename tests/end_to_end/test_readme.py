@@ -67,7 +67,7 @@ def _run(command: str, folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(2400)
+@pytest.mark.timeout(3600)
 def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
     """All of them, in order; only the user's own dataset and training are smaller."""
     _copy_of_the_project(tmp_path)
