@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
-from model.config import VERTEX_COORDINATES, ModelConfig
+from model.config import ModelConfig
 from model.image_head import LAST_CHANNELS
 from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
@@ -86,14 +86,12 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
         "bundle self-attention": 8 * q * d * d + 4 * d * _pairs(config, per_side),
         "view feed-forward": 6 * q * d * f,
     }
-    # nine coordinates of each token, turned into each camera's space by a 3 x 3 matrix
-    to_camera = 2 * 3 * VERTEX_COORDINATES * n
     return {
         "triangle tokens": 2 * workload.triangles * token_inputs * d,
         "triangle self-attention": config.encoder_layers * (8 * n * d * d + 4 * n * n * d),
         "triangle feed-forward": config.encoder_layers * 6 * n * d * f,
         "keys and values": config.decoder_layers * 4 * n * d * d,
-        "bundle tokens": views * (2 * q * 3 * config.patch_px**2 * d + to_camera),
+        "bundle tokens": views * 2 * q * 3 * config.patch_px**2 * d,
         **{name: views * config.decoder_layers * count for name, count in layers.items()},
         "head": views * _head(config, per_side),
     }

@@ -43,6 +43,9 @@ def _locked(path: Path, wait: bool) -> int | None:
         except FileNotFoundError:  # the folder went between the two calls: its owner was done
             continue
         except OSError as error:
+            # mkdir looks twice: what was there at first may be gone at the second look
+            if isinstance(error, FileExistsError) and not path.parent.is_file():
+                continue
             raise write_error(path, error) from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))

@@ -14,7 +14,16 @@ from storage.errors import TrilightError
 if TYPE_CHECKING:
     from infra.bench.harness import Options, Result
 
-_NAMES = ("assets", "exchange", "orchestration", "render", "scenes", "shards", "streaming")
+_NAMES = (
+    "assets",
+    "exchange",
+    "model",
+    "orchestration",
+    "render",
+    "scenes",
+    "shards",
+    "streaming",
+)
 
 _Measured = TypeVar("_Measured", bound="Result")
 
@@ -41,7 +50,9 @@ def bench(
     ] = None,
     part: Annotated[
         list[str] | None,
-        typer.Option(help="of render: frontier, throughput or cost; may be repeated [all]"),
+        typer.Option(
+            help="render: frontier, throughput, cost; model: cases, growth; may be repeated [all]"
+        ),
     ] = None,
     scenes: Annotated[
         Path | None, typer.Option(help="render: folder of RenderFormer scenes to add to the set")
@@ -114,6 +125,8 @@ def _named(name: str) -> list[_Benchmark[Any]]:
         from infra.bench import exchange
 
         return [_whole(exchange, exchange)]
+    if name == "model":
+        return _model_parts()
     if name == "orchestration":
         from infra.bench import orchestration
 
@@ -143,6 +156,16 @@ def _whole(module: Any, report: Any, part: str = "") -> _Benchmark[Any]:
         plot=report.plot,
         part=part,
     )
+
+
+def _model_parts() -> list[_Benchmark[Any]]:
+    try:
+        from infra.bench.model import cases, cases_report, growth
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise TrilightError("bench model: torch is not installed; run `make setup-all`.") from error
+    return [_whole(cases, cases_report, "cases"), _whole(growth, growth, "growth")]
 
 
 def _render_parts() -> list[_Benchmark[Any]]:

@@ -121,6 +121,7 @@ def test_the_digest_of_scenes_does_not_know_the_profile(tmp_path: Path) -> None:
     for shard in dataset.manifest.shards:
         samples = list(dataset.read_shard(shard))
         path = dataset.folder.shard(shard.name)
+        path.unlink()  # a shard is never written over
         write_shard(path, [(sample.key, encode_sample(sample, "compact")) for sample in samples])
         shards.append(index_shard(path))
     write_manifest(

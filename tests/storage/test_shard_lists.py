@@ -98,12 +98,14 @@ def _cut(path: Path) -> None:
 
 def _same_key(path: Path) -> None:
     sample = tiny_sample("000000000")
+    path.unlink()  # a shard is never written over
     write_shard(path, [(sample.key, encode_sample(sample))])
 
 
 def _continued(path: Path) -> None:
     """The end of the first shard's last sample, as a torn pair of shards would hold it."""
     members = encode_sample(tiny_sample("000000001"))
+    path.unlink()
     write_shard(path, [("000000001", {"1.exr": members["1.exr"]})])
 
 
@@ -136,6 +138,7 @@ def _pickled(path: Path) -> None:
     """WebDataset would unpickle it: that would make a folder."""
     bomb = b"cos\nmkdir\n(S'" + str(path.parent / "ran").encode() + b"'\ntR."
     members = encode_sample(tiny_sample("000000009"))
+    path.unlink()
     write_shard(path, [("000000009", {**members, "json": bomb, "extra.pyd": bomb})])
 
 

@@ -30,6 +30,7 @@ def rewrite(dataset: Dataset, name: str, change: Callable[[str, dict[str, bytes]
     for sample in dataset.read_shard(entry):
         members = encode_sample(sample)
         samples.append((change(sample.key, members), members))
+    dataset.folder.shard(name).unlink()  # a shard is never written over
     write_shard(dataset.folder.shard(name), samples)
     shards = tuple(
         index_shard(dataset.folder.shard(shard.name)) for shard in dataset.manifest.shards
