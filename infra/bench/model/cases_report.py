@@ -147,7 +147,7 @@ def plot(result: Comparison, path: Path) -> None:
     memory.set_xlabel("peak memory beyond the weights, as a share of its")
     for axes in (speed, memory):
         axes.grid(axis="x", alpha=0.3)
-    speed.legend(loc="lower right")
+    speed.legend(loc="upper right")
     figure.suptitle(
         f"205 M parameters, matmul in bfloat16 {matmul_ratio(result):.1f} x, {result.date}"
     )
