@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.flows.file_child import file_child
 from pipeline.flows.scene_source import LoadedScene, SceneSource, load_source, source_keys
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.isolation import ChildFailed
 from pipeline.scenes.renderformer_json_write import described_files
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
@@ -21,7 +22,6 @@ from storage.scene import Scene
 from storage.scene_file import encode_scene
 from storage.usd.export import SUFFIXES, write_usd, write_usd_shard
 
-_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
 _EXPECTED = "expected the name of a file: .usda .usdc .usdz, .json, .h5 or .safetensors"
 
 
@@ -55,7 +55,7 @@ def convert_scene(
     suffix = target.suffix.lower()
     if suffix not in (*SUFFIXES, ".json", ".h5", ".safetensors") or target.is_dir():
         raise TrilightError(f"{target}: cannot be written as a scene; {_EXPECTED}.")
-    child = IsolatedChild(limits=_LIMITS, setup=_no_set_up)
+    child = file_child()
     try:
         keys = child.call(source_keys, source)
         if not keys:
@@ -79,10 +79,6 @@ def convert_scene(
         triangles=sum(each.triangles for each in found),
         notes=tuple(dict.fromkeys(note for each in found for note in each.notes)),
     )
-
-
-def _no_set_up() -> None:
-    pass
 
 
 def write_scene(

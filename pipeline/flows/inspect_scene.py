@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.flows.file_child import file_child
 from pipeline.flows.scene_source import SceneSource, load_source
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.isolation import ChildFailed
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.atomic import write_atomically
@@ -24,7 +25,6 @@ from storage.scene_file import scene_digest
 VIEWS, ROWS = 8, 2
 """Pictures of a turntable, and the rows in which they stand."""
 
-_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=2)
 _RESOLUTION, _SPP = 192, 64
 _FOV_DEG, _ELEVATION_DEG = 40.0, 25.0
 
@@ -47,7 +47,7 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
     """
     if turntable is not None and turntable.suffix.lower() != ".png":
         raise TrilightError(f"--turntable is {turntable}; expected the name of a file X.png.")
-    child = IsolatedChild(limits=_LIMITS, setup=_no_set_up)
+    child = file_child()
     try:
         found = child.call(_facts, source)
         if turntable is not None:
@@ -62,10 +62,6 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
     finally:
         child.close()
     return found
-
-
-def _no_set_up() -> None:
-    pass
 
 
 def _facts(source: SceneSource) -> InspectedScene:

@@ -7,6 +7,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.flows.file_child import file_child
 from pipeline.flows.scene_source import (
     LoadedScene,
     SceneSource,
@@ -14,17 +15,15 @@ from pipeline.flows.scene_source import (
     load_source,
     source_keys,
 )
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result
+from pipeline.isolation import ChildFailed, Result
 from storage.errors import TrilightError
-
-_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
 
 
 class SceneReader:
     """One child for any number of sources; close it, or use it in a `with` block."""
 
     def __init__(self) -> None:
-        self._child = IsolatedChild(limits=_LIMITS, setup=_no_set_up)
+        self._child = file_child()
 
     def scenes_of(self, source: SceneSource) -> list[SceneSource]:
         """Return each scene that a file holds as a source of its own, in the order of the file.
@@ -61,7 +60,3 @@ class SceneReader:
             return self._child.call(function, source)
         except ChildFailed as failure:
             raise TrilightError(f"{source.name}: could not be read ({failure}).") from failure
-
-
-def _no_set_up() -> None:
-    pass

@@ -1,5 +1,6 @@
 """Notes on packed shards until the manifest lists them, so that none has to be read again."""
 
+import contextlib
 import json
 
 from storage.atomic import write_atomically
@@ -22,13 +23,12 @@ def noted_shard(folder: DatasetFolder, name: str) -> ShardEntry:
         TrilightError: the file is not a whole shard.
     """
     path, shard = folder.staged_entries / f"{name}.json", folder.shard(name)
-    try:
+    # a kill before the note leaves none; then, and where it is no note, the shard itself is read
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         entry = shard_of_row(json.loads(path.read_bytes()))
         facts = shard.stat()
         if entry.num_bytes == facts.st_size and path.stat().st_mtime_ns >= facts.st_mtime_ns:
             return entry
-    except (OSError, ValueError, KeyError, TypeError):
-        pass  # killed before the note
     return index_shard(shard)
 
 
