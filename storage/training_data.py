@@ -42,6 +42,8 @@ class TrainingData:
     """By split; those without a shard are left out."""
     num_views: int | None
     """Pictures per scene, where a manifest says it."""
+    build: str | None = None
+    """Name of the build, where a manifest says it."""
     max_triangles: int | None = None
     """Most triangles of a scene, where a manifest says it."""
     notes: tuple[str, ...] = ()
@@ -100,6 +102,7 @@ def _of_dataset(root: str) -> TrainingData:
         digest=dataset.digest,
         splits=splits,
         num_views=dataset.manifest.num_views,
+        build=dataset.manifest.build,
         max_triangles=_max_triangles(dataset.manifest),
     )
 

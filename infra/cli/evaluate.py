@@ -67,6 +67,7 @@ def evaluate(
     about = {
         "network": Path(checkpoint).name,
         "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],  # no path of this machine
+        "build": opened.build or "unknown",
         "data digest": opened.digest,
         "split": split,
         "resolution": contest.resolution,

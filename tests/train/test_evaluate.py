@@ -12,14 +12,17 @@ from typer.testing import CliRunner
 
 from infra.cli.app import app
 from infra.excursion_plots import plot_excursions
+from model.light_groups import light_groups
 from model.weights import encode_weights
+from pipeline.flows.judging_builds import JUDGING_BUILDS
 from storage.dataset import Dataset
 from storage.errors import TrilightError
+from storage.scene import Scene
 from storage.seeds import rng_for
 from storage.training_data import open_training_data
 from tests.train.kit import tiny_run
 from tests.train.test_loss_lpips import small_weights
-from tests.train.toy import toy_sample, write_toy_dataset
+from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.evaluate import (
     Contest,
@@ -28,10 +31,12 @@ from train.evaluation.evaluate import (
     worst_and_median,
     worst_of_each_excursion,
 )
+from train.evaluation.grouped_lights import GROUPED, grouped_pictures
 from train.evaluation.groups import by_group, summary
-from train.evaluation.judge import median_picture
+from train.evaluation.judge import median_picture, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
 from train.evaluation.picture_scores import MEANING, hdr_flip, picture_scores
+from train.evaluation.published import BENCHMARK
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals
 from train.loop.state import new_state
@@ -103,6 +108,30 @@ def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
     assert len(judged_views(few, lambda: None)) == 2
     with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):
         judged_views(dataclasses.replace(contest(dataset), resolution=24), lambda: None)
+
+
+SCORES = dict.fromkeys(MEANING, 31.0) | {"lpips": None, "log_l1": 0.1}
+
+
+def with_lights(scene: Scene, lights: int) -> Scene:
+    """Return the scene with its last triangle, which shines, so many times, a step apart."""
+    corners = scene.vertex_positions[scene.faces[-1]]
+    added = np.concatenate([corners + np.array([0, 0, 0.1 * step]) for step in range(1, lights)])
+    first = len(scene.vertex_positions)
+    return dataclasses.replace(
+        scene,
+        vertex_positions=np.concatenate([scene.vertex_positions, added.astype(np.float32)]),
+        vertex_normals=np.concatenate(
+            [scene.vertex_normals, np.tile(scene.vertex_normals[-3:], (lights - 1, 1))]
+        ),
+        faces=np.concatenate(
+            [scene.faces, np.arange(first, first + len(added), dtype=np.uint32).reshape(-1, 3)]
+        ),
+        material_index=np.append(
+            scene.material_index, np.repeat(scene.material_index[-1], lights - 1)
+        ),
+        object_index=np.append(scene.object_index, np.repeat(scene.object_index[-1], lights - 1)),
+    )
 
 
 def row(number: int, **changes: object) -> JudgedView:
@@ -179,6 +208,38 @@ def test_the_page_prints_na_and_escapes_what_comes_from_outside() -> None:
     assert "a\\|b\\<c\\>" in page and "x\\_y" in page
     (line,) = [line for line in page.splitlines() if line.startswith("| lpips (lower")]
     assert line.endswith("| n/a |")
+
+
+def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> None:
+    network = new_state(tiny_run()).model
+    scene = toy_scene(0)
+    assert grouped_pictures(network, scene, 16) is None, "one light is one group"
+    many = with_lights(scene, 20)
+    grouped = grouped_pictures(network, many, 16)
+    assert grouped is not None and grouped.shape == (2, 16, 16, 3)
+    # by hand: every group's picture times its share, the same sums in another order
+    expected = sum(
+        group.share
+        * predict(
+            network, training_scene(dataclasses.replace(toy_sample(0), scene=group.scene), 16)
+        )
+        for group in light_groups(many, 8)
+    )
+    np.testing.assert_allclose(grouped, expected, rtol=1e-5, atol=1e-6)
+    alone, both = row(0), row(1, scores={NETWORK: SCORES, GROUPED: SCORES | {"ssim": 0.5}})
+    assert record([alone], {})["light passes"] is None
+    found = record([alone, both], {})
+    assert list(found["contestants"]) == [NETWORK], "a column is of all views"
+    assert found["light passes"]["groups"]["views"] == 1
+    page = markdown(found)
+    assert "| groups | 1 | 31.00 | 31.00 | 31.00 | 0.5000 |" in page, page
+
+
+def test_the_benchmark_stands_beside_the_paper() -> None:
+    assert record([row(0)], {"build": "smoke"})["published"] is None
+    page = markdown(record([row(0)], {"build": BENCHMARK}))
+    assert BENCHMARK in JUDGING_BUILDS
+    assert "| psnr_linear_db | 29.8 | 30.00 |" in page and "| lpips | 0.055 | n/a |" in page
 
 
 def test_facts_come_from_the_scene() -> None:

@@ -1,7 +1,7 @@
 """A network against every view of a split, beside what knows nothing about scenes."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from storage.shard_set import ShardSet
 from train.data.scenes import TrainingScene, training_scene
 from train.data.splits import first_samples
 from train.data.unusable import Unusable
+from train.evaluation.grouped_lights import GROUPED, grouped_pictures
 from train.evaluation.judge import JudgedScene, judged_scene, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
 from train.evaluation.picture_scores import floors_of, picture_scores
@@ -73,9 +74,13 @@ def judged_views(contest: Contest, scene_done: Callable[[], None]) -> list[Judge
     rows: list[JudgedView] = []
     for sample in contest.samples():
         judged = judged_scene(sample, contest.resolution)
-        pictures = predict(contest.network, judged.scene)
+        contestants = {NETWORK: predict(contest.network, judged.scene)}
+        grouped = grouped_pictures(contest.network, sample.scene, contest.resolution)
+        if grouped is not None:
+            contestants[GROUPED] = grouped
         rows += [
-            _judged(contest, sample, judged, view, picture) for view, picture in enumerate(pictures)
+            _judged(contest, sample, judged, view, contestants)
+            for view in range(len(judged.target_VRR3))
         ]
         scene_done()
     if not rows:
@@ -84,10 +89,14 @@ def judged_views(contest: Contest, scene_done: Callable[[], None]) -> list[Judge
 
 
 def _judged(
-    contest: Contest, sample: Sample, judged: JudgedScene, view: int, picture: NDArray[np.float64]
+    contest: Contest,
+    sample: Sample,
+    judged: JudgedScene,
+    view: int,
+    contestants: Mapping[str, NDArray[np.float64]],
 ) -> JudgedView:
     target, hits = judged.target_VRR3[view], judged.hits_VRR[view]
-    pictures = {NETWORK: picture}
+    pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}
     if contest.rivals is not None:
         pictures |= contest.rivals.pictures(target)
     return JudgedView(

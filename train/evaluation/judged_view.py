@@ -35,7 +35,7 @@ class JudgedView:
     floors: dict[str, float]
     """What the target's noise alone would score (picture_scores.floors_of)."""
     scores: dict[str, dict[str, float | None]]
-    """By contestant and metric; None is n/a."""
+    """By contestant and metric; None is n/a. Not every view has every contestant."""
 
     def gap(self, metric: str, contestant: str = NETWORK) -> float | None:
         """Return how much worse the picture is than the noise of its target; below 0: not worse."""

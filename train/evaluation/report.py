@@ -4,9 +4,11 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from train.evaluation.grouped_lights import passes_compared
 from train.evaluation.groups import NEAR_DB, by_group, summary
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.picture_scores import DECIMALS, HIGHER_IS_BETTER, MEANING
+from train.evaluation.published import PUBLISHED_WHERE, published_beside
 
 NOT_AVAILABLE = "n/a"
 
@@ -21,7 +23,13 @@ def record(views: Sequence[JudgedView], about: Mapping[str, Any]) -> dict[str, A
     return {
         "about": dict(about),
         "metrics": MEANING,
-        "contestants": {name: summary(views, name) for name in views[0].scores},
+        "contestants": {
+            name: summary(views, name)
+            for name in views[0].scores
+            if all(name in view.scores for view in views)
+        },
+        "light passes": passes_compared(views),
+        "published": published_beside(views, about),
         "groups": by_group(views),
         "views": [dataclasses.asdict(view) for view in views],
     }
@@ -35,6 +43,7 @@ def markdown(found: Mapping[str, Any]) -> str:
     lines += _contestants(found["contestants"])
     network = found["contestants"][NETWORK]
     lines += ["", *_against_noise(network)]
+    lines += _published(found["published"]) + _light_passes(found["light passes"])
     for split, parts in found["groups"].items():
         lines += ["", f"## By {split}", "", *_parts(parts)]
     lines += ["", "## What the figures are", ""]
@@ -64,6 +73,39 @@ def _against_noise(network: Mapping[str, Any]) -> list[str]:
         "",
         f"{network['near_floor']:.1%} of {network['views']} views are within {NEAR_DB:g} dB of "
         "their floor.",
+    ]
+
+
+def _published(beside: Mapping[str, Any] | None) -> list[str]:
+    if beside is None:
+        return []
+    rows = [
+        [metric, f"{figures['published']:g}", _shown(metric, figures["ours"])]
+        for metric, figures in beside.items()
+    ]
+    return [
+        "",
+        "## Beside the paper",
+        "",
+        f"{PUBLISHED_WHERE} Means, as there.",
+        "",
+        *_table(["metric", "published", "this network"], rows),
+    ]
+
+
+def _light_passes(passes: Mapping[str, Any] | None) -> list[str]:
+    if passes is None:
+        return []
+    rows = [
+        [name, str(part["views"])]
+        + [_shown(metric, part[metric]["median"]) for metric in HIGHER_IS_BETTER]
+        for name, part in passes.items()
+    ]
+    return [
+        "",
+        "## Many lights: one pass, or groups added up",
+        "",
+        *_table(["", "views", *HIGHER_IS_BETTER], rows),
     ]
 
 
