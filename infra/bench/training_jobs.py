@@ -90,9 +90,9 @@ def _network(width: int, layers: int) -> ModelConfig:
 
 PLANS: Mapping[str, Plan] = {
     "cpu": Plan(
-        sizes={"small": _network(64, 2), "large": _network(128, 4)},
+        sizes={"small": _network(64, 2), "large": _network(128, 3)},
         resolution=64,
-        num_steps=800,
+        num_steps=500,
         scenes_per_step=4,
     ),
     "gpu": Plan(

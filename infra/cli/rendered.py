@@ -1,5 +1,6 @@
 """What `trilight render` says when it is done."""
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,7 +10,7 @@ from rich.text import Text
 
 from infra.cli.console import console, print_json, print_rows
 from infra.rendering.picture_file import PictureFile
-from infra.rendering.run import FinishedShot
+from infra.rendering.run import FinishedShot, Flicker
 from infra.rendering.session import Asked, Outcome
 
 Rows = list[tuple[str, str]]
@@ -54,6 +55,9 @@ def _shot_json(shot: FinishedShot) -> dict[str, Any]:
         (of_engines,) = of_engines.values()
     else:
         of_engines = {**of_engines, "psnr_log_db": round(shot.psnr_log_db or 0, 3)}
+        if shot.flicker is not None:
+            flicker = dataclasses.asdict(shot.flicker)
+            of_engines["flicker"] = {name: round(value, 3) for name, value in flicker.items()}
     return {
         "lights": shot.scene.num_lights,
         "png": str(shot.png),
@@ -113,6 +117,7 @@ def _print_sequence(asked: Asked, outcome: Outcome, seconds: float) -> None:
     ]
     agreements = [shot.psnr_log_db for shot in outcome.shots if shot.psnr_log_db is not None]
     rows += _spread("noise floor", floors) + _spread("agreement", agreements)
+    rows += _flicker([shot.flicker for shot in outcome.shots if shot.flicker is not None])
     rows.append(("wall time", f"{seconds:.1f} s"))
     print_rows("Rendered", rows)
     look = outcome.place.video or outcome.place.folder
@@ -126,3 +131,12 @@ def _spread(name: str, values_db: Sequence[float]) -> Rows:
         return []
     median, low = np.median(values_db), np.percentile(values_db, 5)
     return [(name, f"median {median:.1f} dB, 5th percentile {low:.1f} dB (psnr_log_db)")]
+
+
+def _flicker(found: Sequence[Flicker]) -> Rows:
+    if not found:
+        return []
+    median = np.median([flicker.db for flicker in found])
+    noise = np.median([flicker.noise_db for flicker in found])
+    text = f"median {median:.1f} dB from frame to frame; the traced frames' noise alone {noise:.1f}"
+    return [("flicker", text)]

@@ -4,9 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from numpy.typing import NDArray
+
 from infra.rendering.cameras import Shot, own_camera
 from infra.rendering.comparison import comparison_sheet
 from infra.rendering.engines import Engine
+from infra.rendering.flicker import flicker_db, log_error, noise_flicker_db
 from infra.rendering.picture_file import (
     PictureFile,
     Radiance,
@@ -18,7 +21,7 @@ from infra.rendering.places import Place
 from infra.rendering.tone_maps import ToneMap, tone_mapped
 from pipeline.documents.png import encode_png
 from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_source import LoadedScene
+from pipeline.flows.scene_source import LoadedScene, SceneSource
 from storage.atomic import write_atomically
 from storage.lights import num_lights
 from storage.metrics import psnr_log_db
@@ -39,6 +42,26 @@ class SceneFacts:
     """Emitter objects."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Flicker:
+    """Of the network's error between two pictures in a row (infra.rendering.flicker)."""
+
+    db: float
+    """Higher is calmer."""
+    noise_db: float
+    """What the noise of the traced pictures alone would show."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Frame:
+    """What the next picture is compared with."""
+
+    error_RR3: NDArray
+    """infra.rendering.flicker.log_error."""
+    noise_floor_db: float
+    """Of the traced picture."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FinishedShot:
     """What came of one shot."""
@@ -51,6 +74,8 @@ class FinishedShot:
     """What people look at."""
     psnr_log_db: float | None
     """Of the network's picture against the traced one, where there are both."""
+    flicker: Flicker | None
+    """Since the picture before, of the same scene or stage, where there are both engines."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,6 +86,11 @@ class _OpenScene:
     facts: SceneFacts
     opened_by: set[str]
     """Engines that have taken it."""
+
+
+def _is_next_frame(source: SceneSource, before: SceneSource) -> bool:
+    """Return whether two sources are moments of one stage; a shard's scenes are strangers."""
+    return source.path == before.path and source.path.suffix != ".tar"
 
 
 class ShotRun:
@@ -79,6 +109,7 @@ class ShotRun:
         """
         self._engines, self._place = engines, place
         self._view, self._tone_map = view, tone_map
+        self._before: _Frame | None = None
         self.notes: dict[str, None] = {}
         """What a person should know, each once, in order."""
 
@@ -90,6 +121,8 @@ class ShotRun:
         for index, shot in enumerate(wanted):
             if scene is None or shot.source != wanted[index - 1].source:
                 scene = self._read(shot, reader)
+                if index and not _is_next_frame(shot.source, wanted[index - 1].source):
+                    self._before = None
             finished.append(self._finish(index, shot, scene))
             done(index + 1)
         return finished
@@ -111,17 +144,32 @@ class ShotRun:
         for engine in self._engines:
             found = self._picture(engine, stem, shot, scene)
             files[engine.name], radiances[engine.name] = found
-        agreement = None
+        agreement, flicker = None, None
         if len(self._engines) == 1:
             (radiance_rgb,) = radiances.values()
             shown = tone_mapped(radiance_rgb, self._tone_map)
         else:
             traced, neural = radiances["mitsuba"], radiances["neural"]
             agreement = psnr_log_db(neural, traced)
+            floor_db = float(files["mitsuba"].facts["noise_floor_db"])
+            flicker = self._flicker(log_error(neural, traced), floor_db)
             shown = comparison_sheet(traced, neural, self._tone_map)
         png = Path(f"{stem}.png")
         write_atomically(png, encode_png(shown))
-        return FinishedShot(scene=scene.facts, pictures=files, png=png, psnr_log_db=agreement)
+        return FinishedShot(
+            scene=scene.facts, pictures=files, png=png, psnr_log_db=agreement, flicker=flicker
+        )
+
+    def _flicker(self, error_RR3: NDArray, noise_floor_db: float) -> Flicker | None:
+        """Compare with the picture before, and be what the next one is compared with."""
+        before = self._before
+        self._before = _Frame(error_RR3=error_RR3, noise_floor_db=noise_floor_db)
+        if before is None:
+            return None
+        return Flicker(
+            db=flicker_db(before.error_RR3, error_RR3),
+            noise_db=noise_flicker_db(before.noise_floor_db, noise_floor_db),
+        )
 
     def _exr(self, stem: Path, engine: Engine) -> Path:
         return Path(f"{stem}.exr" if len(self._engines) == 1 else f"{stem}.{engine.name}.exr")

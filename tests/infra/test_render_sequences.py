@@ -57,13 +57,26 @@ def test_a_stage_that_moves_is_drawn_frame_by_frame_by_both_engines(tmp_path: Pa
     assert found["video"] is None
     assert len({picture["scene_sha256"] for picture in found["pictures"]}) == 3
     assert all(0 < picture["psnr_log_db"] < 100 for picture in found["pictures"])
+    # by hand from the files: what of the error is another in the next frame
+    errors = [
+        np.log10(1 + decode_exr((out / f"{at:06d}.neural.exr").read_bytes()))
+        - np.log10(1 + decode_exr((out / f"{at:06d}.mitsuba.exr").read_bytes()))
+        for at in range(3)
+    ]
+    changes = [np.mean((errors[at + 1] - errors[at]) ** 2) for at in range(2)]
+    flicker = [picture.get("flicker") for picture in found["pictures"]]
+    assert flicker[0] is None
+    for at in range(2):
+        # files hold half floats of radiance: 5e-4 of a value, 0.01 dB of an error above 0.1
+        assert flicker[at + 1]["db"] == pytest.approx(-10 * np.log10(changes[at]), abs=0.05)
+        assert flicker[at + 1]["noise_db"] > 0
     names = sorted(path.name for path in out.iterdir())
     suffixes = ("mitsuba.exr", "neural.exr", "png")
     assert names == [f"{at:06d}.{suffix}" for at in range(3) for suffix in suffixes]
     words = ["render", path, "--out", out, "--engine", "both", "--checkpoint", network, *SMALL]
     printed = CliRunner().invoke(app, [str(word) for word in words]).output
     assert "6, of which 6 were there already" in printed
-    assert "agreement" in printed
+    assert "agreement" in printed and "flicker" in printed
 
 
 def test_a_shard_is_a_row_of_scenes_each_from_its_camera(tmp_path: Path) -> None:
