@@ -1,5 +1,6 @@
 """Opening a network, wherever it comes from: one function, and no pickle anywhere.
 
+ours, shipped      builtin:
 our own            model.safetensors of `trilight train`, or the folder that holds one
 published, local   a folder with config.json and model.safetensors
 published, hub     microsoft/renderformer-v1-base, microsoft/renderformer-v1.1-swin-large
@@ -24,6 +25,9 @@ WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
 PUBLISHED = ("microsoft/renderformer-v1-base", "microsoft/renderformer-v1.1-swin-large")
 """The published checkpoints' names on the Hugging Face hub."""
 
+BUILTIN = "builtin:"
+"""Name of the small network that comes with Trilight; model/builtin/README.md is its card."""
+
 MAX_CONFIG_BYTES = 1 << 16
 """A published config.json has about 1 KiB."""
 
@@ -35,13 +39,13 @@ def open_checkpoint(source: str) -> RenderFormer:
     """Return the network of a checkpoint, float32, in evaluation mode on the CPU.
 
     Args:
-        source: a file, a folder, or the name of a repository on the Hugging Face hub.
+        source: BUILTIN, a file, a folder, or the name of a repository on the Hugging Face hub.
 
     Raises:
         TrilightError: there is no such checkpoint, it holds pickled code, or its tensors are not
             those of its configuration; names are listed.
     """
-    path = Path(source)
+    path = checkpoint_path(source)
     if not path.exists():
         if path.suffix in _PICKLES or not _HUB_NAME.fullmatch(source):
             raise TrilightError(
@@ -64,6 +68,11 @@ def open_checkpoint(source: str) -> RenderFormer:
     if CONFIG_KEY in metadata:
         return from_tensors(tensors, metadata)
     return from_published(tensors, _read_config(weights.parent / CONFIG_NAME))
+
+
+def checkpoint_path(source: str) -> Path:
+    """Return the file or folder that is meant; of a name on the hub there is none yet."""
+    return Path(__file__).parent / "builtin" / WEIGHTS_NAME if source == BUILTIN else Path(source)
 
 
 def _has_pickles(folder: Path) -> bool:

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.checkpoints import WEIGHTS_NAME, open_checkpoint
+from model.checkpoints import WEIGHTS_NAME, checkpoint_path, open_checkpoint
 from model.encoded_scene import EncodedScene
 from model.light_groups import light_groups
 from model.precision import set_precision
@@ -54,7 +54,7 @@ class NeuralRenderer:
             trained: what it was trained on, if that is known.
         """
         self._model = model.eval()
-        self._trained = trained
+        self._trained = trained or TrainedRange()
 
     @classmethod
     def load(
@@ -110,7 +110,7 @@ class NeuralRenderer:
         """
         self.require_resolution(resolution)
         prepared = self.prepare(scene)
-        for note in prepared.notes:
+        for note in (*prepared.notes, *self.resolution_notes(resolution)):
             warnings.warn(note, stacklevel=2)
         return np.stack(
             [
@@ -171,6 +171,21 @@ class NeuralRenderer:
                 "this network's ray bundles and windows need."
             )
 
+    @property
+    def trained_resolution(self) -> int | None:
+        """Pixels across the pictures that it was trained on, if that is known."""
+        return self._trained.resolution
+
+    def resolution_notes(self, resolution: int) -> tuple[str, ...]:
+        """Return what a person should know of pictures of this width by this network."""
+        trained = self.trained_resolution
+        if trained is None or resolution == trained:
+            return ()
+        return (
+            f"pictures of {resolution} pixels, and the network was trained on {trained}: expect "
+            f"a worse one than with --resolution {trained}",
+        )
+
     def _notes(self, scene: Scene, num_groups: int) -> tuple[str, ...]:
         notes = []
         if num_groups > 1:
@@ -178,10 +193,11 @@ class NeuralRenderer:
                 f"the {int(scene.triangle_emits.sum())} emitting triangles are rendered in "
                 f"{num_groups} groups, whose pictures are added"
             )
-        if self._trained is not None and scene.num_triangles > self._trained.max_triangles:
+        most = self._trained.max_triangles
+        if most is not None and scene.num_triangles > most:
             notes.append(
-                f"{scene.num_triangles} triangles, and the network was trained on at most "
-                f"{self._trained.max_triangles}: expect less detail (trilight convert --budget)"
+                f"{scene.num_triangles} triangles, and the network was trained on at most {most}: "
+                "expect less detail (trilight convert --budget)"
             )
         return tuple(notes)
 
@@ -229,7 +245,7 @@ def _trained_range(source: str) -> TrainedRange | None:
 
 
 def _weights_file(source: str) -> Path:
-    path = Path(source)
+    path = checkpoint_path(source)
     return path / WEIGHTS_NAME if path.is_dir() else path
 
 

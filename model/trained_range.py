@@ -15,17 +15,19 @@ MAX_LIGHTS = 8
 
 @dataclass(frozen=True, kw_only=True)
 class TrainedRange:
-    """The largest scenes of the training data."""
+    """The largest scenes and the pictures of the training data; None where nobody said."""
 
-    max_triangles: int
+    max_triangles: int | None = None
     """Of a whole scene."""
+    resolution: int | None = None
+    """Pixels across the pictures."""
 
     def as_metadata(self) -> dict[str, str]:
         """Return the entries for the metadata of a safetensors file."""
         return {RANGE_KEY: json.dumps(asdict(self), sort_keys=True)}
 
 
-PUBLISHED = TrainedRange(max_triangles=4096)
+PUBLISHED = TrainedRange(max_triangles=4096, resolution=512)
 """Of the published checkpoints: their second stage (Zeng et al. 2025)."""
 
 
@@ -39,6 +41,9 @@ def trained_range(metadata: Mapping[str, str]) -> TrainedRange | None:
         return None
     try:
         fields = json.loads(metadata[RANGE_KEY])
-        return TrainedRange(max_triangles=int(fields["max_triangles"]))
-    except (KeyError, TypeError, ValueError) as error:
+        known = {name: fields.get(name) for name in ("max_triangles", "resolution")}
+        return TrainedRange(
+            **{name: None if value is None else int(value) for name, value in known.items()}
+        )
+    except (AttributeError, TypeError, ValueError) as error:
         raise TrilightError(f"{RANGE_KEY}: not readable ({error}).") from error

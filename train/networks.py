@@ -3,12 +3,14 @@
 import json
 from pathlib import Path
 
-from model.checkpoints import open_checkpoint
+from model.checkpoints import checkpoint_path, open_checkpoint
 from model.renderformer import RenderFormer
+from model.trained_range import trained_range
 from storage.safe_read import read_safetensors
 from train.folder import RunFolder
 from train.loop.checkpoint import is_checkpoint, read_checkpoint
-from train.loop.checkpoints import checkpoint_path, saved_steps
+from train.loop.checkpoints import checkpoint_path as path_of_step
+from train.loop.checkpoints import saved_steps
 
 
 def open_network(place: str | Path) -> RenderFormer:
@@ -35,10 +37,13 @@ def trained_resolution(place: str | Path) -> int | None:
     if path.is_dir() and RunFolder(path).settings.is_file():
         record = json.loads(RunFolder(path).settings.read_text())
         return int(record["settings"]["resolution"])
+    path = checkpoint_path(str(place))
     if path.is_file():
         _, metadata = read_safetensors(path.read_bytes())
         if is_checkpoint(metadata):
             return int(read_checkpoint(path).header["settings"]["resolution"])
+        known = trained_range(metadata)
+        return known.resolution if known else None
     return None
 
 
@@ -47,5 +52,5 @@ def _run_file(path: Path) -> Path:
     folder = RunFolder(path)
     if path.is_dir() and not folder.weights.is_file():
         if steps := saved_steps(folder.checkpoints):
-            return checkpoint_path(folder.checkpoints, steps[-1])
+            return path_of_step(folder.checkpoints, steps[-1])
     return path

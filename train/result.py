@@ -61,8 +61,7 @@ def finished(
     seconds_before: float,
 ) -> TrainResult:
     """Judge the finished network, write weights, sheet and summary, and return the result."""
-    most = data.max_triangles
-    trained = None if most is None else TrainedRange(max_triangles=most)
+    trained = TrainedRange(max_triangles=data.max_triangles, resolution=settings.resolution)
     write_atomically(folder.weights, encode_weights(state.shown, trained))
     judgement = judge.judge(state.shown)
     loss_at_start, loss_at_end = _losses(folder)

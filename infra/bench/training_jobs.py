@@ -61,6 +61,7 @@ class Job:
             model=plan.sizes[self.size],
             resolution=plan.resolution,
             num_steps=plan.num_steps,
+            learning_rate=1e-3,  # 1.5e-3, of the smoke run, jumps about with so few views a step
             scenes_per_step=plan.scenes_per_step,
             views_per_scene=2,
             warmup_steps=plan.num_steps // 20,
@@ -90,9 +91,9 @@ def _network(width: int, layers: int) -> ModelConfig:
 
 PLANS: Mapping[str, Plan] = {
     "cpu": Plan(
-        sizes={"small": _network(64, 2), "large": _network(128, 3)},
+        sizes={"small": _network(64, 2), "large": _network(128, 2)},
         resolution=64,
-        num_steps=500,
+        num_steps=400,
         scenes_per_step=4,
     ),
     "gpu": Plan(

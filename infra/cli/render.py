@@ -32,9 +32,13 @@ def render(
     ],
     engine: Annotated[str, typer.Option(help="mitsuba, neural, or both side by side")] = "mitsuba",
     checkpoint: Annotated[
-        str | None, typer.Option(help="of the network: model.safetensors of a run")
+        str | None,
+        typer.Option(help="neural: model.safetensors of a run [the small network shipped here]"),
     ] = None,
-    resolution: Annotated[int, typer.Option(help="picture width in pixels")] = 512,
+    resolution: Annotated[
+        int | None,
+        typer.Option(help="picture width in pixels [512; neural: what the network was trained on]"),
+    ] = None,
     noise_floor: Annotated[
         float, typer.Option("--noise-floor", help="mitsuba: target in dB (psnr_log_db)")
     ] = 40.0,
@@ -91,7 +95,7 @@ def render(
     started = time.monotonic()
     with progress_bars() as bars:
         outcome = render_asked(asked, _Bars(bars, visible=not json))
-    print_outcome(asked, outcome, time.monotonic() - started, as_json=json)
+    print_outcome(outcome, time.monotonic() - started, as_json=json)
 
 
 class _Bars:

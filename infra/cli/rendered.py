@@ -16,8 +16,9 @@ from infra.rendering.session import Asked, Outcome
 Rows = list[tuple[str, str]]
 
 
-def print_outcome(asked: Asked, outcome: Outcome, seconds: float, *, as_json: bool) -> None:
+def print_outcome(outcome: Outcome, seconds: float, *, as_json: bool) -> None:
     """Print files and figures: of the only picture, or summed up over all."""
+    asked = outcome.asked
     if as_json:
         shots = [_shot_json(shot) for shot in outcome.shots]
         common = {

@@ -118,7 +118,8 @@ class NeuralEngine:
 
     def open(self, scene: Scene, name: str) -> tuple[str, ...]:
         self._prepared = self._renderer.prepare(scene, lights_per_pass=self._lights_per_pass)
-        return tuple(f"{name}: {note}" for note in self._prepared.notes)
+        of_scene = tuple(f"{name}: {note}" for note in self._prepared.notes)
+        return of_scene + self._renderer.resolution_notes(self._resolution)
 
     def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> Rendered:
         picture = self._renderer.view(self._prepared, c2w, fov_deg, self._resolution)

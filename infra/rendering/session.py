@@ -1,5 +1,6 @@
 """One call of `trilight render`: from what the user asked for to files."""
 
+import dataclasses
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 ENGINES = {"mitsuba": ("mitsuba",), "neural": ("neural",), "both": ("mitsuba", "neural")}
 """What `--engine` may be."""
 
+_RESOLUTION = 512
+
 FIRST_SPP = 2 * PASS_SPP[1]
 """Fewer samples, and the noise floor may flatter (pipeline.renders.noise_floor)."""
 
@@ -41,9 +44,9 @@ class Asked:
     engine: str
     """A key of ENGINES."""
     checkpoint: str | None
-    """Of the network."""
-    resolution: int
-    """Width of pictures."""
+    """Of the network; None for the one that is shipped."""
+    resolution: int | None
+    """Width of pictures; None for what the network was trained on, or 512."""
     noise_floor_db: float
     """Target of the path tracer."""
     max_spp: int
@@ -74,6 +77,8 @@ class Asked:
 class Outcome:
     """What came of it."""
 
+    asked: Asked
+    """With network and width, where none was named."""
     place: Place
     """Where the files are."""
     shots: tuple[FinishedShot, ...]
@@ -102,6 +107,7 @@ def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
             unusable, a scene that cannot be rendered, or files that cannot be written.
     """
     _check(asked)
+    asked = _completed(asked)
     settings, tone_map = _settings(asked), require_tone_map(asked.tone_map)
     if asked.out.suffix.lower() == ".exr":
         scene_source(asked.source)  # a wrong name is said before any library is loaded
@@ -116,6 +122,7 @@ def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
     if where.video is not None:
         write_video(where.video, [shot.png for shot in finished], asked.fps)
     return Outcome(
+        asked=asked,
         place=where,
         shots=tuple(finished),
         settings=settings,
@@ -140,17 +147,43 @@ def _check(asked: Asked) -> None:
             "no --orbit beside it",
         ),
         (
-            neural == (asked.checkpoint is not None),
+            neural or asked.checkpoint is None,
             "--checkpoint",
             asked.checkpoint,
-            "the model.safetensors of a run with --engine neural or both, and only with them",
+            "--engine neural or both beside it",
         ),
     ):
         if not law:
             raise TrilightError(f"{option} is {got}; expected {expected}.")
 
 
+def _completed(asked: Asked) -> Asked:
+    """Return it with the network and the width that are taken where none is named."""
+    checkpoint, resolution = asked.checkpoint, asked.resolution
+    if asked.engine != "mitsuba":
+        _require_torch()
+        from model.checkpoints import BUILTIN
+        from train.networks import trained_resolution
+
+        checkpoint = checkpoint or BUILTIN
+        if resolution is None:
+            resolution = trained_resolution(checkpoint)
+    if resolution is None:
+        resolution = _RESOLUTION
+    return dataclasses.replace(asked, checkpoint=checkpoint, resolution=resolution)
+
+
+def _require_torch() -> None:
+    try:
+        import torch  # noqa: F401
+    except ImportError as error:
+        raise TrilightError(
+            "--engine neural needs PyTorch, which is not installed; expected it: make setup-all."
+        ) from error
+
+
 def _settings(asked: Asked) -> RenderSettings:
+    assert asked.resolution is not None
     return RenderSettings(
         resolution=asked.resolution,
         noise_floor_db=asked.noise_floor_db,
@@ -201,12 +234,8 @@ def _mitsuba(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine
 
 
 def _neural(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
-    try:
-        import torch
-    except ImportError as error:
-        raise TrilightError(
-            "--engine neural needs PyTorch, which is not installed; expected it: make setup-all."
-        ) from error
+    import torch
+
     from model.neural_renderer import NeuralRenderer
 
     if asked.threads is not None:

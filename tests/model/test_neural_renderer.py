@@ -158,10 +158,10 @@ def test_more_triangles_than_trained_are_rendered_with_a_warning(tmp_path: Path)
 
 
 def test_what_it_was_trained_on_goes_round_through_metadata() -> None:
-    known = TrainedRange(max_triangles=1536)
-    assert trained_range(known.as_metadata()) == known
+    for known in (TrainedRange(max_triangles=1536), TrainedRange(resolution=64), TrainedRange()):
+        assert trained_range(known.as_metadata()) == known
     assert trained_range({}) is None
-    for text in ("", "[]", "{}", '{"max_triangles": "many"}'):
+    for text in ("", "[]", '{"max_triangles": "many"}'):
         with pytest.raises(TrilightError, match="trilight_trained_range: not readable"):
             trained_range({RANGE_KEY: text})
 

@@ -131,7 +131,8 @@ def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResu
         assert min(sheet.size) > 200
     weights = folder.weights.read_bytes()
     assert trained_range(safetensors_header(weights)["__metadata__"]) == TrainedRange(
-        max_triangles=64  # of the manifest of the toy dataset
+        max_triangles=64,  # of the manifest of the toy dataset
+        resolution=16,
     )
     model = decode_weights(weights)
     assert sum(weight.numel() for weight in model.parameters()) == whole.num_parameters
