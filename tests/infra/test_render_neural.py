@@ -131,8 +131,7 @@ def test_lights_are_rendered_in_groups_of_the_size_that_is_asked_for(
 def test_mistakes_are_one_line(network: Path, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.exr"
     for words, message in (
-        (("--engine", "neural"), "--checkpoint is None; expected the model.safetensors of a run"),
-        (("--checkpoint", network), "and only with them"),
+        (("--checkpoint", network), "expected --engine neural or both beside it"),
         (
             ("--engine", "neural", "--checkpoint", tmp_path / "no"),
             f"checkpoint {tmp_path / 'no'}: no such file",
