@@ -22,6 +22,7 @@ _NAMES = (
     "render",
     "scenes",
     "shards",
+    "soak",
     "streaming",
 )
 
@@ -141,6 +142,10 @@ def _named(name: str) -> list[_Benchmark[Any]]:
         from infra.bench import shards, shards_report
 
         return [_whole(shards, shards_report)]
+    if name == "soak":
+        from infra.bench import soak
+
+        return [_whole(soak, soak)]
     if name == "streaming":
         from infra.bench import streaming, streaming_report
 

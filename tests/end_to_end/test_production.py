@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from model.neural_renderer import NeuralRenderer
 from storage.dataset import open_dataset
 from storage.verify import verify_dataset
 from tests.end_to_end.production_kit import call, dask_cluster, postgres, served
 
-SMALL = {"objects": "builtin:", "scenes": "12", "resolution": "32", "noise_floor_db": "20"}
-"""Three shards of four tiny scenes."""
-OPTIONS = ("--objects", "builtin:", "--scenes", "12", "--resolution", "32", "--noise-floor", "20")
+SMALL = {"objects": "builtin:", "scenes": "12", "resolution": "64", "noise_floor_db": "20"}
+"""Three shards of four tiny scenes, as wide as the smoke run's pictures."""
+OPTIONS = ("--objects", "builtin:", "--scenes", "12", "--resolution", "64", "--noise-floor", "20")
 CANARY = "CANARY-51b2"
 RUN_S = 900
 """A run takes half a minute; on busy machines many times that."""
@@ -46,11 +47,21 @@ def test_four_ways_one_digest(tmp_path: Path) -> None:
         digests["one worker"] = _verified(tmp_path / "one")
         _run_deployment("build-dataset/local", tmp_path / "two", environment, flow_runs="2")
         digests["two workers"] = _verified(tmp_path / "two")
+        _trains(tmp_path, environment)
         _refuses_secrets(tmp_path, environment)
     with dask_cluster(tmp_path, 2) as address:
         _generate(tmp_path / "dask", "--runner", "dask", "--address", address)
         digests["dask"] = _verified(tmp_path / "dask")
     assert len(set(digests.values())) == 1, digests
+
+
+def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
+    """Learn from what the flows made, as a flow."""
+    where = {"data": f'["{tmp_path / "one"}"]', "out": str(tmp_path / "run"), "steps": "60"}
+    words = [word for key, value in where.items() for word in ("-p", f"{key}={value}")]
+    prefect = ["-m", "prefect", "deployment", "run", "train-model/local", "--watch", *words]
+    call(prefect, environment, RUN_S)
+    assert NeuralRenderer.load(tmp_path / "run").trained_resolution == 64
 
 
 def _refuses_secrets(tmp_path: Path, environment: dict[str, str]) -> None:
