@@ -35,6 +35,20 @@ def smoke() -> TrainSettings:
     )
 
 
+def builtin() -> TrainSettings:
+    """Return the run that the network shipped with Trilight comes from: an hour on one CPU core."""
+    return dataclasses.replace(
+        smoke(),
+        run="builtin",
+        num_steps=2_400,
+        learning_rate=1e-3,
+        warmup_steps=100,
+        ema_decay=0.998,
+        validate_every=200,
+        checkpoint_every=200,
+    )
+
+
 def paper_pretrain() -> TrainSettings:
     """Return the first stage of the paper: 256 pixels, up to 1536 triangles."""
     return TrainSettings(
@@ -119,6 +133,7 @@ def finetune() -> TrainSettings:
 
 RUNS: dict[str, Callable[[], TrainSettings]] = {
     "smoke": smoke,
+    "builtin": builtin,
     "pretrain": pretrain,
     "finetune": finetune,
     "paper-pretrain": paper_pretrain,
