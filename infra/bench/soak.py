@@ -24,7 +24,7 @@ from storage.scene_log import read_scene_logs
 NAME = "soak"
 PARTS = 10
 """Of the run, in the order in which scenes were finished."""
-_EVERY_S = 0.5
+_EVERY_S, _GRACE_S = 0.5, 10.0
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -53,7 +53,7 @@ class Soak(Result):
     parts: tuple[Part, ...]
     """In order."""
     processes_left: int
-    """Of the run, after its end."""
+    """Of the run, ten seconds after its end."""
     files_left: int
     """In the folder for temporary files."""
 
@@ -98,7 +98,7 @@ def run(options: Options, round_done: Callable[[], None]) -> Soak:
             num_scenes=num_scenes,
             seconds=time.monotonic() - started,
             parts=_parts(DatasetFolder(out), looks),
-            processes_left=len(list(_of_session(process.pid))),
+            processes_left=_left(process.pid),
             files_left=sum(path.is_file() for path in temporary.rglob("*")),
         )
     round_done()
@@ -172,6 +172,14 @@ def _parts(folder: DatasetFolder, looks: Sequence[_Look]) -> tuple[Part, ...]:
         )
         since = until
     return tuple(parts)
+
+
+def _left(session: int) -> int:
+    """Return how many processes do not end by themselves once their parent has."""
+    deadline = time.monotonic() + _GRACE_S
+    while (found := len(list(_of_session(session)))) and time.monotonic() < deadline:
+        time.sleep(_EVERY_S)
+    return found
 
 
 def _look(session: int) -> _Look:
