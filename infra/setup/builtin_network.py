@@ -24,6 +24,15 @@ from train.folder import RunFolder
 MOST_BYTES = 8_000_000
 """Of the weights: everybody who clones the project gets them."""
 
+_HEAD = (
+    f"# The network that comes with Trilight (`{BUILTIN}`)",
+    "",
+    "What `trilight render --engine neural` uses where no other is named: small enough to ship and "
+    "to train on one processor core, and as blurred as that makes it. It shows that everything "
+    "works, and is something to beat; it does not replace the path tracer.",
+    "",
+)
+
 ALLOWED_LICENCES = {"CC0-1.0"}
 
 
@@ -68,49 +77,50 @@ def _card(
     weights: bytes,
     command: str,
 ) -> str:
-    settings, contestants = about["settings"], judged["contestants"]
-    model = settings["model"]
-    names = list(contestants)
-    scores = [
-        f"| {metric} | " + " | ".join(_shown(contestants[name][metric]) for name in names) + " |"
-        for metric in judged["metrics"]
-    ]
-    return "\n".join(
-        [
-            f"# The network that comes with Trilight (`{BUILTIN}`)",
-            "",
-            "What `trilight render --engine neural` uses where no other is named: small enough to "
-            "ship and to train on one processor core, and as blurred as that makes it. It shows "
-            "that everything works, and is something to beat; it is no replacement for the path "
-            "tracer.",
-            "",
-            f"- weights: `model.safetensors`, {len(weights)} bytes, sha256 "
-            f"`{sha256_hex(weights)}`, {summary['num_parameters']} parameters ({model['encoder_layers']} and "
-            f"{model['decoder_layers']} layers, {model['width']} wide, {model['head']} head)",
-            "- licence: Trilight's (MIT); its data was made from built-in objects, all CC0-1.0",
-            f"- data: {dataset.manifest.num_scenes} scenes, dataset digest `{dataset.digest}`, by",
-            "",
-            f"      {command}",
-            "",
-            f"- training: `trilight train {settings['run']}`, {summary['num_steps']} steps of "
-            f"{settings['scenes_per_step']} scenes and {settings['views_per_scene']} views, "
-            f"{settings['resolution']} x {settings['resolution']} pixels; all settings below",
-            f"- range: at most {dataset.manifest.settings['scenes']['max_triangles']} triangles "
-            f"and pictures of {settings['resolution']} pixels; beyond both it warns and gets worse",
-            "",
-            f"Scores on the test split ({judged['about']['scenes']} scenes, "
-            f"{len(judged['views'])} views, objects that it has not seen; medians):",
-            "",
-            f"| metric | {' | '.join(names)} |",
-            f"|{'---|' * (len(names) + 1)}",
-            *scores,
-            "",
-            "```json",
-            json.dumps(settings, indent=1, sort_keys=True),
-            "```",
-            "",
-        ]
+    settings, model = about["settings"], about["settings"]["model"]
+    most = dataset.manifest.settings["scenes"]["max_triangles"]
+    shape = (
+        f"{summary['num_parameters']} parameters ({model['encoder_layers']} and "
+        f"{model['decoder_layers']} layers, {model['width']} wide, {model['head']} head)"
     )
+    lines = [
+        *_HEAD,
+        f"- weights: `model.safetensors`, {len(weights)} bytes, sha256 `{sha256_hex(weights)}`",
+        f"- size: {shape}",
+        "- licence: Trilight's (MIT); its data was made from built-in objects, all CC0-1.0",
+        f"- data: {dataset.manifest.num_scenes} scenes, dataset digest `{dataset.digest}`, by",
+        "",
+        f"      {command}",
+        "",
+        f"- training: `trilight train {settings['run']}`, {summary['num_steps']} steps of "
+        f"{settings['scenes_per_step']} scenes and {settings['views_per_scene']} views, "
+        f"{settings['resolution']} x {settings['resolution']} pixels; all settings below",
+        f"- range: at most {most} triangles and pictures of {settings['resolution']} pixels; "
+        "beyond either it warns and gets worse",
+        "",
+        *_scores(judged),
+        "",
+        "```json",
+        json.dumps(settings, indent=1, sort_keys=True),
+        "```",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _scores(judged: Mapping[str, Any]) -> list[str]:
+    contestants = judged["contestants"]
+    return [
+        f"Scores on the test split ({judged['about']['scenes']} scenes, {len(judged['views'])} "
+        "views, objects that it has not seen; medians):",
+        "",
+        f"| metric | {' | '.join(contestants)} |",
+        f"|{'---|' * (len(contestants) + 1)}",
+        *(
+            f"| {metric} | {' | '.join(_shown(who[metric]) for who in contestants.values())} |"
+            for metric in judged["metrics"]
+        ),
+    ]
 
 
 def _shown(figures: Mapping[str, Any]) -> str:
