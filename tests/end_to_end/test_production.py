@@ -1,5 +1,6 @@
 """The README's production path, literally: one dataset by four ways has one digest."""
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -57,7 +58,18 @@ def test_four_ways_one_digest(tmp_path: Path) -> None:
 
 def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
     """Learn from what the flows made, as a flow."""
-    where = {"data": f'["{tmp_path / "one"}"]', "out": str(tmp_path / "run"), "steps": "60"}
+    changes = {
+        "warmup_steps": 1,
+        "scenes_per_step": 1,
+        "views_per_scene": 1,
+        "validation_scenes": 1,
+    }
+    where = {
+        "data": json.dumps([str(tmp_path / "one")]),
+        "out": str(tmp_path / "run"),
+        "steps": "4",
+        "changes": json.dumps(changes),
+    }
     words = [word for key, value in where.items() for word in ("-p", f"{key}={value}")]
     prefect = ["-m", "prefect", "deployment", "run", "train-model/local", "--watch", *words]
     call(prefect, environment, RUN_S)

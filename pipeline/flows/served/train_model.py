@@ -4,9 +4,11 @@ Making and learning meet only through files, so nothing of `train` is imported h
 """
 
 import contextlib
+import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from prefect import flow
@@ -35,6 +37,8 @@ class TrainOrder:
     """Go on from the last checkpoint."""
     steps: int | None = None
     """Replaces the run's number of steps."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Any other setting of the run by its dotted name, such as loss.perceptual."""
     workers: int = 1
     """Threads that decode samples."""
     processes: int = 1
@@ -58,6 +62,8 @@ class TrainOrder:
         options += [part for place in self.data for part in ("--data", place)]
         options += ["--resume"] if self.resume else []
         options += [] if self.steps is None else ["--steps", str(self.steps)]
+        for name, value in sorted(self.changes.items()):
+            options += ["--set", f"{name}={json.dumps(value)}"]
         return [sys.executable, *launch, "train", self.run, *options]
 
 
