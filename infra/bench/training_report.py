@@ -9,6 +9,8 @@ import numpy as np
 from infra.bench.power_law import fit_power_law
 from infra.bench.training_jobs import BASELINE
 
+PAPER = "paper-schedule"
+
 Rows = Sequence[Mapping[str, Any]]
 
 
@@ -28,10 +30,41 @@ def report_lines(rows: Rows) -> list[str]:
         cells = [_cell(mine, ours) for mine, ours in zip(own, base, strict=True)]
         law = law_text(scenes, own)
         lines.append(f"| {plan} {size} | {change} | {' | '.join(cells)} | {law} |")
-    rivals = {(row["data_digest"][:8], row["median_scores"]["log_l1"]) for row in rows}
+    rivals = {
+        (row["data_digest"][:8], row["scenes"], row["median_scores"]["log_l1"]) for row in rows
+    }
     lines += ["", "The median picture of the training views scores, by its training set:"]
-    lines += [f"- data {digest}: {score:.4f}" for digest, score in sorted(rivals)]
-    return lines
+    lines += [
+        f"- data {digest}, {count} scenes: {score:.4f}" for digest, count, score in sorted(rivals)
+    ]
+    return lines + _steps_saved(rows)
+
+
+def _steps_saved(rows: Rows) -> list[str]:
+    """Return when `ours` was as good as the paper's schedule at its end, job by job."""
+    ends = {_place(row): row for row in rows if row["change"] == PAPER}
+    shares = [
+        reached(row["curve"], ends[_place(row)]["scores"]["log_l1"]) / row["num_steps"]
+        for row in rows
+        if row["change"] == BASELINE and _place(row) in ends
+    ]
+    if not shares:
+        return []
+    spread = f"{min(shares):.0%} to {max(shares):.0%} over {len(shares)} pairs"
+    return [
+        "",
+        f"`{BASELINE}` is as good as `{PAPER}` at its end after {np.median(shares):.0%} of the "
+        f"steps ({spread}; read off every tenth of a run whose own schedule goes on; inf: never).",
+    ]
+
+
+def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return row["plan"], row["size"], row["scenes"], row["seed"]
+
+
+def reached(curve: Sequence[Sequence[float]], error: float) -> float:
+    """Return the first step of [(step, error), ...] with at most this error, or infinity."""
+    return next((step for step, found in curve if found <= error), math.inf)
 
 
 def law_text(scenes: Sequence[int], errors: Sequence[Sequence[float]]) -> str:

@@ -17,6 +17,7 @@ import typer
 
 from infra.bench.harness import RESULTS, machine
 from infra.bench.training_jobs import Job, all_jobs
+from infra.bench.training_plot import plot
 from infra.bench.training_report import report_lines
 from infra.cli.console import console
 from storage.dataset import Dataset, open_dataset
@@ -44,7 +45,9 @@ def main(
     jobs = [job for job in all_jobs(plan) if only in job.name]
     if not report:
         run_jobs(jobs, open_dataset(data), work, table, minutes=minutes, device=device)
-    for line in report_lines(read_table(table)):
+    if rows := read_table(table):
+        plot(rows, table.with_suffix(".png"))
+    for line in report_lines(rows):
         console.print(line, soft_wrap=True)
 
 

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from infra.bench import training_jobs, training_table
 from infra.bench.power_law import fit_power_law
 from infra.bench.training_jobs import BASELINE, CHANGES, SCENES, SEEDS, Job, Plan, all_jobs
-from infra.bench.training_report import report_lines
+from infra.bench.training_plot import plot
+from infra.bench.training_report import PAPER, reached, report_lines
 from infra.bench.training_table import read_table, run_jobs
 from storage.errors import TrilightError
 from storage.seeds import rng_for
@@ -89,6 +91,40 @@ def test_jobs_are_run_once_and_within_the_budget(
     with pytest.raises(TrilightError, match="12 training scenes; expected at least 60"):
         run_jobs([job(scenes=60)], dataset, work, table, minutes=9)
     assert json.loads(table.read_text().splitlines()[0])["machine"]["cores"]
+
+
+def test_steps_saved_are_read_off_the_curves() -> None:
+    curve = [[100, 0.06], [200, 0.055], [300, 0.056], [400, 0.05]]
+    assert [reached(curve, error) for error in (0.06, 0.0555, 0.05, 0.049)] == [
+        100,
+        200,
+        400,
+        math.inf,
+    ]
+    row = {
+        "plan": "cpu", "size": "small", "scenes": 6, "seed": 0, "num_steps": 400, "curve": curve,
+        "scores": {"log_l1": 0.05}, "median_scores": {"log_l1": 0.07}, "data_digest": "0" * 64,
+    }  # fmt: skip
+    paper = {**row, "scores": {"log_l1": 0.0555}}
+    lines = report_lines([{**row, "change": BASELINE}, {**paper, "change": PAPER}])
+    assert any("at its end after 50% of the steps (50% to 50% over 1 pairs" in x for x in lines)
+
+
+def test_the_picture_has_a_panel_for_each_network(tmp_path: Path) -> None:
+    base = {
+        "plan": "cpu", "change": BASELINE, "seed": 0, "scores": {"log_l1": 0.05},
+        "median_scores": {"log_l1": 0.07},
+    }  # fmt: skip
+    sizes = (("small", 1000), ("large", 5000))
+    rows = [
+        {**base, "size": size, "num_parameters": count, "scenes": scenes}
+        for size, count in sizes
+        for scenes in (60, 240)
+    ]
+    plot(rows, tmp_path / "two.png")
+    plot(rows[:2], tmp_path / "one.png")
+    with Image.open(tmp_path / "two.png") as two, Image.open(tmp_path / "one.png") as one:
+        assert two.width == 2 * one.width
 
 
 def test_a_table_without_results_says_so(tmp_path: Path) -> None:
