@@ -11,7 +11,7 @@ follows from its number alone, so nothing moves when a dataset grows.
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,10 +31,17 @@ def numbered(number: int, name: str) -> str:
 
 @dataclass(frozen=True)
 class DatasetFolder:
-    """The paths of one dataset."""
+    """The paths of one dataset, or of this machine's part of one that is made in a bucket."""
 
     root: Path
-    """The folder that users name."""
+    """The folder that users name; for a bucket, one in the cache (storage.output)."""
+    bucket: str = ""
+    """URL of the bucket that the dataset is made in, where it is; without secrets."""
+
+    @property
+    def shown(self) -> str:
+        """What people call the dataset."""
+        return self.bucket or str(self.root)
 
     @property
     def manifest(self) -> Path:
@@ -110,6 +117,11 @@ class DatasetFolder:
         """Finished samples of unfinished shards, in a folder for each shard."""
         return self.staging / "samples"
 
+    @property
+    def staged_sent(self) -> Path:
+        """An empty file for each shard that is known to be in the bucket."""
+        return self.staging / "sent"
+
     def staged_shard(self, name: str) -> Path:
         """Folder of the finished samples of an unfinished shard."""
         return self.staged_samples / name
@@ -117,6 +129,14 @@ class DatasetFolder:
     def shard(self, name: str) -> Path:
         """Path of a shard; its name is relative to the folder and may begin with a part of it."""
         return self.root / name
+
+    def has_shard(self, name: str) -> bool:
+        """Return whether a shard is finished: it is here, or in the bucket."""
+        return self.shard(name).exists() or self.is_sent(name)
+
+    def is_sent(self, name: str) -> bool:
+        """Return whether a shard is known to be in the bucket; its bytes need not be here."""
+        return bool(self.bucket) and (self.staged_sent / name).exists()
 
     def shard_files(self) -> list[Path]:
         """Return every file that is called like a shard, listed in the manifest or not."""
@@ -143,19 +163,22 @@ class DatasetFolder:
             os.close(descriptor)
 
     @contextlib.contextmanager
-    def joined(self) -> Iterator[None]:
+    def joined(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
         """Take part in the making, with any number of others.
 
         Whoever is alone at first clears away what killed writers have left.
 
+        Args:
+            when_alone: called by whoever is alone at first, before anybody else can join.
+
         Raises:
-            TrilightError: the folder cannot be written.
+            TrilightError: the folder cannot be written; or as `when_alone`.
         """
         descriptor = self._open_lock()
         try:
-            with contextlib.suppress(BlockingIOError):
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _lock_alone(descriptor):
                 remove_leftovers(self.root)
+                when_alone()
             fcntl.flock(descriptor, fcntl.LOCK_SH)
             yield
         finally:
@@ -172,3 +195,11 @@ class DatasetFolder:
             return os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise write_error(lock, error) from error
+
+
+def _lock_alone(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.atomic import write_atomically
+from storage.atomic import write_atomically, write_error
 from storage.derived import derivation_of
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
@@ -43,8 +43,12 @@ def announce_objects(folder: DatasetFolder, num_objects: int) -> None:
 
 def count_object(folder: DatasetFolder) -> None:
     """Write down that one more object is prepared or rejected: a byte, from any thread."""
-    with _done(folder).open("ab") as stream:
-        stream.write(b".")
+    path = _done(folder)
+    try:
+        with path.open("ab") as stream:
+            stream.write(b".")
+    except OSError as error:
+        raise write_error(path, error) from error
 
 
 def read_progress(folder: DatasetFolder) -> Progress:
@@ -81,7 +85,11 @@ def planned_shards(manifest: Manifest) -> dict[str, int]:
 
 def shards_there(folder: DatasetFolder) -> set[str]:
     """Return the names of the shards that are there under their final names, listed or not."""
-    return {path.relative_to(folder.root).as_posix() for path in folder.shard_files()}
+    here = {path.relative_to(folder.root).as_posix() for path in folder.shard_files()}
+    if not folder.bucket:
+        return here
+    sent = folder.staged_sent
+    return here | {path.relative_to(sent).as_posix() for path in sent.rglob("*.tar")}
 
 
 def num_scenes_done(folder: DatasetFolder, manifest: Manifest) -> int:

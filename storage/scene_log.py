@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from storage.atomic import write_error
 from storage.layout import DatasetFolder
 from storage.sample import sample_key
 
@@ -32,7 +33,11 @@ def log_scene(
     cores: int,
     num_rejected: int,
 ) -> None:
-    """Append the row of a scene that is made."""
+    """Append the row of a scene that is made.
+
+    Raises:
+        TrilightError: the disk is full or the folder cannot be written.
+    """
     row = {
         "scene": sample_key(scene_index),
         "seconds": round(seconds, 3),
@@ -43,9 +48,12 @@ def log_scene(
         "finished_unix_s": round(time.time(), 1),
     }
     path = folder.logs / f"{shard}.jsonl"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as stream:
-        stream.write(json.dumps(row) + "\n")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as stream:
+            stream.write(json.dumps(row) + "\n")
+    except OSError as error:
+        raise write_error(path, error) from error
 
 
 def read_scene_logs(folder: DatasetFolder) -> Iterator[SceneLog]:

@@ -18,6 +18,7 @@ from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
+from storage.output import dataset_folder
 from storage.progress import read_progress
 
 if TYPE_CHECKING:
@@ -32,7 +33,9 @@ def generate(
         str | None,
         typer.Option(help="folder of 3D objects, its URL, builtin: or objaverse: [builtin:]"),
     ] = None,
-    out: Annotated[Path, typer.Option(help="folder of the dataset")] = Path("data/smoke"),
+    out: Annotated[
+        str, typer.Option(help="folder of the dataset, or a bucket such as s3://bucket/folder")
+    ] = "data/smoke",
     scenes: Annotated[
         int | None, typer.Option(help="scenes, rounded up to whole shards [as the build says]")
     ] = None,
@@ -54,7 +57,8 @@ def generate(
     shards: Annotated[
         str | None,
         typer.Option(
-            help="make only shards A up to but not B, given as A:B; who makes the last one finishes"
+            help="make only shards A up to but not B, given as A:B; who makes the last finishes; "
+            "machines that share a bucket should make different ones"
         ),
     ] = None,
     runner: Annotated[str, typer.Option(help="threads, of this process; or dask")] = "threads",
@@ -92,7 +96,7 @@ def generate(
     order = DatasetOrder(
         build=build,
         objects=objects,
-        out=str(out),
+        out=out,
         scenes=scenes,
         seed=seed,
         resolution=resolution,
@@ -108,7 +112,7 @@ def generate(
         changes=parse_changes(set_ or ()),
     )
     make = _runner(runner, address)
-    folder, started = DatasetFolder(out), time.monotonic()
+    folder, started = dataset_folder(out), time.monotonic()
     if note := choose_variant().note:
         console.print(f"Note: {note}; see trilight doctor.", style="yellow")
     with _progress(folder):

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.text import Text
@@ -33,23 +34,24 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
         rows.append(("scenes given up", str(outcome.num_scenes_given_up)))
     rows += [("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in rejected]
     if statistics:
+        looked_at = (folder.contact_sheet, folder.report, folder.card)
         rows.append(("dataset digest", outcome.digest))
-        rows.append(("look at", f"{folder.contact_sheet}, {folder.report}, {folder.card}"))
+        rows.append(("look at", ", ".join(_place(folder, path) for path in looked_at)))
     rows += [
         ("wall time", f"{seconds:.0f} s"),
-        ("shards, manifest", str(folder.root)),
-        ("why rejected", str(folder.failures)),
+        ("shards, manifest", folder.shown),
+        ("why rejected", _place(folder, folder.failures)),
     ]
     _print_notes(outcome.notes)
     if statistics is None:
         there = f"{outcome.num_shards} of {outcome.num_shards_planned} shards are there"
         print_rows(f"Range finished; {there}", rows)
-        console.print(f"\nNext: trilight status {folder.root}", style="bold")
+        console.print(f"\nNext: trilight status {folder.shown}", style="bold")
         return
     print_rows("Dataset finished", rows)
-    console.print(f"\nNext: trilight verify {folder.root}", style="bold")
+    console.print(f"\nNext: trilight verify {folder.shown}", style="bold")
     if statistics.scenes_by_split.get("train"):
-        console.print(f"      trilight train smoke --data {folder.root}", style="bold")
+        console.print(f"      trilight train smoke --data {folder.shown}", style="bold")
 
 
 def _print_json(
@@ -60,7 +62,7 @@ def _print_json(
 ) -> None:
     statistics = outcome.statistics
     row: dict[str, object] = {
-        "out": str(folder.root),
+        "out": folder.shown,
         "dataset_digest": outcome.digest,
         "finished": statistics is not None,
         "shards": outcome.num_shards,
@@ -76,6 +78,11 @@ def _print_json(
         row["scenes"], row["views"] = statistics.num_scenes, statistics.num_views
         row["bytes"] = statistics.num_bytes
     print_json(row)
+
+
+def _place(folder: DatasetFolder, path: Path) -> str:
+    """Return where people find a file of a dataset."""
+    return f"{folder.shown}/{path.relative_to(folder.root)}"
 
 
 def _print_notes(notes: Sequence[str]) -> None:

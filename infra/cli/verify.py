@@ -55,7 +55,10 @@ def _next_step(found: Verification, dataset: str) -> str:
     """Return what makes bad shards whole, which depends on where the dataset is from."""
     settings = found.manifest.settings
     if isinstance(parse_url(dataset, what="dataset"), RemoteUrl):
-        return "repair the folder that it was copied from, and copy the named shards again."
+        return (
+            "delete the named shards there and run trilight generate again, or copy them again "
+            "from the folder that the dataset was copied from."
+        )
     if (derivation := derivation_of(settings)) is not None:
         return f"make it again of its sources: trilight shards {derivation.operation}."
     if settings.get("splits", {}).get("listed_scenes") is not None:

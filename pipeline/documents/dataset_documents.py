@@ -9,25 +9,30 @@ from pipeline.documents.report import write_report
 from pipeline.documents.rights import encode_licences, rights_of
 from storage.atomic import write_atomically
 from storage.dataset import Dataset
+from storage.layout import DatasetFolder
 from storage.statistics import Statistics, dataset_statistics
 
 
-def write_documents(dataset: Dataset) -> Statistics:
+def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Statistics:
     """Write card, licences, croissant, attribution, contact sheet and report of a dataset.
 
     Each appears whole or not at all. They depend on the dataset alone, so equal datasets have equal
     documents whoever made them.
 
+    Args:
+        dataset: in a folder, or on a server.
+        out: the folder to write into; that of the dataset where None.
+
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
     """
-    folder, manifest = dataset.folder, dataset.manifest
+    out, manifest = out or dataset.folder, dataset.manifest
     statistics, found = dataset_statistics(dataset), dataset_distributions(dataset)
     rights = rights_of(found.objects)
-    write_atomically(folder.attribution, attribution_of(found.objects, manifest.settings))
-    write_atomically(folder.licences, encode_licences(rights))
-    write_contact_sheet(dataset, statistics)
-    write_report(dataset, found)
-    write_atomically(folder.croissant, encode_croissant(manifest, rights))
-    write_atomically(folder.card, encode_card(folder, manifest, found, rights))
+    write_atomically(out.attribution, attribution_of(found.objects, manifest.settings))
+    write_atomically(out.licences, encode_licences(rights))
+    write_contact_sheet(dataset, statistics, out=out)
+    write_report(dataset, found, out=out)
+    write_atomically(out.croissant, encode_croissant(manifest, rights))
+    write_atomically(out.card, encode_card(out, manifest, found, rights))
     return statistics

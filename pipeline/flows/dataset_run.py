@@ -1,32 +1,33 @@
 """A run: from an order to a dataset, or to a part of one. Resumable at any moment, by anybody.
 
 Files are the truth. A run looks at what is there, makes what is missing, and leaves each shard as
-it is done; several runs on one folder share the work (storage.claims). Who runs the tasks is not
-known here: `trilight generate` uses threads, the flows Prefect.
+it is done; several runs on one folder share the work (storage.claims), and those on one bucket
+what is finished (pipeline.shards.mirror). Who runs the tasks is not known here: `trilight generate`
+uses threads, the flows Prefect.
 """
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.flows.accept_objects import AcceptedObjects, accept_objects
 from pipeline.flows.accept_scene_files import accept_scene_files, settings_for_files
+from pipeline.flows.bucket_publication import begin_dataset, joined
 from pipeline.flows.builds import BUILDS, frozen_note, named_build, object_source
 from pipeline.flows.environment import environment
 from pipeline.flows.machine import cores_owned, visible_gpus
 from pipeline.flows.make_task import ShardJob, TaskOutcome, close_children
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.pieces import TaskSizes, cut_tasks
-from pipeline.flows.publication import Publication, begin
+from pipeline.flows.publication import Publication
 from pipeline.flows.runners import Runner
 from pipeline.flows.scene_files import SceneFolder, find_scene_files
 from pipeline.flows.settings import BuildSettings
 from pipeline.renders.variant import choose_variant
-from storage.dataset import open_dataset
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
+from storage.output import dataset_folder
 from storage.statistics import Statistics
 
 _POLL_S = 1.0
@@ -84,9 +85,9 @@ def make_dataset(
     Raises:
         TrilightError: what the user can mend; what is finished is safe.
     """
-    folder = DatasetFolder(Path(order.out).resolve())
+    folder = _folder(order)
     settings, listed = _settings(order)
-    with folder.joined():
+    with joined(folder):
         run = _begin(order, settings, listed, folder)
         try:
             _make_missing(run, runner, watch)
@@ -94,16 +95,21 @@ def make_dataset(
             close_children()
         finished = not run.publication.missing_shards()
         run.publication.publish()
-        statistics = runner.finish(lambda: _documents(folder)) if finished else None
+        statistics = runner.finish(lambda: _documents(run.publication)) if finished else None
     return _outcome(run, statistics)
 
 
 def prepare_dataset(order: DatasetOrder) -> Run:
     """Begin a dataset and freeze its objects, without a picture."""
-    folder = DatasetFolder(Path(order.out).resolve())
+    folder = _folder(order)
     settings, listed = _settings(order)
-    with folder.joined():
+    with joined(folder):
         return _begin(order, settings, listed, folder)
+
+
+def _folder(order: DatasetOrder) -> DatasetFolder:
+    folder = dataset_folder(order.out)
+    return replace(folder, root=folder.root.resolve())
 
 
 def _settings(order: DatasetOrder) -> tuple[BuildSettings, SceneFolder | None]:
@@ -123,7 +129,7 @@ def _settings(order: DatasetOrder) -> tuple[BuildSettings, SceneFolder | None]:
 def _begin(
     order: DatasetOrder, settings: BuildSettings, listed: SceneFolder | None, folder: DatasetFolder
 ) -> Run:
-    publication = begin(
+    publication = begin_dataset(
         folder,
         settings,
         environment(choose_variant()),
@@ -193,9 +199,11 @@ def _workers(order: DatasetOrder) -> int:
     return max(1, len(visible_gpus())) if choose_variant().name == "cuda_ad_rgb" else 1
 
 
-def _documents(folder: DatasetFolder) -> Statistics:
-    with folder.turn("documents"):
-        return write_documents(open_dataset(str(folder.root)))
+def _documents(publication: Publication) -> Statistics:
+    with publication.folder.turn("documents"):
+        statistics = write_documents(publication.dataset(), publication.folder)
+        publication.send_documents()
+        return statistics
 
 
 def _outcome(run: Run, statistics: Statistics | None) -> Outcome:
@@ -221,7 +229,7 @@ def _require_within_budget(publication: Publication, failure_budget: float) -> N
     given_up = publication.num_given_up()
     if given_up > failure_budget * publication.manifest.num_scenes:
         raise TrilightError(
-            f"{publication.folder.root}: {given_up} of {publication.manifest.num_scenes} scenes "
+            f"{publication.folder.shown}: {given_up} of {publication.manifest.num_scenes} scenes "
             f"could not be made, more than the failure budget of {failure_budget:.0%}. The reasons "
             f"are in {publication.folder.failures.name}; mend them, or raise --failure-budget."
         )

@@ -61,16 +61,16 @@ def make_piece(
 
 
 def _is_done(folder: DatasetFolder, name: str, scene_index: int) -> bool:
-    return folder.shard(name).exists() or is_staged(folder.staged_shard(name), scene_index)
+    return folder.has_shard(name) or is_staged(folder.staged_shard(name), scene_index)
 
 
 def _packed(folder: DatasetFolder, name: str, scenes: range) -> ShardEntry | None:
     """Pack a shard whose scenes are all staged, unless somebody else does."""
     staged = folder.staged_shard(name)
-    if folder.shard(name).exists() or not all(is_staged(staged, index) for index in scenes):
+    if folder.has_shard(name) or not all(is_staged(staged, index) for index in scenes):
         return None
     with claimed(staged / "pack.claim") as ours:
-        if not ours or folder.shard(name).exists():
+        if not ours or folder.has_shard(name):
             return None
         shard = pack_shard(folder, name, scenes)
     log.info("%s: packed, %d scenes, %d bytes", name, shard.num_samples, shard.num_bytes)

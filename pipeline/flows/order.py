@@ -7,6 +7,7 @@ from typing import Any
 
 from pipeline.flows.builds import BUILDS
 from storage.errors import TrilightError
+from storage.output import dataset_folder
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
@@ -22,7 +23,8 @@ class DatasetOrder:
     what the environment variable NAME of the worker says. By default what the build demands, or
     else builtin:."""
     out: str = "data/smoke"
-    """Folder of the dataset, as the worker sees it."""
+    """Folder of the dataset, as the worker sees it, or a bucket such as s3://bucket/folder. With a
+    bucket, machines that work at the same time should make different shards, or they waste work."""
     scenes: int | None = None
     """How many scenes, rounded up to whole shards; by default the build's number."""
     seed: int | None = None
@@ -71,6 +73,7 @@ class DatasetOrder:
             )
         if self.scenes_from is None and self.views is not None:
             raise TrilightError(f"--views is {self.views}; expected it only with --scenes-from.")
+        dataset_folder(self.out)
         self.shard_range()
 
     def shard_range(self) -> range | None:

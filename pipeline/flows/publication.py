@@ -8,6 +8,7 @@ from typing import Any
 from pipeline.flows.settings import BuildSettings, differences
 from pipeline.shards.notes import forget_note, note_shard, noted_shard
 from pipeline.shards.pack import rejections_of_shard
+from storage.dataset import Dataset, open_dataset
 from storage.derived import derivation_of
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -40,6 +41,13 @@ class Publication:
         self._splits = splits
         self._noted: dict[str, ShardEntry] = {}
 
+    def dataset(self) -> Dataset:
+        """Return what is public, for whoever reads it."""
+        return open_dataset(str(self.folder.root))
+
+    def send_documents(self) -> None:
+        """Bring the documents of the folder to where the dataset is: here they are."""
+
     @property
     def num_shards(self) -> int:
         """How many shards the dataset will have."""
@@ -67,7 +75,7 @@ class Publication:
             found = {
                 name: noted_shard(self.folder, name)
                 for name in names
-                if name not in listed and self.folder.shard(name).exists()
+                if name not in listed and self._is_there(name)
             }
             found |= self._noted
             self._add_failures(
@@ -94,10 +102,14 @@ class Publication:
         """
         listed = {entry.name for entry in self.manifest.shards}
         names = [shard_name(index, self._splits) for index in range(self.num_shards)]
-        there = [self.folder.shard(name).exists() for name in names]
+        there = [self._is_there(name) for name in names]
         if any(exists and name not in listed for name, exists in zip(names, there, strict=True)):
             self.publish()
         return [index for index, exists in enumerate(there) if not exists]
+
+    def _is_there(self, name: str) -> bool:
+        """Return whether a shard is where the dataset is."""
+        return self.folder.shard(name).exists()
 
     def num_shards_finished(self) -> int:
         """Return how many shards are there, as far as this maker knows."""
@@ -162,7 +174,7 @@ def begin(
             _require_same_dataset(folder, manifest, settings, environment, accept_environment)
             whole = max(whole, manifest.num_scenes)
         else:
-            _require_free(folder)
+            require_free(folder, _names_in(folder))
             manifest = Manifest(
                 build=settings.build,
                 settings=settings.as_json(),
@@ -197,25 +209,40 @@ def _require_same_dataset(
         )
 
 
-def _require_free(folder: DatasetFolder) -> None:
-    if folder.shard_files():
+def require_free(folder: DatasetFolder, names: Iterable[str]) -> None:
+    """Refuse to begin a dataset where something else is.
+
+    Args:
+        folder: of the dataset.
+        names: of the shards and documents that are where it is to be.
+
+    Raises:
+        TrilightError: there are shards, or a document that the dataset's own would replace.
+    """
+    there = set(names)
+    if any(name.endswith(".tar") for name in there):
         raise TrilightError(
-            f"{folder.root}: there are shards but no manifest.json; expected an empty folder or a "
+            f"{folder.shown}: there are shards but no manifest.json; expected an empty folder or a "
             "dataset. Choose another --out."
         )
     for path in (folder.card, folder.licences):
-        if path.exists():
+        if path.name in there:
             raise TrilightError(
-                f"{folder.root}: {path.name} is there, and the dataset's own would replace it; "
+                f"{folder.shown}: {path.name} is there, and the dataset's own would replace it; "
                 "expected an empty folder or a dataset. Choose another --out."
             )
+
+
+def _names_in(folder: DatasetFolder) -> Iterator[str]:
+    yield from (path.relative_to(folder.root).as_posix() for path in folder.shard_files())
+    yield from (path.name for path in (folder.card, folder.licences) if path.exists())
 
 
 def _require_generated(folder: DatasetFolder, manifest: Manifest) -> None:
     if derivation := derivation_of(manifest.settings):
         raise TrilightError(
-            f"{folder.root}: this dataset was made by `trilight shards {derivation.operation}` and "
-            "cannot grow; extend its sources and make it anew, or choose another --out."
+            f"{folder.shown}: this dataset was made by `trilight shards {derivation.operation}` "
+            "and cannot grow; extend its sources and make it anew, or choose another --out."
         )
 
 
@@ -231,6 +258,6 @@ def _require_same(
         name, old, new = differing[0]
         more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
         raise TrilightError(
-            f"{folder.root}: this dataset was begun with another {what}: {name} was {old!r}, now "
+            f"{folder.shown}: this dataset was begun with another {what}: {name} was {old!r}, now "
             f"{new!r}{more}; {next_step}."
         )

@@ -69,6 +69,25 @@ class ShardCache:
         except TransferFailed as error:
             raise unreadable(url, error) from error
 
+    def keep(self, path: Path, url: RemoteUrl, sha256: str) -> None:
+        """Take over a shard of this machine that is on the server too: nobody has to fetch it.
+
+        The file is gone afterwards, also where the cache has no room for it.
+
+        Args:
+            path: the shard.
+            url: where it is on the server.
+            sha256: its digest.
+        """
+        with contextlib.suppress(OSError):
+            num_bytes = path.stat().st_size
+            if num_bytes <= self.max_bytes:
+                self._make_room(num_bytes)
+                self.root.mkdir(parents=True, exist_ok=True)
+                os.utime(path)
+                os.replace(path, self.root / _name(url, sha256))
+        path.unlink(missing_ok=True)
+
     def _fetch(self, url: RemoteUrl, path: Path, num_bytes: int | None, sha256: str | None) -> None:
         for _ in range(_ARRIVALS):
             self._make_room(num_bytes or 0)

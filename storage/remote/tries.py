@@ -19,7 +19,8 @@ MAX_PAUSE_S = 20.0
 _MOST_TRIES = 1000
 """Of a transfer that moves on a little each time."""
 _MAX_MESSAGE = 200
-_MAY_PASS_STATUS = (408, 425, 429)
+_MAY_PASS_STATUS = (408, 409, 425, 429)
+"""Among them: two who create one file at the same time, of whom one is told to ask again."""
 
 
 class TransferFailed(Exception):
@@ -96,6 +97,11 @@ def is_absent(error: BaseException) -> bool:
     return is_missing(error) or isinstance(cause, PermissionError) or _status(cause) in (401, 403)
 
 
+def is_taken(error: BaseException) -> bool:
+    """Say whether a server answered that there is such a file already."""
+    return isinstance(error, FileExistsError) or 412 in (_status(error), _status(error.__cause__))
+
+
 def may_pass(error: BaseException) -> bool:
     """Say whether the same request may succeed a little later."""
     status = _status(error)
@@ -117,7 +123,7 @@ def describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}"[:_MAX_MESSAGE].removesuffix(": ")
 
 
-def _status(error: BaseException) -> int | None:
+def _status(error: BaseException | None) -> int | None:
     """Return the HTTP status of an error, where the driver gives one (not all name it alike)."""
     response = getattr(error, "response", None)
     if isinstance(response, dict):  # botocore's

@@ -88,6 +88,22 @@ def test_secrets_are_refused_before_a_run_exists(source: str) -> None:
         generate_scenes.validate_parameters({"objects": harmless})
 
 
+@pytest.mark.parametrize("name", ["prepare-assets", "generate-scenes", "build-dataset"])
+def test_a_place_to_write_to_holds_no_secret(name: str) -> None:
+    for out in (f"s3://me:{CANARY}@bucket/set", f"s3://bucket/set?key={CANARY}"):
+        with pytest.raises(ParameterTypeError, match="out"):
+            FLOWS[name].validate_parameters({"out": out})
+    for out in ("data/set", "/d/2026-01-01T10:30/a", "a:/b", "C:", "s3://bucket/a b/set", "gs://b"):
+        FLOWS[name].validate_parameters({"out": out})
+
+
+def test_a_place_that_cannot_be_written_is_refused_by_name() -> None:
+    """Before anything is begun: a flow makes its order first."""
+    for out in ("https://host/set", "hf://datasets/ada/set", "ftp://host/set"):
+        with pytest.raises(TrilightError, match=f"^out '{out}'"):
+            dataset_order(_defaults(out=out))
+
+
 def test_only_what_can_pass_is_tried_again() -> None:
     class Failed:
         def __init__(self, error: Exception) -> None:

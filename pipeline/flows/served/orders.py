@@ -5,12 +5,19 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.flows.order import DatasetOrder
-from pipeline.flows.served.schema import BuildChanges, BuildName, PublicUrl, changed_values
+from pipeline.flows.served.schema import (
+    BuildChanges,
+    BuildName,
+    PublicPlace,
+    PublicUrl,
+    changed_values,
+)
 from storage.errors import TrilightError
 
 DATASET_FORMS: Mapping[str, Any] = {
     "build": BuildName,
     "objects": PublicUrl | None,
+    "out": PublicPlace,
     "changes": BuildChanges | None,
 }
 """Types of parameters that are narrower in a form than in an order."""

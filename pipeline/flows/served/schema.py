@@ -125,6 +125,11 @@ _NO_SECRET = r"^(?:(?:env|builtin|objaverse):[^@?]*|[A-Za-z][A-Za-z0-9+.\-]*://[
 
 PublicUrl = Annotated[str, Field(pattern=_NO_SECRET)]
 """A path or URL that may be seen by everybody who sees the server."""
+PublicPlace = Annotated[
+    str,
+    Field(pattern=r"^(?:[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|(?:[^:]|:+[^:/]|:+/[^:/])*:*/?)$"),
+]
+"""The same for a place to write to: a folder of any name, or a URL."""
 BuildName = typing.Literal[tuple(BUILDS)]  # type: ignore[valid-type]
 """A list to choose from."""
 BuildChanges = changes_form(BuildSettings, BUILDS["smoke"].settings())

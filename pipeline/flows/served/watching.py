@@ -22,7 +22,7 @@ from pipeline.flows.dataset_run import Outcome, Run
 from pipeline.flows.make_task import TaskOutcome
 from pipeline.flows.order import DatasetOrder
 from storage.failures import count_by_reason, read_failures
-from storage.layout import DatasetFolder
+from storage.output import dataset_folder
 
 USD_PER_CORE_HOUR = 0.04
 """What TRILIGHT_USD_PER_CORE_HOUR says otherwise."""
@@ -35,7 +35,7 @@ class Watched:
 
     def __init__(self, order: DatasetOrder) -> None:
         self._order = order
-        self._folder = DatasetFolder(Path(order.out))
+        self._folder = dataset_folder(order.out)
         self._started = time.monotonic()
         self._told = -_EVERY_S
         self._scenes = 0

@@ -1,0 +1,239 @@
+"""A dataset in a bucket, whose makers meet nowhere else: each has a folder of its own before it.
+
+The bucket holds what a folder would hold. The manifest is begun once, the objects are frozen once,
+and each shard is put there once: the server refuses a second writer, who takes what is there.
+Below `.staging` stand for each shard the rejections of its scenes and a note with its manifest
+entry. A shard is finished when it and its note are there, or the manifest lists it. The manifest
+follows from what it was begun with and from the notes, so anybody may write it at any time.
+
+Claims do not reach from one machine to another: two that are told to make the same shards make
+scenes twice, and the first writer of a shard wins. That is wasted work, never wrong.
+"""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Collection
+from pathlib import Path
+
+from pipeline.shards.notes import note_of, note_shard, noted_shard
+from pipeline.shards.pack import rejections_of_shard
+from storage.atomic import write_atomically
+from storage.claims import claimed
+from storage.dataset import Dataset
+from storage.dataset_files import RemoteFiles
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.failures import decode_failures, read_failures, write_failures
+from storage.layout import DatasetFolder
+from storage.manifest import (
+    SHARD_NAME,
+    Manifest,
+    ShardEntry,
+    decode_manifest,
+    index_stream,
+    read_manifest,
+    shard_of_row,
+    write_manifest,
+)
+from storage.remote.bucket import Bucket
+from storage.remote.cache import shard_cache
+from storage.remote.url import RemoteUrl, parse_url
+
+_PLANNED = ".staging/planned/"
+"""Below it stands a file for each number of scenes that was asked for; the largest counts."""
+
+
+class Mirror:
+    """What a machine's folder and the bucket tell each other."""
+
+    def __init__(self, folder: DatasetFolder) -> None:
+        url = parse_url(folder.bucket, what="out")
+        assert isinstance(url, RemoteUrl)
+        self._folder = folder
+        self._bucket = Bucket(url)
+        self._files = RemoteFiles(url)
+
+    def names(self) -> set[str]:
+        """Return the names of all files of the dataset."""
+        return self._bucket.names()
+
+    def dataset(self, manifest: Manifest) -> Dataset:
+        """Return the dataset of a manifest, to be read from the bucket."""
+        return Dataset(self._files, manifest)
+
+    def adopt(self) -> None:
+        """Make the folder say what the bucket says, as far as that was published.
+
+        Scenes that wait for their shard stay where they are of the same dataset; where the folder
+        is of another one, or the bucket is empty, they go. Call while nobody else has the folder.
+
+        Raises:
+            TrilightError: the bucket cannot be read.
+        """
+        folder, theirs = self._folder, self._manifest()
+        if theirs is None or _identity(self._own_manifest()) != _identity(theirs):
+            _clear(folder)
+        shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `receive` looks again
+        if theirs is None:
+            return
+        lock, failures = self._files.read("objects.lock.jsonl"), self._files.read("failures.jsonl")
+        if lock is not None:
+            write_atomically(folder.objects_lock, lock)
+        known = read_failures(folder.failures)
+        write_failures(folder.failures, [*known, *decode_failures(failures or b"")])
+        write_manifest(folder.manifest, theirs)
+
+    def begin(self) -> bool:
+        """Put the folder's manifest into the bucket; say whether it is ours that is there."""
+        return self._bucket.create("manifest.json", self._folder.manifest)
+
+    def plan(self, num_scenes: int) -> None:
+        """Tell all makers for how many scenes the dataset is meant."""
+        self._bucket.write(f"{_PLANNED}{num_scenes:012d}", b"\n")
+
+    def freeze(self, lock: bytes) -> None:
+        """Put the frozen objects into the bucket, after what was rejected for them.
+
+        Raises:
+            TrilightError: somebody else has frozen others in the meantime.
+        """
+        self._bucket.write("failures.jsonl", self._folder.failures)
+        name = self._folder.objects_lock.name
+        if not self._bucket.create(name, lock) and self._files.read(name) != lock:
+            raise TrilightError(
+                f"{self._folder.shown}: another maker has frozen other objects in the meantime; "
+                "expected the same --objects everywhere. Give that, or choose another --out."
+            )
+
+    def receive(self, listed: Collection[str]) -> tuple[int, int]:
+        """Learn what other makers have finished and planned.
+
+        Args:
+            listed: names of the shards that the folder's manifest lists.
+
+        Returns:
+            How many shards were news, and the scenes of the dataset.
+        """
+        names, news = self.names(), 0
+        for name in sorted(filter(SHARD_NAME.fullmatch, names)):
+            note = self._name(note_of(self._folder, name))
+            if self._folder.is_sent(name) or not (name in listed or note in names):
+                continue
+            if name not in listed:
+                self._take_note(name, note)
+                news += 1
+            self._mark(name)
+        planned = [name.removeprefix(_PLANNED) for name in names if name.startswith(_PLANNED)]
+        return news, max((int(text) for text in planned if text.isdecimal()), default=0)
+
+    def send(self, name: str, made: ShardEntry | None = None) -> ShardEntry | None:
+        """Bring a shard of the folder into the bucket; the cache keeps its bytes.
+
+        Args:
+            name: of the shard.
+            made: its entry, where that is known.
+
+        Returns:
+            The entry of the shard that is in the bucket then, ours or that of who was first; None
+            where another process of this machine sends it, or has sent it.
+        """
+        folder, path = self._folder, self._folder.shard(name)
+        with claimed(folder.staging / "sending" / f"{name}.claim") as ours:
+            if not ours or not path.exists():
+                return None
+            entry = made = made or noted_shard(folder, name)
+            if not folder.is_sent(name):
+                entry = self._put(made)
+                note_shard(folder, entry)
+                for beside in (rejections_of_shard(folder, name), note_of(folder, name)):
+                    self._bucket.write(self._name(beside), beside)
+                self._mark(name)
+            if entry == made:
+                shard_cache().keep(path, self._files.url.child(name), entry.sha256)
+            path.unlink(missing_ok=True)
+        return entry
+
+    def _put(self, made: ShardEntry) -> ShardEntry:
+        """Put a shard into the bucket with its log, and return the entry of what is there then."""
+        log = self._folder.logs / f"{made.name}.jsonl"
+        if self._bucket.create(made.name, self._folder.shard(made.name)):
+            if log.exists():
+                self._bucket.write(self._name(log), log)
+            return made
+        url = self._files.url.child(made.name)
+        with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
+            return index_stream(stream, Path(made.name).name)
+
+    def send_manifest(self) -> None:
+        """Put the folder's manifest and rejections into the bucket, in place of those there."""
+        with self._folder.turn("manifest"):
+            self._bucket.write("failures.jsonl", self._folder.failures)
+            self._bucket.write("manifest.json", self._folder.manifest)
+
+    def send_documents(self) -> None:
+        """Put what people and hubs look at into the bucket, the card last."""
+        folder = self._folder
+        documents = [
+            *(folder.attribution, folder.licences, folder.contact_sheet, folder.report),
+            *sorted(path for path in folder.report_pages.rglob("*") if path.is_file()),
+            *(folder.croissant, folder.card),
+        ]
+        for path in documents:
+            self._bucket.write(self._name(path), path)
+
+    def _manifest(self) -> Manifest | None:
+        """Return the manifest of the bucket with the digest of the objects that are there."""
+        stream = self._files.open_beside("manifest.json") if self.names() else None
+        if stream is None:
+            return None
+        with stream:
+            manifest = decode_manifest(stream, f"{self._folder.shown}/manifest.json")
+        lock = self._files.read(self._folder.objects_lock.name)
+        return dataclasses.replace(manifest, objects_lock_sha256=sha256_hex(lock) if lock else "")
+
+    def _own_manifest(self) -> Manifest | None:
+        try:
+            return read_manifest(self._folder.manifest)
+        except TrilightError:
+            return None
+
+    def _take_note(self, name: str, note: str) -> None:
+        """Copy what another maker says of a shard into the folder."""
+        try:
+            entry = shard_of_row(json.loads(self._files.read(note) or b""))
+            if entry.name != name:
+                raise ValueError(entry.name)
+        except (ValueError, KeyError, TypeError) as error:
+            raise TrilightError(
+                f"{self._folder.shown}/{note}: not a note on {name} ({error}); delete both, and "
+                "the shard is made again."
+            ) from error
+        rejections = rejections_of_shard(self._folder, name)
+        failures = self._files.read(self._name(rejections))
+        write_failures(rejections, decode_failures(failures or b""))
+        note_shard(self._folder, entry)
+
+    def _mark(self, name: str) -> None:
+        """Note that a shard is in the bucket."""
+        write_atomically(self._folder.staged_sent / name, b"")
+
+    def _name(self, path: Path) -> str:
+        return path.relative_to(self._folder.root).as_posix()
+
+
+def _identity(manifest: Manifest | None) -> object:
+    """Return what scenes that are not in a shard yet depend on."""
+    if manifest is None:
+        return None
+    return (manifest.settings, manifest.environment, manifest.objects_lock_sha256)
+
+
+def _clear(folder: DatasetFolder) -> None:
+    """Delete all that is in a folder but the locks of those who work in it."""
+    kept = {folder.staging, folder.staging / "lock", folder.staging / "turns"}
+    for path in {*folder.root.iterdir(), *folder.staging.iterdir()} - kept:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()

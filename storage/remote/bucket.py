@@ -1,0 +1,99 @@
+"""Writing to a bucket: files that appear whole or not at all, and, where asked for, only once.
+
+A bucket shows a file when all of it has come, however large it is, so a kill leaves nothing half
+written; parts of an upload that was cut off are invisible, and a rule of the bucket may delete them
+(AbortIncompleteMultipartUpload). "Only once" is a condition that the server itself looks at.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from storage.errors import EnvironmentFailure, TrilightError
+from storage.remote.tries import TransferFailed, is_missing, is_taken, may_pass, with_tries
+from storage.remote.url import RemoteUrl, shared_driver
+
+WRITABLE = ("s3", "gs")
+"""Schemes of servers that can be told to write a file only where there is none."""
+_PART_BYTES = 32 << 20
+_PARTS_AT_ONCE = 4
+"""Together they bound what an upload holds in memory."""
+
+
+class Bucket:
+    """A folder in a bucket that is written to."""
+
+    def __init__(self, url: RemoteUrl) -> None:
+        self.url = url
+
+    def names(self) -> set[str]:
+        """Return the names of all files below the folder, relative to it.
+
+        Raises:
+            TrilightError: the bucket does not exist or may not be listed, or the server gives no
+                answer (an EnvironmentFailure where that may pass).
+        """
+        root = self.url.root
+
+        def find() -> list[str]:
+            driver = shared_driver(self.url)
+            driver.invalidate_cache()
+            return list(driver.find(root))
+
+        found = self._tried(find, "listed")
+        return {path.removeprefix(f"{root}/") for path in found if path.startswith(f"{root}/")}
+
+    def write(self, name: str, content: Path | bytes) -> None:
+        """Write a file, or replace it.
+
+        Args:
+            name: relative to the folder.
+            content: a file of this machine, or bytes.
+
+        Raises:
+            TrilightError: as `names`, or the folder may not be written.
+        """
+        self._tried(lambda: self._put(name, content, mode="overwrite"), "written")
+
+    def create(self, name: str, content: Path | bytes) -> bool:
+        """Write a file unless there is one, and say whether it was written; else as `write`.
+
+        Where the answer to a write that succeeded is lost, the file counts as one of somebody else.
+        """
+
+        def put() -> bool:
+            try:
+                self._put(name, content, mode="create")
+            except Exception as error:  # drivers raise what they like
+                if not is_taken(error):
+                    raise
+                return False
+            return True
+
+        return self._tried(put, "written")
+
+    def _put(self, name: str, content: Path | bytes, *, mode: str) -> None:
+        driver, target = shared_driver(self.url), self.url.child(name).root
+        if isinstance(content, bytes):
+            driver.pipe_file(target, content, mode=mode)
+            return
+        driver.put_file(
+            str(content),
+            target,
+            mode=mode,
+            chunksize=_PART_BYTES,
+            max_concurrency=_PARTS_AT_ONCE,
+        )
+
+    def _tried(self, function: Callable[[], Any], what: str) -> Any:
+        try:
+            return with_tries(function)
+        except TransferFailed as error:
+            cause = error.__cause__
+            lasting = cause is None or is_missing(cause) or not may_pass(cause)
+            kind = TrilightError if lasting else EnvironmentFailure
+            raise kind(
+                f"{self.url.what} {self.url.shown!r}: cannot be {what} ({error.message}); expected "
+                "a bucket that exists, and access that lets you list, read and write there. What "
+                "was finished is safe: mend it and run the same command again."
+            ) from error

@@ -1,0 +1,37 @@
+"""Native code that dies: what children of a run call in place of the real thing.
+
+These functions run in the child processes of `make_dataset`, whose own modules are untouched.
+"""
+
+import ctypes
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.assets.stage import attempt_in_child
+from pipeline.flows.make_scene import SceneAttempt, attempt_scene
+
+if TYPE_CHECKING:
+    from pipeline.assets.prepare import AssetAttempt
+
+OBJECT = "poison.obj"
+"""Its mesh ends whoever reads it."""
+SCENE = 1
+"""Its first attempt ends whoever renders it."""
+LOST_SCENE = 2
+"""All of its attempts do."""
+
+
+def prepare_or_crash(source: Path, settings: AssetSettings, method: str) -> "AssetAttempt":
+    """Read address 0 as a broken mesh library does, or prepare the object."""
+    if source.name == OBJECT:
+        ctypes.string_at(0)
+    return attempt_in_child(source, settings, method)
+
+
+def render_or_abort(split: str, scene_index: int, attempt: int) -> SceneAttempt:
+    """Abort as LLVM does when it cannot go on, or make the attempt."""
+    if (scene_index, attempt) == (SCENE, 0) or scene_index == LOST_SCENE:
+        os.abort()
+    return attempt_scene(split, scene_index, attempt)

@@ -1,0 +1,57 @@
+"""Writing to a bucket: whole, only once where that is asked for, and only where that can be."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.flows.order import DatasetOrder
+from storage.errors import TrilightError
+from storage.remote import bucket as remote_bucket
+from storage.remote.url import RemoteUrl
+from tests.flows.bucket_kit import empty_bucket
+from tests.s3_server import s3_server
+
+pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
+pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
+
+
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    with s3_server() as port, empty_bucket(port, monkeypatch) as driver:
+        yield driver
+
+
+def test_large_files_come_in_parts_and_only_once(
+    bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(remote_bucket, "_PART_BYTES", 5 << 20)  # no server takes smaller parts
+    place = remote_bucket.Bucket(RemoteUrl(what="out", scheme="s3", root="shards/set"))
+    content = bytes(range(256)) * (11 << 12)
+    (tmp_path / "large").write_bytes(content)
+    assert place.create("part-0001/large", tmp_path / "large")
+    (tmp_path / "large").write_bytes(content[::-1])
+    assert not place.create("part-0001/large", tmp_path / "large")
+    assert not place.create("part-0001/large", b"small")
+    assert bucket.cat_file("shards/set/part-0001/large") == content
+    assert place.names() == {"part-0001/large"}
+
+
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("s3://ada:hunter2@shards/set", "out 's3://shards/set' came with a user or password"),
+        ("s3://shards/set?key=hunter2", "out 's3://shards/set' has a query"),
+        ("https://ada:hunter2@host/set", "out 'https://host/set' has the scheme 'https'; expected"),
+        ("hf://datasets/ada/set", "has the scheme 'hf'; expected a folder, or a URL of s3 or gs"),
+        ("s3://", "names no host or bucket"),
+        ("ftp://host/set", "has the scheme 'ftp'"),
+        ("pipe:cat", "is a pipe: command"),
+    ],
+)
+def test_places_that_cannot_be_written_are_refused_by_name(out: str, message: str) -> None:
+    with pytest.raises(TrilightError, match="^out ") as caught:
+        DatasetOrder(out=out)
+    assert message in str(caught.value)
+    assert "hunter2" not in str(caught.value)
