@@ -6,9 +6,10 @@ size cannot change: two stages, QK-norm over the full width, SwiGLU, RMSNorm bef
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from storage.errors import TrilightError
+from storage.ranges import Within, check_ranges
 
 Head = Literal["dpt", "linear"]
 
@@ -18,55 +19,55 @@ VERTEX_COORDINATES = 9
 NUM_TAPS = 4
 """Decoder layers that a DPT head reads (Ranftl et al. 2021)."""
 
+LAYERS = 256
+"""Most layers of a stage: twenty times the largest published network's."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelConfig:
     """All numbers of one network."""
 
-    width: int
+    width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)]
     """Width of every token."""
-    num_heads: int
+    num_heads: Annotated[int, Within(1, 512)]
     """Attention heads; each is width / num_heads wide."""
-    encoder_layers: int
+    encoder_layers: Annotated[int, Within(1, LAYERS)]
     """Layers of the view-independent stage."""
-    decoder_layers: int
+    decoder_layers: Annotated[int, Within(1, LAYERS)]
     """Layers of the view stage."""
-    hidden_width: int
+    hidden_width: Annotated[int, Within(1, 65_536)]
     """Width inside the SwiGLU."""
-    num_registers: int
+    num_registers: Annotated[int, Within(0, 4096)]
     """Learned tokens that belong to no triangle."""
-    rope_num_freqs: int
+    rope_num_freqs: Annotated[int, Within(1, 64)]
     """Rotary frequencies per coordinate; 2 x 9 x rope_num_freqs may not exceed the head width."""
-    rope_max_freq: float
+    rope_max_freq: Annotated[float, Within(1, 1000, unit="radians per metre")]
     """Highest rotary frequency in radians per metre; the lowest is 1, the rest log-spaced."""
-    register_eps: float = 0.0
+    register_eps: Annotated[float, Within(0, 1)] = 0.0
     """Added to the number of triangles in the registers' mean position; published weights: 1e-5."""
-    normal_octaves: int = 6
+    normal_octaves: Annotated[int, Within(0, 16)] = 6
     """Octaves of the sines that encode vertex normals."""
-    patch_px: int = 8
+    patch_px: Annotated[int, Within(1, 64, unit="pixels")] = 8
     """Width of a ray bundle in pixels."""
-    window_bundles: int = 0
+    window_bundles: Annotated[int, Within(0, 64, unit="bundles")] = 0
     """Width in bundles of the Swin windows of the view stage; 0 where a bundle sees all others."""
     head: Head
     """`dpt` mixes neighbouring bundles by convolution, `linear` reads each bundle alone."""
-    dpt_features: int = 0
+    dpt_features: Annotated[int, Within(0, 4096)] = 0
     """Width of the DPT's fusion path; 0 with a linear head."""
-    dpt_channels: tuple[int, ...] = ()
+    dpt_channels: Annotated[tuple[int, ...], Within(1, 8192)] = ()
     """Widths of the DPT's four grids, finest first; empty with a linear head."""
-    dpt_taps: tuple[int, ...] = ()
+    dpt_taps: Annotated[tuple[int, ...], Within(0, LAYERS - 1)] = ()
     """Decoder layers that feed those grids, in the same order; empty with a linear head."""
 
     def __post_init__(self) -> None:
+        check_ranges(self, "model config: ")
         if self.width % self.num_heads or self.head_width % 2:
             _wrong(f"width {self.width} in {self.num_heads} heads", "even heads of equal width")
         if 2 * VERTEX_COORDINATES * self.rope_num_freqs > self.head_width:
             most = self.head_width // (2 * VERTEX_COORDINATES)
             _wrong(f"rope_num_freqs {self.rope_num_freqs}", f"at most {most} for this head width")
-        if self.rope_num_freqs < 1 or self.rope_max_freq < 1:
-            _wrong("a rotary range without a frequency", "rope_num_freqs and rope_max_freq from 1")
-        if self.register_eps < 0:
-            _wrong(f"register_eps {self.register_eps}", "0 or a little above")
-        if self.window_bundles < 0 or self.window_bundles % 2:
+        if self.window_bundles % 2:
             _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
         if self.head not in ("dpt", "linear"):
             _wrong(f"head {self.head!r}", "dpt or linear")

@@ -7,9 +7,9 @@ state for a cube of side 2 are halved on use (fields that hold such numbers say 
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from scene_templates.checks import check_numbers, require
+from scene_templates.checks import OFFSET, check_numbers, require
 from scene_templates.contents.cameras import CameraSettings
 from scene_templates.contents.lights import LightSettings
 from scene_templates.contents.materials import MaterialSettings
@@ -17,30 +17,32 @@ from scene_templates.contents.placement import PlacementSettings
 from scene_templates.families.excursions import Excursion
 from scene_templates.families.family import Family
 from storage.changes import changed
+from storage.ranges import Share, Within
 
 MAX_TRIANGLES = 65_535
-"""Materials and objects are counted in 16 bits (storage.scene)."""
+"""Materials and objects are counted in 16 bits (storage.scene); a triangle may be a material."""
+
+MIN_TRIANGLES = 129
+"""A floor and one emitter."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewLaws:
     """What a camera must see for its view to be rendered."""
 
-    coverage_grid: int = 32
+    coverage_grid: Annotated[int, Within(1, 256, unit="rays")] = 32
     """Camera rays per side with which a view is judged."""
-    min_coverage: float = 0.02
+    min_coverage: Share = 0.02
     """Least share of the camera rays that meet an object first, where the scene has objects."""
-    min_lit: float = 0.05
+    min_lit: Share = 0.05
     """Least share of what the camera sees that some emitter shines upon, on the side seen."""
-    max_shell_back: float = 0.1
+    max_shell_back: Share = 0.1
     """Greatest share of the camera rays that meet a floor or wall from behind."""
-    min_depth: float = 0.01
+    min_depth: Annotated[float, OFFSET] = 0.01
     """Least distance from the camera to anything, and to the bounding box of any object."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, shares=("min_coverage", "min_lit", "max_shell_back"))
-        grid = self.coverage_grid
-        require(grid > 0, "coverage_grid", grid, "a whole number above 0")
+        check_numbers(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,18 +53,18 @@ class SceneSettings:
     """The layouts with their objects, drawn by weight."""
     families_in_turn: bool = False
     """Take the families one after the other instead, so that each has exactly its share."""
-    max_triangles: int = 1536
+    max_triangles: Annotated[int, Within(MIN_TRIANGLES, MAX_TRIANGLES, unit="triangles")] = 1536
     """Most triangles of a whole scene, shell and emitters included."""
-    enough_error: float = 0.005
+    enough_error: Share = 0.005
     """Distance to its source (99th percentile, share of the diagonal) from which an object gets no
     finer: half a percent is about a pixel of a picture of 256. 0 gives all that the budget has."""
     centring: Literal["vertex_mean", "box"] = "box"
     """What becomes the centre of an object: the middle of its source's bounding box, or as
     published the mean of its vertices, which moves with the tessellation."""
-    fill_to: int | None = None
+    fill_to: Annotated[int | None, Within(1, MAX_TRIANGLES, unit="triangles")] = None
     """Split the triangles of objects until the scene has so many, with the surface unchanged; a
     scene that has more already stays as it is."""
-    num_views: int = 4
+    num_views: Annotated[int, Within(1, 1000, unit="cameras")] = 4
     """Cameras of every scene."""
     placement: PlacementSettings = field(default_factory=PlacementSettings)
     """How objects are put into the room."""
@@ -78,11 +80,10 @@ class SceneSettings:
     """Where given, scenes leave the ranges above along one axis each, in turn."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, shares=("enough_error",))
+        check_numbers(self)
         require(len(self.families) > 0, "families", self.families, "at least one")
         names = [family.name for family in self.families]
         require(len(set(names)) == len(names), "families", names, "unique names")
-        require(self.num_views > 0, "num_views", self.num_views, "a whole number above 0")
         known = self.centring in ("vertex_mean", "box")
         require(known, "centring", self.centring, "vertex_mean or box")
         self._check_budget()
@@ -103,8 +104,6 @@ class SceneSettings:
         return changed(plain, dict(excursion.changes))
 
     def _check_budget(self) -> None:
-        most, limit = self.max_triangles, f"at most {MAX_TRIANGLES}: a triangle may be a material"
-        require(most <= MAX_TRIANGLES, "max_triangles", most, limit)
         for family in self.families:
             lights, objects = self.lights.count[1], family.num_objects[1]
             least = family.shell_triangles + lights + 4 * objects
@@ -115,6 +114,5 @@ class SceneSettings:
                 f"at least {least} for {family.name}: a shell of {family.shell_triangles}, "
                 f"{lights} emitters, and four triangles for each of {objects} objects",
             )
-        fill_to = self.max_triangles if self.fill_to is None else self.fill_to
-        fits = type(fill_to) is int and 0 < fill_to <= self.max_triangles
-        require(fits, "fill_to", self.fill_to, "a whole number of at most max_triangles")
+        fits = self.fill_to is None or self.fill_to <= self.max_triangles
+        require(fits, "fill_to", self.fill_to, "at most max_triangles")

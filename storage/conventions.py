@@ -46,6 +46,10 @@ def alpha_ggx(roughness: ArrayLike) -> NDArray:
     return np.square(np.asarray(roughness))
 
 
+ALONG_THE_VIEW = 1e-9
+"""Radians between the view and `up` below which the roll would be that of rounding errors."""
+
+
 def look_at_c2w(*, eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
     """Return the pose of a camera at `eye` that looks at `target`.
 
@@ -54,13 +58,14 @@ def look_at_c2w(*, eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> NDArray[
 
     Returns:
         c2w, float64 [4, 4]. Undefined (not finite) where the view direction is parallel to `up`
-        or has no length: callers choose other vectors.
+        within ALONG_THE_VIEW, or one of them has no length: callers choose other vectors.
     """
     eye64, up64 = np.asarray(eye, np.float64), np.asarray(up, np.float64)
     backward = eye64 - np.asarray(target, np.float64)
     backward = backward / np.linalg.norm(backward)
     right = np.cross(up64, backward)
-    right = right / np.linalg.norm(right)
+    across = np.linalg.norm(right)
+    right = right / (across if across > ALONG_THE_VIEW * np.linalg.norm(up64) else np.nan)
     c2w = np.eye(4)
     c2w[:3, 0], c2w[:3, 1], c2w[:3, 2] = right, np.cross(backward, right), backward
     c2w[:3, 3] = eye64

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
+from storage.ranges import FLOAT32_MAX, Within
 
 MAX_RESOLUTION = 8192
 """A larger window in a file from outside is refused before any memory is taken."""
@@ -30,6 +31,10 @@ class ExrCodec:
     dwa_level: float | None = None
     """Of DWAA and DWAB: greater is coarser; None is the library's 45."""
 
+
+INT32 = Within(-(2**31), 2**31 - 1)
+FLOAT32 = Within(-FLOAT32_MAX, FLOAT32_MAX)
+"""What numbers of a header are."""
 
 ZIP = ExrCodec(compression="ZIP")
 """Exact on half floats, and known to every reader of OpenEXR."""
@@ -88,7 +93,14 @@ def encode_channels(
     *,
     attributes: Attributes | None = None,
 ) -> bytes:
-    """Return the OpenEXR file of named channels, [H, W] each or [H, W, 3] under the name RGB."""
+    """Return the OpenEXR file of named channels, [H, W] each or [H, W, 3] under the name RGB.
+
+    Raises:
+        TrilightError: a number among the attributes that a header cannot hold: integers end at
+            2^31 - 1, and floats with float32.
+    """
+    for name, value in (attributes or {}).items():
+        _require_held(name, value)
     header: dict[str, object] = {
         "compression": getattr(OpenEXR, f"{codec.compression}_COMPRESSION"),
         "type": OpenEXR.scanlineimage,
@@ -98,6 +110,17 @@ def encode_channels(
     stream = io.BytesIO()
     OpenEXR.File({**header, **(attributes or {})}, dict(channels), num_threads=0).write(stream)
     return stream.getvalue()
+
+
+def _require_held(name: str, value: str | int | float) -> None:
+    """Raise TrilightError for a number that OpenEXR would wrap around, or make infinite."""
+    if isinstance(value, str):
+        return
+    within = INT32 if isinstance(value, int) else FLOAT32
+    if not within.holds(value):
+        raise TrilightError(
+            f"picture: attribute {name} is {value!r}; expected a number {within}, or text."
+        )
 
 
 def decode_exr(data: bytes) -> NDArray[np.float32]:

@@ -7,13 +7,14 @@ other; `check` states its laws, and names the first place where one is broken.
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, SPECULAR
+from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, ROUGHNESS, SPECULAR
 from storage.errors import TrilightError
+from storage.ranges import FLOAT32_MAX, Columns, Within, declared_ranges
 
 ObjectKind = Literal["object", "shell", "emitter"]
 OBJECT_KINDS: tuple[ObjectKind, ...] = ("object", "shell", "emitter")
@@ -26,6 +27,12 @@ UNIT_NORMAL_TOLERANCE = 1e-4
 
 POSE_TOLERANCE = 1e-4
 """How far the rotation of a float32 pose may be from orthonormal."""
+
+FINITE = Within(-FLOAT32_MAX, FLOAT32_MAX)
+"""Any float32 but NaN and infinity."""
+
+COMPONENT = Within(-1 - UNIT_NORMAL_TOLERANCE, 1 + UNIT_NORMAL_TOLERANCE)
+"""Of a unit vector."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,21 +57,29 @@ class SceneObject:
 class Scene:
     """A triangle scene with palette materials, emitters and cameras, in world space."""
 
-    vertex_positions: NDArray[np.float32]
+    vertex_positions: Annotated[NDArray[np.float32], FINITE]
     """[V, 3] world units."""
-    vertex_normals: NDArray[np.float32]
+    vertex_normals: Annotated[NDArray[np.float32], COMPONENT]
     """[V, 3] unit shading normals; a flat face has three vertices of its own."""
-    faces: NDArray[np.uint32]
+    faces: Annotated[NDArray[np.uint32], Within(0, 2**32 - 1)]
     """[T, 3] rows of `vertex_positions`, counter-clockwise seen from outside."""
-    material_index: NDArray[np.uint16]
+    material_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
     """[T] row of `materials`."""
-    materials: NDArray[np.float32]
+    materials: Annotated[
+        NDArray[np.float32],
+        Columns("diffuse", DIFFUSE, Within(0, 1)),
+        Columns("specular", SPECULAR, Within(0, 1)),
+        Columns("roughness", slice(ROUGHNESS, ROUGHNESS + 1), Within(0, 1)),
+        Columns("emission", EMISSION, Within(0, FLOAT32_MAX)),
+    ]
     """[M, 10] diffuse rgb, specular rgb, roughness, emission rgb (storage.conventions)."""
-    object_index: NDArray[np.uint16]
+    object_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
     """[T] row of `objects`."""
-    c2w: NDArray[np.float32]
+    c2w: Annotated[NDArray[np.float32], FINITE]
     """[C, 4, 4] camera to world."""
-    fov_deg: NDArray[np.float32]
+    fov_deg: Annotated[
+        NDArray[np.float32], Within(0, 180, low_open=True, high_open=True, unit="degrees")
+    ]
     """[C] full field of view in degrees."""
     objects: tuple[SceneObject, ...]
     """Names, kinds and rights; shell parts and emitters are objects too."""
@@ -163,6 +178,10 @@ def _check_arrays(scene: Scene) -> None:
             _broken(f"{name} has shape {array.shape}", f"{shape} with None for any length")
         if np.issubdtype(dtype, np.floating):
             _require(np.isfinite(array), name, array, "finite values")
+    for field in declared_ranges(Scene):
+        values = getattr(scene, field.name)
+        part = "" if field.part is None else f"{field.part.name} "
+        _require(~field.outside(values), field.name, values, f"{part}{field.within}")
     for name, other in (("vertex_normals", "vertex_positions"), ("fov_deg", "c2w")):
         _same_length(scene, name, other)
     for name in ("material_index", "object_index"):
@@ -183,14 +202,9 @@ def _check_materials(scene: Scene) -> None:
     _require(
         scene.material_index < rows, "material_index", scene.material_index, f"rows below {rows}"
     )
-    reflective = scene.materials[:, : EMISSION.start]
-    in_range = (reflective >= 0) & (reflective <= 1)
-    _require(in_range, "materials", reflective, "albedo and roughness in [0, 1]")
     total = scene.materials[:, DIFFUSE] + scene.materials[:, SPECULAR]
     bound = 1 + ALBEDO_SUM_TOLERANCE
     _require(total <= bound, "materials", total, "diffuse + specular at most 1")
-    emission = scene.materials[:, EMISSION]
-    _require(emission >= 0, "materials", emission, "emission of at least 0")
     if not scene.triangle_emits.any():
         _broken("materials holds no emission that a triangle uses", "at least one emitter")
 
@@ -198,10 +212,11 @@ def _check_materials(scene: Scene) -> None:
 def _check_objects(scene: Scene) -> None:
     rows = len(scene.objects)
     _require(scene.object_index < rows, "object_index", scene.object_index, f"rows below {rows}")
-    names = [entry.name for entry in scene.objects]
-    repeated = [name for row, name in enumerate(names) if name in names[:row]]
-    if repeated:
-        _broken(f"objects holds the name {repeated[0]!r} twice", "unique names")
+    names = set[str]()
+    for entry in scene.objects:  # a set: a scene may hold 65536 of them
+        if entry.name in names:
+            _broken(f"objects holds the name {entry.name!r} twice", "unique names")
+        names.add(entry.name)
     is_emitter = np.array([entry.kind == "emitter" for entry in scene.objects])
     agrees = is_emitter[scene.object_index] == scene.triangle_emits
     _require(agrees, "objects", scene.object_index, "kind emitter exactly where a triangle emits")
@@ -210,8 +225,6 @@ def _check_objects(scene: Scene) -> None:
 def _check_cameras(scene: Scene) -> None:
     if scene.num_views == 0:
         _broken("c2w is empty", "at least one camera")
-    in_range = (scene.fov_deg > 0) & (scene.fov_deg < 180)
-    _require(in_range, "fov_deg", scene.fov_deg, "degrees between 0 and 180")
     rotation = scene.c2w[:, :3, :3].astype(np.float64)
     gram = rotation.transpose(0, 2, 1) @ rotation
     orthonormal = abs(gram - np.eye(3)).max(axis=(1, 2)) <= POSE_TOLERANCE

@@ -7,10 +7,12 @@ dataset begins with exactly the scenes of a shorter one.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 from storage.conventions import SPLITS
 from storage.errors import TrilightError
 from storage.layout import numbered
+from storage.ranges import Within, check_ranges
 
 JUDGED_SPLIT = "test"
 """Split of whole sets that are judged by, never learnt from."""
@@ -18,39 +20,28 @@ JUDGED_SPLIT = "test"
 _VALIDATION_SLOT, _TEST_SLOT = 2, 5
 """Places in a cycle of shards: early, so that a small dataset has all three splits."""
 
+MOST_SCENES = 1_000_000_000
+"""Of a dataset: a sample's name holds nine digits."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SplitSettings:
     """How objects and scenes are divided."""
 
-    scenes_per_shard: int
+    scenes_per_shard: Annotated[int, Within(1, 1_000_000, unit="scenes")]
     """Scenes in every shard; a shard holds one split."""
-    shards_per_cycle: int = 8
+    shards_per_cycle: Annotated[int, Within(_TEST_SLOT + 1, 1_000_000, unit="shards")] = 8
     """Of this many shards in a row one is for validation and one is for testing."""
-    held_out_objects: float = 0.125
+    held_out_objects: Annotated[float, Within(0, 0.5, low_open=True, high_open=True)] = 0.125
     """Share of objects kept for validation, and again for testing."""
     one_split: bool = False
     """All objects and scenes are of the split `test`: a set to be judged by."""
-    listed_scenes: int | None = None
+    listed_scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
     """How many scenes there are where they come from files instead of being drawn: the last shard
     may hold fewer, and the dataset cannot grow."""
 
     def __post_init__(self) -> None:
-        if self.scenes_per_shard < 1:
-            raise TrilightError(
-                f"scenes_per_shard is {self.scenes_per_shard}; expected at least 1."
-            )
-        if self.shards_per_cycle <= _TEST_SLOT:
-            raise TrilightError(
-                f"shards_per_cycle is {self.shards_per_cycle}; expected at least {_TEST_SLOT + 1}, "
-                "so that each cycle has its validation and its test shard."
-            )
-        if self.listed_scenes is not None and self.listed_scenes < 1:
-            raise TrilightError(f"listed_scenes is {self.listed_scenes}; expected at least 1.")
-        if not 0 < self.held_out_objects < 0.5:
-            raise TrilightError(
-                f"held_out_objects is {self.held_out_objects}; expected a share between 0 and 0.5."
-            )
+        check_ranges(self)
 
 
 def split_of_object(geometry_sha256: str, settings: SplitSettings) -> str:

@@ -7,12 +7,13 @@ one and may replace fields. What is not here cannot be changed.
 import dataclasses
 import json
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import torch
 
 from model.config import ModelConfig
 from storage.errors import TrilightError
+from storage.ranges import Seed, Share, Within, check_ranges
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
 
@@ -20,6 +21,12 @@ PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 Precision = Literal["float32", "bfloat16"]
 """Of the network's products. Positions, losses, weights and AdamW's memories stay float32."""
+
+Count = Annotated[int, Within(1, 10**9)]
+"""Of steps or of scenes; a billion is never reached."""
+
+BelowOne = Within(0, 1, high_open=True)
+"""Of the decay of a running mean; at 1 it would never move."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,100 +39,71 @@ class TrainSettings:
     """The network."""
     from_weights: bool = False
     """Whether the run begins with given weights (`--from`) instead of random ones."""
-    resolution: int
+    resolution: Annotated[int, Within(1, 2048, unit="pixels")]
     """Pixels across the training pictures: a divisor of the data's, a multiple of the bundle's."""
-    most_triangles: int = 0
+    most_triangles: Annotated[int, Within(0, 1_000_000, unit="triangles")] = 0
     """Scenes with more triangles are unusable; 0: none is."""
-    seed: int = 0
+    seed: Seed = 0
     """Of initial weights, order and augmentation."""
     loss: LossSettings
     """What is minimised."""
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
     """Symmetries under which scenes are shown."""
-    num_steps: int
+    num_steps: Count
     """Updates of the weights; the learning rate ends its cosine at the last one."""
-    scenes_per_step: int
+    scenes_per_step: Annotated[int, Within(1, 65_536, unit="scenes")]
     """Scenes whose gradients are averaged into one update."""
-    views_per_scene: int
+    views_per_scene: Annotated[int, Within(1, 1000, unit="views")]
     """Views of each, drawn anew at every visit; at most as many as the data holds."""
-    scenes_per_pass: int = 16
+    scenes_per_pass: Annotated[int, Within(1, 65_536, unit="scenes")] = 16
     """Most scenes that go through the network at once; gradients of the passes of a step add up."""
     precision: Precision = "float32"
     """Of the network's products."""
-    learning_rate: float
+    learning_rate: Annotated[float, Within(0, 1, low_open=True)]
     """Peak learning rate of AdamW."""
-    warmup_steps: int
+    warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear rise to the peak."""
-    final_rate_share: float = 0.05
+    final_rate_share: Share = 0.05
     """Learning rate at the last step, as a share of the peak."""
-    weight_decay: float = 0.01
+    weight_decay: Annotated[float, Within(0, 10)] = 0.01
     """Decoupled decay of every weight (Loshchilov and Hutter 2019)."""
-    betas: tuple[float, float] = (0.9, 0.99)
+    betas: Annotated[tuple[float, float], BelowOne] = (0.9, 0.99)
     """AdamW's memories."""
-    grad_clip: float = 1.0
+    grad_clip: Annotated[float, Within(0, 1e9, low_open=True)] = 1.0
     """Longest gradient that is followed; a longer one is shortened to this."""
-    ema_decay: float = 0.0
+    ema_decay: Annotated[float, BelowOne] = 0.0
     """Of the running mean of the weights, which is then what is judged and kept; 0: no mean."""
     recompute_activations: bool = False
     """Trade a third more time for memory: see RenderFormer.recompute_activations."""
-    shuffle_shards: int = 4
+    shuffle_shards: Annotated[int, Within(1, 100_000, unit="shards")] = 4
     """Shards that are open at the same time, among whose samples is shuffled."""
-    most_unusable: int = 0
+    most_unusable: Annotated[int, Within(0, 10**9, unit="samples")] = 0
     """Damaged samples that may be replaced by others; at 0 the first one ends the run."""
-    log_every: int = 10
+    log_every: Count = 10
     """Steps between rows of metrics.jsonl."""
-    validate_every: int
+    validate_every: Count
     """Steps between validations."""
-    checkpoint_every: int
+    checkpoint_every: Count
     """Steps between checkpoints."""
-    checkpoints_kept: int = 2
+    checkpoints_kept: Count = 2
     """Newest checkpoints that stay; older ones are deleted."""
-    keep_every: int = 0
+    keep_every: Annotated[int, Within(0, 10**9, unit="steps")] = 0
     """Checkpoints at multiples of so many steps stay for good; 0: none does."""
-    validation_scenes: int = 64
+    validation_scenes: Count = 64
     """Most scenes of the validation split that are judged."""
 
     def __post_init__(self) -> None:
+        check_ranges(self, "train settings: ")
         patch_px = self.model.patch_px
-        if self.resolution < patch_px or self.resolution % patch_px:
+        if self.resolution % patch_px:
             _wrong("resolution", self.resolution, f"a multiple of {patch_px}")
-        for name in _AT_LEAST_ONE:
-            if getattr(self, name) < 1:
-                _wrong(name, getattr(self, name), "at least 1")
         for name in ("validate_every", "checkpoint_every"):
             if getattr(self, name) % self.log_every:
                 _wrong(name, getattr(self, name), f"a multiple of log_every, {self.log_every}")
-        if not 0 <= self.warmup_steps < self.num_steps:
+        if self.warmup_steps >= self.num_steps:
             _wrong("warmup_steps", self.warmup_steps, f"0 to {self.num_steps - 1}")
-        for name in ("learning_rate", "grad_clip"):
-            if not getattr(self, name) > 0:
-                _wrong(name, getattr(self, name), "above 0")
-        for name in ("most_unusable", "most_triangles", "keep_every", "weight_decay"):
-            if not getattr(self, name) >= 0:
-                _wrong(name, getattr(self, name), "at least 0")
-        self._check_shares()
         if self.precision not in get_args(Precision):
             _wrong("precision", self.precision, " or ".join(get_args(Precision)))
-
-    def _check_shares(self) -> None:
-        shares = {"ema_decay": (self.ema_decay,), "final_rate_share": (self.final_rate_share,)}
-        for name, parts in {**shares, "betas": self.betas}.items():
-            if not all(0 <= part <= 1 for part in parts):
-                _wrong(name, getattr(self, name), "0 to 1")
-
-
-_AT_LEAST_ONE = (
-    "num_steps",
-    "scenes_per_step",
-    "scenes_per_pass",
-    "views_per_scene",
-    "shuffle_shards",
-    "log_every",
-    "validate_every",
-    "checkpoint_every",
-    "checkpoints_kept",
-    "validation_scenes",
-)
 
 
 def settings_record(settings: TrainSettings) -> dict[str, Any]:

@@ -101,13 +101,14 @@ def _contest(
 
     network = open_network(checkpoint)
     shards = opened.split(split)
-    chosen = resolution or trained_resolution(checkpoint) or stored_resolution(shards)
+    if resolution is None:
+        resolution = trained_resolution(checkpoint) or stored_resolution(shards)
     network.to(choose_device(device))
     return Contest(
         network=network,
         shards=shards,
-        resolution=chosen,
-        rivals=make_rivals(rivals.split("train"), chosen) if "train" in rivals.splits else None,
+        resolution=resolution,
+        rivals=make_rivals(rivals.split("train"), resolution) if "train" in rivals.splits else None,
         lpips=load_lpips(lpips),
         most_scenes=most_scenes,
     )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 from infra.rendering.cameras import Camera, Shot, camera_path, orbit, own_camera, shots
 from infra.rendering.engines import Engine, MitsubaEngine, NeuralEngine
@@ -17,9 +17,10 @@ from infra.rendering.tone_maps import require_tone_map
 from infra.rendering.video import write_video
 from pipeline.flows.read_scenes import SceneReader
 from pipeline.flows.scene_source import SceneSource, scene_source
-from pipeline.renders.settings import PASS_SPP, RenderSettings
+from pipeline.renders.settings import PASS_SPP, NoiseFloor, RenderSettings, Resolution, Samples
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
+from storage.ranges import Seed, Within, check_ranges
 
 if TYPE_CHECKING:
     from pipeline.renders.renderer import Sampling
@@ -45,32 +46,35 @@ class Asked:
     """A key of ENGINES."""
     checkpoint: str | None
     """Of the network; None for the one that is shipped."""
-    resolution: int | None
+    resolution: Resolution | None
     """Width of pictures; None for what the network was trained on, or 512."""
-    noise_floor_db: float
+    noise_floor_db: NoiseFloor
     """Target of the path tracer."""
-    max_spp: int
+    max_spp: Samples
     """Its cap."""
-    view: int
+    view: Annotated[int, Within(0, 999)]
     """Row of a scene's own cameras."""
-    orbit: int | None
+    orbit: Annotated[int | None, Within(1, 100_000, unit="pictures")]
     """Number of pictures of a turn."""
-    arc_deg: float
+    arc_deg: Annotated[float, Within(0, 360, low_open=True, unit="degrees")]
     """Its angle."""
     cameras: str | None
     """File of a camera path."""
-    fps: int
+    fps: Annotated[int, Within(1, 240, unit="pictures a second")]
     """Pictures a second of a video."""
     tone_map: str
     """A name of infra.rendering.tone_maps."""
     precision: str
     """A name of model.precision."""
-    lights_per_pass: int
+    lights_per_pass: Annotated[int, Within(1, 65_535, unit="triangles")]
     """Most emitting triangles of a group (model.light_groups)."""
-    seed: int
+    seed: Seed
     """Of samples."""
-    threads: int | None
+    threads: Annotated[int | None, Within(1, 1024, unit="threads")]
     """Of the processor; None for all cores."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, named=_option)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,12 +138,6 @@ def _check(asked: Asked) -> None:
     neural = asked.engine in ("neural", "both")
     for law, option, got, expected in (
         (asked.engine in ENGINES, "--engine", asked.engine, "mitsuba, neural or both"),
-        (asked.seed >= 0, "--seed", asked.seed, "an integer from 0"),
-        (asked.threads is None or asked.threads > 0, "--threads", asked.threads, "at least 1"),
-        (asked.lights_per_pass > 0, "--lights-per-pass", asked.lights_per_pass, "at least 1"),
-        (1 <= asked.fps <= 240, "--fps", asked.fps, "1 to 240"),
-        (asked.orbit is None or asked.orbit > 0, "--orbit", asked.orbit, "at least 1"),
-        (0 < asked.arc_deg <= 360, "--arc", asked.arc_deg, "degrees above 0, up to 360"),
         (
             asked.orbit is None or asked.cameras is None,
             "--cameras",
@@ -180,6 +178,11 @@ def _require_torch() -> None:
         raise TrilightError(
             "--engine neural needs PyTorch, which is not installed; expected it: make setup-all."
         ) from error
+
+
+def _option(name: str) -> str:
+    """Return the option that a field stands for."""
+    return "--" + name.removesuffix("_db").removesuffix("_deg").replace("_", "-")
 
 
 def _settings(asked: Asked) -> RenderSettings:

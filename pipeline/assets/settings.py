@@ -2,44 +2,40 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from storage.errors import TrilightError
+from storage.ranges import Within, check_ranges
 
 Profile = Literal["faithful", "uniform"]
+
+PART = Within(0, 1, low_open=True)
+"""A share that is more than nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GateSettings:
     """What a level must keep of its source, whatever made it."""
 
-    max_error_p99: float = 0.03
+    max_error_p99: Annotated[float, PART] = 0.03
     """Largest accepted two-way distance to the source (99th percentile), as a share of the diagonal
     of the source's bounding box."""
-    max_outside: float = 0.01
+    max_outside: Annotated[float, PART] = 0.01
     """How far a vertex may lie outside of the source's bounding box, in diagonals."""
-    area_ratio: tuple[float, float] = (0.75, 1.25)
+    area_ratio: Annotated[tuple[float, float], Within(0, 1000, low_open=True)] = (0.75, 1.25)
     """Accepted area as a multiple of the source's."""
-    max_normal_error_deg: float = 35.0
+    max_normal_error_deg: Annotated[float, Within(0, 90, low_open=True, unit="degrees")] = 35.0
     """Largest accepted mean angle between normals; 57 is the mean of unrelated ones."""
-    min_silhouette_iou: float = 0.9
+    min_silhouette_iou: Annotated[float, PART] = 0.9
     """Smallest accepted agreement of the outlines."""
-    max_lost_area: float = 0.01
+    max_lost_area: Annotated[float, PART] = 0.01
     """Largest accepted share of the source's area in parts that have vanished."""
 
     def __post_init__(self) -> None:
         """Raise TrilightError for values that no level, or any, could meet."""
-        for name in ("max_error_p99", "max_outside", "min_silhouette_iou", "max_lost_area"):
-            if not 0 < getattr(self, name) <= 1:
-                raise TrilightError(
-                    f"{name} is {getattr(self, name)}; expected a share in (0, 1], such as 0.03."
-                )
-        if not 0 < self.area_ratio[0] < 1 < self.area_ratio[1]:
+        check_ranges(self)
+        if not self.area_ratio[0] < 1 < self.area_ratio[1]:
             raise TrilightError(f"area_ratio is {self.area_ratio}; expected numbers around 1.")
-        if not 0 < self.max_normal_error_deg <= 90:
-            raise TrilightError(
-                f"max_normal_error_deg is {self.max_normal_error_deg}; expected (0, 90]."
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,34 +45,37 @@ class AssetSettings:
     profile: Profile = "faithful"
     """`faithful`: the fewest triangles for the error. `uniform`: triangles of even size and shape,
     at several times the error; it needs pymeshlab."""
-    budgets: tuple[int, ...] = (1400, 1000, 700, 500, 340, 240)
+    budgets: Annotated[tuple[int, ...], Within(4, 1_500_000, unit="triangles")] = (
+        1400,
+        1000,
+        700,
+        500,
+        340,
+        240,
+    )
     """Most triangles of each level, falling. A scene takes the finest levels that it can hold."""
-    epsilon: float | None = None
+    epsilon: Annotated[float | None, PART] = None
     """Two-way distance (99th percentile, share of the diagonal) that is good enough: the finest
     level is the smallest mesh that keeps it, instead of all that its budget allows."""
     gate: GateSettings = dataclasses.field(default_factory=GateSettings)
     """What a level must keep; one that does not is made by the next method, or left out."""
-    max_source_bytes: int = 200_000_000
+    max_source_bytes: Annotated[int, Within(1, 10_000_000_000, unit="bytes")] = 200_000_000
     """Largest accepted source, with the buffers that it names."""
-    max_source_faces: int = 1_500_000
+    max_source_faces: Annotated[int, Within(1, 100_000_000, unit="triangles")] = 1_500_000
     """Most triangles of an accepted source, instances counted."""
-    max_instances: int = 10_000
+    max_instances: Annotated[int, Within(1, 1_000_000, unit="nodes")] = 10_000
     """Most nodes of a glTF scene that place a mesh."""
 
     def __post_init__(self) -> None:
         """Raise TrilightError for values that contradict each other or their meaning."""
+        check_ranges(self)
         if self.profile not in ("faithful", "uniform"):
             raise TrilightError(f"profile is {self.profile!r}; expected faithful or uniform.")
         falling = all(a > b for a, b in zip(self.budgets, self.budgets[1:], strict=False))
-        if not self.budgets or not falling or self.budgets[-1] < 4:
+        if not self.budgets or not falling:
+            raise TrilightError(f"budgets is {self.budgets}; expected falling numbers.")
+        if self.epsilon is not None and self.epsilon > self.gate.max_error_p99:
             raise TrilightError(
-                f"budgets is {self.budgets}; expected falling numbers of at least 4 triangles."
-            )
-        if self.epsilon is not None and not 0 < self.epsilon <= self.gate.max_error_p99:
-            raise TrilightError(
-                f"epsilon is {self.epsilon}; expected a share of the diagonal above 0 and at most "
+                f"epsilon is {self.epsilon}; expected a share of the diagonal of at most "
                 f"{self.gate.max_error_p99}, such as 0.005."
             )
-        for name in ("max_source_bytes", "max_source_faces", "max_instances"):
-            if getattr(self, name) < 1:
-                raise TrilightError(f"{name} is {getattr(self, name)}; expected at least 1.")

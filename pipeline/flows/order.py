@@ -3,11 +3,14 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from pipeline.flows.builds import BUILDS
+from pipeline.renders.settings import NoiseFloor, Resolution
 from storage.errors import TrilightError
 from storage.output import dataset_folder
+from storage.ranges import Seed, Share, Within, check_ranges
+from storage.splits import MOST_SCENES
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
@@ -25,28 +28,28 @@ class DatasetOrder:
     out: str = "data/smoke"
     """Folder of the dataset, as the worker sees it, or a bucket such as s3://bucket/folder. With a
     bucket, machines that work at the same time should make different shards, or they waste work."""
-    scenes: int | None = None
+    scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
     """How many scenes, rounded up to whole shards; by default the build's number."""
-    seed: int | None = None
+    seed: Seed | None = None
     """Replaces the build's seed of every draw."""
-    resolution: int | None = None
+    resolution: Resolution | None = None
     """Replaces the build's picture width in pixels."""
-    noise_floor_db: float | None = None
+    noise_floor_db: NoiseFloor | None = None
     """Replaces the build's target (psnr_log_db)."""
     allow_licences: tuple[str, ...] = ()
     """Licences allowed in addition to the build's."""
     licence: str | None = None
     """Licence of object files that come without any statement; otherwise they count as yours."""
-    workers: int | None = None
+    workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
     """Render processes that share the cores; by default one, or one for each graphics card."""
-    failure_budget: float = 0.1
+    failure_budget: Share = 0.1
     """Share of scenes that may be given up before the run stops."""
     accept_environment: bool = False
     """Go on with a dataset that was begun with other library versions."""
     scenes_from: str | None = None
     """Folder of scene files (RenderFormer JSON) to render instead of new scenes: scene k is the
     k-th *.json, all are of the split test, and the build's limits on scenes do not apply."""
-    views: int | None = None
+    views: Annotated[int | None, Within(1, 1000, unit="cameras")] = None
     """First cameras of each scene file; by default as many as every file has."""
     shards: str | None = None
     """A range of shards A:B, from A up to but not B: make these only. Whoever makes the last
@@ -58,14 +61,7 @@ class DatasetOrder:
         if self.build not in BUILDS:
             names = ", ".join(BUILDS)
             raise TrilightError(f"build {self.build!r} is unknown; expected one of {names}.")
-        if self.scenes is not None and self.scenes < 1:
-            raise TrilightError(f"scenes is {self.scenes}; expected at least 1.")
-        if self.workers is not None and self.workers < 1:
-            raise TrilightError(f"workers is {self.workers}; expected at least 1.")
-        if not 0 <= self.failure_budget <= 1:
-            raise TrilightError(
-                f"failure_budget is {self.failure_budget}; expected a share from 0 to 1."
-            )
+        check_ranges(self)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(
                 f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "

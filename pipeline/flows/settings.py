@@ -13,6 +13,7 @@ from scene_templates.settings import SceneSettings
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.profiles import StorageSettings
+from storage.ranges import Seed, check_ranges
 from storage.splits import SplitSettings
 
 
@@ -22,8 +23,8 @@ class BuildSettings:
 
     build: str
     """Name of the build that they come from."""
-    seed: int
-    """Seed of every draw; any integer from 0."""
+    seed: Seed
+    """Seed of every draw."""
     source: str | None = None
     """Where objects must come from; by default the user says."""
     allowed_licences: tuple[str, ...]
@@ -42,8 +43,7 @@ class BuildSettings:
     def __post_init__(self) -> None:
         if not isinstance(self.source, str | None):
             raise TrilightError(f"source is {self.source!r}; expected a source of objects.")
-        if self.seed < 0:
-            raise TrilightError(f"seed is {self.seed}; expected an integer from 0.")
+        check_ranges(self)
         if not self.allowed_licences:
             raise TrilightError("allowed_licences is empty; expected at least one licence.")
 

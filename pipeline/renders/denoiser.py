@@ -34,12 +34,16 @@ def denoise(
 ) -> NDArray[np.float32]:
     """Return the picture without noise, and exactly black where no ray met anything.
 
+    A picture without any light stays black.
+
     Args:
         radiance_rgb: [R, R, 3] finite and at least 0. Values that are not finite vanish in the
             filter without a trace: look for them before.
         features: albedo and normal, [R, R, 3] each, free of noise themselves.
         quality: of the network.
     """
+    if not radiance_rgb.any():
+        return np.zeros_like(radiance_rgb)  # the filter would paint the albedo, up to 0.003 bright
     filtered = _filter(radiance_rgb.shape[0], quality, _threads)
     inputs = (radiance_rgb, features.albedo, features.normal)
     picture = filtered.run(dict(zip(_INPUTS, inputs, strict=True)))

@@ -1,10 +1,12 @@
 """`RenderSettings`: how good a picture must be, and how much it may cost."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
+from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB
+from storage.ranges import Within, check_ranges
 
 PASS_SPP = (64, 16, 4)
 """Samples per pixel of one pass of a half, from best to cheapest: squares, as the sampler needs.
@@ -16,52 +18,63 @@ to 2 dB in the median pixel of the easy ones (LOG.md). The small ones are for qu
 MAX_RESOLUTION = 2048
 """Largest picture: one pass of 64 samples takes 3.3 GB there, and that grows with the area."""
 
+MAX_SPP = 1 << 20
+"""Most samples per pixel: at 1.4 dB a doubling, eight times as many as 54 dB take in hard views."""
+
+Resolution = Annotated[int, Within(8, MAX_RESOLUTION, unit="pixels")]
+"""Width of a square picture."""
+
+NoiseFloor = Annotated[float, Within(0, MAX_DB, low_open=True, high_open=True, unit="dB")]
+"""A target for the measured error of a picture."""
+
+Samples = Annotated[int, Within(2 * PASS_SPP[-1], MAX_SPP, unit="samples")]
+"""Of both halves of a picture together, per pixel."""
+
+Depth = Annotated[int, Within(1, 1024, unit="edges")]
+"""Length of a path."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
     """The target, the budget and the estimator of every picture of a build."""
 
-    resolution: int
+    resolution: Resolution
     """Width and height in pixels, a multiple of 8 up to MAX_RESOLUTION."""
-    noise_floor_db: float
+    noise_floor_db: NoiseFloor
     """Sampling stops when the measured floor (psnr_log_db) reaches this."""
-    min_spp: int
+    min_spp: Samples
     """Samples per pixel, both halves together, before the floor is measured first. From 32 on it is
     honest in views without rare bright paths, and goes by what it finds in the others."""
-    max_spp: int
+    max_spp: Samples
     """The cap: sampling stops here whatever the floor is."""
     reject_at_cap: bool = False
     """Reject a view that misses its floor at the cap (floor_not_reached; its camera is tried
     again), after all of its samples, instead of keeping it with the floor that it has. A set
     without its hard views is another distribution: keep them unless every picture must be good."""
-    max_depth: int = 10
+    max_depth: Depth = 10
     """Longest path in edges: 1 sees emitters alone, 2 adds direct light."""
-    rr_depth: int = 2
+    rr_depth: Depth = 2
     """From this many edges on, paths go on by Russian roulette. 2 instead of 5 takes 20 % less
     time for the same error on sampled scenes (LOG.md)."""
-    aux_spp: int = 64
+    aux_spp: Annotated[int, Within(PASS_SPP[-1], PASS_SPP[0], unit="samples")] = 64
     """Samples per pixel of the albedo and normal pictures that guide the denoiser."""
     denoiser: Literal["high", "fast", "off"] = "high"
     """Quality of Open Image Denoise; `fast` costs 1 to 2 dB and saves 0.3 core-seconds."""
-    min_mean_radiance: float = 0.01
+    min_mean_radiance: Annotated[float, Within(0, HALF_FLOAT_MAX)] = 0.01
     """A view whose first samples are darker than this on average is rejected as black_view."""
     per_light: bool = False
     """Render each emitter alone as well, and make the picture their sum (storage.lights). It takes
     about as many times as long as there are emitters."""
 
     def __post_init__(self) -> None:
+        check_ranges(self, "render settings: ")
         _require(
-            0 < self.resolution <= MAX_RESOLUTION and self.resolution % 8 == 0,
-            f"resolution is {self.resolution}; expected a positive multiple of 8 up to "
-            f"{MAX_RESOLUTION}",
+            self.resolution % 8 == 0,
+            f"resolution is {self.resolution}; expected a multiple of 8",
         )
         _require(
-            0 < self.noise_floor_db < MAX_DB,
-            f"noise_floor_db is {self.noise_floor_db}; expected dB between 0 and {MAX_DB:.0f}",
-        )
-        _require(
-            0 < self.min_spp <= self.max_spp,
-            f"min_spp is {self.min_spp} and max_spp {self.max_spp}; expected 0 < min <= max",
+            self.min_spp <= self.max_spp,
+            f"min_spp is {self.min_spp} and max_spp {self.max_spp}; expected min <= max",
         )
         unit = 2 * PASS_SPP[-1]
         _require(
@@ -71,16 +84,8 @@ class RenderSettings:
         )
         _require(self.aux_spp in PASS_SPP, f"aux_spp is {self.aux_spp}; expected one of {PASS_SPP}")
         _require(
-            self.max_depth >= 1 and self.rr_depth >= 1,
-            f"max_depth is {self.max_depth} and rr_depth {self.rr_depth}; expected 1 or more",
-        )
-        _require(
             self.denoiser in ("high", "fast", "off"),
             f"denoiser is {self.denoiser!r}; expected high, fast or off",
-        )
-        _require(
-            self.min_mean_radiance >= 0,
-            f"min_mean_radiance is {self.min_mean_radiance}; expected 0 or more",
         )
 
 

@@ -58,7 +58,8 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
         stem: of the scene file; its meshes stand in folders of that name.
 
     Raises:
-        TrilightError: more objects or cameras than a file may have, or a number beyond its range.
+        TrilightError: more objects or cameras than a file may have, a number beyond its range, or
+            no emitter with an area.
     """
     scene.check()
     lost: list[str] = []
@@ -66,6 +67,8 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
     objects: dict[str, Any] = {}
     taken: set[str] = set()
     for row, material, faces in _parts(scene):
+        if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
+            continue  # readers refuse a mesh of which nothing is left
         name = _unique(_name(scene, row, material), taken)
         normals = scene.vertex_normals[scene.faces[faces]]
         path = _mesh_path(scene, row, material, stem)
@@ -74,6 +77,8 @@ def described_files(scene: Scene, stem: str) -> DescribedFiles:
         objects[name] = _object(path, scene.materials[material], smooth)
         if smooth and not _comes_back(scene, faces, normals):
             lost.append(f"{name}: shading normals; readers make their own")
+    if not any(max(entry["material"]["emissive"]) > 0 for entry in objects.values()):
+        raise TrilightError("scene: no emitter has an area; a scene file needs at least one.")
     data = json.dumps(
         {
             "scene_name": _printable(stem),

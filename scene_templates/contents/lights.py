@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.checks import Counts, Range, check_numbers, require
+from scene_templates.checks import OFFSET, SIZE, Counts, Range, check_numbers, require
 from scene_templates.contents.rotations import ORIENTATIONS, Orientation, rotated, rotation_rand
 from scene_templates.layout import Emitter
 from scene_templates.templates.sectors import Sector
+from storage.ranges import Share, Within
 
 TRIANGLE = 0.025 * np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
 """The published emitter before scaling: equilateral, edge 0.0707."""
@@ -21,6 +23,9 @@ SPACING_TRIES = 256
 """Eight emitters 0.3 apart claim four tenths of the narrowest sector, so that this is hardly ever
 used up; the candidate farthest from the others is taken if it is."""
 
+MOST_LIGHTS = 64
+"""As many as may be kept apart (storage.lights); the published scenes have up to 8."""
+
 PALEST = 0.2
 """Least channel of a coloured light before its mean is made 1: no light is quite monochrome."""
 
@@ -29,37 +34,33 @@ PALEST = 0.2
 class LightSettings:
     """What emitters are drawn from."""
 
-    count: Counts = (1, 8)
+    count: Annotated[Counts, Within(1, MOST_LIGHTS, unit="emitters")] = (1, 8)
     """Fewest and most emitters, each count equally likely."""
-    total_emission: Range = (2500.0, 5000.0)
+    total_emission: Annotated[Range, Within(1e-3, 1e9)] = (2500.0, 5000.0)
     """Radiance summed over the emitters: one of n emits a number from this range divided by n."""
-    scale: Range = (2.0, 2.5)
+    scale: Annotated[Range, SIZE] = (2.0, 2.5)
     """Scale per axis of the emitter triangle (edge 0.0707), which is not halved."""
-    distance: Range = (2.1, 2.7)
+    distance: Annotated[Range, SIZE] = (2.1, 2.7)
     """Distance of an emitter from a point near the origin (see `target_jitter`), world units."""
-    target_jitter: float = 0.2
+    target_jitter: Annotated[float, OFFSET] = 0.2
     """Most offset per axis from the origin of the point that an emitter hangs around."""
-    spacing: float = 0.3
+    spacing: Annotated[float, Within(0, 2 * SPACING_RADIUS)] = 0.3
     """Least distance between two emitters as seen from the origin, on a sphere of radius 0.866."""
     orientation: Orientation = "uniform"
     """How emitters are turned; see `PlacementSettings.orientation`."""
-    coloured_share: float = 0.0
+    coloured_share: Share = 0.0
     """Share of emitters that are coloured at the same mean radiance. An option: published lights
     are white, and a network trained on white ones alone has never seen another."""
-    reflectance: float = 0.0
+    reflectance: Share = 0.0
     """Diffuse albedo of an emitter. What shines at 300 need not reflect; the published ones do,
     with an albedo of 1."""
-    num_inside: int = 0
+    num_inside: Annotated[int, Within(0, MOST_LIGHTS, unit="emitters")] = 0
     """How many of the emitters hang in the middle of objects instead, for tests out of range."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, shares=("coloured_share", "reflectance"))
+        check_numbers(self)
         known = self.orientation in ORIENTATIONS
         require(known, "orientation", self.orientation, " or ".join(ORIENTATIONS))
-        require(self.count[0] >= 1, "count", self.count, "at least 1 emitter")
-        for name in ("total_emission", "scale", "distance"):
-            bounds = getattr(self, name)
-            require(bounds[0] > 0, name, bounds, "numbers above 0")
 
 
 def emitters_rand(

@@ -7,55 +7,44 @@ albedo everywhere.
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from scene_templates.checks import Range, check_numbers, require
 from scene_templates.layout import Surface
+from storage.ranges import Share, Within
 
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialSettings:
     """What surfaces are drawn from."""
 
-    albedo_sum: Range = (0.9, 1.0)
+    albedo_sum: Annotated[Range, Within(0, 1)] = (0.9, 1.0)
     """Diffuse scale plus specular of a surface."""
-    specular_ratio: Range = (0.0, 1.0)
+    specular_ratio: Annotated[Range, Within(0, 1)] = (0.0, 1.0)
     """Share of that sum which is specular."""
-    roughness_log: Range = (0.06, 1.055)
+    roughness_log: Annotated[Range, Within(1e-6, 2)] = (0.06, 1.055)
     """Range whose logarithm is drawn evenly; `roughness_bias` is then taken off."""
-    roughness_bias: float = 0.05
+    roughness_bias: Annotated[float, Within(0, 1)] = 0.05
     """See `roughness_log`; makes smooth surfaces common without a pile at the smallest value."""
-    roughness_clip: Range = (0.01, 1.0)
+    roughness_clip: Annotated[Range, Within(0, 1)] = (0.01, 1.0)
     """Least and greatest roughness."""
-    coloured_share: float = 0.5
+    coloured_share: Share = 0.5
     """Share of the surfaces with interpolated normals that have many colours: floors and walls one
     for each triangle, objects one for each shading group or triangle."""
-    triangle_colours_share: float = 0.5
+    triangle_colours_share: Share = 0.5
     """Share of the many-coloured objects with a colour for each triangle instead of each shading
     group: one half as the paper says; the published code makes none."""
-    coloured_specular_share: float = 0.0
+    coloured_specular_share: Share = 0.0
     """Share of surfaces whose specular albedo is tinted: each channel uniform between 0 and what it
     would be. An option: the published scenes have none, and so no metal but grey ones."""
-    smooth_angle_deg: float = 30.0
+    smooth_angle_deg: Annotated[float, Within(0, 180, unit="degrees")] = 30.0
     """An edge sharper than this separates shading groups."""
 
     def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            shares=(
-                "albedo_sum",
-                "specular_ratio",
-                "roughness_clip",
-                "coloured_share",
-                "triangle_colours_share",
-                "coloured_specular_share",
-            ),
-        )
-        low = self.roughness_log[0]
-        require(low > 0, "roughness_log", self.roughness_log, "numbers above 0")
-        bias = self.roughness_bias
+        check_numbers(self)
+        low, bias = self.roughness_log[0], self.roughness_bias
         require(low >= bias, "roughness_bias", bias, "at most roughness_log's low")
 
 

@@ -19,6 +19,7 @@ from scene_templates.layout import Plane, Pose
 from scene_templates.shell.patches import SIDES
 from scene_templates.shell.rooms import Room
 from storage.errors import Rejected
+from storage.ranges import Share
 
 ARRANGEMENT_TRIES = 100
 """Draws of all sizes before the scene is given up."""
@@ -36,9 +37,9 @@ class PlacementSettings:
 
     orientation: Orientation = "uniform"
     """How objects are turned: uniformly on SO(3), where the published Euler angles prefer poles."""
-    resting_share: float = 0.5
+    resting_share: Share = 0.5
     """Share of objects that rest on the floor; the others float. The published ones all float."""
-    overlap_share: float = 0.1
+    overlap_share: Share = 0.1
     """Share of scenes whose objects may run into each other, so that contact and penetration are
     not unknown to a network. In the others no two meshes meet; in the published ones all may."""
     inside: bool = True
@@ -46,7 +47,7 @@ class PlacementSettings:
     centres are uniform in the cube [-0.5, 0.5]^3 and they may stick through."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, shares=("resting_share", "overlap_share"))
+        check_numbers(self)
         known = self.orientation in ORIENTATIONS
         require(known, "orientation", self.orientation, " or ".join(ORIENTATIONS))
 

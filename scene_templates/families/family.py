@@ -1,11 +1,13 @@
 """A family: one layout with how many objects of which size it holds, and how often it is drawn."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from scene_templates.checks import Counts, Range, check_numbers, require
+from scene_templates.checks import SIZE, Counts, Range, check_numbers, require
 from scene_templates.shell.rooms import SharedRoom
 from scene_templates.shell.separate_sides import SeparateSides
 from scene_templates.templates.registry import TEMPLATES
+from storage.ranges import Share, Within
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,25 +18,22 @@ class Family:
     """Unique, such as `corner-multi`."""
     template: str
     """The layout: a name of scene_templates.templates.registry."""
-    weight: float = 1.0
+    weight: Annotated[float, Within(1e-9, 1e9)] = 1.0
     """How often it is drawn, relative to the others."""
     shell: SharedRoom | SeparateSides
     """How floor and walls are placed."""
-    num_objects: Counts
+    num_objects: Annotated[Counts, Within(0, 64, unit="objects")]
     """Fewest and most objects, each count equally likely."""
-    object_scale: Range
+    object_scale: Annotated[Range, SIZE]
     """Diameter of an object's bounding sphere, before halving. Where no free place is found, the
     sizes of all objects are drawn again."""
-    smooth_share: float = 0.5
+    smooth_share: Share = 0.5
     """Share of objects and shell parts with interpolated normals; the others are flat."""
 
     def __post_init__(self) -> None:
         known = ", ".join(TEMPLATES)
         require(self.template in TEMPLATES, "template", self.template, f"one of {known}")
-        check_numbers(self, shares=("smooth_share",))
-        require(self.weight > 0, "weight", self.weight, "a number above 0")
-        scale = self.object_scale
-        require(scale[0] > 0, "object_scale", scale, "numbers above 0")
+        check_numbers(self)
 
     @property
     def shell_triangles(self) -> int:

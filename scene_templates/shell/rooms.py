@@ -10,13 +10,15 @@ the price of some hidden triangles.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.checks import Range, check_numbers, require
+from scene_templates.checks import OFFSET, SHIFT, SIZE, Range, check_numbers
 from scene_templates.layout import Plane
 from scene_templates.shell.patches import SIDES, PatchPlacement
+from storage.ranges import Share, Within
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,23 +39,21 @@ class Room:
 class SharedRoom:
     """Ranges of rooms whose parts meet."""
 
-    square_share: float = 0.5
+    square_share: Share = 0.5
     """Share of scenes whose floor and walls are exact rectangles of one room, edge to edge."""
-    scale: Range = (1.0, 1.35)
+    scale: Annotated[Range, SIZE] = (1.0, 1.35)
     """Size of the room per axis, before halving; shared by its parts, so that they meet."""
-    shift: float = 0.05
+    shift: Annotated[float, OFFSET] = 0.05
     """How far the room is moved sideways at most, before halving."""
-    raise_z: Range = (-0.05, 0.25)
+    raise_z: Annotated[Range, SHIFT] = (-0.05, 0.25)
     """How far the room is raised, before halving: no fixed height of the floor to learn."""
-    tilt_deg: float = 3.0
+    tilt_deg: Annotated[float, Within(0, 10, unit="degrees")] = 3.0
     """Most tilt of a floor or wall out of its plane, in rooms that are not square. The recipes
     allow 10 for open layouts and 3 for the box; parts tilted by 10 must be half as large again
     for their seams to stay closed."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, shares=("square_share",), signed=("raise_z",))
-        require(self.scale[0] > 0, "scale", self.scale, "numbers above 0")
-        require(self.tilt_deg <= 10, "tilt_deg", self.tilt_deg, "at most 10 degrees")
+        check_numbers(self)
 
     def room_rand(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
         """Draw a room with the parts `names`."""

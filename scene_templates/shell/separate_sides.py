@@ -8,34 +8,35 @@ that (they call it a de-bias): squares spin freely, and floors move. The numbers
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from scene_templates.checks import Range, check_numbers, require
+from scene_templates.checks import SHIFT, SIZE, Range, check_numbers
 from scene_templates.shell.patches import SIDES, PatchPlacement
 from scene_templates.shell.rooms import Room
+from storage.ranges import Within
 
 
 @dataclass(frozen=True, kw_only=True)
 class SideRanges:
     """From what the place of one floor or wall is drawn."""
 
-    spin_deg: float = 0.0
+    spin_deg: Annotated[float, Within(0, 180, unit="degrees")] = 0.0
     """Most turn about its own axis, either way."""
-    tilt_deg: float = 0.0
+    tilt_deg: Annotated[float, Within(0, 90, unit="degrees")] = 0.0
     """Most turn about each of the other two axes."""
-    scale: Range = (1.0, 1.0)
+    scale: Annotated[Range, SIZE] = (1.0, 1.0)
     """Size per axis, before halving."""
-    shift_x: Range = (0.0, 0.0)
+    shift_x: Annotated[Range, SHIFT] = (0.0, 0.0)
     """Move along X, before halving."""
-    shift_y: Range = (0.0, 0.0)
+    shift_y: Annotated[Range, SHIFT] = (0.0, 0.0)
     """Move along Y, before halving."""
-    shift_z: Range = (0.0, 0.0)
+    shift_z: Annotated[Range, SHIFT] = (0.0, 0.0)
     """Move along Z, before halving."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, signed=("shift_x", "shift_y", "shift_z"))
-        require(self.scale[0] > 0, "scale", self.scale, "numbers above 0")
+        check_numbers(self)
 
     def placement_rand(self, rng: np.random.Generator, axis: int) -> PatchPlacement:
         """Draw the place of a side that is perpendicular to `axis` before it is turned."""

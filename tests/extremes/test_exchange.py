@@ -12,7 +12,7 @@ from infra.bench.renders.cost_scene import cost_scene
 from pipeline.scenes.renderformer_json_write import described_files
 from storage.conventions import EMISSION
 from storage.errors import TrilightError
-from storage.scene import Scene
+from storage.scene import Scene, SceneObject
 from tests.renders.scene_kit import join, light, quad
 from tests.scenes.exchange_kit import (
     assert_h5_keeps_light,
@@ -62,6 +62,13 @@ def scaled(size: float) -> Scene:
     return scene
 
 
+def shrunk(*corners: ArrayLike) -> Scene:
+    """Return the tiny scene with another first triangle in its floor, of three vertices."""
+    scene = tiny_scene()
+    scene.vertex_positions[[0, 1, 2]] = np.asarray(corners, np.float32)
+    return scene
+
+
 SCENES: dict[str, Callable[[], Scene]] = {
     "roughness 0": lambda: surface(roughness=0),
     "roughness 1": lambda: surface(roughness=1),
@@ -76,6 +83,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "fov 1 and 170": lambda: seen_at(1, 170),
     "fov 0.001 and 179": lambda: seen_at(0.001, 179),
     "64 lights": many_lights,
+    "sliver 1e-7": lambda: shrunk([0, 0, 0], [1, 0, 0], [0.5, 1e-7, 0]),
     "a micrometre": lambda: scaled(1e-3),
     "a kilometre": lambda: scaled(1e3),
 }
@@ -96,6 +104,46 @@ def test_sixteen_thousand_triangles(tmp_path: Path) -> None:
     assert scene.num_triangles > 15000
     assert_usd_keeps_all(scene, tmp_path, ".usdc")
     assert_json_keeps_light(json_and_back(scene, tmp_path)[0], scene)
+
+
+@pytest.mark.parametrize(
+    ("scene", "flat"),
+    [
+        (shrunk([0, 0, 0], [1, 0, 0], [0.5, 0, 0]), 1),
+        (shrunk([0, 0, 0], [0, 0, 0], [0, 0, 0]), 2),  # then the other half has no width
+    ],
+    ids=["no width", "no size"],
+)
+def test_triangles_without_area_stay_or_are_said_to_be_lost(
+    tmp_path: Path, scene: Scene, flat: int
+) -> None:
+    """A floor of which nothing is left is left out of the JSON, whose readers would refuse it."""
+    assert_usd_keeps_all(scene, tmp_path, ".usdc")
+    assert_h5_keeps_light(h5_and_back(scene, tmp_path), scene)
+    back, lost = json_and_back(with_a_wall(scene), tmp_path)
+    assert back.num_triangles == with_a_wall(scene).num_triangles - flat
+    assert any(f"{flat} triangles without an area" in loss for loss in lost)
+
+
+def with_a_wall(scene: Scene) -> Scene:
+    """Return a scene with one more shell part, of the floor's material and one triangle."""
+    corners = np.array([[-1, 1, 0], [1, 1, 0], [0, 1, 1]], np.float32)
+    return dataclasses.replace(
+        scene,
+        vertex_positions=np.concatenate([scene.vertex_positions, corners]),
+        vertex_normals=np.concatenate([scene.vertex_normals, [[0, -1, 0]] * 3]).astype(np.float32),
+        faces=np.concatenate([scene.faces, [[7, 8, 9]]]).astype(np.uint32),
+        material_index=np.append(scene.material_index, np.uint16(FLOOR)),
+        object_index=np.append(scene.object_index, np.uint16(2)),
+        objects=(*scene.objects, SceneObject(name="wall0", kind="shell")),
+    )
+
+
+def test_a_scene_whose_light_has_no_area_is_no_json() -> None:
+    scene = tiny_scene()
+    scene.vertex_positions[4:] = 1.0
+    with pytest.raises(TrilightError, match="no emitter has an area"):
+        described_files(scene, "a")
 
 
 def at_the_ends_of_floats() -> Scene:

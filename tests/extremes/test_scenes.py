@@ -75,29 +75,23 @@ def test_extreme_settings_keep_the_laws(pool: list[PooledAsset], changes: dict[s
 
 
 BEYOND: list[dict[str, Any]] = [
-    {"families.object_scale": [1e-9, 1e-9]},
-    {"families.object_scale": [1e-300, 1e-300], "placement.overlap_share": 1.0},
-    {"families.object_scale": [1e6, 1e6], "placement.inside": False},
-    {"families.object_scale": [1e99, 1e99], "placement.inside": False},
-    {"families.shell.scale": [1e-6, 1e-6]},
-    {"families.shell.scale": [1e9, 1e9]},
-    {"lights.scale": [1e-9, 1e-9]},
+    {"families.object_scale": [1e-3, 1e-3], "views.min_coverage": 0.0},
+    {"families.object_scale": [1e-3, 1e-3], "placement.overlap_share": 1.0},
+    {"families.object_scale": [1e3, 1e3], "placement.inside": False},
+    {"families.shell.scale": [1e-3, 1e-3]},
+    {"families.shell.scale": [1e3, 1e3]},
+    {"lights.scale": [1e-3, 1e-3], "lights.distance": [1e3, 1e3]},
     {"lights.scale": [1e3, 1e3]},
-    {"lights.distance": [1e9, 1e9]},
-    {"lights.distance": [1e-9, 1e-9], "lights.target_jitter": 0.0},
-    {"lights.total_emission": [1e-40, 1e-40]},
-    {"lights.total_emission": [1e99, 1e99]},
-    {"cameras.distance": [1e-9, 1e-9], "cameras.target_jitter": 0.0},
-    {"cameras.distance": [1e30, 1e30]},
-    {"cameras.fov_deg": [1e-9, 1e-9]},
-    {"cameras.fov_deg": [179.999, 179.999]},
-    {"cameras.up_jitter": 1e6},
+    {"lights.distance": [1e-3, 1e-3], "lights.target_jitter": 0.0},
+    {"lights.total_emission": [1e-3, 1e-3], "lights.count": [64, 64], "lights.spacing": 0.0},
+    {"cameras.distance": [1e-3, 1e-3], "cameras.target_jitter": 0.0},
+    {"cameras.distance": [1e3, 1e3], "cameras.target_jitter": 1e3},
+    {"cameras.fov_deg": [170.0, 170.0]},
+    {"cameras.fov_deg": [1.0, 1.0], "cameras.up_jitter": 1.0},
 ]
-"""Settings that are admitted, and beyond what float32 or a room can hold."""
+"""Settings that are admitted, and of which few rooms can be (ends one by one: test_range_ends)."""
 
 
-@pytest.mark.filterwarnings("ignore:overflow encountered")
-@pytest.mark.filterwarnings("ignore:invalid value encountered")
 @pytest.mark.parametrize("changes", BEYOND, ids=lambda changes: "+".join(changes))
 def test_absurd_settings_give_scenes_or_reasons(
     pool: list[PooledAsset], changes: dict[str, Any]
@@ -112,7 +106,7 @@ def test_absurd_settings_give_scenes_or_reasons(
         _require_laws(scene, settings)
 
 
-REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside", "law_broken")
+REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")
 
 
 @pytest.mark.parametrize("build", BUILDS)

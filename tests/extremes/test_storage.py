@@ -1,13 +1,18 @@
 """Pictures and scenes at the ends of what they may hold come back, or are refused by name."""
 
 import dataclasses
+import io
+import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
+from pipeline.flows.builds import named_build
 from storage.conventions import EMISSION, HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.exr import decode_exr, encode_exr
@@ -15,6 +20,8 @@ from storage.profiles import PROFILES, Profile, keeps_law, pack_picture
 from storage.renderformer_h5 import write_renderformer_h5
 from storage.renderformer_h5_read import read_renderformer_h5
 from storage.sample import decode_sample, encode_sample
+from storage.scene import Scene, SceneObject
+from tests.scenes.exchange_kit import assert_usd_keeps_all
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
 
 FINITE = np.arange(0x7C00, dtype=np.uint16).view(np.float16)
@@ -120,3 +127,83 @@ def test_hdf5_refuses_what_no_picture_may_hold(tmp_path: Path, value: float) -> 
     with pytest.raises(TrilightError, match="expected values in"):
         write_renderformer_h5(tmp_path / "a.h5", tiny_scene(), pictures)
     assert not list(tmp_path.iterdir())
+
+
+def _counted_to_the_end() -> Scene:
+    """65536 materials and objects, and vertex rows beyond 16 bits."""
+    scene, count = tiny_scene(), 1 << 16
+    materials = np.repeat(scene.materials[[0]], count, axis=0)
+    materials[-1] = scene.materials[LIGHT]
+    shells = tuple(SceneObject(name=f"part{row}", kind="shell") for row in range(count - 1))
+    positions, normals = (
+        np.concatenate([np.repeat(array[:1], count, axis=0), array])
+        for array in (scene.vertex_positions, scene.vertex_normals)
+    )
+    last = np.array([0, count - 2, count - 1], np.uint16)
+    return dataclasses.replace(
+        scene,
+        vertex_positions=positions,
+        vertex_normals=normals,
+        faces=scene.faces + np.uint32(count),
+        material_index=last,
+        object_index=last,
+        materials=materials,
+        objects=(*shells, SceneObject(name="light", kind="emitter")),
+    )
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_the_ends_of_integers_are_packed_exactly(profile: Profile) -> None:
+    scene = _counted_to_the_end()
+    scene.check()
+    sample = dataclasses.replace(tiny_sample(), scene=scene)
+    back = decode_sample("0", encode_sample(sample, profile)).scene
+    for name in ("faces", "material_index", "object_index"):
+        found, wanted = getattr(back, name), getattr(scene, name)
+        assert found.dtype == wanted.dtype and np.array_equal(found, wanted)
+    assert back.objects == scene.objects
+
+
+NUMBERS = {
+    "seed": 2**256 - 1, "far": -(2**64), "least": 5e-324, "largest": 1.7976931348623157e308,
+    "zero": -0.0, "third": 1 / 3,
+}  # fmt: skip
+
+
+def test_numbers_of_json_come_back_digit_by_digit(tmp_path: Path) -> None:
+    """Of provenance, in samples and in USD, and of settings: also integers beyond 64 bits."""
+    scene = tiny_scene(provenance=NUMBERS)
+    sample = dataclasses.replace(tiny_sample(), scene=scene)
+    back = decode_sample("0", encode_sample(sample)).scene.provenance
+    assert json.dumps(dict(back), sort_keys=True) == json.dumps(NUMBERS, sort_keys=True)
+    for suffix in (".usda", ".usdc"):
+        assert_usd_keeps_all(scene, tmp_path, suffix)
+    build = named_build("smoke", seed=2**256 - 1)
+    assert json.loads(json.dumps(build.as_json()))["seed"] == 2**256 - 1
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_json_holds_no_number_that_is_none(value: float) -> None:
+    sample = dataclasses.replace(tiny_sample(), scene=tiny_scene(provenance={"value": value}))
+    with pytest.raises(ValueError, match="JSON compliant"):
+        encode_sample(sample)
+
+
+HEADER = [
+    ("most", 2**31 - 1), ("least", -(2**31)), ("float", float(np.finfo(np.float32).max)),
+    ("text", str(2**256 - 1)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), HEADER)
+def test_the_ends_of_numbers_go_through_the_header_of_a_picture(name: str, value: object) -> None:
+    data = encode_exr(np.ones((8, 8, 3), np.float32), attributes={name: value})  # type: ignore[dict-item]
+    header = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()
+    assert header[name] == value
+
+
+@pytest.mark.parametrize("value", [2**31, -(2**31) - 1, 2**64, 1e39, -1e39, math.inf, math.nan])
+def test_numbers_beyond_a_header_are_refused(value: float) -> None:
+    """OpenEXR would write 2^31 as -2^31, 1e39 as infinity, and raise SystemError for 2^64."""
+    with pytest.raises(TrilightError, match="attribute seed is .*; expected a number from -"):
+        encode_exr(np.ones((8, 8, 3), np.float32), attributes={"seed": value})

@@ -233,9 +233,9 @@ def test_mistakes_on_the_command_line_are_one_line(tmp_path: Path) -> None:
         (("--orbit", "3"), "expected a folder, X.mp4 or X.webp"),
         (("--orbit", "3", "--cameras", "a.json"), "expected no --orbit beside it"),
         (("--lights-per-pass", "0"), "--lights-per-pass is 0"),
-        (("--resolution", "20"), "resolution is 20; expected a positive multiple of 8"),
+        (("--resolution", "20"), "resolution is 20; expected a multiple of 8"),
         (("--max-spp", "100"), "max_spp 100; expected multiples of 8"),
-        (("--noise-floor", "0"), "noise_floor_db is 0"),
+        (("--noise-floor", "0"), "--noise-floor is 0.0; expected a number above 0"),
         (("--seed", "-1"), "--seed is -1"),
         (("--threads", "0"), "--threads is 0"),
     ):

@@ -58,3 +58,10 @@ def test_the_denoiser_brings_no_torch() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert child.stdout.strip() == "False"
+
+
+def test_a_picture_without_light_stays_black() -> None:
+    """The filter alone would paint what it sees of the albedo."""
+    _, noisy, features = _noisy_step()
+    for quality in ("high", "fast"):
+        np.testing.assert_array_equal(denoise(np.zeros_like(noisy), features, quality), 0)

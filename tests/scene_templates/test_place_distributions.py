@@ -231,8 +231,8 @@ def test_lights_hang_evenly_in_their_sector(name: str) -> None:
     distance = np.linalg.norm(centres, axis=1)
     table = {"distance": uniform(distance, 2.1, 2.7)}
     table |= _sector_table(centres / distance[:, None], sector)
-    # All but at the point that they hang around.
-    for axis, around in enumerate(_light_centres(sector, distance=(1e-12, 1e-12)).T):
+    # As near as can be to the point that they hang around: a millimetre of 400 is not seen in it.
+    for axis, around in enumerate(_light_centres(sector, distance=(1e-3, 1e-3)).T):
         table[f"target {axis}"] = uniform(around, -0.2, 0.2)
     require_plausible(table)
     other = TEMPLATES["corner" if name != "corner" else "open_box"].lights
@@ -250,7 +250,7 @@ def _camera_table(sector: Sector, **changes: object) -> Table:
     backward = np.stack([pose.c2w[:3, 2] for pose in poses])
     roll = [_roll(pose.c2w[:3, 1], pose.c2w[:3, 2]) for pose in poses]
     still = _cameras(sector, **{**changes, "target_jitter": 0.0})
-    near = _cameras(sector, **{**changes, "distance": (1e-12, 1e-12)})
+    near = _cameras(sector, **{**changes, "distance": (1e-3, 1e-3)})
     table = {
         "fov": uniform([pose.fov_deg for pose in poses], 30, 60),
         "distance": uniform([np.linalg.norm(pose.c2w[:3, 3]) for pose in still], 1.5, 2.0),
@@ -258,7 +258,8 @@ def _camera_table(sector: Sector, **changes: object) -> Table:
         **_sector_table(backward, sector),
     }
     for axis in range(3):
-        table[f"target {axis}"] = uniform([pose.c2w[axis, 3] for pose in near], -0.2, 0.2)
+        targets = [pose.c2w[axis, 3] - 1e-3 * pose.c2w[axis, 2] for pose in near]
+        table[f"target {axis}"] = uniform(targets, -0.2, 0.2)
     return table
 
 

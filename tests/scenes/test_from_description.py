@@ -204,6 +204,8 @@ REFUSED: list[tuple[tuple[str | int, ...], dict[str, Any], str]] = [
     (TRANSFORM, {"scale": [0, 1, 0]}, "objects.box: no triangle of box.obj has an area"),
     (CAMERA, {"look_at": [0, -2, 0]}, "cameras[0] looks from (0.0, -2.0, 0.0) at"),
     (CAMERA, {"up": [0, 3, 0]}, "and an up that is not along the view"),
+    # along the view but for 1e-16, of which a camera with an arbitrary roll was made
+    (CAMERA, {"up": [0.3, 0.6, 0.9], "position": [0.1, 0.2, 0.3], "look_at": [0, 0, 0]}, "along"),
     (CAMERA, {"up": [0, 0, 0]}, "cameras[0] looks from"),
 ]
 

@@ -1,9 +1,10 @@
 """Which symmetries of light transport a run shows its scenes under."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from storage.errors import TrilightError
+from storage.ranges import Within, check_ranges
 
 Rotation = Literal["none", "recipe", "uniform"]
 """`recipe`: a rotation vector of three normal numbers, which favours small turns; `uniform`: every
@@ -16,7 +17,7 @@ class AugmentationSettings:
 
     rotation: Rotation = "none"
     """How scene and cameras are turned together."""
-    translation: float = 0.0
+    translation: Annotated[float, Within(0, 100, unit="metres")] = 0.0
     """Standard deviation per axis of their common shift, metres."""
     mirror: bool = False
     """Whether half of the visits see the mirrored scene."""
@@ -24,19 +25,14 @@ class AugmentationSettings:
     """Whether the colour channels are permuted."""
     vertex_order: bool = False
     """Whether each triangle begins with any of its vertices."""
-    light_scale: float = 1.0
+    light_scale: Annotated[float, Within(1, 1000)] = 1.0
     """Largest factor by which all light is made stronger or weaker, log-uniform."""
-    light_mix: float = 1.0
+    light_mix: Annotated[float, Within(1, 1000)] = 1.0
     """The same for each light alone; needs a dataset that keeps lights apart (`per_light`)."""
 
     def __post_init__(self) -> None:
-        for name, right, expected in (
-            ("rotation", self.rotation in get_args(Rotation), "none, recipe or uniform"),
-            ("translation", self.translation >= 0, "at least 0"),
-            ("light_scale", self.light_scale >= 1, "at least 1"),
-            ("light_mix", self.light_mix >= 1, "at least 1"),
-        ):
-            if not right:
-                raise TrilightError(
-                    f"train settings: {name} is {getattr(self, name)!r}; expected {expected}."
-                )
+        check_ranges(self, "train settings: ")
+        if self.rotation not in get_args(Rotation):
+            raise TrilightError(
+                f"train settings: rotation is {self.rotation!r}; expected none, recipe or uniform."
+            )

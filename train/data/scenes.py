@@ -83,7 +83,7 @@ def _lights_apart(sample: Sample, resolution: int) -> Tensor:
     if sample.lights_rgb is None:
         raise TrilightError(
             f"sample {sample.key}: its lights are not kept apart, which light_mix needs. Generate "
-            "the dataset with --set render.per_light=true, or set augmentation.light_mix=1."
+            "the dataset with --set renders.per_light=true, or set augmentation.light_mix=1."
         )
     smaller = [block_mean(lights, resolution) for lights in sample.lights_rgb]
     return torch.from_numpy(np.stack(smaller))

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from model.renderformer import RenderFormer
 from storage.conventions import radiance_from_log10
 from storage.errors import TrilightError
+from storage.ranges import Within, check_ranges
 from storage.sample import Sample
 from storage.shard_set import ShardSet
 from train.data.scenes import TrainingScene, training_scene
@@ -38,14 +40,17 @@ class Contest:
     """On the device where it is to run."""
     shards: ShardSet
     """The split."""
-    resolution: int
+    resolution: Annotated[int, Within(1, 8192, unit="pixels")]
     """Pixels across, a divisor of the data's."""
     rivals: Rivals | None
     """None where no training data is at hand."""
     lpips: Lpips | None
     """None where its weights are not at hand: LPIPS is then n/a."""
-    most_scenes: int
+    most_scenes: Annotated[int, Within(1, 10**9, unit="scenes")]
     """The first so many scenes of the split are judged."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "evaluate: ")
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; one that is damaged ends it, since it would be another set."""

@@ -1,9 +1,10 @@
 """What a run minimises."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from storage.errors import TrilightError
+from storage.ranges import Within, check_ranges
 
 Perceptual = Literal["lpips", "ms_ssim", "none"]
 """`lpips` is the recipe's and needs published weights; `ms_ssim` needs none and is another term."""
@@ -15,25 +16,15 @@ class LossSettings:
 
     perceptual: Perceptual
     """The second term, on tone-mapped pictures."""
-    perceptual_weight: float = 0.05
+    perceptual_weight: Annotated[float, Within(0, 1000)] = 0.05
     """Its factor beside the first term, the L1 error of log10(1 + radiance)."""
-    noise_half: float = 0.0
+    noise_half: Annotated[float, Within(0, 10)] = 0.0
     """Root mean square noise of log10(1 + radiance) at which a view counts half; 0 weighs none."""
 
     def __post_init__(self) -> None:
-        for name, got, expected, right in (
-            ("perceptual", self.perceptual, "lpips, ms_ssim or none", self._is_known),
-            (
-                "perceptual_weight",
-                self.perceptual_weight,
-                "at least 0",
-                self.perceptual_weight >= 0,
-            ),
-            ("noise_half", self.noise_half, "at least 0", self.noise_half >= 0),
-        ):
-            if not right:
-                raise TrilightError(f"train settings: {name} is {got!r}; expected {expected}.")
-
-    @property
-    def _is_known(self) -> bool:
-        return self.perceptual in get_args(Perceptual)
+        check_ranges(self, "train settings: ")
+        if self.perceptual not in get_args(Perceptual):
+            raise TrilightError(
+                f"train settings: perceptual is {self.perceptual!r}; expected lpips, ms_ssim or "
+                "none."
+            )

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.served.schema import (
@@ -12,7 +12,8 @@ from pipeline.flows.served.schema import (
     PublicUrl,
     changed_values,
 )
-from storage.errors import TrilightError
+from storage.ranges import Within
+from storage.shard_places import MAX_SHARDS
 
 DATASET_FORMS: Mapping[str, Any] = {
     "build": BuildName,
@@ -27,15 +28,10 @@ DATASET_FORMS: Mapping[str, Any] = {
 class DatasetInRuns(DatasetOrder):
     """A dataset whose ranges of shards are flow runs of their own, for as many workers."""
 
-    flow_runs: int = 1
+    flow_runs: Annotated[int, Within(1, MAX_SHARDS, unit="flow runs")] = 1
     """Ranges that are made as separate runs of the deployment; with 1, everything is made here."""
     deployment: str = "generate-scenes/local"
     """The deployment that makes the ranges, as FLOW/DEPLOYMENT."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.flow_runs < 1:
-            raise TrilightError(f"flow_runs is {self.flow_runs}; expected at least 1.")
 
 
 def dataset_order(parameters: Mapping[str, Any]) -> DatasetOrder:

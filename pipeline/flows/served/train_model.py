@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from prefect import flow
 from prefect.concurrency.sync import concurrency
@@ -20,6 +20,7 @@ from pipeline.flows.served.runner import GPU_LIMIT
 from pipeline.flows.served.schema import PublicUrl, parameters_of
 from pipeline.isolation import die_with_parent
 from storage.errors import TrilightError
+from storage.ranges import Within, check_ranges
 from storage.safe_url import safe_text
 
 
@@ -35,20 +36,17 @@ class TrainOrder:
     """Folder of the run, as the worker sees it."""
     resume: bool = False
     """Go on from the last checkpoint."""
-    steps: int | None = None
+    steps: Annotated[int | None, Within(1, 10**9, unit="steps")] = None
     """Replaces the run's number of steps."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Any other setting of the run by its dotted name, such as loss.perceptual."""
-    workers: int = 1
+    workers: Annotated[int, Within(1, 1024, unit="threads")] = 1
     """Threads that decode samples."""
-    processes: int = 1
+    processes: Annotated[int, Within(1, 1024, unit="processes")] = 1
     """Processes on this machine, started by torchrun; one for each graphics card."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "workers", "processes"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise TrilightError(f"{name} is {value}; expected at least 1.")
+        check_ranges(self)
         if not self.data:
             raise TrilightError("data is empty; expected at least one dataset.")
 

@@ -1,0 +1,283 @@
+"""What settings make at the ends of their ranges: something right, or a rejection with reason."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.config import ModelConfig
+from model.renderformer import RenderFormer
+from model.scene_tensors import batch_scenes
+from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.settings import MAX_SPP, RenderSettings
+from pipeline.scenes.compose import compose_scene
+from pipeline.scenes.pool import PooledAsset
+from scene_templates.contents.cameras import CameraSettings
+from scene_templates.contents.lights import LightSettings
+from scene_templates.contents.materials import MaterialSettings
+from scene_templates.contents.placement import PlacementSettings
+from scene_templates.families.family import Family
+from scene_templates.settings import SceneSettings, ViewLaws
+from scene_templates.shell.rooms import SharedRoom
+from storage.changes import changed
+from storage.errors import Rejected, TrilightError
+from storage.ranges import Declared
+from storage.splits import MOST_SCENES, SplitSettings, scenes_of_shard, shard_name, shards_for
+from tests.extremes.range_examples import FIELDS, SMOKE, End
+from tests.model.kit import awake, random_scene, tiny_config
+from tests.renders.scene_kit import join, light, material, quad
+from tests.train.kit import tiny_run
+from tests.train.toy import toy_sample
+from train.data.augment import augmented
+from train.data.augmentation import AugmentationSettings
+from train.data.buckets import make_batch
+from train.data.scenes import training_scene
+from train.loop.crew import Crew
+from train.loop.optim import learning_rate
+from train.loop.state import new_state
+from train.loop.step import Stepper
+from train.loss.objective import Objective
+from train.loss.settings import LossSettings
+
+GROUPS: dict[type, str] = {
+    SceneSettings: "",
+    Family: "families.",
+    SharedRoom: "families.shell.",
+    PlacementSettings: "placement.",
+    MaterialSettings: "materials.",
+    LightSettings: "lights.",
+    CameraSettings: "cameras.",
+    ViewLaws: "views.",
+}
+"""Under which name a group of scene settings stands."""
+
+BLIND: dict[str, Any] = {
+    "views.min_coverage": 0.0, "views.min_lit": 0.0, "views.max_shell_back": 1.0,
+    "views.min_depth": 0.0,
+}  # fmt: skip
+"""Every view is good enough."""
+
+BESIDE: dict[tuple[str, End], dict[str, Any]] = {
+    ("max_triangles", "low"): {
+        "families.template": "plane", "families.num_objects": [0, 0], "lights.count": [1, 1],
+    },
+    ("fill_to", "high"): {"max_triangles": 65535, "num_views": 1},
+    ("num_views", "high"): {"views.coverage_grid": 2},
+    ("families.num_objects", "high"): {
+        "families.object_scale": [0.2, 0.2], "max_triangles": 16384, "num_views": 1,
+    },
+    # 64 lights do not find places so far apart, and look 256 times for each
+    ("lights.count", "high"): {"lights.spacing": 0.0},
+    ("materials.roughness_log", "low"): {"materials.roughness_bias": 0.0},
+    ("materials.roughness_bias", "high"): {"materials.roughness_log": [1.0, 2.0]},
+}  # fmt: skip
+"""What laws between fields, or time, want beside an end."""
+
+NO_SCENE: dict[tuple[str, End], str] = {
+    ("families.object_scale", "high"): "no_room",
+    ("families.shell.scale", "low"): "no_room",
+    ("families.shell.shift", "high"): "no_room",
+    ("lights.scale", "high"): "emitter_inside",
+    ("lights.distance", "low"): "emitter_inside",
+    ("views.min_coverage", "high"): "no_camera",
+    ("views.min_lit", "high"): "no_camera",
+    ("views.max_shell_back", "low"): "no_camera",
+    ("views.min_depth", "high"): "no_camera",
+}
+"""Ends at which some scenes cannot be, with everything else as it is: why they are rejected."""
+
+SCENE_FIELDS = [(GROUPS[group] + field.name, field) for group, field in FIELDS if group in GROUPS]
+ONE_FAMILY = dataclasses.replace(SMOKE.scenes, families=SMOKE.scenes.families[:1])
+
+
+def _value(field: Declared, end: End) -> Any:
+    number = getattr(field.within, end)
+    return [number, number] if field.shape == "pair" else number
+
+
+@pytest.mark.parametrize("end", ["low", "high"])
+@pytest.mark.parametrize(("name", "field"), SCENE_FIELDS, ids=lambda part: str(part)[:40])
+def test_scenes_at_an_end_keep_their_laws(
+    pool: list[PooledAsset], name: str, field: Declared, end: End
+) -> None:
+    blind = {} if name.startswith("views.") else BLIND
+    beside = BESIDE.get((name, end), {})
+    wanted = changed(ONE_FAMILY, {**blind, **beside, name: _value(field, end)})
+    try:
+        for attempt in range(4):
+            scene = compose_scene(wanted, pool, seed=0, scene_index=0, attempt=attempt)
+            scene.check()
+            break
+    except Rejected as rejection:
+        assert rejection.reason == NO_SCENE.get((name, end)), rejection
+
+
+REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")
+CHEAP = [
+    name for name, _ in SCENE_FIELDS
+    if name not in ("num_views", "fill_to", "views.coverage_grid", "lights.count")
+    and name != "families.num_objects"
+]  # fmt: skip
+
+
+@settings(max_examples=25, derandomize=True)
+@given(st.dictionaries(st.sampled_from(CHEAP), st.sampled_from(["low", "high"]), min_size=2))
+def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
+    pool: list[PooledAsset], ends: dict[str, End]
+) -> None:
+    fields = dict(SCENE_FIELDS)
+    changes = {name: _value(fields[name], end) for name, end in ends.items()}
+    try:
+        wanted = changed(ONE_FAMILY, {"num_views": 1, **changes})
+    except TrilightError:
+        return  # laws between fields
+    try:
+        compose_scene(wanted, pool, seed=0, scene_index=0, attempt=0).check()
+    except Rejected as rejection:
+        assert rejection.reason in REASONS, rejection
+
+
+RENDER = RenderSettings(
+    resolution=8, noise_floor_db=1.0, min_spp=8, max_spp=8, aux_spp=4, min_mean_radiance=0.0
+)
+FLOOR = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.8))
+WALL = quad([[-1, 1, 0], [1, 1, 0], [1, 1, 2], [-1, 1, 2]], material(diffuse=0.8))
+LAMP = light([[-0.5, -0.5, 2], [0, 0.5, 2], [0.5, -0.5, 2]], 10.0)
+
+
+def _render(**changes: Any) -> RenderedView:
+    scene = join([FLOOR, WALL, LAMP], fov_deg=60)
+    renderer = SceneRenderer(scene, dataclasses.replace(RENDER, **changes))
+    view = renderer.render_view(scene.c2w[0], 60.0, seed=0)
+    assert np.isfinite(view.radiance_rgb).all() and (view.radiance_rgb >= 0).all()
+    return view
+
+
+def test_pictures_at_the_ends_of_depth() -> None:
+    """One edge sees emitters alone, which cameras do not: black. 1024 are as bright as 10, but for
+    what 10 cut away."""
+    assert _render(max_depth=1).radiance_rgb.max() == 0
+    usual = _render(min_spp=128, max_spp=128, denoiser="off").radiance_rgb.mean()
+    for depths in ({"max_depth": 1024}, {"max_depth": 1024, "rr_depth": 1024}, {"rr_depth": 1}):
+        deep = _render(min_spp=128, max_spp=128, denoiser="off", **depths).radiance_rgb.mean()
+        # the cut leaves out less than 0.8^10; 64 pixels of 128 samples have 3 % of noise, measured
+        assert deep == pytest.approx(usual, rel=0.1), depths
+
+
+def test_pictures_at_the_ends_of_samples_and_floors() -> None:
+    assert _render().spp == 8
+    assert _render(max_spp=MAX_SPP).spp < MAX_SPP
+    for floor_db, at_cap in ((np.nextafter(0, 1), False), (np.nextafter(100, 0), True)):
+        view = _render(noise_floor_db=float(floor_db))
+        assert (view.spp, view.at_cap) == (8, at_cap)
+    _render(aux_spp=64)
+
+
+def test_no_picture_is_as_bright_as_the_brightest_bound() -> None:
+    with pytest.raises(Rejected, match="black_view"):
+        _render(min_mean_radiance=65504.0)
+
+
+LEAST = ModelConfig(
+    width=18, num_heads=1, encoder_layers=1, decoder_layers=1, hidden_width=1, num_registers=0,
+    rope_num_freqs=1, rope_max_freq=1.0, normal_octaves=0, patch_px=1, head="linear",
+)  # fmt: skip
+NETWORKS: dict[str, ModelConfig] = {
+    "least of everything": LEAST,
+    "largest bundles": dataclasses.replace(LEAST, patch_px=64),
+    "largest windows": dataclasses.replace(LEAST, window_bundles=64),
+    "most octaves, fastest rotation": dataclasses.replace(
+        LEAST, normal_octaves=16, rope_max_freq=1000.0, register_eps=1.0, num_registers=64
+    ),
+    "most frequencies": dataclasses.replace(LEAST, width=18 * 64, rope_num_freqs=64),
+    "narrowest dpt": tiny_config("dpt", dpt_features=2, dpt_channels=(1, 1, 1, 1)),
+}
+
+
+@pytest.mark.parametrize("config", NETWORKS.values(), ids=NETWORKS.keys())
+def test_networks_at_an_end_see_and_learn(config: ModelConfig) -> None:
+    model = awake(config, torch.float32)
+    scene = random_scene(5, num_views=1, dtype=torch.float32)
+    picture = model(batch_scenes([scene]), config.picture_px)
+    picture.square().mean().backward()
+    assert picture.shape[2:] == (config.picture_px, config.picture_px, 3)
+    assert torch.isfinite(picture).all()
+    for name, weight in model.named_parameters():
+        assert weight.grad is not None and torch.isfinite(weight.grad).all(), name
+
+
+def test_the_largest_networks_can_be_described() -> None:
+    """None fits into a memory; their parts fit together."""
+    wide = dataclasses.replace(LEAST, width=16_384, num_heads=512, hidden_width=65_536)
+    deep = dataclasses.replace(
+        tiny_config("dpt"), encoder_layers=256, decoder_layers=256, num_registers=4096,
+        dpt_features=4096, dpt_channels=(8192,) * 4, dpt_taps=(0, 1, 254, 255),
+    )  # fmt: skip
+    with torch.device("meta"):
+        for config in (wide, deep):
+            RenderFormer(config)
+
+
+STEPS: dict[str, dict[str, Any]] = {
+    "lows": {
+        "learning_rate": 5e-324, "final_rate_share": 0.0, "weight_decay": 0.0, "betas": (0.0, 0.0),
+        "grad_clip": 5e-324, "ema_decay": 0.0,
+        "loss": LossSettings(perceptual="ms_ssim", perceptual_weight=0.0, noise_half=0.0),
+    },
+    "highs": {
+        "learning_rate": 1.0, "final_rate_share": 1.0, "weight_decay": 10.0,
+        "betas": (float(np.nextafter(1, 0)),) * 2, "grad_clip": 1e9,
+        "ema_decay": float(np.nextafter(1, 0)),
+        "loss": LossSettings(perceptual="ms_ssim", perceptual_weight=1000.0, noise_half=10.0),
+        "seed": 2**256 - 1,
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("changes", STEPS.values(), ids=STEPS.keys())
+def test_weights_stay_finite_at_the_ends_of_training(changes: dict[str, Any]) -> None:
+    """At the least rate nothing moves; at the greatest, much does, and nothing breaks."""
+    run = tiny_run(**changes)
+    state = new_state(run)
+    before = [weight.detach().clone() for weight in state.model.parameters()]
+    stepper = Stepper(state, run, Objective(run.loss, None), Crew(device=torch.device("cpu")))
+    scenes = [training_scene(toy_sample(index), 16) for index in range(2)]
+    for number in range(4):
+        report = stepper.step([make_batch(scenes)], learning_rate(number, run))
+        assert report.applied
+    after = list(state.model.parameters())
+    assert all(torch.isfinite(weight).all() for weight in after)
+    same = all(torch.equal(old, new) for old, new in zip(before, after, strict=True))
+    assert same == (run.learning_rate < 1e-300)
+
+
+STRONGEST = AugmentationSettings(
+    rotation="uniform", translation=100.0, mirror=True, channels=True, vertex_order=True,
+    light_scale=1000.0,
+)  # fmt: skip
+
+
+def test_the_strongest_augmentation_leaves_scenes_finite() -> None:
+    scene = training_scene(toy_sample(0), 16)
+    for seed in range(20):
+        shown = augmented(scene, STRONGEST, np.random.default_rng(seed))
+        assert torch.isfinite(shown.target_VRR3).all()
+        for tensor in vars(shown.tensors).values():
+            assert torch.isfinite(tensor).all()
+
+
+@pytest.mark.parametrize("per_shard", [1, 1_000_000])
+@pytest.mark.parametrize("per_cycle", [6, 1_000_000])
+def test_shards_at_the_ends_hold_every_scene_once(per_shard: int, per_cycle: int) -> None:
+    """Up to the last of a billion scenes."""
+    splits = SplitSettings(scenes_per_shard=per_shard, shards_per_cycle=per_cycle)
+    count = shards_for(MOST_SCENES, splits)
+    assert scenes_of_shard(count - 1, splits).stop == MOST_SCENES
+    listed = dataclasses.replace(splits, listed_scenes=MOST_SCENES)
+    assert scenes_of_shard(count - 1, listed).stop == MOST_SCENES
+    names = {shard_name(index, splits).split("-")[0] for index in range(6)}
+    assert names == {"train", "validation", "test"}

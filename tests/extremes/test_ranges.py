@@ -1,0 +1,256 @@
+"""Every numeric field declares its range; both ends are accepted, and a step outside is refused."""
+
+import ast
+import dataclasses
+import math
+import typing
+from collections.abc import Iterator
+from typing import Annotated, Any, get_args, get_origin
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from infra.setup.ranges import FILE, ROOTS, ranges_page, reachable
+from storage.conventions import EMISSION
+from storage.errors import TrilightError
+from storage.ranges import Columns, Declared, Within, check_ranges, declared_ranges
+from storage.scene import Scene, SceneObject
+from tests.conftest import ROOT
+from tests.extremes.range_examples import EXAMPLES, FIELDS, End, at_end
+from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
+
+ENDS: tuple[End, End] = ("low", "high")
+every_end = pytest.mark.parametrize("end", ENDS)
+every_field = pytest.mark.parametrize(
+    ("settings", "field"), FIELDS, ids=lambda part: getattr(part, "__name__", None) or part.name
+)
+
+
+def last_inside(field: Declared, end: End) -> float:
+    """Return the extreme number that a range admits."""
+    within = field.within
+    bound, is_open = {
+        "low": (within.low, within.low_open),
+        "high": (within.high, within.high_open),
+    }[end]
+    if field.kind is int:
+        assert isinstance(bound, int) and not is_open
+        return bound
+    return math.nextafter(bound, {"low": math.inf, "high": -math.inf}[end]) if is_open else bound
+
+
+def first_outside(field: Declared, end: End) -> float:
+    """Return the next number beyond."""
+    inside = last_inside(field, end)
+    if field.kind is int:
+        return inside + {"low": -1, "high": 1}[end]
+    return math.nextafter(inside, {"low": -math.inf, "high": math.inf}[end])
+
+
+@every_end
+@every_field
+def test_an_end_is_accepted(settings: type, field: Declared, end: End) -> None:
+    at_end(settings, field, end, last_inside(field, end))
+
+
+@every_end
+@every_field
+def test_one_step_outside_is_refused_by_name(settings: type, field: Declared, end: End) -> None:
+    number = first_outside(field, end)
+    option = field.name.removesuffix("_db").removesuffix("_deg").replace("_", "-")
+    with pytest.raises(TrilightError) as caught:
+        at_end(settings, field, end, number)
+    message = str(caught.value)
+    assert f"{field.name} is " in message or f"--{option} is " in message
+    assert f"expected {field.expected}." in message
+    assert repr(number) in message
+    assert "\n" not in message
+
+
+@every_field
+def test_other_kinds_of_values_are_refused(settings: type, field: Declared) -> None:
+    wrong: list[Any] = [math.nan, math.inf, -math.inf, True, "1", (1, 2, 3) * 3]
+    if field.kind is int:
+        wrong.append(last_inside(field, "low") + 0.5)
+    for value in wrong:
+        with pytest.raises(TrilightError, match="expected"):
+            at_end(settings, field, "low", value)
+    if field.shape != "one":
+        for value in ((), 1.0, [1.0, 2.0], None):
+            with pytest.raises(TrilightError, match="expected"):
+                dataclasses.replace(EXAMPLES[settings], **{field.name: value})
+
+
+def _numbers(hint: Any) -> Iterator[bool]:
+    """Yield for each number of a type whether a range is declared around it."""
+    if get_origin(hint) is Annotated:
+        inner, *notes = get_args(hint)
+        declared = any(isinstance(note, Within | Columns) for note in notes)
+        yield from (declared or found for found in _numbers(inner))
+    elif hint in (int, float) or (isinstance(hint, type) and issubclass(hint, np.number)):
+        yield False
+    elif get_origin(hint) is not typing.Literal:
+        for part in get_args(hint):
+            yield from _numbers(part)
+
+
+def test_no_number_is_without_a_range() -> None:
+    undeclared = [
+        f"{settings.__name__}.{name}"
+        for roots in ROOTS.values()
+        for settings in reachable(*roots)
+        if settings is Scene or settings in EXAMPLES or _is_settings(settings.__name__)
+        for name, hint in typing.get_type_hints(settings, include_extras=True).items()
+        if not all(_numbers(hint))
+    ]
+    assert undeclared == []
+
+
+def test_the_walk_sees_a_number_without_a_range() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Group:
+        pair: tuple[float, float] | None
+        fine: Annotated[int | None, Within(0, 1)]
+        words: dict[str, typing.Literal["a"]]
+
+    hints = typing.get_type_hints(Group, include_extras=True)
+    assert [all(_numbers(hint)) for hint in hints.values()] == [False, True, True]
+
+
+INTERNAL = {
+    "StreamSettings": "made of TrainSettings",
+    "OrderSettings": "made of StreamSettings",
+    "PublishedConfig": "a ModelConfig, and one number that the published code fixes",
+    "StorageSettings": "has no number",
+}
+"""Settings that nobody writes, or without numbers."""
+
+
+def _is_settings(name: str) -> bool:
+    return name.endswith(("Settings", "Order", "Config"))
+
+
+def test_no_class_of_settings_is_forgotten() -> None:
+    named = {
+        node.name
+        for package in ("scene_templates", "storage", "pipeline", "model", "train", "infra")
+        for path in (ROOT / package).rglob("*.py")
+        if "bench" not in path.parts
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ClassDef) and _is_settings(node.name)
+    }
+    reached = {settings.__name__ for settings, _ in FIELDS}
+    assert named - reached - set(INTERNAL) == {"DatasetOrder"}, "which DatasetInRuns is"
+    assert set(EXAMPLES) == {settings for settings, _ in FIELDS}
+
+
+def test_what_is_checked_is_what_is_declared() -> None:
+    """A field is looked at by its range and by nothing before it: the first wrong one is named."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Group:
+        share: Annotated[float, Within(0, 1, high_open=True, unit="parts")] = 0.5
+
+        def __post_init__(self) -> None:
+            check_ranges(self, "group: ", named=str.upper)
+
+    Group(share=0.0)
+    with pytest.raises(TrilightError) as caught:
+        Group(share=1.0)
+    expected = "group: SHARE is 1.0; expected a number from 0 to below 1 parts."
+    assert str(caught.value) == expected
+
+
+def test_the_page_of_ranges_is_current() -> None:
+    assert FILE.read_text() == ranges_page(), "run make ranges"
+
+
+ARRAYS = declared_ranges(Scene)
+every_array = pytest.mark.parametrize(
+    "field", ARRAYS, ids=lambda field: field.name + (f"-{field.part.name}" if field.part else "")
+)
+PLACES = {
+    "vertex_positions": (1, 2), "vertex_normals": (0, 0), "faces": (1, 2), "material_index": 1,
+    "object_index": 1, "c2w": (1, 0, 3), "fov_deg": 1,
+    "diffuse": (FLOOR, 1), "specular": (FLOOR, 4), "roughness": (FLOOR, 6), "emission": (LIGHT, 8),
+}  # fmt: skip
+"""One number of each array, and of each part of the materials."""
+
+
+def _with(field: Declared, number: Any) -> Scene:
+    """Return a dark floor under a light, with one number of an array replaced."""
+    scene = tiny_scene()
+    scene.materials[FLOOR] = 0
+    if field.name == "vertex_normals":
+        scene.vertex_normals[0] = 0
+    array: NDArray = getattr(scene, field.name).copy()
+    array[_place(field)] = number
+    changes: dict[str, Any] = {field.name: array}
+    return dataclasses.replace(scene, **changes)
+
+
+def _place(field: Declared) -> Any:
+    return PLACES[field.part.name if field.part else field.name]
+
+
+@every_end
+@every_array
+def test_an_array_of_a_scene_may_reach_the_end(field: Declared, end: End) -> None:
+    inwards = {"low": np.float32(np.inf), "high": np.float32(-np.inf)}[end]
+    number: Any = getattr(field.within, end)
+    if field.kind is float:
+        number = np.float32(number)
+        is_open = getattr(field.within, f"{end}_open")
+        # a normal's length, rounded to float32, is held to the same end by a law of its own
+        if is_open or field.name == "vertex_normals":
+            number = np.nextafter(number, inwards)
+    scene = _with(field, number)
+    if field.kind is float:
+        scene.check()
+        return
+    # What rows there are is a law between arrays; the range is that of the type.
+    array = getattr(scene, field.name)
+    assert number == {"low": 0, "high": np.iinfo(array.dtype).max}[end]
+    assert not field.outside(array).any()
+    if end == "low":
+        return
+    with pytest.raises(TrilightError, match=rf"{field.name}\[.*{number}; expected .*rows below"):
+        scene.check()
+
+
+@every_end
+@every_array
+def test_an_array_of_a_scene_beyond_the_end_is_refused(field: Declared, end: End) -> None:
+    if field.kind is int:
+        return  # the range is that of the type: nothing is beyond
+    outwards = {"low": np.float32(-np.inf), "high": np.float32(np.inf)}[end]
+    number = np.float32(getattr(field.within, end))
+    if not getattr(field.within, f"{end}_open"):
+        with np.errstate(over="ignore"):
+            number = np.nextafter(number, outwards)
+    place = _place(field)
+    index = ", ".join(str(at) for at in (place if isinstance(place, tuple) else (place,)))
+    with pytest.raises(TrilightError, match=rf"{field.name}\[{index}\] is .*; expected"):
+        _with(field, number).check()
+
+
+def test_as_many_materials_and_objects_as_can_be_counted() -> None:
+    """65536 of each: the last row is 65535, the greatest that 16 bits hold."""
+    count = 1 << 16
+    scene = tiny_scene()
+    materials = np.repeat(scene.materials[[FLOOR]], count, axis=0)
+    materials[-1, EMISSION] = 1
+    objects = tuple(SceneObject(name=f"part{row}", kind="shell") for row in range(count - 1))
+    last = np.array([0, 0, count - 1], np.uint16)
+    whole = dataclasses.replace(
+        scene,
+        materials=materials,
+        objects=(*objects, SceneObject(name="light", kind="emitter")),
+        material_index=last,
+        object_index=last,
+    )
+    whole.check()
+    with pytest.raises(TrilightError, match="the name 'part7' twice"):
+        twice = (*objects[:-1], objects[7], whole.objects[-1])
+        dataclasses.replace(whole, objects=twice).check()
