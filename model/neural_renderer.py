@@ -80,6 +80,11 @@ class NeuralRenderer:
         return cls(set_precision(model.to(place), precision), _trained_range(source))
 
     @property
+    def trained(self) -> TrainedRange:
+        """What the network was trained on, as far as that is known."""
+        return self._trained
+
+    @property
     def device(self) -> torch.device:
         """Where the network is."""
         return next(self._model.parameters()).device
@@ -162,23 +167,23 @@ class NeuralRenderer:
         picture: NDArray[np.float32] = total.numpy().astype(np.float32)
         return picture
 
+    @property
+    def picture_px(self) -> int:
+        """Pictures are a multiple of so many pixels wide."""
+        return self._model.config.picture_px
+
     def require_resolution(self, resolution: int) -> None:
         """Raise TrilightError unless pictures of this width can be made."""
-        step = self._model.config.picture_px
+        step = self.picture_px
         if resolution < step or resolution % step:
             raise TrilightError(
                 f"resolution is {resolution}; expected a positive multiple of {step}, as "
                 "this network's ray bundles and windows need."
             )
 
-    @property
-    def trained_resolution(self) -> int | None:
-        """Pixels across the pictures that it was trained on, if that is known."""
-        return self._trained.resolution
-
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
         """Return what a person should know of pictures of this width by this network."""
-        trained = self.trained_resolution
+        trained = self.trained.resolution
         if trained is None or resolution == trained:
             return ()
         return (

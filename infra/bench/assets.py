@@ -61,7 +61,7 @@ QUICK = Effort(most_objects=4, sizes=SIZES[:2], repeats=1)
 def run(options: Options, round_done: Callable[[], None]) -> Comparison:
     """Measure on the objects of all sources together."""
     preload(["pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters"])
-    effort, records = _effort(options), _records(options)
+    effort, records = _effort(options), object_records(options)
     with tempfile.TemporaryDirectory() as work, contextlib.closing(_child()) as child:
         sizes = _sizes(child, records)
         sides = {
@@ -92,7 +92,7 @@ def _nothing() -> None:
     """The fork server has imported everything already."""
 
 
-def _records(options: Options) -> list[ObjectRecord]:
+def object_records(options: Options) -> list[ObjectRecord]:
     return [
         record
         for source in options.objects
@@ -120,7 +120,7 @@ def _comparisons(
     for budget in BUDGETS:
         paths = [path for path, faces in sizes.items() if faces > budget][: effort.most_objects]
         for side in (remeshing.REFERENCE, *remeshing.METHODS):
-            sides[f"{side} at {budget}"] = _side(child, paths, side, budget)
+            sides[f"{side} at {budget}"] = medians_side(child, paths, side, budget)
     return sides
 
 
@@ -129,13 +129,13 @@ def _curves(
 ) -> dict[str, Callable[[], Mapping[str, float]]]:
     paths = [path for path, faces in sizes.items() if faces > _CURVE_SOURCE]
     return {
-        f"curve {side} at {budget}": _side(child, paths[: effort.most_objects], side, budget)
+        f"curve {side} at {budget}": medians_side(child, paths[: effort.most_objects], side, budget)
         for side in remeshing.METHODS
         for budget in CURVE
     }
 
 
-def _side(
+def medians_side(
     child: IsolatedChild, paths: list[Path], side: str, budget: int
 ) -> Callable[[], Mapping[str, float]]:
     """Return a run over `paths`; what one side cannot do is taken from all (the list is shared)."""

@@ -54,6 +54,10 @@ class Options:
     """What computing costs."""
     resume: bool = False
     """Keep what an interrupted run of the same plan has measured."""
+    knobs: tuple[str, ...] = ()
+    """Of `trade`: these alone."""
+    checkpoint: str | None = None
+    """Network that `trade` compares with the path tracer."""
 
 
 @dataclass(frozen=True, kw_only=True)

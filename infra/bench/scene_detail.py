@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.flows.make_scene import assets_of
 from pipeline.flows.training_builds import smoke
 from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
 from pipeline.scenes.compose import scene_pieces
 from pipeline.scenes.pieces import joined
@@ -31,22 +32,32 @@ _SPP = 256
 _NO_LIMIT = 10**9
 
 
-def picture_errors(scene_index: int) -> Mapping[str, tuple[float, float]]:
+def picture_errors(
+    scene_index: int, resolution: int = 256, spp: int = _SPP
+) -> Mapping[str, tuple[float, float]]:
     """Return (triangles of objects, psnr_log_db to the finest) by stated error, in a render child.
 
     "finest" holds the comparison of the finest with itself under another seed.
+
+    Args:
+        scene_index: which scene of the build `smoke`.
+        resolution: pixels across its first view.
+        spp: samples per pixel.
     """
+    renders = dataclasses.replace(
+        smoke().renders, resolution=resolution, min_spp=spp, max_spp=spp, min_mean_radiance=0.0
+    )
     settings = dataclasses.replace(smoke().scenes, num_views=1)
     pool = assets_of("train")
     finest = _scene(settings, pool, scene_index, 0.0)
     with_camera = with_first_cameras(finest, settings)
     camera = (with_camera.c2w, with_camera.fov_deg)
-    reference = _picture(finest.with_cameras(*camera), seed=0)
-    other = _picture(finest.with_cameras(*camera), seed=1)
+    reference = _picture(finest.with_cameras(*camera), renders, seed=0)
+    other = _picture(finest.with_cameras(*camera), renders, seed=1)
     found = {"finest": (float(_object_triangles(finest)), psnr_log_db(reference, other))}
     for error in ERRORS:
         scene = _scene(settings, pool, scene_index, error)
-        picture = _picture(scene.with_cameras(*camera), seed=0)
+        picture = _picture(scene.with_cameras(*camera), renders, seed=0)
         db = psnr_log_db(reference, picture)
         found[f"{error:.2%}"] = (float(_object_triangles(scene)), db)
     return found
@@ -85,10 +96,7 @@ def _scene(
     )
 
 
-def _picture(scene: Scene, *, seed: int) -> NDArray[np.float32]:
-    renders = dataclasses.replace(
-        smoke().renders, min_spp=_SPP, max_spp=_SPP, min_mean_radiance=0.0
-    )
+def _picture(scene: Scene, renders: RenderSettings, *, seed: int) -> NDArray[np.float32]:
     view = SceneRenderer(scene, renders).render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
     return view.radiance_rgb
 

@@ -24,6 +24,7 @@ _NAMES = (
     "shards",
     "soak",
     "streaming",
+    "trade",
 )
 
 _Measured = TypeVar("_Measured", bound="Result")
@@ -63,10 +64,22 @@ def bench(
     ] = "",
     price: Annotated[float, typer.Option(help="render: USD per core-hour")] = 0.04,
     resume: Annotated[
-        bool, typer.Option(help="render: go on with the same run where it was interrupted")
+        bool, typer.Option(help="render, trade: go on with the same run where it was interrupted")
+    ] = False,
+    knob: Annotated[
+        list[str] | None, typer.Option(help="trade: this knob alone; may be repeated [all]")
+    ] = None,
+    checkpoint: Annotated[
+        str | None, typer.Option(help="trade: network to compare with the path tracer")
+    ] = None,
+    write_docs: Annotated[
+        bool, typer.Option(help="trade: measure nothing, write docs/tradeoffs.md from the results")
     ] = False,
 ) -> None:
     """Run a benchmark; writes a dated JSON line and a figure under docs/bench."""
+    if write_docs:
+        _write_docs(name)
+        return
     benchmarks = _chosen(name, part or [])
     from infra.bench.harness import Options
 
@@ -78,9 +91,22 @@ def bench(
         cycles_spp=_samples(cycles),
         usd_per_core_hour=price,
         resume=resume,
+        knobs=tuple(knob or ()),
+        checkpoint=checkpoint,
     )
     for benchmark in benchmarks:
         _measure(benchmark, options)
+
+
+def _write_docs(name: str) -> None:
+    if name != "trade":
+        raise TrilightError(f"--write-docs was given with {name}; expected it only with trade.")
+    from infra.bench.harness import RESULTS
+    from infra.bench.trade.page import write_block
+
+    page = RESULTS.parent / "tradeoffs.md"
+    write_block(page, RESULTS)
+    console.print(f"Written: {page}", style="bold")
 
 
 def _measure(benchmark: _Benchmark[Any], options: "Options") -> None:
@@ -150,6 +176,10 @@ def _named(name: str) -> list[_Benchmark[Any]]:
         from infra.bench import streaming, streaming_report
 
         return [_whole(streaming, streaming_report)]
+    if name == "trade":
+        from infra.bench.trade import run as trade
+
+        return [_whole(trade, trade)]
     raise TrilightError(f"benchmark {name!r} is unknown; expected one of {', '.join(_NAMES)}.")
 
 

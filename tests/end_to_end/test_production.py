@@ -73,7 +73,7 @@ def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
     words = [word for key, value in where.items() for word in ("-p", f"{key}={value}")]
     prefect = ["-m", "prefect", "deployment", "run", "train-model/local", "--watch", *words]
     call(prefect, environment, RUN_S)
-    assert NeuralRenderer.load(tmp_path / "run").trained_resolution == 64
+    assert NeuralRenderer.load(tmp_path / "run").trained.resolution == 64
 
 
 def _refuses_secrets(tmp_path: Path, environment: dict[str, str]) -> None:

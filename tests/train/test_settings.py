@@ -21,7 +21,7 @@ def test_named_runs_carry_their_name_and_survive_json(name: str) -> None:
 
 
 def test_an_unknown_run_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(TrilightError, match="run 'smoek': no such run; expected one of builtin, finetune"):
+    with pytest.raises(TrilightError, match="'smoek': no such run; expected one of builtin, fine"):
         named_run("smoek")
 
 

@@ -15,6 +15,7 @@ from torch.nn.functional import elu
 
 from infra.bench.model.published_forward import published_forward, published_inputs
 from infra.bench.model.workloads import PUBLISHED_LENGTH, scene_of
+from model.config import ModelConfig
 from model.costs import Workload
 from model.layer_errors import probe_batch, random_network
 from model.precision import set_precision
@@ -42,7 +43,7 @@ class Contenders:
         self, config: PublishedConfig, sides: tuple[str, ...], device: torch.device
     ) -> None:
         self._config, self._device = config, device
-        weights = to_published(_bright_network(config), config.texture_patch)
+        weights = to_published(bright_network(config.model), config.texture_patch)
         model = from_published(weights, config)
         self._weights = {}
         if PUBLISHED in sides:
@@ -73,13 +74,13 @@ def published_like(log10_rgb: Tensor) -> Tensor:
     return elu(log10_rgb, alpha=ELU_ALPHA)
 
 
-def _bright_network(config: PublishedConfig) -> RenderFormer:
+def bright_network(config: ModelConfig) -> RenderFormer:
     """Return a random network whose pictures are as bright and varied as rendered ones."""
-    model = random_network(config.model)
+    model = random_network(config)
     last = model.decoder.head.last
     assert last.bias is not None
     with torch.no_grad():
-        picture = model(probe_batch(), max(_PROBE_PX, config.model.picture_px))
+        picture = model(probe_batch(), max(_PROBE_PX, config.picture_px))
         scale = RENDERED_STD / picture.std()
         last.weight *= scale
         last.bias.copy_(RENDERED_MEAN - scale * picture.mean())

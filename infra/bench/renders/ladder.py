@@ -13,7 +13,7 @@ import numpy as np
 
 from infra.bench.renders.remembering_tracer import RememberingTracer
 from pipeline.flows.training_builds import pretrain_256
-from pipeline.renders.denoiser import denoise
+from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features
@@ -75,35 +75,42 @@ def render_ladder(
     SceneRenderer(scene, small).render_view(*camera, seed)
     warm_up_denoiser(resolution)
     started = time.process_time()
-    remembering = _RememberingRenderer(scene, settings)
+    remembering = RememberingRenderer(scene, settings)
     load_core_s = time.process_time() - started
     rungs = []
     for target_db in targets_db:
-        renderer = remembering.at(target_db)
-        remembering.tracer.owed_core_s = 0.0
-        started = time.process_time()
-        view = renderer.render_view(*camera, seed)
-        core_s = time.process_time() - started + remembering.tracer.owed_core_s
+        view, core_s = remembering.timed_view(
+            seed, dataclasses.replace(settings, noise_floor_db=target_db)
+        )
         rungs.append(Rung(target_db=target_db, view=view, core_s=core_s))
     return Ladder(load_core_s=load_core_s, rungs=tuple(rungs))
 
 
-def warm_up_denoiser(resolution: int) -> None:
+def warm_up_denoiser(resolution: int, quality: Quality = "high") -> None:
     """Let this process make its filter for pictures of a size."""
     black = np.zeros((resolution, resolution, 3), np.float32)
-    denoise(black, Features(albedo=black, normal=black), "high")
+    denoise(black, Features(albedo=black, normal=black), quality)
 
 
-class _RememberingRenderer(SceneRenderer):
+class RememberingRenderer(SceneRenderer):
     """The product's renderer around a tracer that remembers the passes of its one view."""
 
     def __init__(self, scene: Scene, settings: RenderSettings) -> None:
         super().__init__(scene, settings)
-        self.tracer = RememberingTracer(self._tracer)
-        self._tracer, self._parts = self.tracer, [self.tracer]
+        self._camera = (scene.c2w[0], float(scene.fov_deg[0]))
+        self._remembering = RememberingTracer(self._tracer)
+        self._tracer, self._parts = self._remembering, [self._remembering]
 
-    def at(self, target_db: float) -> SceneRenderer:
-        """Return the same renderer with another target."""
+    def timed_view(self, seed: int, settings: RenderSettings) -> tuple[RenderedView, float]:
+        """Return the first view under other settings, and the core-seconds it would take alone.
+
+        Args:
+            seed: of the view.
+            settings: with the depths that the tracer was made with, and lights together.
+        """
         other = copy.copy(self)
-        other._settings = dataclasses.replace(self._settings, noise_floor_db=target_db)
-        return other
+        other._settings = settings
+        self._remembering.owed_core_s = 0.0
+        started = time.process_time()
+        view = other.render_view(*self._camera, seed)
+        return view, time.process_time() - started + self._remembering.owed_core_s

@@ -1,0 +1,153 @@
+"""The generated part of docs/tradeoffs.md: a section for each knob, and what to choose when.
+
+<!-- trade:begin -->  ...everything between is written by `trilight bench trade --write-docs`
+<!-- trade:end -->
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from infra.bench.trade.choices import CHOICES
+from infra.bench.trade.curves import JudgedPoint, Knob, default_point, judged
+from infra.bench.trade.figures import shown, shown_error
+from infra.bench.trade.knobs import KNOBS, knob_named
+from infra.bench.trade.saved import SavedCurve, saved_curves
+from infra.bench.trade.without_curve import WITHOUT_CURVE
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+
+BEGIN, END = "<!-- trade:begin -->", "<!-- trade:end -->"
+
+
+def block(folder: Path) -> str:
+    """Return the Markdown between the two markers, from the results in a folder."""
+    curves = saved_curves(folder)
+    lines = [*_head(curves)]
+    for knob in KNOBS:
+        lines += _section(knob, curves.get(knob.name))
+    lines += [*_choices(curves), *_without_curve()]
+    return "\n".join(lines) + "\n"
+
+
+def read_block(page: Path) -> str:
+    """Return what stands between the markers of a page.
+
+    Raises:
+        TrilightError: a marker is missing, or they are there twice.
+    """
+    return _parts(page)[1]
+
+
+def write_block(page: Path, folder: Path) -> None:
+    """Write the block anew; all else of the page stays. Raises TrilightError as `read_block`."""
+    before, _, after = _parts(page)
+    write_atomically(page, f"{before}{block(folder)}{after}".encode())
+
+
+def _parts(page: Path) -> tuple[str, str, str]:
+    text = page.read_text()
+    begin, end = f"{BEGIN}\n", f"{END}\n"
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise TrilightError(f"{page.name}: expected one line {BEGIN} and, after it, one {END}.")
+    before, rest = text.split(begin)
+    inside, after = rest.split(end)
+    return before + begin, inside, end + after
+
+
+def _head(curves: Mapping[str, SavedCurve]) -> Iterator[str]:
+    yield "## Every knob: cost against error"
+    yield ""
+    yield (
+        "Written by `trilight bench trade --write-docs` from the results in `docs/bench`; do not "
+        "edit it here. Costs are core-seconds unless a table says otherwise; ratios are to the "
+        "default of the same knob in the same run. A point is on the front where no other setting "
+        "is at least as good in cost and error and better in one; differences of a few percent "
+        "in core-seconds are noise."
+    )
+    for file in sorted({saved.file for saved in curves.values()}):
+        saved = next(one for one in curves.values() if one.file == file)
+        figure = file.replace(".json", ".png")
+        yield ""
+        yield f"![Error against cost of the knobs]({'bench/' + figure})"
+        yield ""
+        yield f"`{file}`: {saved.processor}."
+
+
+def _section(knob: Knob, saved: SavedCurve | None) -> Iterator[str]:
+    yield ""
+    yield f"### {knob.title}"
+    yield ""
+    if saved is None:
+        yield f"Not measured yet (`trilight bench trade --knob {knob.name}`)."
+        yield ""
+        yield f"Default: {knob.because}"
+        return
+    way = "more is better" if knob.better == "higher" else "less is better"
+    yield f"Cost: {knob.cost}. Error: {knob.error} ({way}), against {knob.against}."
+    yield f"{saved.curve.measured_on[0].upper()}{saved.curve.measured_on[1:]} ({saved.date})."
+    yield ""
+    yield from _table(knob, judged(knob, saved.curve))
+    yield ""
+    yield f"Default: {knob.because}"
+
+
+def _table(knob: Knob, points: Sequence[JudgedPoint]) -> Iterator[str]:
+    names = list(dict.fromkeys(name for one in points for name in one.point.further))
+    yield f"| setting | cost | to the default | error | {' | '.join([*names, 'front'])} |"
+    yield f"|{'---|' * (5 + len(names))}"
+    for one in points:
+        point = one.point
+        setting = f"**{point.setting}**" if point.default else point.setting
+        further = [shown(point.further[name]) if name in point.further else "" for name in names]
+        cells = [
+            setting,
+            shown(point.cost),
+            f"{shown(one.cost_ratio)} x",
+            shown_error(knob, point.error),
+            *further,
+            mark(one),
+        ]
+        yield f"| {' | '.join(cells)} |"
+
+
+def mark(one: JudgedPoint) -> str:
+    """Return whether a point is on the front, in a word."""
+    return {True: "yes", False: "no", None: "n/a"}[one.on_front]
+
+
+def _choices(curves: Mapping[str, SavedCurve]) -> Iterator[str]:
+    yield ""
+    yield "### If you need this, choose that"
+    yield ""
+    yield "| you need | choose | cost, to the default's | error (the default's) |"
+    yield "|---|---|---|---|"
+    for choice in CHOICES:
+        knob = knob_named(choice.knob)
+        saved = curves.get(knob.name)
+        if saved is None:
+            yield f"| {choice.need} | {choice.how} | not measured yet | |"
+            continue
+        base = default_point(knob, saved.curve)
+        points = {one.point.setting: one for one in judged(knob, saved.curve)}
+        if choice.setting not in points:
+            raise TrilightError(
+                f"choice {choice.need!r}: {choice.setting!r} was not measured; expected one of "
+                f"{', '.join(points)}."
+            )
+        one = points[choice.setting]
+        error = shown_error(knob, one.point.error)
+        if not one.point.default:
+            error = f"{error} ({shown_error(knob, base.error)})"
+        cost = f"{shown(one.cost_ratio)} x {knob.cost}"
+        yield f"| {choice.need} | {choice.how} | {cost} | {error} {knob.error} |"
+
+
+def _without_curve() -> Iterator[str]:
+    yield ""
+    yield "### Settings without a curve"
+    yield ""
+    reasons: dict[str, list[str]] = {}
+    for name, why in WITHOUT_CURVE.items():
+        reasons.setdefault(why, []).append(name)
+    for why, names in reasons.items():
+        yield f"- {why} {', '.join(f'`{name}`' for name in names)}"

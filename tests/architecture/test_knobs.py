@@ -1,0 +1,75 @@
+"""No setting is forgotten: each has a curve, a section by hand, or a reason for neither."""
+
+import dataclasses
+import inspect
+import re
+import typing
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+from infra.bench.trade.knobs import KNOBS
+from infra.bench.trade.without_curve import IN_SECTION, WITHOUT_CURVE
+from infra.cli.render import render
+from pipeline.flows.order import DatasetOrder
+from pipeline.flows.settings import BuildSettings
+from tests.conftest import ROOT
+from train.settings import TrainSettings
+
+
+def _groups(hint: Any) -> list[type]:
+    """Return the dataclasses that a type holds: itself, of a union, or in a tuple."""
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return [hint]
+    return [group for part in typing.get_args(hint) for group in _groups(part)]
+
+
+def _fields(settings: type, prefix: str, seen: set[type]) -> Iterator[str]:
+    """Yield dotted names; a class that occurs several times is walked where it comes first."""
+    hints = typing.get_type_hints(settings)
+    for field in dataclasses.fields(settings):
+        name, groups = f"{prefix}.{field.name}", _groups(hints[field.name])
+        for group in groups:
+            if group not in seen:
+                seen.add(group)
+                yield from _fields(group, name, seen)
+        if not groups:
+            yield name
+
+
+def _every_setting() -> set[str]:
+    names = {f"render.{name}" for name in inspect.signature(render).parameters}
+    for settings, prefix in ((BuildSettings, "build"), (DatasetOrder, "order")):
+        names |= set(_fields(settings, prefix, set()))
+    return names | set(_fields(TrainSettings, "train", set()))
+
+
+def test_the_walk_reaches_all_groups() -> None:
+    found = _every_setting()
+    for name in (
+        "build.renders.max_spp",
+        "build.assets.gate.area_ratio",
+        "build.scenes.families.shell.tilt_deg",
+        "build.scenes.families.shell.floor.spin_deg",
+        "build.scenes.excursions.axis",
+        "order.workers",
+        "train.model.width",
+        "train.augmentation.mirror",
+        "train.precision",
+        "render.tone_map",
+    ):
+        assert name in found
+
+
+def test_every_setting_has_a_curve_a_section_or_a_reason() -> None:
+    covered = [name for knob in KNOBS for name in knob.covers]
+    named = Counter([*covered, *IN_SECTION, *WITHOUT_CURVE])
+    settings = _every_setting()
+    assert settings - set(named) == set(), "these have neither"
+    assert set(named) - settings == set(), "these exist no longer"
+    assert {name for name, count in named.items() if count > 1} == set(), "these are named twice"
+
+
+def test_sections_exist() -> None:
+    headings = set(re.findall(r"(?m)^## (.+)$", (ROOT / "docs" / "tradeoffs.md").read_text()))
+    assert set(IN_SECTION.values()) <= headings

@@ -1,0 +1,230 @@
+"""Fronts, tables, the page and its choices; and the knobs that need no renderer."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from infra.bench import harness
+from infra.bench.harness import Options
+from infra.bench.trade import page, run
+from infra.bench.trade.choices import CHOICES
+from infra.bench.trade.curves import Curve, Knob, Point, judged, on_front
+from infra.bench.trade.equal_error import Priced, at_error
+from infra.bench.trade.figures import shown, shown_error
+from infra.bench.trade.knobs import KNOBS, knob_named
+from infra.bench.trade.saved import saved_curves
+from infra.bench.trade.workshop import QUICK, Workshop
+from infra.cli.app import app
+from storage.errors import TrilightError
+from tests.conftest import ROOT
+from tests.infra.trade_kit import TINY
+from tests.scenes_by_hand import tiny_sample
+
+OPTIONS = Options(quick=True, objects=("builtin:",), allowed_licences=())
+_figure = st.integers(0, 4).map(float)
+
+
+@given(st.lists(st.tuples(_figure, _figure, _figure), min_size=1, max_size=12))
+def test_the_front_is_what_nobody_dominates(points: list[tuple[float, ...]]) -> None:
+    front = on_front(points)
+    assert any(front)
+    for mine, mark in zip(points, front, strict=True):
+        better = [
+            other
+            for other in points
+            if other != mine and all(a <= b for a, b in zip(other, mine, strict=True))
+        ]
+        assert mark == (not better)
+
+
+def _knob(**changes: object) -> Knob:
+    return dataclasses.replace(knob_named("guides"), **changes)  # type: ignore[arg-type]
+
+
+def _curve(*points: tuple[str, float, float | None]) -> Curve:
+    made = [
+        Point(setting=name, cost=cost, error=error, default=name == "b", further={"kB": -cost})
+        for name, cost, error in points
+    ]
+    return Curve(points=tuple(made), measured_on="points by hand")
+
+
+def test_points_are_judged_beside_the_default() -> None:
+    curve = _curve(("a", 1, 30), ("b", 2, 40), ("c", 3, 35), ("d", 4, None), ("e", 5, 41))
+    found = judged(_knob(), curve)
+    assert [one.cost_ratio for one in found] == [0.5, 1, 1.5, 2, 2.5]
+    assert [one.on_front for one in found] == [True, True, False, None, True]
+    lower = judged(_knob(better="lower"), curve)
+    assert [one.on_front for one in lower] == [True, False, False, None, False]
+    # c is cheaper in the second cost than all before it
+    both = judged(_knob(also_cost=("kB",)), curve)
+    assert [one.on_front for one in both] == [True, True, True, None, True]
+    with pytest.raises(TrilightError, match="knob guides: 0 of 1 settings are the default"):
+        judged(_knob(), _curve(("a", 1, 30)))
+
+
+def test_equal_error_lies_between_levels() -> None:
+    levels = [Priced(spp=4, core_s=1.4, db=20), Priced(spp=16, core_s=2.6, db=30)]
+    middle = at_error(levels, 25)
+    # half of two doublings; each sample costs a tenth of a core-second
+    assert (middle.bound, middle.spp, middle.core_s) == ("exactly", 8, pytest.approx(1.8))
+    assert at_error(levels, 30).core_s == pytest.approx(2.6)
+    assert (at_error(levels, 19).bound, at_error(levels, 19).spp) == ("at most", 4)
+    assert (at_error(levels, 31).bound, at_error(levels, 31).spp) == ("more than", 16)
+
+
+def test_figures_are_shown_with_three_digits() -> None:
+    assert [shown(x) for x in (0, 0.0123, 0.998, 1, 12.34, 123.4, 12345.6)] == [
+        "0", "0.012", "1.00", "1.00", "12.3", "123", "12346"
+    ]  # fmt: skip
+    assert shown_error(knob_named("depth"), 46.04) == "46.0"
+    assert shown_error(knob_named("size"), None) == "n/a"
+
+
+def test_knobs_are_told_apart_and_say_what_they_are() -> None:
+    for field in ("name", "title"):
+        values = [getattr(knob, field) for knob in KNOBS]
+        assert len(set(values)) == len(values)
+    for choice in CHOICES:
+        assert knob_named(choice.knob)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["trade", "--knob", "speed"], "--knob 'speed': unknown; expected one of samples, "),
+        (["trade", "--part", "cost"], "it has no parts"),
+        (["shards", "--write-docs"], "expected it only with trade"),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_measured(words: list[str], said: str) -> None:
+    result = CliRunner().invoke(app, ["bench", *words])
+    assert isinstance(result.exception, TrilightError), result.output
+    assert said in str(result.exception)
+
+
+def _write(folder: Path, name: str, date: str, knob: str, cost: float) -> None:
+    curve = dataclasses.asdict(_curve(("b", cost, 40)))
+    record = {"curves": {knob: curve}, "date": date, "machine": {"processor": "abacus"}}
+    (folder / f"{name}-{date}.json").write_text(json.dumps(record))
+
+
+def test_the_newest_and_most_careful_result_counts(tmp_path: Path) -> None:
+    def cost(knob: str) -> float:
+        return saved_curves(tmp_path)[knob].curve.points[0].cost
+
+    _write(tmp_path, "trade", "2026-01-01", "guides", 1)
+    _write(tmp_path, "trade", "2026-01-01", "depth", 1)
+    _write(tmp_path, "trade-quick", "2026-01-02", "guides", 2)
+    assert (cost("guides"), cost("depth")) == (2, 1)
+    _write(tmp_path, "trade-guides-quick", "2026-01-02", "guides", 3)
+    assert cost("guides") == 3
+    _write(tmp_path, "trade", "2026-01-02", "guides", 4)
+    assert cost("guides") == 4
+
+
+def test_the_page_is_written_between_its_markers(tmp_path: Path) -> None:
+    _write(tmp_path, "trade-quick", "2026-01-02", "guides", 2)
+    target = tmp_path / "page.md"
+    target.write_text(f"before\n{page.BEGIN}\nof yesterday\n{page.END}\nafter\n")
+    page.write_block(target, tmp_path)
+    text = target.read_text()
+    assert text.startswith(f"before\n{page.BEGIN}\n## Every knob")
+    assert text.endswith(f"\n{page.END}\nafter\n") and "of yesterday" not in text
+    assert "| **b** | 2.00 | 1.00 x | 40.0 | -2.00 | yes |" in text
+    assert "Not measured yet (`trilight bench trade --knob depth`)" in text
+    assert page.read_block(target) == page.block(tmp_path)
+    for knob in KNOBS:
+        assert f"\n### {knob.title}\n" in text and knob.because in text
+    target.write_text(f"{page.END}\n{page.BEGIN}\n")
+    with pytest.raises(TrilightError, match="expected one line"):
+        page.write_block(target, tmp_path)
+
+
+def test_the_documentation_is_what_the_results_say() -> None:
+    """`trilight bench trade --write-docs` was run after the last benchmark."""
+    written = page.read_block(ROOT / "docs" / "tradeoffs.md")
+    assert written == page.block(ROOT / "docs" / "bench")
+
+
+def test_what_is_missing_is_left_out_with_a_line() -> None:
+    options = dataclasses.replace(OPTIONS, knobs=("engines",))
+    rounds: list[None] = []
+    result = run.run(options, lambda: rounds.append(None))
+    assert len(rounds) == run.num_rounds(options) == 1
+    assert run.rows(result) == [("engines", "left out: no --checkpoint was given")]
+
+
+@pytest.mark.parametrize("name", ["precision", "attention", "size"])
+def test_knobs_of_the_network(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(harness, "RESULTS", tmp_path)  # without a table of small trainings
+    monkeypatch.setattr("model.config.SIZES", {"smoke": knob_config()})
+    curve = knob_named(name).measure(Workshop(TINY, OPTIONS))
+    assert sum(one.point.default for one in judged(knob_named(name), curve)) == 1
+    assert all(point.cost > 0 for point in curve.points)
+    errors = {point.setting: point.error for point in curve.points}
+    if name == "precision":
+        # 8 bits of bfloat16 over a few layers: a percent; another network would have below 30
+        assert errors["float32"] == 100 and 40 < (errors["bfloat16"] or 0) < 99
+    if name == "attention":
+        # float32 rounds to 6e-8, bfloat16 to 4e-3, of numbers of size 1
+        assert (errors["fused"] or 1) < 1e-5 < (errors["fused, bfloat16"] or 0) < 0.1
+    if name == "size":
+        assert set(errors.values()) == {None}
+
+
+def knob_config():  # type: ignore[no-untyped-def]
+    from model.config import smoke
+
+    return smoke
+
+
+def test_errors_of_sizes_come_from_the_table(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from infra.bench.trade.network_knobs import trained_errors
+
+    monkeypatch.setattr(harness, "RESULTS", tmp_path)
+    rows = [
+        {"plan": plan, "change": change, "scenes": scenes, "size": "small",
+         "scores": {"log_l1": score}}
+        for plan, change, scenes, score in (
+            ("cpu", "ours", 960, 0.02), ("cpu", "ours", 960, 0.04), ("cpu", "ours", 60, 0.9),
+            ("cpu", "ema", 960, 0.9), ("gpu", "ours", 960, 0.9),
+        )
+    ]  # fmt: skip
+    (tmp_path / "training_table.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
+    assert trained_errors() == {"table, small": pytest.approx(0.03)}
+
+
+def test_the_codec_knob_on_samples_by_hand() -> None:
+    shop = Workshop(TINY, OPTIONS)
+    shop.__dict__["samples"] = [tiny_sample("0", 32, seed=0)]
+    knob = knob_named("codec")
+    found = {one.point.setting: one for one in judged(knob, knob.measure(shop))}
+    assert found["profile compact"].point.default
+    assert found["raw half floats"].cost_ratio > found["profile lossless"].cost_ratio
+    # nothing is nearer to the picture than its half floats
+    exact = found["raw half floats"].point.error
+    assert exact is not None
+    assert all((one.point.error or 0) <= exact + 1e-9 for one in found.values())
+
+
+def test_a_result_is_told_and_drawn(tmp_path: Path) -> None:
+    curves = {"guides": _curve(("a", 1, 30), ("b", 2, 40)), "depth": _curve(("b", 1, None))}
+    result = run.Trade(name="trade", curves=curves, skipped={"engines": "why"}, seconds={})
+    lines = run.rows(result)
+    assert ("  b", "  1.00 x      40.0  front  default") in lines
+    assert ("engines", "left out: why") in lines
+    run.plot(result, tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 10_000
+    assert json.loads(result.as_json_line())["curves"]["guides"]["points"][0]["cost"] == 1
+
+
+def test_quick_is_less() -> None:
+    assert QUICK.scenes < 12 and QUICK.max_spp % 128 == 0

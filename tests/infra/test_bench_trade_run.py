@@ -1,0 +1,48 @@
+"""`trilight bench trade` as a whole on tiny pictures: children, references, a checkpoint, files."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from infra.bench import harness
+from infra.bench.renders import kept
+from infra.bench.trade import run
+from infra.bench.trade.curves import judged
+from infra.bench.trade.knobs import knob_named
+from infra.bench.trade.saved import saved_curves
+from infra.cli.app import app
+from model.config import smoke
+from model.layer_errors import random_network
+from model.weights import encode_weights
+from tests.infra.trade_kit import TINY
+
+pytestmark = pytest.mark.slow
+
+WITH_CHILDREN = ("samples", "profile", "scene-budget", "detail", "views", "bundles", "pipeline")
+
+
+def test_knobs_with_children_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(run, "QUICK", TINY)
+    monkeypatch.setattr(harness, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(kept, "cache_folder", lambda name: tmp_path / name)
+    checkpoint = tmp_path / "model.safetensors"
+    torch.manual_seed(0)
+    checkpoint.write_bytes(encode_weights(random_network(smoke())))
+    words = [word for name in (*WITH_CHILDREN, "engines") for word in ("--knob", name)]
+    result = CliRunner().invoke(
+        app, ["bench", "trade", "--quick", "--checkpoint", str(checkpoint), *words]
+    )
+    assert result.exit_code == 0, result.exception
+    (path,) = (tmp_path / "results").glob("trade-*.json")
+    assert path.with_suffix(".png").stat().st_size > 10_000
+    assert set(json.loads(path.read_bytes())["curves"]) == {*WITH_CHILDREN, "engines"}
+    for name, saved in saved_curves(tmp_path / "results").items():
+        assert any(one.on_front for one in judged(knob_named(name), saved.curve))
+    engines = saved_curves(tmp_path / "results")["engines"].curve
+    assert len({point.error for point in engines.points}) == 1  # equal error on all sides
+    assert len(engines.details) == TINY.scenes
+    # a network of random weights is no match for a single denoised sample
+    assert {row["denoised bound"] for row in engines.details} == {"at most"}
