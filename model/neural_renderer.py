@@ -167,14 +167,9 @@ class NeuralRenderer:
         picture: NDArray[np.float32] = total.numpy().astype(np.float32)
         return picture
 
-    @property
-    def picture_px(self) -> int:
-        """Pictures are a multiple of so many pixels wide."""
-        return self._model.config.picture_px
-
     def require_resolution(self, resolution: int) -> None:
         """Raise TrilightError unless pictures of this width can be made."""
-        step = self.picture_px
+        step = self._model.config.picture_px
         if resolution < step or resolution % step:
             raise TrilightError(
                 f"resolution is {resolution}; expected a positive multiple of {step}, as "
