@@ -19,6 +19,7 @@ from storage.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.objects_lock import read_objects_lock
+from train.evaluation.judged_view import NETWORK
 from train.folder import RunFolder
 
 MOST_BYTES = 8_000_000
@@ -109,7 +110,8 @@ def _card(
 
 
 def _scores(judged: Mapping[str, Any]) -> list[str]:
-    contestants = judged["contestants"]
+    everybody = judged["contestants"]
+    contestants = {NETWORK: everybody[NETWORK]} | everybody  # the file has them by their names
     return [
         f"Scores on the test split ({judged['about']['scenes']} scenes, {len(judged['views'])} "
         "views, objects that it has not seen; medians):",

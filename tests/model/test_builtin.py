@@ -1,0 +1,34 @@
+"""The network that is shipped: it opens by its name, is small, and its card is of these weights."""
+
+import re
+
+from model.checkpoints import BUILTIN, checkpoint_path, open_checkpoint
+from model.neural_renderer import NeuralRenderer
+from model.renderformer import count_parameters
+from storage.digests import sha256_hex
+from tests.scenes_by_hand import tiny_scene
+
+MOST_BYTES = 8_000_000
+"""Everybody who clones the project gets them."""
+
+
+def test_the_card_is_of_these_weights() -> None:
+    weights = checkpoint_path(BUILTIN).read_bytes()
+    card = checkpoint_path(BUILTIN).with_name("README.md").read_text()
+    assert len(weights) <= MOST_BYTES
+    assert f"{len(weights)} bytes, sha256 `{sha256_hex(weights)}`" in card
+    (stated,) = re.findall(r"size: (\d+) parameters", card)
+    assert count_parameters(open_checkpoint(BUILTIN)) == int(stated)
+    # it was judged, and it has learned: the network's error is below the median picture's
+    (network, median, _) = re.findall(r"\| log_l1 \| (\S+) \| (\S+) \| (\S+) \|", card)[0]
+    assert float(network) < 0.8 * float(median)
+
+
+def test_it_renders_by_its_name_and_knows_its_range() -> None:
+    renderer = NeuralRenderer.load(BUILTIN, device="cpu")
+    known = renderer.trained
+    assert known.resolution == 64 and known.max_triangles is not None
+    picture = renderer.render(tiny_scene(), 64)
+    assert picture.shape[1:] == (64, 64, 3) and picture.min() >= 0 and picture.max() > 0.01
+    (note,) = renderer.resolution_notes(128)
+    assert "trained on 64" in note and renderer.resolution_notes(64) == ()
