@@ -19,10 +19,10 @@ dataset: setup  ## 24 scenes of built-in objects, verified
 	trilight verify data/smoke
 
 test: setup-all  ## the tests that take minutes
-	python -m pytest
+	python -m pytest -n 2
 
 test-slow: setup-all  ## the others
-	python -m pytest -m slow
+	python -m pytest -m slow -n 2
 
 train: setup-all  ## the smoke model on what `make dataset` made
 	trilight train smoke --data data/smoke --out runs/smoke $(if $(wildcard runs/smoke/checkpoints/*),--resume)

@@ -61,7 +61,10 @@ SHAPES = {
     "sliver 1e-7": [_sliver(1e-7), _floor(), _lamp()],
     "coincident floors": [_floor(), _floor(material(specular=0.9, roughness=0.1)), _lamp()],
     "interpenetrating": [sphere([0, 0, 0], 0.5, material(diffuse=0.9)), _floor(), _lamp()],
-    "light on the floor": [_floor(), light(np.array(LAMP) * [1, 1, 0], 100.0)],
+    "light on the floor": [  # which it does not light: only what stands above it
+        _floor(), light(np.array(LAMP) * [1, 1, 0], 100.0),
+        sphere([0.5, 0, 0.5], 0.3, material(diffuse=0.9)),
+    ],
     "light inside an object": [
         sphere([0, 0, 2], 0.5, material(diffuse=0.9)), _floor(), _lamp(),
         light(np.add(LAMP, [0, 0, 1]), 1.0),

@@ -30,7 +30,7 @@ TERMS = [
     LossSettings(perceptual="none"),
     LossSettings(perceptual="ms_ssim"),
     LossSettings(perceptual="none", noise_half=1e-6),
-    LossSettings(perceptual="none", noise_half=1e6),
+    LossSettings(perceptual="none", noise_half=10.0),
 ]
 
 
@@ -88,7 +88,7 @@ def test_a_weight_beyond_float32_skips_the_step_and_the_next_one_is_as_before() 
     assert again == first
 
 
-@pytest.mark.parametrize("factor", [1.0, 1e3, 1e6])
+@pytest.mark.parametrize("factor", [1.0, 30.0, 1e3])
 def test_light_may_be_scaled_as_far_as_half_floats_hold(factor: float) -> None:
     scene = training_scene(toy_sample(0), RESOLUTION)
     changed = augmented(scene, AugmentationSettings(light_scale=factor), np.random.default_rng(0))

@@ -173,7 +173,7 @@ OTHERS: dict[str, tuple[str, Any, str]] = {
     "texture not finite": ("texture", np.full((3, 13, 32, 32), np.nan, "<f4"), "holds nan"),
     "fewer angles than cameras": ("fov", np.ones(1, "<f4"), "has shape"),
     "a camera that is none": ("c2w", np.ones((2, 4, 4), "<f4"), "orthonormal"),
-    "angle of zero": ("fov", np.zeros(2, "<f4"), "between 0 and 180"),
+    "angle of zero": ("fov", np.zeros(2, "<f4"), "above 0 and below 180"),
     "albedo over 1": ("texture", _ones_without_light(), "diffuse . specular at most 1"),
     "no light": ("texture", np.zeros((3, 13, 32, 32), "<f4"), "no emission"),
     "pictures without end": ("img", None, "img: would take"),
