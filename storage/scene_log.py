@@ -47,7 +47,7 @@ def log_scene(
         "pid": os.getpid(),
         "finished_unix_s": round(time.time(), 1),
     }
-    path = folder.logs / f"{shard}.jsonl"
+    path = folder.root / log_name(shard)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as stream:
@@ -59,13 +59,29 @@ def log_scene(
 def read_scene_logs(folder: DatasetFolder) -> Iterator[SceneLog]:
     """Yield what the logs of a dataset say; rows that a kill has cut are left out."""
     for path in sorted(folder.logs.rglob("*.jsonl")):
-        for line in path.read_text().splitlines():
-            try:
-                row = json.loads(line)
-                yield SceneLog(
-                    seconds=float(row["seconds"]),
-                    cores=int(row.get("cores", 1)),  # earlier versions did not say
-                    finished_unix_s=float(row["finished_unix_s"]),
-                )
-            except (ValueError, KeyError, TypeError, AttributeError):
-                continue
+        yield from decode_scene_log(path.read_text())
+
+
+def read_shard_log(folder: DatasetFolder, shard: str) -> list[SceneLog]:
+    """Return what the log of one shard, such as `train-000003.tar`, says; nothing without one."""
+    path = folder.root / log_name(shard)
+    return list(decode_scene_log(path.read_text())) if path.is_file() else []
+
+
+def log_name(shard: str) -> str:
+    """Return the name of a shard's log, relative to the dataset."""
+    return f"logs/{shard}.jsonl"
+
+
+def decode_scene_log(text: str) -> Iterator[SceneLog]:
+    """Yield what the rows of a log say; those that a kill has cut are left out."""
+    for line in text.splitlines():
+        try:
+            row = json.loads(line)
+            yield SceneLog(
+                seconds=float(row["seconds"]),
+                cores=int(row.get("cores", 1)),  # earlier versions did not say
+                finished_unix_s=float(row["finished_unix_s"]),
+            )
+        except (ValueError, KeyError, TypeError, AttributeError):
+            continue

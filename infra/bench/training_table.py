@@ -27,6 +27,7 @@ from train.loop.checkpoints import saved_steps
 from train.loop.crew import join_crew
 from train.loop.metrics_log import read_rows
 from train.run import Start, train_run
+from train.settings import TrainSettings
 
 TABLE = RESULTS / "training_table.jsonl"
 
@@ -90,13 +91,6 @@ def is_done(job: Job, data_digest: str, rows: Sequence[dict[str, Any]]) -> bool:
 def run_job(job: Job, dataset: Dataset, folder: Path, device: str | None) -> dict[str, Any]:
     """Train and return the row of the table."""
     shards, num_scenes = _shards(dataset, job.scenes)
-    resume = bool(saved_steps(RunFolder(folder).checkpoints))
-    with join_crew(device) as crew:
-        result = train_run(
-            job.settings(), data=shards, out=folder, start=Start(resume=resume), crew=crew
-        )
-    assert result is not None
-    validations = [row for row in read_rows(result.folder.metrics) if "validation" in row]
     return {
         "job": job.name,
         "plan": job.plan,
@@ -106,6 +100,20 @@ def run_job(job: Job, dataset: Dataset, folder: Path, device: str | None) -> dic
         "seed": job.seed,
         "settings_sha256": job.digest(),
         "data_digest": dataset.digest,
+        **train_and_score(job.settings(), shards, folder, device),
+    }
+
+
+def train_and_score(
+    settings: TrainSettings, shards: Sequence[str], folder: Path, device: str | None
+) -> dict[str, Any]:
+    """Train on shards, or go on, and return what every table says of a training."""
+    resume = bool(saved_steps(RunFolder(folder).checkpoints))
+    with join_crew(device) as crew:
+        result = train_run(settings, data=shards, out=folder, start=Start(resume=resume), crew=crew)
+    assert result is not None
+    validations = [row for row in read_rows(result.folder.metrics) if "validation" in row]
+    return {
         "num_parameters": result.num_parameters,
         "num_steps": result.num_steps,
         "scores": result.scores,

@@ -102,10 +102,11 @@ def _write_docs(name: str) -> None:
     if name != "trade":
         raise TrilightError(f"--write-docs was given with {name}; expected it only with trade.")
     from infra.bench.harness import RESULTS
-    from infra.bench.trade.page import write_block
+    from infra.bench.marked_block import write_block
+    from infra.bench.trade.page import MARK, block
 
     page = RESULTS.parent / "tradeoffs.md"
-    write_block(page, RESULTS)
+    write_block(page, MARK, block(RESULTS))
     console.print(f"Written: {page}", style="bold")
 
 

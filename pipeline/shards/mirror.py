@@ -39,6 +39,7 @@ from storage.manifest import (
 from storage.remote.bucket import Bucket
 from storage.remote.cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_url
+from storage.scene_log import log_name
 
 _PLANNED = ".staging/planned/"
 """Below it stands a file for each number of scenes that was asked for; the largest counts."""
@@ -156,7 +157,7 @@ class Mirror:
 
     def _put(self, made: ShardEntry) -> ShardEntry:
         """Put a shard into the bucket with its log, and return the entry of what is there then."""
-        log = self._folder.logs / f"{made.name}.jsonl"
+        log = self._folder.root / log_name(made.name)
         if self._bucket.create(made.name, self._folder.shard(made.name)):
             if log.exists():
                 self._bucket.write(self._name(log), log)

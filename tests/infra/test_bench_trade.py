@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from infra.bench import harness
 from infra.bench.harness import Options
+from infra.bench.marked_block import read_block
 from infra.bench.trade import page, run
 from infra.bench.trade.choices import CHOICES
 from infra.bench.trade.curves import Curve, Knob, Point, judged, on_front
@@ -128,27 +129,19 @@ def test_the_newest_and_most_careful_result_counts(tmp_path: Path) -> None:
     assert cost("guides") == 4
 
 
-def test_the_page_is_written_between_its_markers(tmp_path: Path) -> None:
+def test_the_page_says_what_the_results_say(tmp_path: Path) -> None:
     _write(tmp_path, "trade-quick", "2026-01-02", "guides", 2)
-    target = tmp_path / "page.md"
-    target.write_text(f"before\n{page.BEGIN}\nof yesterday\n{page.END}\nafter\n")
-    page.write_block(target, tmp_path)
-    text = target.read_text()
-    assert text.startswith(f"before\n{page.BEGIN}\n## Every knob")
-    assert text.endswith(f"\n{page.END}\nafter\n") and "of yesterday" not in text
+    text = page.block(tmp_path)
+    assert text.startswith("## Every knob")
     assert "| **b** | 2.00 | 1.00 x | 40.0 | -2.00 | yes |" in text
     assert "Not measured yet (`trilight bench trade --knob depth`)" in text
-    assert page.read_block(target) == page.block(tmp_path)
     for knob in KNOBS:
         assert f"\n### {knob.title}\n" in text and knob.because in text
-    target.write_text(f"{page.END}\n{page.BEGIN}\n")
-    with pytest.raises(TrilightError, match="expected one line"):
-        page.write_block(target, tmp_path)
 
 
 def test_the_documentation_is_what_the_results_say() -> None:
     """`trilight bench trade --write-docs` was run after the last benchmark."""
-    written = page.read_block(ROOT / "docs" / "tradeoffs.md")
+    written = read_block(ROOT / "docs" / "tradeoffs.md", page.MARK)
     assert written == page.block(ROOT / "docs" / "bench")
 
 

@@ -13,10 +13,10 @@ from infra.bench.trade.figures import shown, shown_error
 from infra.bench.trade.knobs import KNOBS, knob_named
 from infra.bench.trade.saved import SavedCurve, saved_curves
 from infra.bench.trade.without_curve import WITHOUT_CURVE
-from storage.atomic import write_atomically
 from storage.errors import TrilightError
 
-BEGIN, END = "<!-- trade:begin -->", "<!-- trade:end -->"
+MARK = "trade"
+"""Of the block on the page (infra.bench.marked_block)."""
 
 
 def block(folder: Path) -> str:
@@ -27,31 +27,6 @@ def block(folder: Path) -> str:
         lines += _section(knob, curves.get(knob.name))
     lines += [*_choices(curves), *_without_curve()]
     return "\n".join(lines) + "\n"
-
-
-def read_block(page: Path) -> str:
-    """Return what stands between the markers of a page.
-
-    Raises:
-        TrilightError: a marker is missing, or they are there twice.
-    """
-    return _parts(page)[1]
-
-
-def write_block(page: Path, folder: Path) -> None:
-    """Write the block anew; all else of the page stays. Raises TrilightError as `read_block`."""
-    before, _, after = _parts(page)
-    write_atomically(page, f"{before}{block(folder)}{after}".encode())
-
-
-def _parts(page: Path) -> tuple[str, str, str]:
-    text = page.read_text()
-    begin, end = f"{BEGIN}\n", f"{END}\n"
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise TrilightError(f"{page.name}: expected one line {BEGIN} and, after it, one {END}.")
-    before, rest = text.split(begin)
-    inside, after = rest.split(end)
-    return before + begin, inside, end + after
 
 
 def _head(curves: Mapping[str, SavedCurve]) -> Iterator[str]:

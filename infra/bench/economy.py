@@ -1,0 +1,223 @@
+"""What the scenes of a dataset cost part by part, and what was left out, from its own records.
+
+    python -m infra.bench.economy SET [--write]
+
+Reads every sample of a finished dataset and prints a table; `--write` puts it into docs/economy.md.
+The sources' triangles are looked up in this machine's asset store: make the set here.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from infra.bench.economy_counts import SceneCosts, scene_costs
+from infra.bench.harness import ROOT
+from infra.bench.marked_block import write_block
+from infra.bench.model.workloads import PUBLISHED_LENGTH
+from infra.cli.console import console
+from model.config import base
+from model.costs import Workload, flops
+from storage.dataset import Dataset, open_dataset
+from storage.errors import TrilightError
+from storage.renderformer_h5 import CELLS, CHANNELS, write_renderformer_h5
+
+MARK = "economy"
+_HDF5_SCENES = 6
+"""Written in the published form: half a second each."""
+_PICTURE_CHANNELS = 3
+_HALF_BYTES = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """One part of a scene."""
+
+    part: str
+    """What it is."""
+    everything: str
+    """What it would take with nothing left out."""
+    kept: str
+    """What it takes."""
+    factor: float
+    """How many times less."""
+    error: str
+    """What leaving it out adds."""
+
+
+def main(
+    dataset: Annotated[str, typer.Argument(help="root of a finished dataset")],
+    write: Annotated[bool, typer.Option(help="write docs/economy.md")] = False,
+) -> None:
+    """Count and print."""
+    opened = open_dataset(dataset)
+    found = list(scene_costs(opened))
+    if not found:
+        raise TrilightError(f"{opened.shown}: no scene; expected a finished dataset.")
+    text = "\n".join(table(opened, found)) + "\n"
+    console.print(text, soft_wrap=True, markup=False)
+    if write:
+        write_block(ROOT / "docs" / "economy.md", MARK, text)
+
+
+def table(dataset: Dataset, found: Sequence[SceneCosts]) -> list[str]:
+    """Return the table as lines of Markdown."""
+    manifest = dataset.manifest
+    px = int(manifest.settings["renders"]["resolution"])
+    head = (
+        f"Set: {len(found)} scenes of `{manifest.build}`, {manifest.num_views} views of {px} x "
+        f"{px} each; means per scene, from manifest, samples and asset store (`python -m "
+        "infra.bench.economy SET --write`)."
+    )
+    lines = [
+        *_geometry(found, px),
+        *_smallest(found, px),
+        _samples(found, int(manifest.settings["renders"]["max_spp"])),
+        *_bytes(dataset, found, px),
+    ]
+    rows = [
+        f"| {line.part} | {line.everything} | {line.kept} | {line.factor:.3g} x | {line.error} |"
+        for line in lines
+    ]
+    return [
+        head,
+        "",
+        "| part | with everything | what is kept | saving | error that it adds |",
+        "|---|---|---|---|---|",
+        *rows,
+    ]
+
+
+def _geometry(found: Sequence[SceneCosts], px: int) -> list[Line]:
+    sources = sum(one.source_faces for one in found)
+    objects = sum(one.object_faces for one in found)
+    views = len(found[0].spp)
+    padded = _flops(PUBLISHED_LENGTH.get(px, max(PUBLISHED_LENGTH.values())), views, px)
+    counted = float(np.mean([_flops(one.triangles, views, px) for one in found]))
+    empty = float(np.mean([one.empty_share for one in found]))
+    scenes = len(found)
+    return [
+        Line(
+            part="triangles of the objects",
+            everything=f"{sources / scenes:.0f} in their sources",
+            kept=f"{objects / scenes:.0f}",
+            factor=sources / max(objects, 1),
+            error="p99 distance at most 3 % of an object, mostly below 1 %",
+        ),
+        Line(
+            part="FLOPs of all views (Base)",
+            everything=f"{padded / 1e9:.0f} G, padded as published",
+            kept=f"{counted / 1e9:.0f} G, the scene's own triangles",
+            factor=padded / counted,
+            error="none",
+        ),
+        Line(
+            part="ray bundles that see nothing",
+            everything="all are computed",
+            kept=f"{100 * (1 - empty):.1f} % see geometry; the rest is skipped on request only",
+            factor=1 / (1 - empty),
+            error="none while it is off, the default",
+        ),
+    ]
+
+
+def _smallest(found: Sequence[SceneCosts], px: int) -> list[Line]:
+    """Return what the least scene of the set takes of the most."""
+    least = min(found, key=lambda one: one.triangles)
+    most = max(found, key=lambda one: one.triangles)
+    costs = [_flops(one.triangles, len(one.spp), px) / 1e9 for one in (most, least)]
+    sizes = [one.array_bytes / 1e3 for one in (most, least)]
+    return [
+        Line(
+            part=f"the smallest scene, {least.triangles} triangles: {what}",
+            everything=f"{of_most:.1f} {unit} for {most.triangles} triangles",
+            kept=f"{of_least:.1f} {unit}, {100 * of_least / of_most:.0f} %",
+            factor=of_most / of_least,
+            error="none",
+        )
+        for what, unit, (of_most, of_least) in (("FLOPs", "G", costs), ("arrays", "kB", sizes))
+    ]
+
+
+def _samples(found: Sequence[SceneCosts], most: int) -> Line:
+    spent = np.array([spp for one in found for spp in one.spp], np.float64)
+    floors = np.array([floor for one in found for floor in one.floors_db])
+    return Line(
+        part="samples of a pixel",
+        everything=f"{most}, the cap, in every view",
+        kept=f"{spent.mean():.0f}; {100 * np.mean(spent >= most):.0f} % of the views at the cap",
+        factor=most / float(spent.mean()),
+        error=f"stated per view: median floor {np.median(floors):.1f} dB, 5th percentile "
+        f"{np.percentile(floors, 5):.1f}",
+    )
+
+
+def _bytes(dataset: Dataset, found: Sequence[SceneCosts], px: int) -> list[Line]:
+    arrays = float(np.mean([one.array_bytes + one.record_bytes for one in found]))
+    pictures = float(np.mean([one.picture_bytes for one in found]))
+    published, same = _published_bytes(dataset, found)
+    texture = np.mean([one.triangles for one in found]) * CHANNELS * CELLS**2 * _HALF_BYTES
+    raw = len(found[0].spp) * px * px * _PICTURE_CHANNELS * _HALF_BYTES
+    profile = dataset.manifest.settings["storage"]["profile"]
+    added = "none" if profile == "lossless" else "at most a tenth of each view's own noise"
+    return [
+        Line(
+            part="arrays and record on disk",
+            everything=f"{published / 1e3:.0f} kB, the published HDF5 with half-float textures",
+            kept=f"{same / 1e3:.1f} kB, the first {min(len(found), _HDF5_SCENES)} scenes",
+            factor=published / same,
+            error="none",
+        ),
+        Line(
+            part="materials in memory",
+            everything=f"{texture / 1e6:.1f} MB of textures",
+            kept=f"{arrays / 1e3:.1f} kB for all arrays and the record",
+            factor=float(texture / arrays),
+            error="none: the textures are constant",
+        ),
+        Line(
+            part=f"pictures (`{profile}`)",
+            everything=f"{raw / 1e3:.0f} kB of half floats",
+            kept=f"{pictures / 1e3:.0f} kB",
+            factor=raw / pictures,
+            error=added,
+        ),
+        Line(
+            part="a whole sample",
+            everything=f"{(published + raw) / 1e3:.0f} kB",
+            kept=f"{(arrays + pictures) / 1e3:.0f} kB",
+            factor=(published + raw) / (arrays + pictures),
+            error=f"in pictures only: {added}",
+        ),
+    ]
+
+
+def _published_bytes(dataset: Dataset, found: Sequence[SceneCosts]) -> tuple[float, float]:
+    """Return bytes a scene as HDF5, and as stored here, of the same first scenes."""
+    total, count = 0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        for shard in dataset.manifest.shards:
+            for record in dataset.read_scenes(shard):
+                if count == _HDF5_SCENES:
+                    break
+                path = Path(folder, f"{record.key}.h5")
+                write_renderformer_h5(path, record.scene, texture_type="float16")
+                total, count = total + path.stat().st_size, count + 1
+    same = [one.array_bytes + one.record_bytes for one in found[:count]]
+    return total / count, float(np.mean(same))
+
+
+def _flops(triangles: int, views: int, px: int) -> int:
+    workload = Workload(triangles=triangles, views=views, resolution=px)
+    return sum(flops(base(), workload).values())
+
+
+if __name__ == "__main__":
+    try:
+        typer.run(main)
+    except TrilightError as mistake:
+        raise SystemExit(f"economy: {mistake}") from mistake

@@ -1,0 +1,150 @@
+"""Nothing is stored that nobody reads: whatever a sample holds changes what a consumer makes of it.
+
+Consumers are the training, the report's numbers and the page of a scene. Conversions copy a scene
+whole and therefore do not count.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load, save
+
+from pipeline.documents.scene_facts import scene_values
+from pipeline.documents.scene_page import Neighbours, encode_scene_page
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.exr import decode_exr, encode_exr
+from storage.lights import decode_lights_exr, encode_lights_exr, num_lights
+from storage.sample import Sample, decode_sample, decode_scene, encode_sample
+from tests.scenes_by_hand import tiny_sample
+from train.data.scenes import TrainingScene, training_scene
+
+Members = dict[str, bytes]
+Change = Callable[[Members], None]
+
+ARRAYS, RECORD = "scene.safetensors", "json"
+_PIXELS = 16
+
+
+def _sample() -> Sample:
+    """Return a sample that keeps its only light apart, so that every kind of member is there."""
+    sample = tiny_sample(resolution=_PIXELS)
+    return dataclasses.replace(sample, lights_rgb=sample.radiance_rgb[:, None])
+
+
+def _consumed(members: Members) -> str:
+    """Return a digest of all that consumers make of a sample, or what they refuse it with."""
+    try:
+        sample = decode_sample("000000000", members)
+        scene = training_scene(sample, _PIXELS, lights_apart=True)
+        values = {
+            name: array.tolist()
+            for name, array in scene_values(decode_scene(sample.key, members)).items()
+        }
+    except TrilightError as error:
+        return str(error)
+    page = encode_scene_page(sample, "train", [], Neighbours(report="", before=None, after=None))
+    return sha256_hex(b"".join([*_tensors(scene), json.dumps(values).encode(), page]))
+
+
+def _tensors(scene: TrainingScene) -> Iterator[bytes]:
+    for part in (scene, scene.tensors):
+        for field in dataclasses.fields(part):
+            value = getattr(part, field.name)
+            if hasattr(value, "numpy"):
+                yield value.numpy().tobytes()
+
+
+def _leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the path of every number and word of a record; of lists, the first entry stands."""
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            yield from _leaves(entry, (*path, name))
+    elif isinstance(value, list):
+        yield from _leaves(value[0], (*path, 0))
+    else:
+        yield path
+
+
+def _other(value: Any) -> Any:
+    """Return another value of the same kind; of the words with a meaning, another one."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, str):
+        return {"shell": "object", "emitter": "object"}.get(value, f"{value}x")
+    return value + 1
+
+
+def _change_record(path: tuple[Any, ...]) -> Change:
+    def change(members: Members) -> None:
+        record = json.loads(members[RECORD])
+        place = record
+        for step in path[:-1]:
+            place = place[step]
+        place[path[-1]] = _other(place[path[-1]])
+        members[RECORD] = json.dumps(record).encode()
+
+    return change
+
+
+def _change_array(name: str) -> Change:
+    def change(members: Members) -> None:
+        arrays = dict(load(members[ARRAYS]))
+        changed = arrays[name].copy()
+        # the middle, since the last row of a camera's pose is constant; by little, so that an
+        # index still points somewhere
+        place = tuple(size // 2 for size in changed.shape)
+        changed[place] = changed[place] - 1 if changed[place] else 1
+        members[ARRAYS] = save({**arrays, name: changed})
+
+    return change
+
+
+def _brighter_picture(members: Members) -> None:
+    members["1.exr"] = encode_exr(decode_exr(members["1.exr"]) * np.float32(2))
+
+
+def _brighter_light(members: Members) -> None:
+    shape = (num_lights(_sample().scene), _PIXELS, _PIXELS)
+    lights = decode_lights_exr(members["1.lights.exr"], shape)
+    members["1.lights.exr"] = encode_lights_exr(lights * np.float32(2))
+
+
+def _changes() -> dict[str, Change]:
+    members = encode_sample(_sample())
+    changes: dict[str, Change] = {
+        f"{RECORD} {'.'.join(map(str, path))}": _change_record(path)
+        for path in _leaves(json.loads(members[RECORD]))
+    }
+    changes |= {f"{ARRAYS} {name}": _change_array(name) for name in load(members[ARRAYS])}
+    return changes | {"1.exr": _brighter_picture, "1.lights.exr": _brighter_light}
+
+
+CHANGES = _changes()
+
+
+@pytest.mark.parametrize("stored", CHANGES)
+def test_a_consumer_reads_it(stored: str) -> None:
+    members = encode_sample(_sample())
+    before = _consumed(members)
+    CHANGES[stored](members)
+    assert _consumed(members) != before
+
+
+def test_every_member_is_changed_above() -> None:
+    """Members that come with more views are of the same kinds."""
+    of_the_second_view = {suffix.replace("0.", "1.", 1) for suffix in encode_sample(_sample())}
+    assert of_the_second_view == {stored.partition(" ")[0] for stored in CHANGES}
+
+
+def test_what_nobody_reads_would_be_found() -> None:
+    members = encode_sample(_sample())
+    before = _consumed(members)
+    record = json.loads(members[RECORD])
+    record["extra"] = 1
+    members[RECORD] = json.dumps(record).encode()
+    assert _consumed(members) == before
