@@ -8,7 +8,6 @@ All of the network that is used here is in `_encode` and `_decode`.
 
 import dataclasses
 import functools
-import hashlib
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import Cameras, batch_scenes, scene_tensors
 from model.trained_range import MAX_LIGHTS, PUBLISHED, TrainedRange, trained_range
-from model.weights import CONFIG_KEY, encode_config
+from model.weights import CONFIG_KEY, network_digest
 from storage.errors import TrilightError
 from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
 from storage.scene import Scene
@@ -92,11 +91,7 @@ class NeuralRenderer:
     @functools.cached_property
     def digest(self) -> str:
         """The sha256 of configuration and weights, whatever file they came from."""
-        digest = hashlib.sha256(encode_config(self._model.config).encode())
-        for name, tensor in sorted(self._model.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().data)
-        return digest.hexdigest()
+        return network_digest(self._model)
 
     def render(self, scene: Scene, resolution: int) -> NDArray[np.float32]:
         """Return the pictures of all cameras of a scene.

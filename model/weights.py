@@ -1,6 +1,7 @@
 """Weights as one safetensors file that carries its own configuration; no pickle anywhere."""
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,6 +31,15 @@ def encode_weights(model: RenderFormer, trained: TrainedRange | None = None) -> 
     tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
     known = {} if trained is None else trained.as_metadata()
     return _in_order(save(tensors, metadata={CONFIG_KEY: encode_config(model.config), **known}))
+
+
+def network_digest(model: RenderFormer) -> str:
+    """Return the sha256 of configuration and weights, whatever file they came from."""
+    digest = hashlib.sha256(encode_config(model.config).encode())
+    for name, tensor in sorted(model.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def _in_order(data: bytes) -> bytes:

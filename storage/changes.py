@@ -5,7 +5,7 @@ changed. Values come as JSON has them, and must be of the kind that they replace
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 from storage.errors import TrilightError
@@ -13,41 +13,67 @@ from storage.errors import TrilightError
 Settings = TypeVar("Settings")
 
 
+Change = tuple[Sequence[str], Any, str]
+"""The way that is left to a value, the value, and the whole name."""
+
+
 def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
-    """Return settings, a frozen dataclass, with the named values replaced.
+    """Return settings, a frozen dataclass, with the named values replaced, all at once.
+
+    Values that only fit each other may therefore come in any order.
 
     Raises:
         TrilightError: a name that does not exist, a value of another kind, or one that the
             settings themselves refuse.
     """
-    for name, value in changes.items():
-        try:
-            settings = _changed(settings, name.split("."), value, name)
-        except TrilightError as error:
-            if name in str(error):
-                raise
-            raise TrilightError(f"setting {name!r}: {error}") from error
-    return settings
+    found: Settings = _changed(settings, [(n.split("."), v, n) for n, v in changes.items()])
+    return found
 
 
-def _changed(group: Any, path: list[str], value: Any, name: str) -> Any:
-    if isinstance(group, tuple) and group and dataclasses.is_dataclass(group[0]):
-        return tuple(_changed(entry, path, value, name) for entry in group)
-    names = [field.name for field in dataclasses.fields(group)]
-    if path[0] not in names:
-        raise TrilightError(
-            f"setting {name!r} does not exist; expected one of {', '.join(names)} in place of "
-            f"{path[0]!r}."
-        )
-    old = getattr(group, path[0])
-    is_group = dataclasses.is_dataclass(old) or (
-        isinstance(old, tuple) and bool(old) and dataclasses.is_dataclass(old[0])
-    )
-    if is_group != (len(path) > 1):
-        kind = "a group: name one of its settings" if is_group else "a single setting"
-        raise TrilightError(f"setting {name!r}: {path[0]!r} is {kind}.")
-    new = _changed(old, path[1:], value, name) if is_group else _like(old, value, name)
-    return dataclasses.replace(group, **{path[0]: new})
+def _changed(group: Any, changes: Sequence[Change]) -> Any:
+    if not changes:
+        return group
+    if _is_group(group) and isinstance(group, tuple):
+        return tuple(_changed(entry, changes) for entry in group)
+    values = {}
+    for field, own in _by_field(group, changes).items():
+        old = getattr(group, field)
+        if _is_group(old):
+            values[field] = _changed(old, [(path[1:], value, name) for path, value, name in own])
+        else:
+            ((_, value, name),) = own
+            values[field] = _like(old, value, name)
+    try:
+        return dataclasses.replace(group, **values)
+    except TrilightError as error:
+        names = [name for _, _, name in changes]
+        if any(name in str(error) for name in names):
+            raise
+        shown = ", ".join(map(repr, names))
+        raise TrilightError(f"setting{'s' * (len(names) > 1)} {shown}: {error}") from error
+
+
+def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Change]]:
+    """Return the changes by the field of the group that they lead through."""
+    fields = [field.name for field in dataclasses.fields(group)]
+    found: dict[str, list[Change]] = {}
+    for path, value, name in changes:
+        if path[0] not in fields:
+            raise TrilightError(
+                f"setting {name!r} does not exist; expected one of {', '.join(fields)} in place of "
+                f"{path[0]!r}."
+            )
+        is_group = _is_group(getattr(group, path[0]))
+        if is_group != (len(path) > 1):
+            kind = "a group: name one of its settings" if is_group else "a single setting"
+            raise TrilightError(f"setting {name!r}: {path[0]!r} is {kind}.")
+        found.setdefault(path[0], []).append((path, value, name))
+    return found
+
+
+def _is_group(value: Any) -> bool:
+    first = value[0] if isinstance(value, tuple) and value else value
+    return dataclasses.is_dataclass(first)
 
 
 def _like(old: Any, value: Any, name: str) -> Any:

@@ -122,10 +122,16 @@ def add_row(
     price: float,
 ) -> None:
     """Train unless the table has it, and append what came out."""
-    known = {"recipe": recipe, "size": job.size, "seed": job.seed, "price_core_s": price}
+    known = {
+        "recipe": recipe,
+        "size": job.size,
+        "seed": job.seed,
+        "price_core_s": price,
+        "settings_sha256": job.digest(),
+    }
     if any(all(row[name] == value for name, value in known.items()) for row in read_table(table)):
         return
-    folder = runs / f"{recipe}-{price:.0f}-{job.size}-{job.seed}"
+    folder = runs / f"{recipe}-{price:.0f}-{job.size}-{job.seed}-{job.digest()[:8]}"
     result = train_and_score(job.settings(), [*bought.shards, *judge], folder, None)
     facts = {name: value for name, value in asdict(bought).items() if name != "shards"}
     table.parent.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,7 @@ when it has ended.
 """
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -88,9 +89,12 @@ def run(options: Options, round_done: Callable[[], None]) -> Soak:
             start_new_session=True,  # the processes of a session are found by its number
         )
         looks = []
-        while process.poll() is None:
-            looks.append(_look(process.pid))
-            time.sleep(_EVERY_S)
+        try:
+            while process.poll() is None:
+                looks.append(_look(process.pid))
+                time.sleep(_EVERY_S)
+        finally:
+            _end(process)
         if process.returncode:
             raise RuntimeError(f"generate ended with {process.returncode}")
         result = Soak(
@@ -154,14 +158,22 @@ def _command(options: Options, out: Path, num_scenes: int) -> list[str]:
     ]
 
 
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a run that was left early, before its folder goes; one that has ended stays ended."""
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait()
+
+
 def _parts(folder: DatasetFolder, looks: Sequence[_Look]) -> tuple[Part, ...]:
     """Cut the run into tenths by the moments at which scenes were finished."""
     scenes = sorted(read_scene_logs(folder), key=lambda scene: scene.finished_unix_s)
-    parts, since = [], 0.0
+    # what was prepared before the first scene would hide growth in the first tenth
+    parts, since = [], scenes[0].finished_unix_s - scenes[0].seconds if scenes else 0.0
     for tenth in np.array_split(np.arange(len(scenes)), PARTS):
         until = scenes[tenth[-1]].finished_unix_s
-        # a tenth of a few scenes may end between two looks
-        seen = [look for look in looks if since < look.unix_s <= until + _EVERY_S]
+        # a tenth of a few scenes may end between two looks, which take time themselves
+        seen = [look for look in looks if since < look.unix_s <= until + 2 * _EVERY_S]
         parts.append(
             Part(
                 seconds_a_scene=float(np.median([scenes[index].seconds for index in tenth])),

@@ -8,10 +8,12 @@ import matplotlib.figure
 import numpy as np
 
 from infra.bench.training_jobs import BASELINE
+from infra.bench.training_report import of_newest_data
 
 
 def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw a panel for each network: means over seeds, bars from the best to the worst."""
+    rows = of_newest_data(rows)
     kinds = sorted(
         {(row["plan"], row["size"], row["num_parameters"]) for row in rows}, key=_weights
     )

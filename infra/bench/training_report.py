@@ -18,6 +18,7 @@ def report_lines(rows: Rows) -> list[str]:
     """Return the report as Markdown lines; a change that does not help is there like any other."""
     if not rows:
         return ["No result yet."]
+    rows = of_newest_data(rows)
     lines = ["Held-out log L1, mean over seeds (half the range), and its ratio to `ours`.", ""]
     scenes = sorted({row["scenes"] for row in rows})
     lines += [
@@ -38,6 +39,12 @@ def report_lines(rows: Rows) -> list[str]:
         f"- data {digest}, {count} scenes: {score:.4f}" for digest, count, score in sorted(rivals)
     ]
     return lines + _steps_saved(rows)
+
+
+def of_newest_data(rows: Rows) -> Rows:
+    """Return the rows of each plan that learned from the set that was used last: others differ."""
+    newest = {row["plan"]: row["data_digest"] for row in rows}
+    return [row for row in rows if row["data_digest"] == newest[row["plan"]]]
 
 
 def _steps_saved(rows: Rows) -> list[str]:

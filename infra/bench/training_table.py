@@ -68,13 +68,18 @@ def run_jobs(
             continue
         if time.monotonic() - began > 60 * minutes:
             break
-        row = run_job(job, dataset, work / job.name, device)
+        row = run_job(job, dataset, work / _folder_name(job, dataset), device)
         table.parent.mkdir(parents=True, exist_ok=True)
         with table.open("a") as stream:
             stream.write(json.dumps(row, sort_keys=True) + "\n")
         ran += 1
         console.print(f"{job.name}: log L1 {row['scores']['log_l1']:.4f}, {row['seconds']:.0f} s")
     return ran
+
+
+def _folder_name(job: Job, dataset: Dataset) -> str:
+    """Return a name that another training never has: a run of other settings cannot go on."""
+    return f"{job.name}-{job.digest()[:8]}-{dataset.digest[:8]}"
 
 
 def read_table(table: Path) -> list[dict[str, Any]]:

@@ -42,6 +42,7 @@ def evaluate(
 ) -> None:
     """Judge a network; writes evaluation.json, evaluation.md and sheets of pictures."""
     try:
+        from model.weights import network_digest
         from storage.training_data import open_training_data
         from train.evaluation.evaluate import judged_views
         from train.evaluation.report import markdown, record
@@ -66,6 +67,7 @@ def evaluate(
         views = judged_views(contest, lambda: bars.advance(task))
     about = {
         "network": Path(checkpoint).name,
+        "network sha256": network_digest(contest.network),
         "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],  # no path of this machine
         "build": opened.build or "unknown",
         "data digest": opened.digest,

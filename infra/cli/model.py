@@ -8,6 +8,7 @@ import typer
 from rich.table import Table
 
 from infra.cli.console import console, print_json, print_rows
+from infra.cli.layer_plot import plot_layer_errors
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
@@ -27,6 +28,9 @@ def model(
     errors: Annotated[
         bool, typer.Option(help="also measure each precision against float64, layer by layer")
     ] = False,
+    plot: Annotated[
+        Path | None, typer.Option(help="draw those errors into this picture; implies --errors")
+    ] = None,
     publish: Annotated[
         Path | None, typer.Option(help="also write the checkpoint here under published names")
     ] = None,
@@ -45,7 +49,9 @@ def model(
     _require_pictures(config, resolution)
     workload = Workload(triangles=triangles, views=views, resolution=resolution)
     counted = costs(config, workload)
-    measured = _errors(network, config) if errors else {}
+    measured = _errors(network, config) if errors or plot else {}
+    if plot:
+        plot_layer_errors(measured, f"{name}, random scene", plot)
     if publish:
         _publish(name, network, publish)
     if json:

@@ -1,7 +1,7 @@
 """Ships a trained network: `model/builtin/`, its weights and its card.
 
     trilight evaluate RUN --data SET --split test --out EVALUATION
-    python -m infra.setup.builtin_network RUN --data SET --evaluation EVALUATION
+    python -m infra.setup.builtin_network RUN --data SET --evaluation EVALUATION --command "..."
 
 Only data of objects that ask for nothing (CC0) may be behind it, and only a small file is shipped.
 """
@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from model.checkpoints import BUILTIN, checkpoint_path
+from model.weights import decode_weights, network_digest
 from storage.atomic import write_atomically
 from storage.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
@@ -48,7 +49,7 @@ def main(
     weights = folder.weights.read_bytes()
     about = json.loads(folder.settings.read_text())
     judged = json.loads((evaluation / "evaluation.json").read_text())
-    _check(dataset, weights, about, judged)
+    _check(dataset, weights, about, judged["about"])
     place = checkpoint_path(BUILTIN)
     write_atomically(place, weights)
     card = _card(dataset, about, judged, json.loads(folder.summary.read_text()), weights, command)
@@ -56,14 +57,22 @@ def main(
 
 
 def _check(
-    dataset: Dataset, weights: bytes, about: Mapping[str, Any], judged: Mapping[str, Any]
+    dataset: Dataset, weights: bytes, run: Mapping[str, Any], judged: Mapping[str, Any]
 ) -> None:
     licences = {entry.licence for entry in read_objects_lock(dataset.folder.objects_lock)}
     for law, complaint in (
         (len(weights) <= MOST_BYTES, f"{len(weights)} bytes; expected at most {MOST_BYTES}"),
-        (about["data_digest"] == dataset.digest, "the run learned from other data than --data"),
-        (judged["about"]["data digest"] == dataset.digest, "it was judged on other data"),
-        (judged["about"]["split"] == "test", "it was not judged on the test split"),
+        (run["data_digest"] == dataset.digest, "the run learned from other data than --data"),
+        (judged["data digest"] == dataset.digest, "it was judged on other data"),
+        (judged["split"] == "test", "it was not judged on the test split"),
+        (
+            judged["network sha256"] == network_digest(decode_weights(weights)),
+            "another network was judged",
+        ),
+        (
+            judged["resolution"] == run["settings"]["resolution"],
+            "it was not judged at the resolution of the run",
+        ),
         (licences <= ALLOWED_LICENCES, f"objects under {', '.join(sorted(licences))}; CC0 only"),
     ):
         if not law:

@@ -133,3 +133,7 @@ def at_end(settings: type, field: Declared, end: End, number: float) -> Any:
     example = EXAMPLES[settings]
     changes = {field.name: with_number(example, field, end, number)}
     return dataclasses.replace(example, **(BESIDE.get((settings, field.name, end), {}) | changes))
+
+
+SCENE_REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")
+"""Why a room may not be possible."""

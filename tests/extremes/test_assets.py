@@ -108,6 +108,7 @@ def test_two_hundred_thousand_faces(tmp_path: Path, method: str) -> None:
     settings = AssetSettings(budgets=(1400,))
     asset = prepare(write_off(tmp_path / "a.off", ball), settings, method)
     check(asset, settings)
+    # 1400 triangles of a ball leave chords of 0.1 % of its diagonal; five times that is a hole
     assert asset.levels[0].record.quality.error_p99 < 0.005
 
 

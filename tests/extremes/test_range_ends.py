@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from model.config import ModelConfig
@@ -27,7 +27,7 @@ from storage.changes import changed
 from storage.errors import Rejected, TrilightError
 from storage.ranges import Declared
 from storage.splits import MOST_SCENES, SplitSettings, scenes_of_shard, shard_name, shards_for
-from tests.extremes.range_examples import FIELDS, SMOKE, End
+from tests.extremes.range_examples import FIELDS, SCENE_REASONS, SMOKE, End
 from tests.model.kit import awake, random_scene, tiny_config
 from tests.renders.scene_kit import join, light, material, quad
 from tests.train.kit import tiny_run
@@ -84,8 +84,6 @@ NO_SCENE: dict[tuple[str, End], str] = {
     ("lights.scale", "high"): "emitter_inside",
     ("lights.distance", "low"): "emitter_inside",
     ("views.min_coverage", "high"): "no_camera",
-    ("views.min_lit", "high"): "no_camera",
-    ("views.max_shell_back", "low"): "no_camera",
     ("views.min_depth", "high"): "no_camera",
 }
 """Ends at which some scenes cannot be, with everything else as it is: why they are rejected."""
@@ -108,15 +106,14 @@ def test_scenes_at_an_end_keep_their_laws(
     beside = BESIDE.get((name, end), {})
     wanted = changed(ONE_FAMILY, {**blind, **beside, name: _value(field, end)})
     try:
-        for attempt in range(4):
-            scene = compose_scene(wanted, pool, seed=0, scene_index=0, attempt=attempt)
-            scene.check()
-            break
+        scene = compose_scene(wanted, pool, seed=0, scene_index=0, attempt=0)
     except Rejected as rejection:
         assert rejection.reason == NO_SCENE.get((name, end)), rejection
+    else:
+        assert (name, end) not in NO_SCENE
+        scene.check()
 
 
-REASONS = ("no_room", "over_budget", "no_faces", "no_camera", "emitter_inside")
 CHEAP = [
     name for name, _ in SCENE_FIELDS
     if name not in ("num_views", "fill_to", "views.coverage_grid", "lights.count")
@@ -134,11 +131,11 @@ def test_scenes_at_several_ends_keep_their_laws_or_have_a_reason(
     try:
         wanted = changed(ONE_FAMILY, {"num_views": 1, **changes})
     except TrilightError:
-        return  # laws between fields
+        reject()  # laws between fields
     try:
         compose_scene(wanted, pool, seed=0, scene_index=0, attempt=0).check()
     except Rejected as rejection:
-        assert rejection.reason in REASONS, rejection
+        assert rejection.reason in SCENE_REASONS, rejection
 
 
 RENDER = RenderSettings(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from typer.testing import CliRunner
 
 from infra.cli.app import app
@@ -51,10 +52,13 @@ def test_a_checkpoint_is_described_measured_and_published(tmp_path: Path) -> Non
         assert torch.equal(a, b), name
 
 
-def test_errors_are_a_table() -> None:
-    text = printed("smoke", "--errors")
+def test_errors_are_a_table_and_a_picture(tmp_path: Path) -> None:
+    place = tmp_path / "plots" / "errors.png"
+    text = printed("smoke", "--plot", str(place))
     assert "bfloat16 against float64" in text
     assert "decoder.layers.3" in text
+    with Image.open(place) as picture:
+        assert picture.width > picture.height > 300
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,12 @@
 
 import re
 
+from infra.setup.builtin_network import MOST_BYTES
 from model.checkpoints import BUILTIN, checkpoint_path, open_checkpoint
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import count_parameters
 from storage.digests import sha256_hex
 from tests.scenes_by_hand import tiny_scene
-
-MOST_BYTES = 8_000_000
-"""Everybody who clones the project gets them."""
 
 
 def test_the_card_is_of_these_weights() -> None:

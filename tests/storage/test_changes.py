@@ -180,3 +180,32 @@ def test_any_name_and_value_give_settings_or_a_clear_refusal(name: str, value: A
         assert isinstance(changed(TREE, {name: value}), Tree)
     except TrilightError as error:
         assert "\n" not in str(error)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Span:
+    low: int = 32
+    high: int = 256
+
+    def __post_init__(self) -> None:
+        if self.low > self.high:
+            raise TrilightError(f"{self.low} to {self.high}; expected low <= high.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spans:
+    one: Span = field(default_factory=Span)
+    many: tuple[Span, ...] = (Span(), Span())
+
+
+@pytest.mark.parametrize("names", [("low", "high"), ("high", "low")])
+def test_values_that_only_fit_each_other_come_in_any_order(names: tuple[str, str]) -> None:
+    numbers = {"low": 8, "high": 16}
+    for group in ("one", "many"):
+        found = changed(Spans(), {f"{group}.{name}": numbers[name] for name in names})
+        new = found.one if group == "one" else found.many[1]
+        assert (new.low, new.high) == (8, 16)
+    with pytest.raises(TrilightError, match=r"settings 'one\.(low|high)', .*: 9 to 8; expected"):
+        changed(Spans(), {f"one.{name}": {"low": 9, "high": 8}[name] for name in names})
+    with pytest.raises(TrilightError, match=r"^setting 'many\.high': 32 to 8; expected"):
+        changed(Spans(), {"many.high": 8})

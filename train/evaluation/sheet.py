@@ -103,7 +103,7 @@ def _block(view: SheetView) -> Image.Image:
         "target": preview_srgb8(view.target_rgb),
         "prediction": preview_srgb8(view.predicted_rgb),
         f"error (white: {ERROR_WHITE})": error_picture(view.predicted_rgb, view.target_rgb),
-        f"error / noise (white: {NOISE_WHITE:.0f})": noise_picture(view),
+        f"... / noise (white: {NOISE_WHITE:.0f})": noise_picture(view),
     }
     scale = max(TILE_PX // view.target_rgb.shape[0], 1)
     tile = scale * view.target_rgb.shape[0]
