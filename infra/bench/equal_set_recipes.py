@@ -51,13 +51,7 @@ RECIPES: Mapping[str, Recipe] = {
     ),
     "two-views": Recipe(words="2 views a scene", changes={"scenes.num_views": 2}),
     "many-views": Recipe(words="12 views a scene", changes={"scenes.num_views": 12}),
-    "coarse": Recipe(
-        words="384 triangles a scene",
-        changes={
-            "scenes.max_triangles": 384,
-            "assets.budgets": [300, 210, 150, 100, 60, 35],
-        },
-    ),
+    "coarse": Recipe(words="600 triangles a scene", changes={"scenes.max_triangles": 600}),
 }
 """By name; all are judged on the same scenes of JUDGE."""
 

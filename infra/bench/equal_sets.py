@@ -20,6 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from infra.bench.equal_set_plot import plot
 from infra.bench.equal_set_recipes import JUDGE, JUDGE_ARGUMENTS, RECIPES, USUAL, Recipe
 from infra.bench.harness import RESULTS
 from infra.bench.training_jobs import BASELINE, SEEDS, Job
@@ -76,7 +77,9 @@ def main(
                         seed=seed,
                     )
                     add_row(name, job, bought, judge, work / "runs", table, share * core_seconds)
-    for line in report_lines(read_table(table)):
+    if rows := read_table(table):
+        plot(rows, table.with_suffix(".png"))
+    for line in report_lines(rows):
         console.print(line, soft_wrap=True)
 
 

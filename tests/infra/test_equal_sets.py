@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from infra.bench import equal_sets, training_jobs
 from infra.bench.equal_set_recipes import COMMON, JUDGE, RECIPES, USUAL, Recipe
@@ -87,5 +88,7 @@ def test_a_set_grows_is_learned_from_and_is_kept(
         assert [(row["price_core_s"], row["seed"]) for row in rows] == [
             (1.0, 0), (1.0, 1), (4.0, 0), (4.0, 1),
         ]  # fmt: skip
+    with Image.open(table.with_suffix(".png")) as picture:
+        assert picture.width > picture.height > 300
     assert 0 < rows[0]["num_scenes"] < rows[2]["num_scenes"]
     assert rows[0]["core_s"] <= 1.0 and rows[2]["core_s"] <= 4.0
