@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -55,10 +56,18 @@ def write_atomically(path: Path, data: bytes) -> None:
         stream.write(data)
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Delete what killed writers left below `folder`. Call only while holding its lock."""
+def remove_leftovers(folder: Path, *, older_than_s: float = 0.0) -> None:
+    """Delete what killed writers left below `folder`. Call only while holding its lock.
+
+    Args:
+        folder: where to look, however deep.
+        older_than_s: what was written to within so many seconds stays; for locks that may not reach
+            every machine that writes there.
+    """
     for leftover in folder.rglob(f"*{TEMPORARY_SUFFIX}"):
-        leftover.unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError):  # its writer is alive, and was done just now
+            if time.time() - leftover.stat().st_mtime >= older_than_s:
+                leftover.unlink()
 
 
 def write_error(path: Path, error: OSError) -> TrilightError:

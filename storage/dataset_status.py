@@ -77,7 +77,7 @@ def read_status(url: str) -> DatasetStatus:
     planned = planned_shards(manifest)
     names = shards_there(local) if local else {entry.name for entry in manifest.shards}
     names &= planned.keys()
-    done = num_scenes_done(local, manifest) if local else sum(planned[name] for name in names)
+    done = num_scenes_done(local, planned) if local else sum(planned[name] for name in names)
     logs, share = (list(read_scene_logs(local)), 1.0) if local else _sampled_logs(dataset)
     last = sorted(logs, key=lambda row: row.finished_unix_s)[-_RATE_SCENES if local else 0 :]
     views_per_hour, remaining_s = _rate(last, share, manifest, manifest.num_scenes - done)

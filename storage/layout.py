@@ -19,6 +19,10 @@ from storage.atomic import remove_leftovers, write_error
 from storage.claims import claimed
 from storage.errors import TrilightError
 
+_LEFT_S = 3600.0
+"""What nobody has written to for so long was left by a kill. Not all file systems carry locks
+between machines, so who seems to be alone may not be; no file is an hour in the writing."""
+
 FILES_PER_FOLDER = 4096
 """Numbered files of one folder; with their sub-folders and what else lies there, below 5,000."""
 
@@ -166,7 +170,7 @@ class DatasetFolder:
     def joined(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
         """Take part in the making, with any number of others.
 
-        Whoever is alone at first clears away what killed writers have left.
+        Whoever is alone at first clears away what killed writers have left for an hour.
 
         Args:
             when_alone: called by whoever is alone at first, before anybody else can join.
@@ -177,7 +181,7 @@ class DatasetFolder:
         descriptor = self._open_lock()
         try:
             if _lock_alone(descriptor):
-                remove_leftovers(self.root)
+                remove_leftovers(self.root, older_than_s=_LEFT_S)
                 when_alone()
             fcntl.flock(descriptor, fcntl.LOCK_SH)
             yield

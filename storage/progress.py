@@ -1,6 +1,8 @@
 """How far a dataset is, from its files alone: anybody may look, from any process."""
 
+import functools
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,11 +54,12 @@ def count_object(folder: DatasetFolder) -> None:
 
 
 def read_progress(folder: DatasetFolder) -> Progress:
-    """Count files; cheap enough to be called twice a second."""
+    """Count files; cheap enough to be called twice a second: a manifest is read when it changes."""
     try:
-        manifest = read_manifest(folder.manifest)
-        scenes_planned, scenes_done = manifest.num_scenes, num_scenes_done(folder, manifest)
-    except TrilightError:
+        facts = folder.manifest.stat()
+        scenes_planned, planned = _plan_of(folder.manifest, facts.st_mtime_ns, facts.st_size)
+        scenes_done = num_scenes_done(folder, planned)
+    except (TrilightError, OSError):
         scenes_planned = scenes_done = 0
     plan = json.loads(_plan(folder).read_bytes()) if _plan(folder).exists() else {"objects": 0}
     done, total = (
@@ -70,6 +73,13 @@ def read_progress(folder: DatasetFolder) -> Progress:
         scenes_done=scenes_done,
         scenes_planned=scenes_planned,
     )
+
+
+@functools.lru_cache(maxsize=4)
+def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, Mapping[str, int]]:
+    """Return the scenes and the shards of a manifest file, which is known by its time and size."""
+    found = read_manifest(manifest)
+    return found.num_scenes, planned_shards(found)
 
 
 def planned_shards(manifest: Manifest) -> dict[str, int]:
@@ -92,9 +102,13 @@ def shards_there(folder: DatasetFolder) -> set[str]:
     return here | {path.relative_to(sent).as_posix() for path in sent.rglob("*.tar")}
 
 
-def num_scenes_done(folder: DatasetFolder, manifest: Manifest) -> int:
-    """Return how many scenes are in shards, listed or not, or wait for theirs."""
-    planned = planned_shards(manifest)
+def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
+    """Return how many scenes are in shards, listed or not, or wait for theirs.
+
+    Args:
+        folder: of the dataset.
+        planned: what `planned_shards` says of it.
+    """
     there = shards_there(folder) & planned.keys()
     unpacked = sum(path.is_file() for path in folder.staged_samples.rglob("*.tar"))
     return sum(planned[name] for name in there) + unpacked

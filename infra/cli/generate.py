@@ -111,7 +111,7 @@ def generate(
         shards=shards,
         changes=parse_changes(set_ or ()),
     )
-    make = _runner(runner, address)
+    make = _runner(runner, address, workers)
     folder, started = dataset_folder(out), time.monotonic()
     if note := choose_variant().note:
         console.print(f"Note: {note}; see trilight doctor.", style="yellow")
@@ -120,7 +120,9 @@ def generate(
     report(folder, outcome, time.monotonic() - started, as_json=json)
 
 
-def _runner(name: str, address: str | None) -> "Callable[[DatasetOrder], Outcome]":
+def _runner(
+    name: str, address: str | None, workers: int | None
+) -> "Callable[[DatasetOrder], Outcome]":
     """Return what makes an order; imports are slow, since they bring every stage."""
     if name not in ("threads", "dask"):
         raise TrilightError(f"--runner is {name!r}; expected threads or dask.")
@@ -128,6 +130,11 @@ def _runner(name: str, address: str | None) -> "Callable[[DatasetOrder], Outcome
         raise TrilightError(
             f"--runner is {name} and --address is {address}; expected an address with --runner "
             "dask, and only then."
+        )
+    if name == "dask" and workers is not None:
+        raise TrilightError(
+            f"--workers is {workers}; expected it without --runner dask: how many tasks run at a "
+            "time is how many threads the cluster's workers have. Leave it away."
         )
     if address is None:
         from pipeline.flows.dataset_run import make_dataset

@@ -2,8 +2,8 @@
 
 Everything binds to loopback and needs a password as soon as it does not. What is started carries a
 mark in its environment, which flow runs and their children inherit, so that `stop` ends exactly
-those, also where a worker was killed, and never a stranger. The database is SQLite, or what
-PREFECT_API_DATABASE_CONNECTION_URL says.
+those, also where a worker was killed, and never a stranger. Several workers share the cores and the
+graphics cards evenly. The database is SQLite, or what PREFECT_API_DATABASE_CONNECTION_URL says.
 """
 
 import contextlib
@@ -11,6 +11,7 @@ import ipaddress
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -18,8 +19,12 @@ import uuid
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.flows.machine import visible_gpus
-from pipeline.flows.prefect_server import quiet_prefect, wait_until_healthy
+from pipeline.flows.machine import cores_owned, visible_gpus
+from pipeline.flows.prefect_server import (
+    TOLD_BY_ITS_STARTER,
+    quiet_prefect,
+    wait_until_healthy,
+)
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.errors import TrilightError
@@ -30,27 +35,32 @@ _DISK_SLOTS = 2
 """Runs that write documents at the same time: each reads its whole dataset."""
 _MARK = "TRILIGHT_SERVED"
 _END_S = 20.0
+_DEFAULT_PORT = 4200
+_MOST = {"TRILIGHT_PORT": 65535, "TRILIGHT_WORKERS": 1024}
 
 
 def start(*, host: str, port: int, workers: int) -> str:
     """Start everything and return the URL of the API.
 
     Args:
-        host: address to bind to; anything but loopback needs PREFECT_SERVER_API_AUTH_STRING.
+        host: name, or address of IPv4, to bind to; anything but loopback needs
+            PREFECT_SERVER_API_AUTH_STRING.
         port: of the server.
         workers: workers of the pool; each runs one flow at a time.
 
     Raises:
-        TrilightError: it runs already, the address is open without a password, or a part does not
-            start; then the other parts are ended again.
+        TrilightError: it runs already, the address is open without a password, or cannot be bound
+            to, or a part does not start; then the other parts are ended again.
     """
     if running():
         raise TrilightError("make serve: it runs already; expected nothing. Try make stop first.")
     _require_password(host)
     if shutil.which("prefect") is None:
         raise TrilightError("make serve: there is no command `prefect`; run make setup.")
+    _require_free(host, port)
+    shares = [_share(number, workers) for number in range(workers)]
     quiet_prefect()
-    url = f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else host}:{port}/api"
+    url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}/api"
     write_atomically(_mark_file(), (mark := uuid.uuid4().hex).encode())
     environment = {
         **os.environ,
@@ -68,18 +78,10 @@ def start(*, host: str, port: int, workers: int) -> str:
         process = _launch("server", server, environment)
         wait_until_healthy(url, process, _log("server"))
         _prepare(environment)
-        for number in range(workers):
-            worker = [
-                "worker",
-                "start",
-                "--pool",
-                POOL,
-                "--name",
-                f"worker-{number}",
-                "--limit",
-                "1",
-            ]
-            _launch(f"worker-{number}", worker, environment)
+        for number, share in enumerate(shares):
+            name = f"worker-{number}"
+            worker = ["worker", "start", "--pool", POOL, "--name", name, "--limit", "1"]
+            _launch(name, worker, environment | share)
     except BaseException:
         stop()
         raise
@@ -87,10 +89,14 @@ def start(*, host: str, port: int, workers: int) -> str:
 
 
 def stop() -> int:
-    """End what `start` started, with every flow run and child of theirs; return how many it was."""
+    """End what `start` started, with every flow run and child of theirs; return how many it was.
+
+    Training is told to save by the flow run that started it, and by nobody else.
+    """
     ours = running()
     for number in (signal.SIGTERM, signal.SIGKILL):
-        for pid in running():
+        told = running() if number == signal.SIGKILL else running(without=TOLD_BY_ITS_STARTER)
+        for pid in told:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
         deadline = time.monotonic() + _END_S
@@ -100,8 +106,12 @@ def stop() -> int:
     return len(ours)
 
 
-def running() -> list[int]:
-    """Return the living processes that `start` started, and theirs, by the mark that they carry."""
+def running(*, without: str | None = None) -> list[int]:
+    """Return the living processes that `start` started, and theirs, by the mark that they carry.
+
+    Args:
+        without: leave out those that have this variable in their environment.
+    """
     try:
         mark = f"{_MARK}={_mark_file().read_text()}".encode()
     except FileNotFoundError:
@@ -110,7 +120,9 @@ def running() -> list[int]:
     for place in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # ended meanwhile, or of another user
             alive = (place / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
-            if alive and mark in (place / "environ").read_bytes().split(b"\0"):
+            variables = (place / "environ").read_bytes().split(b"\0")
+            other = without and any(text.startswith(f"{without}=".encode()) for text in variables)
+            if alive and mark in variables and not other:
                 found.append(int(place.name))
     return found
 
@@ -123,8 +135,8 @@ def _prepare(environment: Mapping[str, str]) -> None:
     ):
         _call(arguments, environment)
     for name, limit in (("trilight-disk", _DISK_SLOTS), ("trilight-gpu", len(visible_gpus()) or 1)):
-        if not _call(["gcl", "inspect", name], environment, check=False):
-            _call(["gcl", "create", name, "--limit", str(limit)], environment)
+        action = "update" if _call(["gcl", "inspect", name], environment, check=False) else "create"
+        _call(["gcl", action, name, "--limit", str(limit)], environment)
 
 
 def _call(arguments: list[str], environment: Mapping[str, str], *, check: bool = True) -> bool:
@@ -172,6 +184,36 @@ def _require_password(host: str) -> None:
         )
 
 
+def _require_free(host: str, port: int) -> None:
+    """Refuse an address that is none of ours, or where somebody listens, be it another Prefect."""
+    if ":" in host:
+        raise TrilightError(
+            f"make serve: TRILIGHT_HOST is {host!r}; expected a name or an address of IPv4, such "
+            "as 127.0.0.1."
+        )
+    try:
+        with socket.socket() as probe:
+            # as servers do: connections of one that was stopped just now are no obstacle
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except OSError as error:
+        raise TrilightError(
+            f"make serve: {host}:{port} cannot be had ({error.strerror}); expected an address of "
+            "this machine and a port at which nobody listens. Set TRILIGHT_PORT to another port, "
+            "or mend TRILIGHT_HOST."
+        ) from error
+
+
+def _share(number: int, workers: int) -> dict[str, str]:
+    """Return what a worker's environment says of its part of the machine; alone, it has all."""
+    if workers == 1:
+        return {}
+    share = {"TRILIGHT_CORES": str(max(1, cores_owned() // workers))}
+    if cards := visible_gpus():  # with fewer cards than workers, some share one
+        share["CUDA_VISIBLE_DEVICES"] = ",".join(cards[number % len(cards) :: workers])
+    return share
+
+
 def state_folder() -> Path:
     """Return where logs and the list of processes are: TRILIGHT_STATE, or in the cache."""
     place = os.environ.get("TRILIGHT_STATE")
@@ -186,20 +228,33 @@ def _log(name: str) -> Path:
     return state_folder() / f"{name}.log"
 
 
+def next_command(url: str) -> str:
+    """Return what starts a flow at the API of a URL; pyproject.toml names the default one."""
+    command = "prefect deployment run generate-scenes/local --watch"
+    known = url == f"http://127.0.0.1:{_DEFAULT_PORT}/api"
+    return command if known else f"PREFECT_API_URL={url} {command}"
+
+
+def _number(variable: str, default: int) -> int:
+    text, most = os.environ.get(variable, str(default)), _MOST[variable]
+    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= most:
+        raise TrilightError(
+            f"make serve: {variable} is {text!r}; expected a whole number from 1 to {most}."
+        )
+    return int(text)
+
+
 def main(arguments: list[str]) -> None:
     """Start or stop, as the only argument says; TRILIGHT_HOST, _PORT and _WORKERS say how."""
     try:
         if arguments == ["stop"]:
             print(f"ended: {stop()} processes")  # noqa: T201
             return
-        url = start(
-            host=os.environ.get("TRILIGHT_HOST", "127.0.0.1"),
-            port=int(os.environ.get("TRILIGHT_PORT", "4200")),
-            workers=int(os.environ.get("TRILIGHT_WORKERS", "1")),
-        )
-        page = url.removesuffix("/api")
-        print(f"Prefect: {page}; logs: {state_folder()}")  # noqa: T201
-        print("Next: prefect deployment run generate-scenes/local --watch")  # noqa: T201
+        host = os.environ.get("TRILIGHT_HOST", "127.0.0.1")
+        port, workers = _number("TRILIGHT_PORT", _DEFAULT_PORT), _number("TRILIGHT_WORKERS", 1)
+        url = start(host=host, port=port, workers=workers)
+        print(f"Prefect: {url.removesuffix('/api')}; logs: {state_folder()}")  # noqa: T201
+        print(f"Next: {next_command(url)}")  # noqa: T201
     except TrilightError as mistake:
         sys.exit(f"trilight: {mistake}")
 

@@ -39,9 +39,10 @@ class BucketPublication(Publication):
         self.add_failures(())  # where nothing was rejected, there is a file that says so
         self._mirror.freeze(encode_objects_lock(objects))
         super().lock_objects(objects)
-        self._mirror.send_manifest()
+        self.publish()  # somebody may have frozen the same before, and made shards
 
     def add_shard(self, shard: ShardEntry) -> None:
+        self._require_here(shard.name)
         if sent := self._mirror.send(shard.name, shard):
             super().add_shard(sent)
 
@@ -63,6 +64,11 @@ class BucketPublication(Publication):
 
     def _is_there(self, name: str) -> bool:
         return self.folder.is_sent(name)
+
+    def _has(self, name: str) -> bool:
+        if not self.folder.has_shard(name):
+            self.learn()
+        return self.folder.has_shard(name)
 
     def learn(self) -> bool:
         """Take notice of what others have finished and planned; say whether there was news."""

@@ -21,6 +21,8 @@ class ChildPool:
         self._free: queue.SimpleQueue[IsolatedChild] = queue.SimpleQueue()
         for child in self._children:
             self._free.put(child)
+        self.num_users = 0
+        """Of the pool, as they are counted by who shares it out."""
 
     @contextlib.contextmanager
     def borrow(self) -> Iterator[IsolatedChild]:
@@ -30,10 +32,6 @@ class ChildPool:
             yield child
         finally:
             self._free.put(child)
-
-    def is_idle(self) -> bool:
-        """Return whether no child is lent."""
-        return self._free.qsize() == len(self._children)
 
     def close(self) -> None:
         """End all children at once."""

@@ -17,9 +17,10 @@ from pipeline.flows.bucket_publication import begin_dataset, joined
 from pipeline.flows.builds import BUILDS, frozen_note, named_build, object_source
 from pipeline.flows.environment import environment
 from pipeline.flows.machine import cores_owned, visible_gpus
+from pipeline.flows.make_shard import is_free
 from pipeline.flows.make_task import ShardJob, TaskOutcome, close_children
 from pipeline.flows.order import DatasetOrder
-from pipeline.flows.pieces import TaskSizes, cut_tasks
+from pipeline.flows.pieces import TaskSizes, TasksLeft
 from pipeline.flows.publication import Publication
 from pipeline.flows.runners import Runner
 from pipeline.flows.scene_files import SceneFolder, find_scene_files
@@ -30,8 +31,9 @@ from storage.layout import DatasetFolder
 from storage.output import dataset_folder
 from storage.statistics import Statistics
 
-_POLL_S = 1.0
-"""Between two looks at what others are making."""
+_FIRST_PAUSE_S = 1.0
+_LONGEST_PAUSE_S = 60.0
+"""Between two looks at what others are making; it doubles as long as nothing is left for us."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,6 +96,7 @@ def make_dataset(
         finally:
             close_children()
         finished = not run.publication.missing_shards()
+        _require_within_budget(run.publication, order.failure_budget)  # of earlier runs too
         run.publication.publish()
         statistics = runner.finish(lambda: _documents(run.publication)) if finished else None
     return _outcome(run, statistics)
@@ -165,7 +168,7 @@ def _make_missing(run: Run, runner: Runner, watch: Watcher) -> None:
     """
     order, publication = run.order, run.publication
     wanted = order.shard_range()
-    sizes = TaskSizes()
+    sizes, tasks, pause_s = TaskSizes(), TasksLeft(), _FIRST_PAUSE_S
     num_at_once = runner.num_at_once or _workers(order)
     job = ShardJob(
         folder=publication.folder,
@@ -179,7 +182,7 @@ def _make_missing(run: Run, runner: Runner, watch: Watcher) -> None:
         index for index in publication.missing_shards() if wanted is None or index in wanted
     ]:
         made = 0
-        for outcome in runner.run(cut_tasks(missing, run.settings.splits, sizes), job):
+        for outcome in runner.run(tasks.cut(missing, run.settings.splits, sizes), job):
             made += outcome.scenes + len(outcome.shards)
             if outcome.scenes:
                 sizes.measured(outcome.scenes, outcome.seconds)
@@ -187,10 +190,23 @@ def _make_missing(run: Run, runner: Runner, watch: Watcher) -> None:
                 publication.add_shard(shard)
             watch(run, outcome)
             _require_within_budget(publication, order.failure_budget)
-        if made == 0:
-            if wanted is not None:
-                return
-            time.sleep(_POLL_S)
+        if made == 0 and wanted is not None:
+            return
+        pause_s = _FIRST_PAUSE_S if made else _wait_for_others(run, pause_s)
+
+
+def _wait_for_others(run: Run, pause_s: float) -> float:
+    """Return when something is missing that nobody is at, or nothing; and the next pause.
+
+    Only then tasks are handed out again: each is a row of a scheduler's database.
+    """
+    folder, settings = run.publication.folder, run.settings
+    while True:
+        time.sleep(pause_s)
+        pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+        missing = run.publication.missing_shards()
+        if not missing or any(is_free(folder, settings, index) for index in missing):
+            return pause_s
 
 
 def _workers(order: DatasetOrder) -> int:

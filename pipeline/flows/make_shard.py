@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from pipeline.flows.make_scene import MAX_ATTEMPTS, SceneAttempt, attempt_scene
 from pipeline.flows.pieces import Piece
@@ -18,6 +19,8 @@ from storage.splits import SplitSettings, scenes_of_shard, shard_name, split_of_
 from storage.staging import is_staged, stage_scene
 
 log = logging.getLogger("trilight.scenes")
+
+_PACKING = "pack.claim"
 
 
 def make_piece(
@@ -46,18 +49,46 @@ def make_piece(
         TrilightError: the output cannot be written. A scene that cannot be made is not an error:
             its rejections are recorded and the shard goes without it.
     """
-    name = shard_name(piece.shard_index, settings.splits)
+    name, scenes = _named(piece.shard_index, settings)
     for scene_index in range(piece.first, piece.last):
         if _is_done(folder, name, scene_index):
             continue
-        claim = numbered(scene_index, f"{sample_key(scene_index)}.claim")
-        with claimed(folder.staged_shard(name) / claim) as ours:
+        with claimed(_claim(folder, name, scene_index)) as ours:
             if ours and not _is_done(folder, name, scene_index):  # nor in the meantime
                 scene_done(
                     scene_index,
                     *_make_and_stage(folder, settings, piece.shard_index, scene_index, child),
                 )
-    return _packed(folder, name, scenes_of_shard(piece.shard_index, settings.splits))
+    return _packed(folder, name, scenes)
+
+
+def is_free(folder: DatasetFolder, settings: BuildSettings, shard_index: int) -> bool:
+    """Return whether a shard lacks something that nobody is at: a scene, or being packed.
+
+    Whoever wants to claim a scene at the moment of this look may leave it to us: where the answer
+    is yes, go and make it.
+    """
+    name, scenes = _named(shard_index, settings)
+    staged = folder.staged_shard(name)
+    missing = [index for index in scenes if not is_staged(staged, index)]
+    claims = (_claim(folder, name, index) for index in missing)
+    if folder.has_shard(name):  # also in the meantime
+        return False
+    return any(map(_is_unclaimed, claims if missing else [staged / _PACKING]))
+
+
+def _is_unclaimed(claim: Path) -> bool:
+    with claimed(claim) as ours:
+        return ours
+
+
+def _claim(folder: DatasetFolder, name: str, scene_index: int) -> Path:
+    return folder.staged_shard(name) / numbered(scene_index, f"{sample_key(scene_index)}.claim")
+
+
+def _named(shard_index: int, settings: BuildSettings) -> tuple[str, range]:
+    splits = settings.splits
+    return shard_name(shard_index, splits), scenes_of_shard(shard_index, splits)
 
 
 def _is_done(folder: DatasetFolder, name: str, scene_index: int) -> bool:
@@ -69,7 +100,7 @@ def _packed(folder: DatasetFolder, name: str, scenes: range) -> ShardEntry | Non
     staged = folder.staged_shard(name)
     if folder.has_shard(name) or not all(is_staged(staged, index) for index in scenes):
         return None
-    with claimed(staged / "pack.claim") as ours:
+    with claimed(staged / _PACKING) as ours:
         if not ours or folder.has_shard(name):
             return None
         shard = pack_shard(folder, name, scenes)

@@ -1,8 +1,9 @@
 """One task: some pieces in turn, with a render child that this process keeps warm between tasks."""
 
+import contextlib
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,7 +79,7 @@ def make_task(job: ShardJob, pieces: tuple[Piece, ...]) -> TaskOutcome:
             job.folder, name, scene_index, seconds=seconds, cores=cores, num_rejected=len(failures)
         )
 
-    with _pool_of(job).borrow() as child:
+    with _child_of(job) as child:
         packed = [make_piece(job.folder, job.settings, piece, child, log) for piece in pieces]
     seconds = time.monotonic() - started
     return TaskOutcome(
@@ -101,15 +102,33 @@ def close_children() -> None:
         _pools.clear()
 
 
-def _pool_of(job: ShardJob) -> ChildPool:
-    """Return the children for a job, made at its first task; idle ones of other jobs end."""
+def close_idle_children() -> None:
+    """End the render children of this process that no task uses; others may be at work here."""
+    with _pools_lock:
+        _close_idle()
+
+
+def _close_idle() -> None:
+    for key in [key for key, pool in _pools.items() if pool.num_users == 0]:
+        _pools.pop(key).close()
+
+
+@contextlib.contextmanager
+def _child_of(job: ShardJob) -> Iterator[IsolatedChild]:
+    """Lend a child for a job, made at its first task; idle ones of other jobs end then."""
     key = (str(job.folder.root), job.settings.digest, job.lock_sha256)
     with _pools_lock:
         if key not in _pools:
-            for other in [name for name, pool in _pools.items() if pool.is_idle()]:
-                _pools.pop(other).close()
+            _close_idle()
             _pools[key] = _new_pool(job)
-        return _pools[key]
+        pool = _pools[key]
+        pool.num_users += 1
+    try:
+        with pool.borrow() as child:
+            yield child
+    finally:
+        with _pools_lock:
+            pool.num_users -= 1
 
 
 def _new_pool(job: ShardJob) -> ChildPool:

@@ -8,6 +8,7 @@ one, each when it is handed out.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from storage.errors import EnvironmentFailure
 from storage.splits import SplitSettings, scenes_of_shard
 
 MOST_TASKS = 1000
@@ -48,6 +49,30 @@ class TaskSizes:
         if self._scenes:
             wanted = TASK_S * self._scenes / max(self._seconds, 1e-3)
         return max(1, int(wanted), -(-scenes_left // max(1, tasks_left)))
+
+
+class TasksLeft:
+    """How many tasks a run may still hand out: MOST_TASKS, in however many rounds."""
+
+    def __init__(self) -> None:
+        self._left = MOST_TASKS
+
+    def cut(
+        self, shards: Sequence[int], splits: SplitSettings, sizes: TaskSizes
+    ) -> Iterator[tuple[Piece, ...]]:
+        """Yield as `cut_tasks`, but keep a tenth of what is left for rounds that may follow.
+
+        Raises:
+            EnvironmentFailure: none is left.
+        """
+        if self._left == 0:
+            raise EnvironmentFailure(
+                f"this run has handed out its {MOST_TASKS} tasks, and others were at what is still "
+                "missing. What was finished is safe: run the same command again."
+            )
+        for task in cut_tasks(shards, splits, sizes, most=self._left - self._left // 10):
+            self._left -= 1
+            yield task
 
 
 def cut_tasks(

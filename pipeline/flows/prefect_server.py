@@ -21,6 +21,8 @@ from pipeline.isolation import die_with_parent
 from storage.cache import cache_folder
 from storage.errors import TrilightError
 
+TOLD_BY_ITS_STARTER = "TRILIGHT_TOLD_BY_ITS_STARTER"
+"""In the environment of processes that get SIGTERM from who started them, and from nobody else."""
 _START_UP_S = 120.0
 _LOG_NAME = "server.log"
 
@@ -82,11 +84,12 @@ def wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -
     while time.monotonic() < deadline and server.poll() is None:
         with contextlib.suppress(urllib.error.URLError, OSError):
             with urllib.request.urlopen(f"{url}/health", timeout=2):
-                return
+                if server.poll() is None:  # else it was somebody else who answered
+                    return
         time.sleep(0.1)
     raise TrilightError(
-        f"Prefect: the private server did not start within {_START_UP_S:.0f} s; see {log}, and try "
-        "`trilight doctor`."
+        f"Prefect: the server did not start within {_START_UP_S:.0f} s, or ended; see {log}, and "
+        "try `trilight doctor`."
     )
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -24,6 +25,9 @@ from storage.splits import (
     shard_name,
     shards_for,
 )
+
+_LOOKS = 7
+"""For a shard that a worker says it has packed; network file systems may show it a minute later."""
 
 
 class Publication:
@@ -61,7 +65,12 @@ class Publication:
             self._write(objects_lock_sha256=digest)
 
     def add_shard(self, shard: ShardEntry) -> None:
-        """Note a finished shard; the manifest lists it soon, at the latest after `publish`."""
+        """Note a finished shard; the manifest lists it soon, at the latest after `publish`.
+
+        Raises:
+            TrilightError: it is not here, so that its maker works in another folder.
+        """
+        self._require_here(shard.name)
         note_shard(self.folder, shard)
         self._noted[shard.name] = shard
         if 10 * len(self._noted) >= len(self.manifest.shards):
@@ -110,6 +119,21 @@ class Publication:
     def _is_there(self, name: str) -> bool:
         """Return whether a shard is where the dataset is."""
         return self.folder.shard(name).exists()
+
+    def _has(self, name: str) -> bool:
+        """Return whether a shard that somebody has packed can be seen."""
+        return self._is_there(name)
+
+    def _require_here(self, name: str) -> None:
+        for look in range(_LOOKS):
+            if self._has(name):
+                return
+            time.sleep(2**look if look < _LOOKS - 1 else 0)
+        raise TrilightError(
+            f"{self.folder.shown}: a worker has packed {name}, and it is not here: the worker's "
+            "folder is not this one. Expected workers that see the same --out at the same place "
+            "(for a bucket, the same TRILIGHT_CACHE); share it, and run the same command again."
+        )
 
     def num_shards_finished(self) -> int:
         """Return how many shards are there, as far as this maker knows."""

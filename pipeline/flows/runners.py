@@ -65,17 +65,24 @@ def in_window(
     result: Callable[[Waiting], Result],
     window: int,
 ) -> Iterator[Result]:
-    """Yield results as they come, with at most `window` tasks handed out at a time."""
+    """Yield results as they come, with at most `window` tasks handed out at a time.
+
+    The next task is handed out before a result is: whoever takes it may take long over it.
+    """
     waiting = iter(tasks)
     running: list[Waiting] = []
-    while True:
+
+    def fill() -> None:
         while len(running) < window and (task := next(waiting, None)) is not None:
             running.append(submit(task))
-        if not running:
-            return
+
+    fill()
+    while running:
         done = first_done(running)
         running.remove(done)
-        yield result(done)
+        outcome = result(done)
+        fill()
+        yield outcome
 
 
 def _first_done(running: list["Future[TaskOutcome]"]) -> "Future[TaskOutcome]":

@@ -78,11 +78,9 @@ class Mirror:
         shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `receive` looks again
         if theirs is None:
             return
-        lock, failures = self._files.read("objects.lock.jsonl"), self._files.read("failures.jsonl")
-        if lock is not None:
+        if (lock := self._files.read("objects.lock.jsonl")) is not None:
             write_atomically(folder.objects_lock, lock)
-        known = read_failures(folder.failures)
-        write_failures(folder.failures, [*known, *decode_failures(failures or b"")])
+        self._take_failures()
         write_manifest(folder.manifest, theirs)
 
     def begin(self) -> bool:
@@ -96,12 +94,20 @@ class Mirror:
     def freeze(self, lock: bytes) -> None:
         """Put the frozen objects into the bucket, after what was rejected for them.
 
+        What others have rejected in the meantime stays.
+
         Raises:
             TrilightError: somebody else has frozen others in the meantime.
         """
-        self._bucket.write("failures.jsonl", self._folder.failures)
         name = self._folder.objects_lock.name
-        if not self._bucket.create(name, lock) and self._files.read(name) != lock:
+        theirs = self._files.read(name)
+        if theirs in (None, lock):
+            with self._folder.turn("manifest"):
+                self._take_failures()
+                self._bucket.write("failures.jsonl", self._folder.failures)
+        if theirs is None and not self._bucket.create(name, lock):
+            theirs = self._files.read(name)
+        if theirs not in (None, lock):
             raise TrilightError(
                 f"{self._folder.shown}: another maker has frozen other objects in the meantime; "
                 "expected the same --objects everywhere. Give that, or choose another --out."
@@ -146,9 +152,6 @@ class Mirror:
             entry = made = made or noted_shard(folder, name)
             if not folder.is_sent(name):
                 entry = self._put(made)
-                note_shard(folder, entry)
-                for beside in (rejections_of_shard(folder, name), note_of(folder, name)):
-                    self._bucket.write(self._name(beside), beside)
                 self._mark(name)
             if entry == made:
                 shard_cache().keep(path, self._files.url.child(name), entry.sha256)
@@ -156,15 +159,28 @@ class Mirror:
         return entry
 
     def _put(self, made: ShardEntry) -> ShardEntry:
-        """Put a shard into the bucket with its log, and return the entry of what is there then."""
-        log = self._folder.root / log_name(made.name)
-        if self._bucket.create(made.name, self._folder.shard(made.name)):
+        """Put a shard and what stands beside it into the bucket; return the entry of what is there.
+
+        Who was not first takes the rejections of who was, and writes none, unless they are lacking:
+        then the first writer was killed, and ours are the best that there are.
+        """
+        folder, name = self._folder, made.name
+        log, rejections = folder.root / log_name(name), rejections_of_shard(folder, name)
+        if self._bucket.create(name, folder.shard(name)):
             if log.exists():
                 self._bucket.write(self._name(log), log)
-            return made
-        url = self._files.url.child(made.name)
-        with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
-            return index_stream(stream, Path(made.name).name)
+            entry = made
+            self._bucket.write(self._name(rejections), rejections)
+        else:
+            url = self._files.url.child(name)
+            with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
+                entry = index_stream(stream, Path(name).name)
+            if not self._bucket.create(self._name(rejections), rejections):
+                self._take_rejections(name)
+        note_shard(folder, entry)
+        note = note_of(folder, name)
+        self._bucket.write(self._name(note), note)
+        return entry
 
     def send_manifest(self) -> None:
         """Put the folder's manifest and rejections into the bucket, in place of those there."""
@@ -193,6 +209,12 @@ class Mirror:
         lock = self._files.read(self._folder.objects_lock.name)
         return dataclasses.replace(manifest, objects_lock_sha256=sha256_hex(lock) if lock else "")
 
+    def _take_failures(self) -> None:
+        """Add what the bucket lists as rejected to what the folder does."""
+        theirs = decode_failures(self._files.read("failures.jsonl") or b"")
+        known = read_failures(self._folder.failures)
+        write_failures(self._folder.failures, [*known, *theirs])
+
     def _own_manifest(self) -> Manifest | None:
         try:
             return read_manifest(self._folder.manifest)
@@ -210,10 +232,13 @@ class Mirror:
                 f"{self._folder.shown}/{note}: not a note on {name} ({error}); delete both, and "
                 "the shard is made again."
             ) from error
+        self._take_rejections(name)
+        note_shard(self._folder, entry)
+
+    def _take_rejections(self, name: str) -> None:
         rejections = rejections_of_shard(self._folder, name)
         failures = self._files.read(self._name(rejections))
         write_failures(rejections, decode_failures(failures or b""))
-        note_shard(self._folder, entry)
 
     def _mark(self, name: str) -> None:
         """Note that a shard is in the bucket."""

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
 from storage.safe_url import printable, safe_text
 
 Result = TypeVar("Result")
@@ -56,7 +56,7 @@ def with_tries(
 
     Raises:
         TransferFailed: as the function raised it, or `download_failed` for any other exception.
-        TrilightError: as the function raised it, or the disk is full.
+        TrilightError: as the function raised it, or the disk is full (an EnvironmentFailure).
     """
     number, reached = 0, position()
     for _ in range(_MOST_TRIES):
@@ -67,9 +67,9 @@ def with_tries(
         except Exception as error:  # drivers raise what they like
             cause = root_error(error)
             if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise TrilightError(
-                    "download: the disk is full. What was downloaded is safe: free some space and "
-                    "run the same command again."
+                raise EnvironmentFailure(
+                    "the disk is full. What was finished is safe: free some space and run the same "
+                    "command again."
                 ) from error
             number, reached = (0 if position() > reached else number) + 1, position()
             if number == TRIES or not may_pass(cause):

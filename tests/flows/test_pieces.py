@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.flows.order import DatasetOrder
-from pipeline.flows.pieces import MOST_TASKS, TASK_S, Piece, TaskSizes, cut_tasks
-from storage.errors import TrilightError
+from pipeline.flows.pieces import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
+from storage.errors import EnvironmentFailure, TrilightError
 from storage.splits import SplitSettings, scenes_of_shard
 
 
@@ -61,6 +61,15 @@ def test_two_million_slow_scenes_are_at_most_a_thousand_tasks() -> None:
     sizes.measured(1, 100.0)
     splits = SplitSettings(scenes_per_shard=256)
     assert sum(1 for _ in cut_tasks(range(2_000_000 // 256), splits, sizes)) <= MOST_TASKS
+
+
+def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
+    splits, left, rounds = SplitSettings(scenes_per_shard=1), TasksLeft(), list[int]()
+    with pytest.raises(EnvironmentFailure, match="run the same command again"):
+        while True:
+            rounds.append(sum(1 for _ in left.cut(range(5000), splits, TaskSizes())))
+    assert rounds[:2] == [900, 90]
+    assert sum(rounds) == MOST_TASKS
 
 
 @pytest.mark.parametrize(

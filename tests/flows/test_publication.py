@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from pipeline.flows import publication as publications
 from pipeline.flows.builds import BUILDS, named_build
 from pipeline.flows.publication import Publication, begin
 from pipeline.flows.settings import BuildSettings, differences
@@ -265,3 +266,25 @@ def test_a_shard_is_packed_as_the_settings_say(tmp_path: Path) -> None:
     assert _build().storage.profile == "compact"
     (shard, *_) = _dataset(tmp_path, 4).manifest.shards
     assert set(shard.index["000000000"]) == {"scene.safetensors.gz", "json", "0.exr", "1.exr"}
+
+
+def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such a run would go on for ever: what is packed would be missing again and again."""
+    pauses: list[float] = []
+    elsewhere = _dataset(tmp_path / "worker", 4).manifest.shards[0]
+    publication = _begin(tmp_path / "here", _build(), 4)
+    monkeypatch.setattr(publications.time, "sleep", pauses.append)
+    with pytest.raises(TrilightError, match="a worker has packed .* folder is not this one"):
+        publication.add_shard(elsewhere)
+    assert sum(pauses) > 60  # a network file system may keep a listing for a minute
+    assert publication.missing_shards() == [0]
+
+    def appear(seconds: float) -> None:
+        name = elsewhere.name
+        (tmp_path / "here" / name).write_bytes((tmp_path / "worker" / name).read_bytes())
+
+    monkeypatch.setattr(publications.time, "sleep", appear)
+    publication.add_shard(elsewhere)
+    assert publication.manifest.shards == (elsewhere,)

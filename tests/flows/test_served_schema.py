@@ -51,6 +51,20 @@ def test_the_forms_within_have_every_setting_of_a_build() -> None:
     assert set(groups["BuildSettingsChanges"]["properties"]) == set(field_docs(BuildSettings))
 
 
+def test_the_forms_say_what_numbers_may_be() -> None:
+    """As declared at the fields, but for what no form can hold exactly."""
+    schema = generate_scenes.parameters.model_dump()
+    shown = schema["properties"]
+    assert shown["scenes"]["anyOf"][0] == {"type": "integer", "minimum": 1, "maximum": 10**9}
+    assert shown["seed"]["anyOf"][0] == {"type": "integer", "minimum": 0}
+    assert (shown["failure_budget"]["minimum"], shown["failure_budget"]["maximum"]) == (0, 1)
+    cameras = schema["definitions"]["CameraSettingsChanges"]["properties"]
+    assert cameras["fov_deg"]["anyOf"][0]["items"] == {
+        "type": "number", "minimum": 1, "maximum": 170,
+    }  # fmt: skip
+    assert train_model.parameters.properties["processes"]["maximum"] == 1024
+
+
 def test_changes_become_dotted_names() -> None:
     form = BuildChanges(**{"renders": {"max_spp": 64}, "storage": {"profile": "lossless"}})
     expected = {"renders.max_spp": 64, "storage.profile": "lossless"}
@@ -65,6 +79,8 @@ def test_changes_become_dotted_names() -> None:
     [
         ({"build": "nonsense"}, "build"),
         ({"scenes": "many"}, "scenes"),
+        ({"scenes": 0}, "scenes"),
+        ({"changes": {"scenes": {"cameras": {"fov_deg": [30, 171]}}}}, "fov_deg.1"),
         ({"changes": {"renders": {"most_spp": 4}}}, "changes.renders.most_spp"),
         ({"changes": {"renders": {"denoiser": "best"}}}, "changes.renders.denoiser"),
     ],

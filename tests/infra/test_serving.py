@@ -1,13 +1,22 @@
 """`make serve`: a password as soon as it is not loopback; `make stop`: exactly what was started."""
 
+import contextlib
+import http.server
 import os
+import signal
+import socket
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
+from infra.serving import local
 from infra.serving.local import running, start, stop
+from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER, wait_until_healthy
 from storage.errors import TrilightError
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(120)"]
@@ -46,3 +55,106 @@ def test_stop_ends_what_was_started_and_no_stranger(cache: Path) -> None:
         for process in processes:
             process.kill()
             process.wait()
+
+
+def test_stop_leaves_it_to_the_starter_to_tell_what_may_save(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second SIGTERM would end training before it has saved; who does not end is killed."""
+    monkeypatch.setattr(local, "_END_S", 0.5)
+    cache.write_text("ours")
+    environment = {**os.environ, "TRILIGHT_SERVED": "ours", TOLD_BY_ITS_STARTER: "1"}
+    with subprocess.Popen(SLEEP, env=environment, start_new_session=True) as process:
+        assert stop() == 1
+        assert process.wait(30) == -signal.SIGKILL
+
+
+def test_a_port_of_somebody_else_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local.shutil, "which", lambda name: name)
+    monkeypatch.setattr(local, "_launch", lambda *arguments: pytest.fail("launched"))
+    with socket.create_server(("127.0.0.1", 0)) as stranger:
+        port = stranger.getsockname()[1]
+        with pytest.raises(TrilightError, match=rf"127.0.0.1:{port} cannot.*Set TRILIGHT_PORT"):
+            start(host="127.0.0.1", port=port, workers=1)
+
+
+def test_an_answer_counts_only_while_our_server_lives(tmp_path: Path) -> None:
+    class Ends:
+        """A server that cannot bind, and ends while a stranger answers for it."""
+
+        answers = 0
+
+        def poll(self) -> int | None:
+            self.answers += 1
+            return None if self.answers == 1 else 1
+
+    with healthy_server() as url, pytest.raises(TrilightError, match="did not start"):
+        wait_until_healthy(url, cast(Any, Ends()), tmp_path / "log")
+
+
+@contextlib.contextmanager
+def healthy_server() -> Iterator[str]:
+    class Healthy(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, format: str, *arguments: object) -> None:
+            pass
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Healthy) as stranger:
+        threading.Thread(target=stranger.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{stranger.server_port}/api"
+        stranger.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [
+        ("TRILIGHT_PORT", "x"), ("TRILIGHT_PORT", "0"), ("TRILIGHT_PORT", "65536"),
+        ("TRILIGHT_HOST", "::1"), ("TRILIGHT_WORKERS", "0"), ("TRILIGHT_WORKERS", "-1"),
+    ],
+)  # fmt: skip
+def test_wrong_variables_are_named(
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str
+) -> None:
+    monkeypatch.setattr(local.shutil, "which", lambda name: name)
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(SystemExit, match=rf"{variable} is '{value}'; expected"):
+        local.main(["start"])
+
+
+def test_what_to_do_next_reaches_the_server_that_was_started() -> None:
+    plain = "prefect deployment run generate-scenes/local --watch"
+    assert local.next_command("http://127.0.0.1:4200/api") == plain
+    other = "http://127.0.0.1:4300/api"
+    assert local.next_command(other) == f"PREFECT_API_URL={other} {plain}"
+
+
+def test_workers_share_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRILIGHT_CORES", "9")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
+    assert local._share(0, 1) == {}
+    two = [local._share(number, 2) for number in range(2)]
+    assert [share["CUDA_VISIBLE_DEVICES"] for share in two] == ["0,2", "1"]
+    assert [share["TRILIGHT_CORES"] for share in two] == ["4", "4"]
+    four = [local._share(number, 4)["CUDA_VISIBLE_DEVICES"] for number in range(4)]
+    assert four == ["0", "1", "2", "0"]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert local._share(11, 12) == {"TRILIGHT_CORES": "1"}
+
+
+@pytest.mark.parametrize(("there", "action"), [(True, "update"), (False, "create")])
+def test_limits_that_are_there_become_those_of_this_machine(
+    monkeypatch: pytest.MonkeyPatch, there: bool, action: str
+) -> None:
+    calls: list[list[str]] = []
+
+    def call(arguments: list[str], environment: object, *, check: bool = True) -> bool:
+        calls.append(arguments)
+        return there
+
+    monkeypatch.setattr(local, "_call", call)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
+    local._prepare({})
+    assert ["gcl", action, "trilight-gpu", "--limit", "3"] in calls

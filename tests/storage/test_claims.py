@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -80,12 +81,16 @@ def test_the_first_writer_wins_where_asked(tmp_path: Path) -> None:
 def test_leftovers_are_cleared_only_where_nobody_works(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path)
     with folder.joined():
-        leftover = tmp_path / "a.tar.1-00.part"
-        leftover.write_bytes(b"")
+        leftover, young = tmp_path / "a.tar.1-00.part", tmp_path / "b.tar.1-00.part"
+        for path in (leftover, young):
+            path.write_bytes(b"")
+        hours_ago = time.time() - 7200
+        os.utime(leftover, (hours_ago, hours_ago))
         with folder.joined():
             assert leftover.exists()
     with folder.joined():
         assert not leftover.exists()
+        assert young.exists()  # of another machine, perhaps, that our locks do not reach
 
 
 @pytest.mark.parametrize(

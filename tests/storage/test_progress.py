@@ -2,13 +2,18 @@
 
 from pathlib import Path
 
+import pytest
+
+from storage import progress
 from storage.layout import DatasetFolder
+from storage.manifest import Manifest, read_manifest
 from storage.progress import (
     announce_downloads,
     announce_objects,
     count_object,
     read_progress,
 )
+from tests.flows.test_publication import begin_tiny, make_tiny_shard
 
 
 def test_an_empty_folder_has_no_progress(tmp_path: Path) -> None:
@@ -35,3 +40,21 @@ def test_a_new_run_counts_from_the_start(tmp_path: Path) -> None:
     announce_objects(folder, 7)
     now = read_progress(folder)
     assert (now.objects_done, now.objects_planned) == (0, 7)
+
+
+def test_a_manifest_is_read_when_it_changes_and_not_twice_a_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, publication = list[Path](), begin_tiny(tmp_path, 8)
+
+    def counted(path: Path) -> Manifest:
+        read.append(path)
+        return read_manifest(path)
+
+    monkeypatch.setattr(progress, "read_manifest", counted)
+    for _ in range(3):
+        assert read_progress(publication.folder).scenes_planned == 8
+    assert len(read) == 1
+    make_tiny_shard(publication, 0)
+    now = read_progress(publication.folder)
+    assert (now.scenes_done, now.scenes_planned, len(read)) == (4, 8, 2)

@@ -9,11 +9,10 @@ from prefect.deployments import run_deployment
 
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.served.generate_scenes import generate_scenes
-from pipeline.flows.served.orders import DATASET_FORMS, DatasetInRuns
+from pipeline.flows.served.orders import DATASET_FORMS, DatasetInRuns, dataset_in_runs
 from pipeline.flows.served.prepare_assets import prepare_assets
 from pipeline.flows.served.schema import parameters_of
 from storage.dataset_status import read_status
-from storage.errors import TrilightError
 
 
 @flow(name="build-dataset", persist_result=False)
@@ -21,30 +20,27 @@ from storage.errors import TrilightError
 def build_dataset(**parameters: Any) -> None:
     """Make a dataset: its objects, its scenes, its documents; on several workers if asked for.
 
-    The ranges of the others are flow runs of their own. This run takes part in all of them: it
-    makes what nobody is making yet, so that it ends whether or not another worker ever comes.
+    With N flow runs there are N ranges of shards: N - 1 are runs of their own, and this run makes
+    the first. Then it makes what is left and nobody is at, so that it ends whether or not another
+    worker ever comes.
     """
-    flow_runs, deployment = parameters.pop("flow_runs"), parameters.pop("deployment")
-    if flow_runs < 1 or parameters["shards"] is not None:
-        raise TrilightError(
-            f"flow_runs is {flow_runs} and shards {parameters['shards']!r}; expected at least 1 "
-            "and no range, since the whole dataset is made."
-        )
-    prepare_assets(**parameters)
-    if flow_runs > 1:
-        _start_ranges(parameters, flow_runs, deployment)
-    generate_scenes(**parameters)
+    order = dataset_in_runs(parameters)
+    given = {field.name: parameters[field.name] for field in dataclasses.fields(DatasetOrder)}
+    prepare_assets(**given)
+    if order.flow_runs > 1:
+        own, *others = ranges_of(read_status(order.out).shards_planned, order.flow_runs)
+        for shards in others:
+            ranged = {name: _json(value) for name, value in given.items()} | {"shards": shards}
+            run_deployment(order.deployment, parameters=ranged, timeout=0, as_subflow=False)
+        generate_scenes(**{**given, "shards": own})
+    generate_scenes(**given)
 
 
-def _start_ranges(parameters: dict[str, Any], flow_runs: int, deployment: str) -> None:
-    count = read_status(parameters["out"]).shards_planned
-    bounds = [count * part // flow_runs for part in range(flow_runs + 1)]
-    names = [field.name for field in dataclasses.fields(DatasetOrder)]
-    given = {name: _json(parameters[name]) for name in names}
-    for first, last in itertools.pairwise(bounds):
-        if first < last:
-            ranged = {**given, "shards": f"{first}:{last}"}
-            run_deployment(deployment, parameters=ranged, timeout=0, as_subflow=False)
+def ranges_of(num_shards: int, flow_runs: int) -> list[str]:
+    """Return ranges A:B of shards, nearly equal, as many as there are runs or shards."""
+    count = min(flow_runs, num_shards)
+    bounds = [num_shards * part // count for part in range(count + 1)]
+    return [f"{first}:{last}" for first, last in itertools.pairwise(bounds)]
 
 
 def _json(value: Any) -> Any:

@@ -21,10 +21,14 @@ def generate_scenes(**parameters: Any) -> Outcome:
 
 
 def make_watched(order: DatasetOrder, runner: PrefectRunner) -> Outcome:
-    """Make a dataset within a flow run, with its artifacts."""
+    """Make a dataset within a flow run, with its artifacts; the summary also says what failed."""
     # one line per scene; PREFECT_LOGGING_EXTRA_LOGGERS=trilight brings it to the server
     logging.getLogger("trilight").setLevel(logging.INFO)
     watched = Watched(order)
-    outcome = make_dataset(order, runner, watched.task_done)
+    try:
+        outcome = make_dataset(order, runner, watched.task_done)
+    except Exception as error:
+        watched.failed(error)
+        raise
     watched.finished(outcome)
     return outcome

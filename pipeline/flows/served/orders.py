@@ -12,6 +12,7 @@ from pipeline.flows.served.schema import (
     PublicUrl,
     changed_values,
 )
+from storage.errors import TrilightError
 from storage.ranges import Within
 from storage.shard_places import MAX_SHARDS
 
@@ -29,9 +30,17 @@ class DatasetInRuns(DatasetOrder):
     """A dataset whose ranges of shards are flow runs of their own, for as many workers."""
 
     flow_runs: Annotated[int, Within(1, MAX_SHARDS, unit="flow runs")] = 1
-    """Ranges that are made as separate runs of the deployment; with 1, everything is made here."""
+    """Flow runs in all: this one, and one run of the deployment for each of the other ranges."""
     deployment: str = "generate-scenes/local"
-    """The deployment that makes the ranges, as FLOW/DEPLOYMENT."""
+    """The deployment that makes the other ranges, as FLOW/DEPLOYMENT."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.shards is not None:
+            raise TrilightError(
+                f"shards is {self.shards!r}; expected no range, since the whole dataset is made. "
+                "Run generate-scenes for a range."
+            )
 
 
 def dataset_order(parameters: Mapping[str, Any]) -> DatasetOrder:
@@ -40,7 +49,16 @@ def dataset_order(parameters: Mapping[str, Any]) -> DatasetOrder:
     Raises:
         TrilightError: a value that no schema can refuse; the message names it.
     """
-    order = {name: parameters[name] for name in DatasetOrder.__dataclass_fields__}
-    order["allow_licences"] = tuple(order["allow_licences"])
-    order["changes"] = changed_values(order["changes"])
-    return DatasetOrder(**order)
+    return DatasetOrder(**_values(parameters, DatasetOrder))
+
+
+def dataset_in_runs(parameters: Mapping[str, Any]) -> DatasetInRuns:
+    """Return the order in several runs that a flow's parameters state; raises as above."""
+    return DatasetInRuns(**_values(parameters, DatasetInRuns))
+
+
+def _values(parameters: Mapping[str, Any], kind: type[DatasetOrder]) -> dict[str, Any]:
+    values = {name: parameters[name] for name in kind.__dataclass_fields__}
+    values["allow_licences"] = tuple(values["allow_licences"])
+    values["changes"] = changed_values(values["changes"])
+    return values

@@ -4,6 +4,7 @@ A task run is some minutes of scenes (pipeline.flows.pieces). Native code runs i
 own, never in a process pool of Prefect's, which one segfault breaks as a whole.
 """
 
+import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -17,6 +18,7 @@ from prefect.tasks import Task, exponential_backoff
 from pipeline.flows.make_task import ShardJob, TaskOutcome, make_task
 from pipeline.flows.pieces import Piece
 from pipeline.flows.runners import in_window
+from pipeline.renders.variant import choose_variant
 from storage.errors import EnvironmentFailure
 from storage.statistics import Statistics
 
@@ -49,8 +51,12 @@ def may_pass(task_: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
     retry_condition_fn=may_pass,
 )
 def make_scenes(first: str, work: "Sealed") -> TaskOutcome:
-    """Make some pieces; `first` says for people where they begin."""
-    return make_task(work.job, work.pieces)
+    """Make some pieces; `first` says for people where they begin.
+
+    Where pictures are made on a graphics card, GPU_LIMIT says how many tasks may run at a time.
+    """
+    with _card():
+        return make_task(work.job, work.pieces)
 
 
 class Sealed:
@@ -90,7 +96,15 @@ class PrefectRunner:
         return write_documents_task(Deferred(write_documents))
 
 
-@task(name="write-documents", cache_policy=NO_CACHE, persist_result=False)
+@task(
+    name="write-documents",
+    cache_policy=NO_CACHE,
+    persist_result=False,
+    retries=_RETRIES,
+    retry_delay_seconds=exponential_backoff(_FIRST_DELAY_S),
+    retry_jitter_factor=0.5,
+    retry_condition_fn=may_pass,
+)
 def write_documents_task(write: "Deferred") -> Statistics:
     """Write what people and hubs look at; DISK_LIMIT says how many may at the same time."""
     with concurrency(DISK_LIMIT, occupy=1, strict=False):
@@ -102,6 +116,12 @@ class Deferred:
 
     def __init__(self, call: Callable[[], Statistics]) -> None:
         self.call = call
+
+
+def _card() -> contextlib.AbstractContextManager[None]:
+    if choose_variant().name != "cuda_ad_rgb":
+        return contextlib.nullcontext()
+    return concurrency(GPU_LIMIT, occupy=1, strict=False)
 
 
 def _first_done(running: list[PrefectFuture[TaskOutcome]]) -> PrefectFuture[TaskOutcome]:

@@ -1,7 +1,8 @@
 """Typed parameters of flows, made of our frozen settings: Prefect's forms show names and docs.
 
-A flow takes the fields of a dataclass as its parameters. Types, defaults and the sentence under
-each field become the schema that Prefect checks before a run exists, and of which it draws a form.
+A flow takes the fields of a dataclass as its parameters. Types, defaults, ranges (storage.ranges)
+and the sentence under each field become the schema that Prefect checks before a run exists, and of
+which it draws a form.
 The groups of a build's settings become forms within the form, where every field may stay empty.
 """
 
@@ -18,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from pipeline.flows.builds import BUILDS
 from pipeline.flows.settings import BuildSettings
+from storage.ranges import Within
 
 Returned = TypeVar("Returned")
 
@@ -46,7 +48,8 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
         settings: the dataclass.
         annotations: types that take the place of those of some fields.
     """
-    docs, hints = field_docs(settings), typing.get_type_hints(settings)
+    docs = field_docs(settings)
+    hints = typing.get_type_hints(settings, include_extras=True)
 
     def with_signature(function: Callable[..., Returned]) -> Callable[..., Returned]:
         parameters, lines = [], []
@@ -79,7 +82,8 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
         settings: the dataclass, whose fields may be groups, or tuples of groups.
         example: an instance, which says what the groups within tuples are.
     """
-    docs, hints = field_docs(settings), typing.get_type_hints(settings)
+    docs = field_docs(settings)
+    hints = typing.get_type_hints(settings, include_extras=True)
     fields: dict[str, Any] = {}
     for field in dataclasses.fields(settings):
         value, kind = getattr(example, field.name), _form_type(hints[field.name])
@@ -108,16 +112,39 @@ def _has_factory(field: "dataclasses.Field[Any]") -> bool:
     return field.default_factory is not dataclasses.MISSING
 
 
-def _form_type(hint: Any) -> Any:
-    """Return a type as JSON has it: tuples of one kind are lists, mappings are objects."""
+_EXACT = 2**53
+"""Beyond it forms show other numbers than were meant: JavaScript has no larger integers."""
+
+
+def _form_type(hint: Any, within: Within | None = None) -> Any:
+    """Return a type as JSON has it: tuples of one kind are lists, mappings are objects.
+
+    Args:
+        hint: the type.
+        within: the range of its numbers, where one was declared around it.
+    """
     origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        declared = [note for note in args[1:] if isinstance(note, Within)]
+        return _form_type(args[0], declared[0] if declared else within)
     if origin in (typing.Union, types.UnionType):
-        return typing.Union[tuple(_form_type(arg) for arg in args)]  # noqa: UP007
+        return typing.Union[tuple(_form_type(arg, within) for arg in args)]  # noqa: UP007
     if origin is tuple:
-        return list[_form_type(args[0])] if args[1:] == (...,) else list[Any]  # type: ignore[misc]
+        one_kind = args[1:] == (...,) or len(set(args)) == 1
+        return list[_form_type(args[0], within)] if one_kind else list[Any]  # type: ignore[misc]
     if origin in (Mapping, dict):
         return dict[str, Any]
-    return hint
+    return Annotated[hint, _bounds(within)] if within and hint in (int, float) else hint
+
+
+def _bounds(within: Within) -> Any:
+    """Return a range as pydantic and the schema have it; ends that are no limit are left out."""
+    bounds: dict[str, Any] = {}
+    if abs(within.low) <= _EXACT:
+        bounds["gt" if within.low_open else "ge"] = within.low
+    if abs(within.high) <= _EXACT:
+        bounds["lt" if within.high_open else "le"] = within.high
+    return Field(**bounds)
 
 
 _NO_SECRET = r"^(?:(?:env|builtin|objaverse):[^@?]*|[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|[^:]*)$"

@@ -5,7 +5,6 @@ Making and learning meet only through files, so nothing of `train` is imported h
 
 import contextlib
 import json
-import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,12 +15,11 @@ from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
 from pipeline.flows.machine import visible_gpus
+from pipeline.flows.served.process import run_to_end
 from pipeline.flows.served.runner import GPU_LIMIT
 from pipeline.flows.served.schema import PublicUrl, parameters_of
-from pipeline.isolation import die_with_parent
 from storage.errors import TrilightError
 from storage.ranges import Within, check_ranges
-from storage.safe_url import safe_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,30 +66,19 @@ class TrainOrder:
 @flow(name="train-model", persist_result=False)
 @parameters_of(TrainOrder, data=list[PublicUrl])
 def train_model(**parameters: Any) -> None:
-    """Train a model on a dataset, in processes of its own."""
+    """Train a model on a dataset, in processes of its own; a run that is cancelled is saved.
+
+    Prefect waits for half a minute then; `resume` goes on from there.
+    """
     order = TrainOrder(**{**parameters, "data": tuple(parameters["data"])})
-    last, log = "", get_run_logger()
+    log = get_run_logger()
     cards = len(visible_gpus())
     limit = (
         concurrency(GPU_LIMIT, occupy=min(order.processes, cards), strict=False)
         if cards
         else contextlib.nullcontext()
     )
-    with (
-        limit,
-        subprocess.Popen(
-            order.command(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            preexec_fn=die_with_parent,
-        ) as process,
-    ):
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.strip():
-                last = safe_text(line.strip())
-                log.info("%s", last)
-    if process.returncode:
-        raise TrilightError(f"train {order.run} ended with status {process.returncode}: {last}")
+    with limit:
+        status, last = run_to_end(order.command(), lambda line: log.info("%s", line))
+    if status:
+        raise TrilightError(f"train {order.run} ended with status {status}: {last}")

@@ -1,11 +1,12 @@
 """What people watch on Prefect's page: progress, a table, a link, a summary.
 
-It shows what the files say (`trilight status` says the same); nothing is decided by it.
+It shows what the files say (`trilight status` says the same); nothing is decided by it, and a run
+goes on where it cannot be shown.
 """
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
 from uuid import UUID
@@ -21,8 +22,10 @@ from prefect.logging import get_run_logger
 from pipeline.flows.dataset_run import Outcome, Run
 from pipeline.flows.make_task import TaskOutcome
 from pipeline.flows.order import DatasetOrder
+from storage.errors import TrilightError
 from storage.failures import count_by_reason, read_failures
 from storage.output import dataset_folder
+from storage.safe_url import safe_text
 
 USD_PER_CORE_HOUR = 0.04
 """What TRILIGHT_USD_PER_CORE_HOUR says otherwise."""
@@ -34,33 +37,74 @@ class Watched:
     """The artifacts of one flow run."""
 
     def __init__(self, order: DatasetOrder) -> None:
+        """Begin to show a run.
+
+        Raises:
+            TrilightError: TRILIGHT_USD_PER_CORE_HOUR is no price.
+        """
         self._order = order
+        self._price = usd_per_core_hour()
         self._folder = dataset_folder(order.out)
-        self._started = time.monotonic()
+        self._began: float | None = None  # the first scene; objects are prepared before
         self._told = -_EVERY_S
         self._scenes = 0
         self._core_s = 0.0
-        # Prefect's functions return coroutines only where an event loop runs
-        self._progress = cast(
-            UUID, create_progress_artifact(0.0, key="shards", description=order.out)
-        )
+        self._warned = False
+        self._progress: UUID | None = None
         self._log = get_run_logger()
+        self._shown(self._begin)
 
     def task_done(self, run: Run, outcome: TaskOutcome) -> None:
         """Take a finished task into account, and tell it where the last table is old."""
+        now = time.monotonic()
+        if self._began is None and outcome.scenes:
+            self._began = now - outcome.seconds
         self._scenes += outcome.scenes
         self._core_s += outcome.core_s
         for shard in outcome.shards:
             self._log.info("shard %s: %d scenes", shard.name, shard.num_samples)
-        if time.monotonic() - self._told < _EVERY_S:
-            return
-        self._told = time.monotonic()
+        if now - self._told >= _EVERY_S:
+            self._told = now
+            self._shown(lambda: self._tell(run))
+
+    def finished(self, outcome: Outcome) -> None:
+        """Tell the outcome."""
+        self._shown(lambda: self._sum_up(outcome))
+        done, planned = outcome.num_shards, outcome.num_shards_planned
+        self._log.info("%d of %d shards are there; digest %s", done, planned, outcome.digest)
+
+    def failed(self, error: Exception) -> None:
+        """Tell why the run ended early; what it made is safe."""
+        what = safe_text(f"{type(error).__name__}: {error}".partition("\n")[0])
+        made = ("scenes of this run", str(self._scenes))
+        self._shown(lambda: self._table("summary", [("failed", what), made]))
+
+    def scenes_per_s(self) -> float:
+        """Return the rate of this run since its first scene was begun; 0 before one is made."""
+        return self._scenes / (time.monotonic() - self._began) if self._began is not None else 0.0
+
+    def _shown(self, show: Callable[[], None]) -> None:
+        try:
+            show()
+        except Exception as error:  # a server away for a moment must not cost hours of pictures
+            if not self._warned:
+                self._warned = True
+                why = safe_text(str(error).partition("\n")[0])
+                self._log.warning("what this page shows is not complete (%s)", why)
+
+    def _begin(self) -> None:
+        # Prefect's functions return coroutines only where an event loop runs
+        self._progress = cast(
+            UUID, create_progress_artifact(0.0, key="shards", description=self._order.out)
+        )
+
+    def _tell(self, run: Run) -> None:
         publication = run.publication
         done = publication.num_scenes_finished()
         planned = publication.manifest.num_scenes
-        per_s = self._scenes / (time.monotonic() - self._started)
+        per_s = self.scenes_per_s()
         left = "unknown" if per_s == 0 else f"{(planned - done) / per_s / 60:.0f} minutes"
-        update_progress_artifact(self._progress, 100.0 * done / planned)
+        self._percent(100.0 * done / planned)
         self._table(
             "progress",
             [
@@ -71,28 +115,47 @@ class Watched:
             ],
         )
 
-    def finished(self, outcome: Outcome) -> None:
-        """Tell the outcome."""
+    def _sum_up(self, outcome: Outcome) -> None:
         done, planned = outcome.num_shards, outcome.num_shards_planned
-        update_progress_artifact(self._progress, 100.0 * done / planned)
+        self._percent(100.0 * done / planned)
         rows = [("shards", f"{done} of {planned}"), ("dataset digest", outcome.digest)]
         rows += outcome.statistics.lines() if outcome.statistics else []
         self._table("summary", rows)
         if outcome.statistics:
             create_link_artifact(_report_url(self._order.out), key="report", link_text="report")
-        self._log.info("%d of %d shards are there; digest %s", done, planned, outcome.digest)
+
+    def _percent(self, percent: float) -> None:
+        if self._progress is not None:
+            update_progress_artifact(self._progress, percent)
 
     def _table(self, key: str, rows: Sequence[tuple[str, str]]) -> None:
         rejected = count_by_reason(read_failures(self._folder.failures))
-        price = float(os.environ.get("TRILIGHT_USD_PER_CORE_HOUR", USD_PER_CORE_HOUR))
         core_hours = self._core_s / 3600
-        cost = f"{core_hours:.3f} core-hours, {core_hours * price:.2f} USD"
+        cost = f"{core_hours:.3f} core-hours, {core_hours * self._price:.2f} USD"
         everything = [
             *rows,
             *((f"rejected: {reason} ({stage})", str(count)) for stage, reason, count in rejected),
             ("cost of this run", cost),
         ]
         create_table_artifact([{"what": name, "value": value} for name, value in everything], key)
+
+
+def usd_per_core_hour() -> float:
+    """Return what an hour of a core costs.
+
+    Raises:
+        TrilightError: TRILIGHT_USD_PER_CORE_HOUR is not a number from 0.
+    """
+    text = os.environ.get("TRILIGHT_USD_PER_CORE_HOUR", str(USD_PER_CORE_HOUR))
+    try:
+        price = float(text)
+    except ValueError:
+        price = -1.0
+    if not 0 <= price < float("inf"):
+        raise TrilightError(
+            f"TRILIGHT_USD_PER_CORE_HOUR is {text!r}; expected a number from 0, such as 0.04."
+        )
+    return price
 
 
 def _report_url(out: str) -> str:

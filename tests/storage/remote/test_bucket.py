@@ -1,5 +1,6 @@
 """Writing to a bucket: whole, only once where that is asked for, and only where that can be."""
 
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -7,8 +8,9 @@ from typing import Any
 import pytest
 
 from pipeline.flows.order import DatasetOrder
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote import bucket as remote_bucket
+from storage.remote.tries import with_tries
 from storage.remote.url import RemoteUrl
 from tests.flows.bucket_kit import empty_bucket
 from tests.s3_server import s3_server
@@ -55,3 +57,11 @@ def test_places_that_cannot_be_written_are_refused_by_name(out: str, message: st
         DatasetOrder(out=out)
     assert message in str(caught.value)
     assert "hunter2" not in str(caught.value)
+
+
+def test_a_full_disk_may_pass_whichever_way_the_bytes_go() -> None:
+    def full() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(EnvironmentFailure, match="^the disk is full. What was finished is safe"):
+        with_tries(full)

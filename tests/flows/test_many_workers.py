@@ -1,0 +1,139 @@
+"""Runs on several workers: ranges, cards, a Dask cluster whose workers are asked before work."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from infra.cli.generate import _runner
+from pipeline.flows import make_task
+from pipeline.flows.children import ChildPool
+from pipeline.flows.order import DatasetOrder
+from pipeline.flows.served import build_dataset as building
+from pipeline.flows.served import on_dask, runner
+from pipeline.flows.served.orders import DatasetInRuns, dataset_in_runs
+from pipeline.isolation import IsolatedChild
+from storage.errors import TrilightError
+from storage.layout import DatasetFolder
+
+
+def _parameters(**given: Any) -> dict[str, Any]:
+    example = DatasetInRuns()
+    plain = {name: getattr(example, name) for name in DatasetInRuns.__dataclass_fields__}
+    return {**plain, "changes": None, **given}
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
+    """Which ranges are made, those of other runs first; nothing is."""
+    ranges: list[str | None] = []
+
+    def started(deployment: str, *, parameters: dict[str, Any], **options: Any) -> None:
+        ranges.append(f"{deployment} {parameters['shards']}")
+
+    status = SimpleNamespace(shards_planned=10)
+    monkeypatch.setattr(building, "prepare_assets", lambda **given: None)
+    monkeypatch.setattr(building, "read_status", lambda out: status)
+    monkeypatch.setattr(building, "run_deployment", started)
+    monkeypatch.setattr(building, "generate_scenes", lambda **given: ranges.append(given["shards"]))
+    return ranges
+
+
+def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
+    flow: Any = building.build_dataset
+    flow.fn(**_parameters(flow_runs=3, deployment="d/x"))
+    assert made == ["d/x 3:6", "d/x 6:10", "0:3", None]
+    made.clear()
+    flow.fn(**_parameters())
+    assert made == [None]
+
+
+def test_there_are_no_more_ranges_than_shards() -> None:
+    assert building.ranges_of(2, 5) == ["0:1", "1:2"]
+    assert building.ranges_of(7, 1) == ["0:7"]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"flow_runs": 0}, "flow_runs is 0; expected a whole number from 1"),
+        ({"flow_runs": 10**6}, "flow_runs is 1000000"),
+        ({"shards": "0:2"}, "shards is '0:2'; expected no range"),
+    ],
+)
+def test_wrong_numbers_of_runs_are_named(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        dataset_in_runs(_parameters(**given))
+
+
+@pytest.mark.parametrize(("variant", "held"), [("cuda_ad_rgb", [1]), ("llvm_ad_rgb", [])])
+def test_rendering_on_a_card_takes_its_limit(
+    monkeypatch: pytest.MonkeyPatch, variant: str, held: list[int]
+) -> None:
+    taken: list[int] = []
+
+    @contextlib.contextmanager
+    def limit(name: str, *, occupy: int, strict: bool) -> Iterator[None]:
+        assert name == runner.GPU_LIMIT
+        taken.append(occupy)
+        yield
+
+    monkeypatch.setattr(runner, "concurrency", limit)
+    monkeypatch.setattr(runner, "choose_variant", lambda: SimpleNamespace(name=variant))
+    monkeypatch.setattr(runner, "make_task", lambda job, pieces: (job, pieces, list(taken)))
+    work = SimpleNamespace(job="job", pieces=())
+    assert cast(Any, runner.make_scenes).fn("0", work) == ("job", (), held)
+
+
+def test_documents_are_tried_again_where_that_can_help() -> None:
+    task = cast(Any, runner.write_documents_task)
+    assert task.retries == cast(Any, runner.make_scenes).retries > 0
+    assert task.retry_condition_fn is runner.may_pass
+
+
+def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another run may be at work on the same Dask worker."""
+    closed: list[str] = []
+
+    def pool(name: str) -> ChildPool:
+        child = SimpleNamespace(close=lambda: closed.append(name))
+        return ChildPool(lambda number: cast(IsolatedChild, child), 1)
+
+    job = cast(Any, SimpleNamespace(
+        folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l"
+    ))  # fmt: skip
+    monkeypatch.setattr(make_task, "_pools", {("b", "d", "l"): pool("other")})
+    monkeypatch.setattr(make_task, "_new_pool", lambda job: pool("ours"))
+    with make_task._child_of(job):
+        assert closed == ["other"]
+        make_task.close_idle_children()
+        assert closed == ["other"]
+    make_task.close_idle_children()
+    assert closed == ["other", "ours"]
+
+
+def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_path: Path) -> None:
+    class Client:
+        """Two workers, of which the second is on another machine."""
+
+        def run(self, function: Any, *arguments: Any) -> dict[str, bool]:
+            return {"tcp://a:1": function(*arguments), "tcp://b:1": False}
+
+    order = DatasetOrder(out=str(tmp_path / "set"))
+    with pytest.raises(TrilightError, match="1 of 2 Dask workers do not see.*such as tcp://b:1"):
+        on_dask._require_shared(cast(Any, Client()), order)
+    assert list((tmp_path / "set" / ".staging").iterdir()) == []
+
+
+def test_what_cannot_be_told_to_dask_is_named() -> None:
+    with pytest.raises(TrilightError, match="--workers is 2; expected it without --runner dask"):
+        _runner("dask", "tcp://127.0.0.1:1", 2)
+    pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
+    with (
+        pytest.raises(TrilightError, match="--address http://127.0.0.1:1: no Dask scheduler"),
+        on_dask._client("http://127.0.0.1:1"),
+    ):
+        pass
