@@ -63,7 +63,7 @@ def run(options: Options, round_done: Callable[[], None]) -> Comparison:
     preload(["pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters"])
     effort, records = _effort(options), object_records(options)
     with tempfile.TemporaryDirectory() as work, contextlib.closing(_child()) as child:
-        sizes = _sizes(child, records)
+        sizes = clean_sizes(child, records)
         sides = {
             **_comparisons(child, sizes, effort),
             **_curves(child, sizes, effort),
@@ -93,6 +93,7 @@ def _nothing() -> None:
 
 
 def object_records(options: Options) -> list[ObjectRecord]:
+    """Return the objects of all sources together; raises TrilightError as `find_objects`."""
     return [
         record
         for source in options.objects
@@ -104,8 +105,8 @@ def object_records(options: Options) -> list[ObjectRecord]:
     ]
 
 
-def _sizes(child: IsolatedChild, records: list[ObjectRecord]) -> dict[Path, int]:
-    """Return the clean faces of every usable source, the largest first."""
+def clean_sizes(child: IsolatedChild, records: list[ObjectRecord]) -> dict[Path, int]:
+    """Return the faces after cleaning of every usable source, the largest first."""
     sizes = {}
     for record in records:
         with contextlib.suppress(Rejected, ChildFailed):

@@ -56,8 +56,8 @@ class Options:
     """Keep what an interrupted run of the same plan has measured."""
     knobs: tuple[str, ...] = ()
     """Of `trade`: these alone."""
-    checkpoint: str | None = None
-    """Network that `trade` compares with the path tracer."""
+    checkpoint: str = "builtin:"
+    """Network, the shipped one by default, that `trade` compares with the path tracer."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,10 @@
 """A render child to measure with: a build's settings, and its objects at hand."""
 
+import dataclasses
+import os
 from pathlib import Path
 
+from infra.bench.harness import Options
 from pipeline.flows.accept_objects import accept_objects
 from pipeline.flows.environment import environment
 from pipeline.flows.make_scene import SceneSource, set_up_child
@@ -32,6 +35,16 @@ def render_child(
     accepted = accept_objects(objects, None, build, publication, workers=threads)
     source = SceneSource(settings=build, variant=variant, threads=threads, objects=accepted.objects)
     return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(source,))
+
+
+def asked_child(folder: Path, build: BuildSettings, options: Options) -> IsolatedChild:
+    """Return a child on all cores for a build of the objects that the user names.
+
+    Of several sources the first counts.
+    """
+    allowed = dataclasses.replace(build, allowed_licences=options.allowed_licences)
+    threads = os.cpu_count() or 1
+    return render_child(folder, allowed, objects=options.objects[0], threads=threads)
 
 
 def smoke_child(folder: Path, *, threads: int) -> IsolatedChild:

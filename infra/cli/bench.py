@@ -70,8 +70,8 @@ def bench(
         list[str] | None, typer.Option(help="trade: this knob alone; may be repeated [all]")
     ] = None,
     checkpoint: Annotated[
-        str | None, typer.Option(help="trade: network to compare with the path tracer")
-    ] = None,
+        str, typer.Option(help="trade: network to compare with the path tracer [the shipped one]")
+    ] = "builtin:",
     write_docs: Annotated[
         bool, typer.Option(help="trade: measure nothing, write docs/tradeoffs.md from the results")
     ] = False,
@@ -103,11 +103,14 @@ def _write_docs(name: str) -> None:
         raise TrilightError(f"--write-docs was given with {name}; expected it only with trade.")
     from infra.bench.harness import RESULTS
     from infra.bench.marked_block import write_block
+    from infra.bench.trade.figures import FIGURES, write_figures
     from infra.bench.trade.page import MARK, block
+    from infra.bench.trade.saved import saved_curves
 
     page = RESULTS.parent / "tradeoffs.md"
     write_block(page, MARK, block(RESULTS))
-    console.print(f"Written: {page}", style="bold")
+    write_figures(saved_curves(RESULTS), RESULTS / FIGURES)
+    console.print(f"Written: {page}, and its figures", style="bold")
 
 
 def _measure(benchmark: _Benchmark[Any], options: "Options") -> None:

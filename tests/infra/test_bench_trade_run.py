@@ -1,6 +1,7 @@
 """`trilight bench trade` as a whole on tiny pictures: children, references, a checkpoint, files."""
 
 import json
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -8,15 +9,19 @@ import torch
 from typer.testing import CliRunner
 
 from infra.bench import harness
+from infra.bench.harness import Options
 from infra.bench.renders import kept
 from infra.bench.trade import run
 from infra.bench.trade.curves import judged
 from infra.bench.trade.knobs import knob_named
 from infra.bench.trade.saved import saved_curves
+from infra.bench.trade.workshop import Workshop
 from infra.cli.app import app
 from model.config import smoke
 from model.layer_errors import random_network
 from model.weights import encode_weights
+from pipeline.objects.generated import generate_objects
+from pipeline.objects.licences import DEFAULT_ALLOWED
 from tests.infra.trade_kit import TINY
 
 pytestmark = pytest.mark.slow
@@ -46,3 +51,20 @@ def test_knobs_with_children_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert len(engines.details) == TINY.scenes
     # a network of random weights is no match for a single denoised sample
     assert {row["denoised bound"] for row in engines.details} == {"at most"}
+    for point in engines.points[1:]:
+        assert point.further["scenes where no samples suffice %"] == 0
+    assert "`builtin:benchmark-v1`" in engines.measured_on
+
+
+def test_objects_of_a_folder(tmp_path: Path) -> None:
+    """They have names of their own, and are made coarser like any other."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for index, record in enumerate(generate_objects("builtin:24", tmp_path / "made")):
+        (folder / f"thing-{index}.ply").write_bytes(Path(record.path).read_bytes())
+    options = Options(quick=True, objects=(str(folder),), allowed_licences=DEFAULT_ALLOWED)
+    with closing(Workshop(TINY, options)) as shop:
+        assert all(path.parent == folder for path in shop.sources)
+        assert 0 < len(shop.sources) <= TINY.objects
+        curve = knob_named("profile").measure(shop)
+    assert [point.default for point in curve.points].count(True) == 1

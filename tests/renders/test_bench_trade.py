@@ -6,11 +6,12 @@ import functools
 import pytest
 
 from infra.bench.harness import Options
+from infra.bench.renders.fixed_samples import fixed_samples
 from infra.bench.trade import path_knobs, picture_knobs, render_knobs, stored_knobs
 from infra.bench.trade.bare_pictures import bare_pictures
 from infra.bench.trade.curves import Curve, Knob, Point, judged
 from infra.bench.trade.knobs import knob_named
-from infra.bench.trade.rendered import fixed, shots
+from infra.bench.trade.rendered import shots
 from infra.bench.trade.workshop import Subject, Workshop
 from pipeline.renders.renderer import SceneRenderer
 from storage.metrics import psnr_log_db
@@ -25,10 +26,10 @@ OPTIONS = Options(quick=True, objects=("builtin:",), allowed_licences=())
 @functools.cache
 def _subject() -> Subject:
     scene = sampled_like_scene(rng_for(0, "trade"), num_views=1)
-    reference = SceneRenderer(scene, fixed(32, 2048)).render_view(
+    reference = SceneRenderer(scene, fixed_samples(32, 2048)).render_view(
         scene.c2w[0], float(scene.fov_deg[0]), 1_000_003
     )
-    return Subject(name="tiny", scene=scene, reference_rgb=reference.radiance_rgb)
+    return Subject(scene=scene, reference_rgb=reference.radiance_rgb)
 
 
 class _Here(Workshop):
@@ -114,7 +115,7 @@ def test_rounded_arrays_are_smaller_and_less_exact() -> None:
 
 def test_shared_passes_are_the_pictures_that_each_setting_gives_alone() -> None:
     scene = _subject().scene
-    variants = {str(spp): fixed(32, spp) for spp in (32, 128)}
+    variants = {str(spp): fixed_samples(32, spp) for spp in (32, 128)}
     together = shots(scene, variants)
     for name, settings in variants.items():
         alone = shots(scene, {name: settings})[name]
@@ -124,14 +125,14 @@ def test_shared_passes_are_the_pictures_that_each_setting_gives_alone() -> None:
 
 def test_bare_pictures_come_nearer_with_samples() -> None:
     subject = _subject()
-    found = bare_pictures(subject.scene, 32, (1, 8, 128))
-    assert [one.spp for one in found.raw] == [one.spp for one in found.denoised] == [1, 8, 128]
-    raw = [psnr_log_db(one.radiance_rgb, subject.reference_rgb) for one in found.raw]
-    clean = [psnr_log_db(one.radiance_rgb, subject.reference_rgb) for one in found.denoised]
+    sampled, denoised = (one.levels for one in bare_pictures(subject.scene, 32, (1, 8, 128)))
+    assert [one.spp for one in sampled] == [one.spp for one in denoised] == [1, 8, 128]
+    raw = [psnr_log_db(one.radiance_rgb, subject.reference_rgb) for one in sampled]
+    clean = [psnr_log_db(one.radiance_rgb, subject.reference_rgb) for one in denoised]
     # 128 times the samples are 21 dB of a raw picture; half of that is left for luck
     assert raw[2] > raw[0] + 10 and clean[2] > clean[0]
     assert clean[0] > raw[0]
-    assert found.denoised[0].core_s > found.raw[0].core_s > 0
+    assert denoised[0].core_s > sampled[0].core_s > 0
     # the mean of all samples is the scene's light, up to the noise of 128 of them
     mean = subject.reference_rgb.mean()
-    assert abs(found.raw[2].radiance_rgb.mean() / mean - 1) < 0.02
+    assert abs(sampled[2].radiance_rgb.mean() / mean - 1) < 0.02

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from infra.bench.renders.fixed_samples import fixed_samples
 from pipeline.assets.settings import AssetSettings
 from pipeline.flows.make_scene import MAX_ATTEMPTS, assets_of
 from pipeline.flows.scene_files import build_scene
 from pipeline.flows.training_builds import smoke
 from pipeline.renders.renderer import SceneRenderer
-from pipeline.renders.settings import PASS_SPP, RenderSettings
+from pipeline.renders.settings import PASS_SPP
 from pipeline.scenes.compose import compose_scene
 from storage.errors import Rejected, TrilightError
-from storage.metrics import MAX_DB
 from storage.scene import Scene
 
 _WARM_UP_SPP = 2 * PASS_SPP[0]
@@ -68,24 +68,13 @@ def our_picture(scene: Scene, view: int, resolution: int, spp: int, seed: int) -
     Kernels are compiled by a picture that does not count.
     """
     camera = (scene.c2w[view], float(scene.fov_deg[view]))
-    warm_up = SceneRenderer(scene, _fixed(resolution, _WARM_UP_SPP))
+    warm_up = SceneRenderer(scene, fixed_samples(resolution, _WARM_UP_SPP))
     warm_up.render_view(*camera, seed)
-    renderer = SceneRenderer(scene, _fixed(resolution, spp))
+    renderer = SceneRenderer(scene, fixed_samples(resolution, spp))
     wall, core = time.perf_counter(), time.process_time()
     rendered = renderer.render_view(*camera, seed)
     return OurPicture(
         radiance_rgb=rendered.radiance_rgb,
         render_s=time.perf_counter() - wall,
         core_s=time.process_time() - core,
-    )
-
-
-def _fixed(resolution: int, spp: int) -> RenderSettings:
-    """Settings that no noise floor stops early; `spp` is a multiple of _WARM_UP_SPP."""
-    return RenderSettings(
-        resolution=resolution,
-        noise_floor_db=MAX_DB - 1,
-        min_spp=spp,
-        max_spp=spp,
-        min_mean_radiance=0.0,
     )

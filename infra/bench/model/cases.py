@@ -25,13 +25,12 @@ from infra.bench.model.contenders import (
     published_like,
 )
 from infra.bench.model.memory import peaks_of
+from infra.bench.model.network_errors import log10_psnr_db
 from infra.bench.model.training import TRAINING, training_step
 from infra.bench.model.workloads import cases
 from model.config import ModelConfig
 from model.costs import Workload, flops
 from model.published.config import PublishedConfig, decode_published
-from storage.conventions import radiance_from_log10
-from storage.metrics import psnr_log_db
 
 NAME = "model-cases"
 MATMUL = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -170,7 +169,6 @@ def _errors(plan: Plan, pictures: Mapping[str, Tensor]) -> dict[str, dict[str, f
         work = 1e-9 * sum(flops(plan.config.model, plan.workloads[case]).values())
         found[side_name(case, PUBLISHED)] = {}
         found[side_name(case, EQUAL)] = {"gflop": work, "difference": difference}
-        # before the ELU, which would hide what is wrong in the dark
-        linear = (radiance_from_log10(picture.double().numpy()) for picture in (default, equal))
-        found[side_name(case, DEFAULT)] = {"gflop": work, "psnr_log_db": psnr_log_db(*linear)}
+        rounding_db = log10_psnr_db(default, equal)
+        found[side_name(case, DEFAULT)] = {"gflop": work, "psnr_log_db": rounding_db}
     return found

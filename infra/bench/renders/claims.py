@@ -1,11 +1,11 @@
 """Errors and costs of each side over the set, and how many times cheaper one is than another."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
+
+from infra.bench.renders.equal_error import Bound, Priced, at_error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ class Claim:
     """The side that the ratio divides by."""
     theirs: str
     """What it is compared with, in words."""
-    bound: Literal["exactly", "more than", "at most"]
+    bound: Bound
     """`more than` where no level of theirs is as good, `at most` where all are better."""
     ratio: float
     """Mean core-seconds a view of theirs by those of ours."""
@@ -102,30 +102,16 @@ def summarised(shots: Sequence[Shot], side: str) -> Summary:
 def at_equal_worst_error(ours: Summary, levels: Sequence[Summary], name: str) -> Claim:
     """Return what `name` takes at the fixed number of samples whose worst view is as good as ours.
 
-    The number is interpolated between measured levels: the worst error linearly in log2 of the
-    samples, and the core-seconds linearly in the samples, since each sample costs the same.
+    Between measured levels the number is interpolated (infra.bench.renders.equal_error).
 
     Args:
         ours: one of our targets.
         levels: theirs, from few samples to many.
         name: what they are called.
     """
-    first = next((row for row, one in enumerate(levels) if one.worst_db >= ours.worst_db), None)
-    if first is None:
-        return _claim(ours, name, "more than", levels[-1].mean_core_s, levels[-1].mean_spp)
-    above = levels[first]
-    if first == 0:
-        bound: Literal["exactly", "at most"] = (
-            "exactly" if above.worst_db == ours.worst_db else "at most"
-        )
-        return _claim(ours, name, bound, above.mean_core_s, above.mean_spp)
-    below = levels[first - 1]
-    share = (ours.worst_db - below.worst_db) / (above.worst_db - below.worst_db)
-    doublings = math.log2(above.mean_spp / below.mean_spp)
-    spp = below.mean_spp * 2 ** (share * doublings)
-    slope = (above.mean_core_s - below.mean_core_s) / (above.mean_spp - below.mean_spp)
-    core_s = below.mean_core_s + slope * (spp - below.mean_spp)
-    return _claim(ours, name, "exactly", core_s, spp)
+    priced = [Priced(spp=one.mean_spp, core_s=one.mean_core_s, db=one.worst_db) for one in levels]
+    found = at_error(priced, ours.worst_db)
+    return _claim(ours, name, found.bound, found.core_s, found.spp)
 
 
 def at_error_not_worse(targets: Sequence[Summary], theirs: Summary) -> Claim | None:
@@ -147,7 +133,7 @@ def at_error_not_worse(targets: Sequence[Summary], theirs: Summary) -> Claim | N
 def _claim(
     ours: Summary,
     theirs: str,
-    bound: Literal["exactly", "more than", "at most"],
+    bound: Bound,
     core_s: float,
     spp: float,
 ) -> Claim:

@@ -69,10 +69,7 @@ def render_ladder(
         max_spp=max_spp,
         min_mean_radiance=0.0,
     )
-    camera = (scene.c2w[0], float(scene.fov_deg[0]))
-    # The tracer's kernels do not depend on the resolution; the denoiser's memory does.
-    small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
-    SceneRenderer(scene, small).render_view(*camera, seed)
+    warm_up_kernels(scene, settings)
     warm_up_denoiser(resolution)
     started = time.process_time()
     remembering = RememberingRenderer(scene, settings)
@@ -84,6 +81,15 @@ def render_ladder(
         )
         rungs.append(Rung(target_db=target_db, view=view, core_s=core_s))
     return Ladder(load_core_s=load_core_s, rungs=tuple(rungs))
+
+
+def warm_up_kernels(scene: Scene, settings: RenderSettings) -> None:
+    """Let this process compile the tracer for a scene with a camera: kernels depend on the depths.
+
+    They do not depend on the resolution; the denoiser's memory does (`warm_up_denoiser`).
+    """
+    small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
+    SceneRenderer(scene, small).render_view(scene.c2w[0], float(scene.fov_deg[0]), seed=0)
 
 
 def warm_up_denoiser(resolution: int, quality: Quality = "high") -> None:

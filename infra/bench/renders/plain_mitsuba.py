@@ -8,12 +8,12 @@ denoiser reads our own guide pictures: both favour this side.
 """
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from infra.bench.renders.ladder import warm_up_denoiser
+from infra.bench.renders.levels import Level, Levels
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
@@ -26,30 +26,10 @@ _RR_DEPTH = 5
 """Mitsuba's default."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Level:
-    """One view with a fixed number of samples."""
-
-    spp: int
-    """Samples per pixel."""
-    radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance, denoised."""
-    core_s: float
-    """Core-seconds of so many samples, the guide pictures, and one denoise."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Levels:
-    """One view at every level."""
-
-    load_core_s: float
-    """Core-seconds of loading the scene."""
-    levels: tuple[Level, ...]
-    """From few samples to many: each holds the samples of the one before."""
-
-
 def render_levels(scene: Scene, resolution: int, levels_spp: tuple[int, ...], seed: int) -> Levels:
     """Render a scene's first view with each number of samples; no sample is traced twice.
+
+    Core-seconds are those of the samples, the guide pictures, and one denoise.
 
     Args:
         scene: that passes `Scene.check`.

@@ -11,6 +11,9 @@ from infra.bench.model.cases import timed_forward
 from infra.bench.trade.forward import CPU
 from model.attention import attend
 
+DEFAULT = "fused"
+"""What the network does, in float32."""
+
 Sides = dict[str, Callable[[], Mapping[str, float]]]
 
 
@@ -29,7 +32,7 @@ def attention_sides(q: Tensor, k: Tensor, v: Tensor, outputs: dict[str, Tensor])
             return attend(q, k, v, None)
 
     ways: dict[str, Callable[[], Tensor]] = {
-        "fused": lambda: attend(q, k, v, None),
+        DEFAULT: lambda: attend(q, k, v, None),
         "fused, bfloat16": lambda: attend(*rounded, None),
         "fused, with a mask": lambda: attend(q, k, v, every_key),
         "torch's own products": plain,

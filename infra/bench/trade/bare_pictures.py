@@ -6,12 +6,12 @@ guide pictures and one denoise. Guide pictures of few samples go with few sample
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from infra.bench.renders.ladder import warm_up_denoiser
+from infra.bench.renders.levels import Level, Levels
 from infra.bench.trade.rendered import SEED
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
@@ -24,32 +24,10 @@ from storage.seeds import seed_for
 _PASSES = (*PASS_SPP, 1)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Bare:
-    """One picture."""
-
-    spp: int
-    """Samples per pixel."""
-    radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance."""
-    core_s: float
-    """Core-seconds, kernels warm and scene loaded."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class BarePictures:
-    """One view at every number of samples."""
-
-    load_core_s: float
-    """Core-seconds of loading the scene."""
-    raw: tuple[Bare, ...]
-    """As sampled."""
-    denoised: tuple[Bare, ...]
-    """After Open Image Denoise at its best."""
-
-
-def bare_pictures(scene: Scene, resolution: int, levels_spp: Sequence[int]) -> BarePictures:
-    """Return a scene's first view at rising numbers of samples; runs in a render child.
+def bare_pictures(
+    scene: Scene, resolution: int, levels_spp: Sequence[int]
+) -> tuple[Levels, Levels]:
+    """Return a scene's first view as sampled, and denoised; runs in a render child.
 
     Args:
         scene: that passes `Scene.check`.
@@ -69,12 +47,15 @@ def bare_pictures(scene: Scene, resolution: int, levels_spp: Sequence[int]) -> B
         total += _sum_of_samples(tracer, camera, done, spp)
         picture = (total / spp).astype(np.float32)
         spent, done = spent + time.process_time() - started, spp
-        raw.append(Bare(spp=spp, radiance_rgb=picture, core_s=spent))
+        raw.append(Level(spp=spp, radiance_rgb=picture, core_s=spent))
         started = time.process_time()
         clean = _denoised(tracer, camera, picture, spp)
         core_s = spent + time.process_time() - started
-        denoised.append(Bare(spp=spp, radiance_rgb=clean, core_s=core_s))
-    return BarePictures(load_core_s=load_core_s, raw=tuple(raw), denoised=tuple(denoised))
+        denoised.append(Level(spp=spp, radiance_rgb=clean, core_s=core_s))
+    return (
+        Levels(load_core_s=load_core_s, levels=tuple(raw)),
+        Levels(load_core_s=load_core_s, levels=tuple(denoised)),
+    )
 
 
 def _load(scene: Scene) -> Tracer:

@@ -50,7 +50,8 @@ class Knob:
     title: str
     """Heading of its section."""
     covers: tuple[str, ...]
-    """Dotted names of the settings that this curve is about (infra.bench.trade.fields)."""
+    """Dotted names of the settings that this curve is about, as in infra.bench.trade.without_curve;
+    none where the choice is made in the code."""
     cost: str
     """Unit of the cost, in words."""
     error: str
@@ -65,7 +66,9 @@ class Knob:
     """Measures it."""
     also_cost: tuple[str, ...] = ()
     """Further figures that count as costs too: a setting that is cheaper in any of them stays."""
-    needs: tuple[Literal["torch", "checkpoint"], ...] = ()
+    yardstick: str = ""
+    """A row that is no setting, and shows what cannot be told apart: it is not judged."""
+    needs: tuple[Literal["torch"], ...] = ()
     """Without these the knob is left out, with a line that says so."""
 
 
@@ -78,22 +81,33 @@ class JudgedPoint:
     cost_ratio: float
     """Its cost by that of the default."""
     on_front: bool | None
-    """Whether no other setting is at least as good in all and better in something; None without an
-    error."""
+    """Whether no other setting dominates it (`on_front`); None without an error, and for what is no
+    setting."""
 
 
-def on_front(figures: Sequence[Sequence[float]]) -> list[bool]:
-    """Return which of some points no other one dominates; smaller is better in every figure.
+COST_NOISE = 0.03
+"""Costs that differ by less than this share are equal: core-seconds of one run vary by as much."""
+
+
+def on_front(figures: Sequence[tuple[float, Sequence[float]]]) -> list[bool]:
+    """Return which of some points no other one dominates.
+
+    One with less error dominates where none of its costs is more than COST_NOISE higher; one with
+    the same error where none is higher and one is more than COST_NOISE lower. Some point always
+    stays: whoever dominates has less error, or the same and less cost.
 
     Args:
-        figures: of each point, equally many. Of equal points all stay.
+        figures: error (smaller is better) and costs above 0 of each point, equally many.
     """
     return [not any(_dominates(other, mine) for other in figures) for mine in figures]
 
 
-def _dominates(other: Sequence[float], mine: Sequence[float]) -> bool:
-    no_worse = all(a <= b for a, b in zip(other, mine, strict=True))
-    return no_worse and any(a < b for a, b in zip(other, mine, strict=True))
+def _dominates(other: tuple[float, Sequence[float]], mine: tuple[float, Sequence[float]]) -> bool:
+    costs = list(zip(other[1], mine[1], strict=True))
+    if other[0] < mine[0]:
+        return all(a <= (1 + COST_NOISE) * b for a, b in costs)
+    lower = any((1 + COST_NOISE) * a < b for a, b in costs)
+    return other[0] == mine[0] and lower and all(a <= b for a, b in costs)
 
 
 def judged(knob: Knob, curve: Curve) -> list[JudgedPoint]:
@@ -103,7 +117,11 @@ def judged(knob: Knob, curve: Curve) -> list[JudgedPoint]:
         TrilightError: not exactly one point is the default.
     """
     base = default_point(knob, curve)
-    known = [point for point in curve.points if point.error is not None]
+    known = [
+        point
+        for point in curve.points
+        if point.error is not None and point.setting != knob.yardstick
+    ]
     front = on_front([_figures(knob, point) for point in known])
     marks = {point.setting: mark for point, mark in zip(known, front, strict=True)}
     return [
@@ -127,8 +145,8 @@ def default_point(knob: Knob, curve: Curve) -> Point:
     return defaults[0]
 
 
-def _figures(knob: Knob, point: Point) -> list[float]:
-    """Return what a point is judged by, smaller is better."""
+def _figures(knob: Knob, point: Point) -> tuple[float, list[float]]:
+    """Return what a point is judged by: its error, smaller is better, and its costs."""
     assert point.error is not None
     error = -point.error if knob.better == "higher" else point.error
-    return [point.cost, error, *(point.further[name] for name in knob.also_cost)]
+    return error, [point.cost, *(point.further[name] for name in knob.also_cost)]

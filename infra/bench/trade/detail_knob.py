@@ -50,5 +50,7 @@ KNOBS = (
         "before a distance is seen; but every picture of a set is of the very triangles that the "
         "network is given, so this is no error of the labels.",
         measure=measure_detail,
+        needs=("torch",),
+        yardstick=FINEST,
     ),
 )

@@ -1,22 +1,26 @@
 """What geometry costs: triangles of an object and of a scene, against error, picture, network."""
 
 import contextlib
-import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from infra.bench import remeshing
+from infra.bench.assets import CURVE, medians_side
 from infra.bench.trade.curves import Curve, Knob, Point
 from infra.bench.trade.workshop import LARGE, Workshop
 from pipeline.assets.settings import AssetSettings
 from pipeline.flows.make_scene import assets_of
 from pipeline.flows.training_builds import pretrain_256
-from storage.errors import Rejected
+from pipeline.isolation import ChildFailed
+from storage.asset import Asset
+from storage.errors import Rejected, TrilightError
 from storage.seeds import rng_for
 
-BUDGETS = (64, 128, 256, 512, 1024)
+OBJECTS = 2
+"""In the scene that the budget of one object is priced in."""
 PROFILE_BUDGET = 512
 EPSILONS = (None, 0.02, 0.01, 0.005, 0.0025)
 SCENE_BUDGETS = (768, 1024, 1536, 2048, 4096)
@@ -24,8 +28,6 @@ SCENE_BUDGETS = (768, 1024, 1536, 2048, 4096)
 
 def _remeshed(shop: Workshop, sides: Mapping[str, tuple[str, int]]) -> dict[str, dict[str, float]]:
     """Return medians over objects by setting; an object that one side fails on counts for none."""
-    from infra.bench.assets import medians_side
-
     paths = list(shop.sources)
     runs = {
         name: medians_side(shop.mesh_child, paths, method, budget)
@@ -36,22 +38,25 @@ def _remeshed(shop: Workshop, sides: Mapping[str, tuple[str, int]]) -> dict[str,
 
 def measure_budget(shop: Workshop) -> Curve:
     """Measure geometric error at budgets of one object, and the network's time for a scene."""
-    found = _remeshed(shop, {f"{budget}": ("faithful", budget) for budget in BUDGETS})
+    found = _remeshed(shop, {f"{budget}": ("faithful", budget) for budget in CURVE})
+    room = pretrain_256().scenes.max_triangles
+    default = max(budget for budget in CURVE if OBJECTS * budget <= room)
     points = [
         Point(
             setting=f"{budget} triangles",
-            # four objects in a room, as the larger half of the scenes
-            cost=shop.network_core_s(4 * found[f"{budget}"]["faces"]),
+            cost=shop.network_core_s(OBJECTS * found[f"{budget}"]["faces"]),
             error=100 * found[f"{budget}"]["error_p99"],
-            default=budget == BUDGETS[-1],
+            default=budget == default,
             further={
                 "mean error %": 100 * found[f"{budget}"]["error_mean"],
                 "making it, core-ms": 1000 * found[f"{budget}"]["cpu_s"],
             },
         )
-        for budget in BUDGETS
+        for budget in CURVE
     ]
-    words = f"{len(shop.sources)} objects, four in a scene; the network is {shop.effort.network}"
+    words = (
+        f"{len(shop.sources)} objects, {OBJECTS} in a scene; the network is {shop.effort.network}"
+    )
     return Curve(points=tuple(points), measured_on=f"{words}, {shop.effort.network_px} pixels")
 
 
@@ -91,67 +96,100 @@ def prepared(path: Path, epsilon: float | None) -> tuple[float, float, float]:
 
 
 def measure_epsilon(shop: Workshop) -> Curve:
-    """Measure an error bound in place of a budget."""
-    found = []
-    for epsilon in EPSILONS:
-        rows = np.array([shop.mesh_child.call(prepared, path, epsilon) for path in shop.sources])
-        found.append(
-            Point(
-                setting="none" if epsilon is None else f"{100 * epsilon:g} %",
-                cost=float(rows[:, 0].mean()),
-                error=100 * float(np.median(rows[:, 1])),
-                default=epsilon is AssetSettings.epsilon,
-                further={
-                    "largest error %": 100 * float(rows[:, 1].max()),
-                    "making it, core-s": float(rows[:, 2].mean()),
-                },
-            )
+    """Measure an error bound in place of a budget; an object that fails counts for none."""
+    rows = []
+    for path in shop.sources:
+        with contextlib.suppress(Rejected, ChildFailed):
+            rows.append([shop.mesh_child.call(prepared, path, epsilon) for epsilon in EPSILONS])
+    if not rows:
+        raise TrilightError(f"knob epsilon: none of {len(shop.sources)} objects could be prepared.")
+    triangles, errors, core_s = np.moveaxis(np.array(rows), -1, 0)  # each [objects, bounds]
+    points = [
+        Point(
+            setting="none" if epsilon is None else f"{100 * epsilon:g} %",
+            cost=float(triangles[:, column].mean()),
+            error=100 * float(np.median(errors[:, column])),
+            default=epsilon == AssetSettings.epsilon,
+            further={
+                "largest error %": 100 * float(errors[:, column].max()),
+                "making it, core-s": float(core_s[:, column].mean()),
+            },
         )
-    words = f"{len(shop.sources)} objects of {LARGE} faces or more"
+        for column, epsilon in enumerate(EPSILONS)
+    ]
+    words = f"{len(rows)} objects of {LARGE} faces or more"
     return Curve(
-        points=tuple(found), measured_on=f"{words}, at most {AssetSettings.budgets[0]} kept"
+        points=tuple(points), measured_on=f"{words}, at most {AssetSettings.budgets[0]} kept"
     )
 
 
-def budget_errors(max_triangles: int, count: int) -> tuple[float, float, float]:
-    """Return triangles of objects (mean), errors (median, 95th percentile); in a render child."""
-    from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """One scene within a budget."""
+
+    triangles: int
+    """Of the whole scene."""
+    errors: tuple[float, ...]
+    """Of each object: two-way distance, 99th percentile, as a share of the diagonal."""
+
+
+def scene_fits(budgets: tuple[int, ...], count: int) -> list[tuple[Fit, ...]]:
+    """Return what becomes of the objects of scenes within each budget; in a render child.
+
+    Objects are drawn once, as for the largest budget, and a scene that some budget cannot hold is
+    left out: without its hardest scenes, or with simpler objects, a small one would look better.
+    """
+    from pipeline.scenes.budget import drawn_within, least_triangles
     from scene_templates.plans import scene_plan
 
-    settings = dataclasses.replace(pretrain_256().scenes, max_triangles=max_triangles)
-    pool, errors, triangles = assets_of("train"), list[float](), list[int]()
+    settings, pool = pretrain_256().scenes, assets_of("train")
     least = [least_triangles(entry.asset) for entry in pool]
+    found = []
     for index in range(count):
         plan = scene_plan(settings, seed=0, scene_index=index)
-        room = max_triangles - plan.family.shell_triangles - plan.num_lights
+        taken = plan.family.shell_triangles + plan.num_lights
         rng = rng_for(0, "trade-budget", index)
         with contextlib.suppress(Rejected):
-            chosen = drawn_within(rng, pool, least, plan.num_objects, room)
-            levels = levels_within([one.asset for one in chosen], room, settings.enough_error)
-            errors += [level.record.quality.error_p99 for level in levels]
-            triangles.append(max_triangles - room + sum(len(level.faces) for level in levels))
-    return float(np.mean(triangles)), float(np.median(errors)), float(np.percentile(errors, 95))
+            chosen = drawn_within(rng, pool, least, plan.num_objects, max(budgets) - taken)
+            assets = [one.asset for one in chosen]
+            fits = [_fit(assets, taken, budget, settings.enough_error) for budget in budgets]
+            found.append(tuple(fits))
+    return found
+
+
+def _fit(assets: Sequence[Asset], taken: int, budget: int, enough_error: float) -> Fit:
+    from pipeline.scenes.budget import levels_within
+
+    levels = levels_within(assets, budget - taken, enough_error)
+    return Fit(
+        triangles=taken + sum(len(level.faces) for level in levels),
+        errors=tuple(level.record.quality.error_p99 for level in levels),
+    )
 
 
 def measure_scene_budget(shop: Workshop) -> Curve:
-    """Measure what the objects of scenes lose to the budget of a whole scene."""
-    count = shop.effort.composed
-    rows: Sequence[tuple[float, float, float]] = [
-        shop.call(budget_errors, budget, count) for budget in SCENE_BUDGETS
-    ]
-    default = pretrain_256().scenes.max_triangles
-    points = [
-        Point(
-            setting=f"{budget} triangles",
-            cost=shop.network_core_s(triangles),
-            error=100 * high,
-            default=budget == default,
-            further={"median error %": 100 * median, "triangles": triangles},
+    """Measure what objects lose to the budget of a scene, in the scenes that fit into every one."""
+    effort, count = shop.effort, shop.effort.composed
+    scenes: list[tuple[Fit, ...]] = shop.call(scene_fits, SCENE_BUDGETS, count)
+    if not scenes:
+        raise TrilightError(f"knob scene-budget: none of {count} scenes fits into every budget.")
+    default, points = pretrain_256().scenes.max_triangles, []
+    for budget, fits in zip(SCENE_BUDGETS, zip(*scenes, strict=True), strict=True):
+        errors = [error for fit in fits for error in fit.errors]
+        triangles = float(np.mean([fit.triangles for fit in fits]))
+        points.append(
+            Point(
+                setting=f"{budget} triangles",
+                cost=shop.network_core_s(triangles),
+                error=100 * float(np.percentile(errors, 95)),
+                default=budget == default,
+                further={"median error %": 100 * float(np.median(errors)), "triangles": triangles},
+            )
         )
-        for budget, (triangles, median, high) in zip(SCENE_BUDGETS, rows, strict=True)
-    ]
-    words = f"objects drawn for {count} scenes; the network is {shop.effort.network}"
-    return Curve(points=tuple(points), measured_on=f"{words}, {shop.effort.network_px} pixels")
+    words = f"the objects of {len(scenes)} of {count} scenes, the same in every row"
+    dropped = f"{count - len(scenes)} that some budget cannot hold are dropped"
+    network = f"the network is {effort.network}, {effort.network_px} pixels"
+    return Curve(points=tuple(points), measured_on=f"{words}; {dropped}; {network}")
 
 
 _DISTANCE = "two-way distance to the source, 99th percentile, % of the diagonal"
@@ -167,9 +205,11 @@ KNOBS = (
         better="lower",
         against="the cleaned source; median over the objects",
         because="six levels are kept of every object, so the budget is not chosen once: each scene "
-        "takes the finest levels that it can hold. Making them costs milliseconds; what "
-        "triangles cost is the network's time, at every visit.",
+        "takes the finest levels that it can hold, and the table marks the finest of which a scene "
+        f"of 1536 triangles holds {OBJECTS}. Making them costs milliseconds; what triangles cost "
+        "is the network's time, at every visit.",
         measure=measure_budget,
+        needs=("torch",),
     ),
     Knob(
         name="profile",
@@ -207,5 +247,6 @@ KNOBS = (
         "the square, and the worst objects decide what a budget loses. Scenes are not filled "
         "up (`fill_to`): triangles that change no surface cost the network the same.",
         measure=measure_scene_budget,
+        needs=("torch",),
     ),
 )

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from infra.bench.trade.choices import CHOICES
-from infra.bench.trade.curves import JudgedPoint, Knob, default_point, judged
-from infra.bench.trade.figures import shown, shown_error
+from infra.bench.trade.curves import COST_NOISE, JudgedPoint, Knob, default_point, judged
+from infra.bench.trade.figures import FIGURES, shown, shown_error
 from infra.bench.trade.knobs import KNOBS, knob_named
 from infra.bench.trade.saved import SavedCurve, saved_curves
 from infra.bench.trade.without_curve import WITHOUT_CURVE
@@ -30,20 +30,20 @@ def block(folder: Path) -> str:
 
 
 def _head(curves: Mapping[str, SavedCurve]) -> Iterator[str]:
+    percent = f"{100 * COST_NOISE:.0f} %"
     yield "## Every knob: cost against error"
     yield ""
     yield (
         "Written by `trilight bench trade --write-docs` from the results in `docs/bench`; do not "
         "edit it here. Costs are core-seconds unless a table says otherwise; ratios are to the "
         "default of the same knob in the same run. A point is on the front where no other setting "
-        "is at least as good in cost and error and better in one; differences of a few percent "
-        "in core-seconds are noise."
+        f"has less error for at most {percent} more, nor the same error for more than "
+        f"{percent} less: smaller differences in core-seconds are noise. In the figures "
+        "the line is the front, the default is ringed, a triangle at the lower edge has no known "
+        "error, and a cross is no setting."
     )
     for file in sorted({saved.file for saved in curves.values()}):
         saved = next(one for one in curves.values() if one.file == file)
-        figure = file.replace(".json", ".png")
-        yield ""
-        yield f"![Error against cost of the knobs]({'bench/' + figure})"
         yield ""
         yield f"`{file}`: {saved.processor}."
 
@@ -52,6 +52,8 @@ def _section(knob: Knob, saved: SavedCurve | None) -> Iterator[str]:
     yield ""
     yield f"### {knob.title}"
     yield ""
+    names = ", ".join(f"`{name}`" for name in knob.covers)
+    yield f"Settings: {names or 'none, the choice is made in the code'}."
     if saved is None:
         yield f"Not measured yet (`trilight bench trade --knob {knob.name}`)."
         yield ""
@@ -59,7 +61,11 @@ def _section(knob: Knob, saved: SavedCurve | None) -> Iterator[str]:
         return
     way = "more is better" if knob.better == "higher" else "less is better"
     yield f"Cost: {knob.cost}. Error: {knob.error} ({way}), against {knob.against}."
+    if knob.also_cost:
+        yield f"Also a cost: {', '.join(knob.also_cost)}."
     yield f"{saved.curve.measured_on[0].upper()}{saved.curve.measured_on[1:]} ({saved.date})."
+    yield ""
+    yield f"![Error against cost: {knob.title}](bench/{FIGURES}/{knob.name}.png)"
     yield ""
     yield from _table(knob, judged(knob, saved.curve))
     yield ""
@@ -114,7 +120,8 @@ def _choices(curves: Mapping[str, SavedCurve]) -> Iterator[str]:
         if not one.point.default:
             error = f"{error} ({shown_error(knob, base.error)})"
         cost = f"{shown(one.cost_ratio)} x {knob.cost}"
-        yield f"| {choice.need} | {choice.how} | {cost} | {error} {knob.error} |"
+        how = choice.how if one.on_front else f"{choice.how} (not on the front: {choice.despite})"
+        yield f"| {choice.need} | {how} | {cost} | {error} {knob.error} |"
 
 
 def _without_curve() -> Iterator[str]:

@@ -4,9 +4,10 @@ import dataclasses
 
 import numpy as np
 
+from infra.bench.renders.fixed_samples import fixed_samples
 from infra.bench.trade.curves import Curve, Knob, Point
 from infra.bench.trade.render_knobs import points
-from infra.bench.trade.rendered import fixed, shots
+from infra.bench.trade.rendered import shots
 from infra.bench.trade.workshop import Workshop
 from pipeline.renders.settings import RenderSettings
 from storage.metrics import psnr_log_db
@@ -20,7 +21,7 @@ ROULETTE = (2, 3, 5, 8)
 def measure_depth(shop: Workshop) -> Curve:
     """Measure the light that is lost with paths of so many edges."""
     effort = shop.effort
-    base = fixed(effort.resolution, effort.fixed_spp)
+    base = fixed_samples(effort.resolution, effort.fixed_spp)
     variants = {depth: dataclasses.replace(base, max_depth=depth) for depth in (*DEPTHS, DEEPEST)}
     named = {f"{depth}": settings for depth, settings in variants.items()}
     taken = [shop.call(shots, subject.scene, named) for subject in shop.subjects]
@@ -49,7 +50,7 @@ def measure_depth(shop: Workshop) -> Curve:
 
 def measure_roulette(shop: Workshop) -> Curve:
     """Measure the edge from which on paths may end by chance."""
-    base = fixed(shop.effort.resolution, shop.effort.fixed_spp)
+    base = fixed_samples(shop.effort.resolution, shop.effort.fixed_spp)
     variants = {f"{depth}": dataclasses.replace(base, rr_depth=depth) for depth in ROULETTE}
     words = f"{shop.scenes_in_words}, {shop.effort.fixed_spp} samples"
     default = f"{RenderSettings.rr_depth}"

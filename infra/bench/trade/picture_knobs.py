@@ -5,9 +5,10 @@ import time
 
 import numpy as np
 
+from infra.bench.renders.fixed_samples import fixed_samples
 from infra.bench.trade.curves import Curve, Knob, Point
 from infra.bench.trade.render_knobs import to_reference
-from infra.bench.trade.rendered import fixed, shots
+from infra.bench.trade.rendered import shots
 from infra.bench.trade.workshop import Workshop
 from pipeline.flows.training_builds import pretrain_256, smoke
 from storage.metrics import psnr_log_db
@@ -60,12 +61,12 @@ def measure_resolution(shop: Workshop) -> Curve:
 
 def measure_lights(shop: Workshop) -> Curve:
     """Measure one picture against one of every light."""
-    together = fixed(shop.effort.resolution, 64)
+    together = fixed_samples(shop.effort.resolution, 64)
     variants = {
         "one picture": together,
         "one picture of each light": dataclasses.replace(together, per_light=True),
     }
-    found, lights = [], []
+    found = []
     subjects = shop.subjects[:4]
     taken = [(subject, shop.call(shots, subject.scene, variants)) for subject in subjects]
     lights = [sum(entry.kind == "emitter" for entry in s.scene.objects) for s in subjects]
@@ -81,7 +82,7 @@ def measure_lights(shop: Workshop) -> Curve:
             )
         )
     words = f"{len(subjects)} scenes with {np.mean(lights):.1f} lights on average, 64 samples"
-    return Curve(points=tuple(found), measured_on=words)
+    return Curve(points=tuple(found), measured_on=f"{words}, of each light where they are apart")
 
 
 def scene_parts(scene_index: int, resolution: int) -> dict[str, float]:

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import os
 import tempfile
 import time
 from dataclasses import dataclass
@@ -10,12 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from infra.bench.render_child import render_child
+from infra.bench.cycles.child import sampled_scene
+from infra.bench.render_child import asked_child
+from infra.bench.renders.ladder import warm_up_denoiser, warm_up_kernels
+from infra.bench.samples import first_sample
 from infra.bench.trade.curves import Curve, Knob, Point
 from infra.bench.trade.workshop import Workshop
-from pipeline.flows.make_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.flows.settings import BuildSettings
 from pipeline.flows.training_builds import pretrain_256
+from pipeline.renders.settings import RenderSettings
 from storage.changes import changed
 from storage.sample import encode_sample
 
@@ -37,11 +39,7 @@ class SetFigures:
 def packed_sample(build: BuildSettings, scene_index: int) -> SetFigures:
     """Make one sample of a build, attempt after attempt; runs in a render child of it."""
     started = time.process_time()
-    for attempt in range(MAX_ATTEMPTS):
-        sample = attempt_scene("train", scene_index, attempt).sample
-        if sample is not None:
-            break
-    assert sample is not None, "the first scenes of every build pass"
+    sample = first_sample(scene_index)
     members = encode_sample(sample, build.storage.profile)
     return SetFigures(
         core_s=time.process_time() - started,
@@ -85,22 +83,16 @@ def measure_pipeline(shop: Workshop) -> Curve:
 def _made(build: BuildSettings, shop: Workshop) -> list[SetFigures]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        threads = os.cpu_count() or 1
-        child = render_child(folder, build, objects=shop.options.objects[0], threads=threads)
+        child = asked_child(folder, build, shop.options)
         stack.enter_context(contextlib.closing(child))
-        cheap = dataclasses.replace(build.renders, max_spp=build.renders.min_spp)
-        child.call(warm_up, dataclasses.replace(build, renders=cheap))
+        child.call(warm_up, build.renders)
         return [child.call(packed_sample, build, index) for index in range(shop.effort.scenes)]
 
 
-def warm_up(build: BuildSettings) -> None:
+def warm_up(renders: RenderSettings) -> None:
     """Compile the kernels, in a render child: a run does it once for hundreds of scenes."""
-    from infra.bench.cycles.child import sampled_scene
-    from pipeline.renders.renderer import SceneRenderer
-
-    scene = sampled_scene(0)
-    settings = dataclasses.replace(build.renders, min_mean_radiance=0.0)
-    SceneRenderer(scene, settings).render_view(scene.c2w[0], float(scene.fov_deg[0]), 0)
+    warm_up_kernels(sampled_scene(0), dataclasses.replace(renders, min_mean_radiance=0.0))
+    warm_up_denoiser(renders.resolution)
 
 
 KNOBS = (

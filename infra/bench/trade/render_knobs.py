@@ -5,8 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from infra.bench.renders.fixed_samples import fixed_samples
 from infra.bench.trade.curves import Curve, Knob, Point
-from infra.bench.trade.rendered import Shot, fixed, shots
+from infra.bench.trade.rendered import Shot, shots
 from infra.bench.trade.workshop import Subject, Workshop
 from pipeline.flows.training_builds import pretrain_256, smoke
 from pipeline.renders.settings import RenderSettings
@@ -60,7 +61,9 @@ def measure_samples(shop: Workshop) -> Curve:
     """Measure fixed numbers of samples, by denoiser."""
     effort = shop.effort
     variants = {
-        f"{spp}, {denoiser}": dataclasses.replace(fixed(effort.resolution, spp), denoiser=denoiser)
+        f"{spp}, {denoiser}": dataclasses.replace(
+            fixed_samples(effort.resolution, spp), denoiser=denoiser
+        )
         for denoiser in ("off", "fast", "high")
         for spp in _doublings(32, effort.max_spp)
     }
@@ -108,7 +111,7 @@ def measure_first_samples(shop: Workshop) -> Curve:
 
 def measure_guides(shop: Workshop) -> Curve:
     """Measure the samples of the pictures that guide the denoiser."""
-    base = fixed(shop.effort.resolution, shop.effort.fixed_spp)
+    base = fixed_samples(shop.effort.resolution, shop.effort.fixed_spp)
     variants = {f"{spp}": dataclasses.replace(base, aux_spp=spp) for spp in (4, 16, 64)}
     words = f"{shop.scenes_in_words}, {shop.effort.fixed_spp} samples"
     return Curve(points=points(shop, variants, f"{base.aux_spp}"), measured_on=words)

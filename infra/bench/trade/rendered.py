@@ -1,11 +1,10 @@
 """What a render child does for the knobs: one view under many settings, each with its price."""
 
-import dataclasses
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from infra.bench.renders.ladder import RememberingRenderer, warm_up_denoiser
+from infra.bench.renders.ladder import RememberingRenderer, warm_up_denoiser, warm_up_kernels
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from storage.lights import encode_lights_exr
@@ -13,10 +12,7 @@ from storage.profiles import pack_picture
 from storage.scene import Scene
 
 SEED = 20_261_122
-_SMALL = 32
-"""Pixels each way of what only compiles."""
-_NEVER_DB = 99.0
-"""A floor that no picture reaches, so that every one takes the samples that are asked for."""
+"""Of pictures and of scenes that are drawn here: no build and no run has it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,17 +27,6 @@ class Shot:
     """In the profile `compact`, with the pictures of single lights where there are any."""
 
 
-def fixed(resolution: int, spp: int) -> RenderSettings:
-    """Return the settings of a picture with a fixed number of samples."""
-    return RenderSettings(
-        resolution=resolution,
-        noise_floor_db=_NEVER_DB,
-        min_spp=spp,
-        max_spp=spp,
-        min_mean_radiance=0.0,
-    )
-
-
 def shots(scene: Scene, variants: Mapping[str, RenderSettings]) -> dict[str, Shot]:
     """Return a scene's first view under each setting, with equal seeds; runs in a render child.
 
@@ -52,23 +37,17 @@ def shots(scene: Scene, variants: Mapping[str, RenderSettings]) -> dict[str, Sho
     for name, settings in variants.items():
         key = (settings.max_depth, settings.rr_depth, settings.resolution)
         if settings.per_light:
-            _warm_up(scene, settings)
+            warm_up_kernels(scene, settings)
             found[name] = _alone(scene, settings)
             continue
         if key not in renderers:
-            _warm_up(scene, settings)
+            warm_up_kernels(scene, settings)
             renderers[key] = RememberingRenderer(scene, settings)
         if settings.denoiser != "off":
             warm_up_denoiser(settings.resolution, settings.denoiser)
         view, core_s = renderers[key].timed_view(SEED, settings)
         found[name] = _shot(view, core_s)
     return found
-
-
-def _warm_up(scene: Scene, settings: RenderSettings) -> None:
-    """Compile: kernels depend on the depth, not on the resolution."""
-    small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
-    SceneRenderer(scene, small).render_view(scene.c2w[0], float(scene.fov_deg[0]), SEED)
 
 
 def _alone(scene: Scene, settings: RenderSettings) -> Shot:

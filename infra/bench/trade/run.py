@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from infra.bench.harness import Options, Result, machine
 from infra.bench.renders.kept import Kept
 from infra.bench.trade.curves import Curve, Knob, judged
+from infra.bench.trade.engine_knob import NAME as ENGINES
 from infra.bench.trade.figures import plot as plot
 from infra.bench.trade.figures import shown, shown_error
 from infra.bench.trade.knobs import KNOBS, knob_named
@@ -44,17 +45,18 @@ def run(options: Options, round_done: Callable[[], None]) -> Trade:
     """Measure; quickly four scenes and few samples, otherwise twelve.
 
     Raises:
-        TrilightError: no such knob.
+        TrilightError: no such knob, or no such checkpoint.
     """
     chosen = _chosen(options)
     effort = QUICK if options.quick else CAREFUL
     here = machine()
-    asked = {"checkpoint": options.checkpoint, **dataclasses.asdict(effort)}
-    kept = Kept(_name(options), {**here, **asked}, resume=options.resume)
+    plan = {"machine": here, "asked": _asked(options), "effort": dataclasses.asdict(effort)}
+    kept_name = _name(options) + ("-quick" if options.quick else "")
+    kept = Kept(kept_name, plan, resume=options.resume)
     skipped, curves, seconds = {}, {}, {}
     with closing(Workshop(effort, options)) as shop:
         for knob in chosen:
-            lack = _lack(knob, options)
+            lack = _lack(knob)
             if lack:
                 skipped[knob.name] = lack
             else:
@@ -63,6 +65,19 @@ def run(options: Options, round_done: Callable[[], None]) -> Trade:
             round_done()
     kept.forget()
     return Trade(name=_name(options), machine=here, curves=curves, skipped=skipped, seconds=seconds)
+
+
+def _asked(options: Options) -> dict[str, object]:
+    """Return what the user says and the curves depend on; opens the network, wherever it is."""
+    asked: dict[str, object] = {
+        "objects": options.objects,
+        "allowed_licences": options.allowed_licences,
+    }
+    if any(knob.name == ENGINES and not _lack(knob) for knob in _chosen(options)):
+        from model.neural_renderer import NeuralRenderer
+
+        asked["checkpoint"] = NeuralRenderer.load(options.checkpoint, device="cpu").digest
+    return asked
 
 
 def _record(knob: Knob, shop: Workshop) -> dict[str, object]:
@@ -84,11 +99,9 @@ def _name(options: Options) -> str:
     return "-".join([NAME, *(knob.name for knob in _chosen(options) if options.knobs)])
 
 
-def _lack(knob: Knob, options: Options) -> str:
+def _lack(knob: Knob) -> str:
     if "torch" in knob.needs and importlib.util.find_spec("torch") is None:
         return "torch is not installed; run `make setup-all`"
-    if "checkpoint" in knob.needs and options.checkpoint is None:
-        return "no --checkpoint was given"
     return ""
 
 

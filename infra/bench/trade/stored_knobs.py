@@ -6,9 +6,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from infra.bench.renders.fixed_samples import fixed_samples
 from infra.bench.shard_pictures import codecs, picture_side
 from infra.bench.trade.curves import Curve, Knob, Point
-from infra.bench.trade.rendered import fixed, shots
+from infra.bench.trade.rendered import shots
 from infra.bench.trade.workshop import Workshop
 from storage.conventions import DIFFUSE, SPECULAR
 from storage.metrics import psnr_log_db
@@ -95,7 +96,7 @@ def _kilobytes(scene: Scene, in_half: tuple[str, ...]) -> float:
 
 def measure_arrays(shop: Workshop) -> Curve:
     """Measure what rounding the arrays of a scene saves, and what its picture loses."""
-    settings = {"view": fixed(shop.effort.resolution, shop.effort.fixed_spp)}
+    settings = {"view": fixed_samples(shop.effort.resolution, shop.effort.fixed_spp)}
     sizes: dict[str, list[float]] = {name: [] for name in PRECISIONS}
     errors: dict[str, list[float]] = {name: [] for name in PRECISIONS}
     for subject in shop.subjects:

@@ -88,9 +88,16 @@ _BY_REASON: tuple[tuple[str, tuple[str, ...]], ...] = (
         "One of the changes of the table of small trainings (infra.bench.training_table), which "
         "judges it by the held-out error of whole trainings.",
         (
-            *_named("train.augmentation.", "rotation mirror channels vertex_order light_scale"),
+            *_named("train.augmentation.", "rotation mirror channels vertex_order"),
+            *_named("train.", "learning_rate warmup_steps final_rate_share betas"),
+        ),
+    ),
+    (
+        "A change of that table that was not run yet.",
+        (
+            "train.augmentation.light_scale",
             *_named("train.loss.", "perceptual perceptual_weight noise_half"),
-            *_named("train.", "learning_rate warmup_steps final_rate_share betas ema_decay"),
+            "train.ema_decay",
         ),
     ),
     (

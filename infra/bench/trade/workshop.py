@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.assets import object_records
+from infra.bench.assets import clean_sizes, object_records
 from infra.bench.harness import Options
 from infra.bench.render_child import smoke_child
 from infra.bench.renders.named_set import named_set
 from infra.bench.renders.references import make_reference
-from pipeline.flows.make_scene import assets_of
 from pipeline.isolation import ChildLimits, IsolatedChild, preload
+from storage.errors import TrilightError
+from storage.safe_url import safe_url
 from storage.scene import Scene
 
 if TYPE_CHECKING:
@@ -98,11 +99,6 @@ LARGE = 1100
 """Clean faces of a source that is decimated, so that most budgets take something away."""
 
 
-def faces_by_uid() -> dict[str, int]:
-    """Return the clean faces of each training object, in a render child."""
-    return {one.locked.uid: one.asset.source.num_faces for one in assets_of("train")}
-
-
 def _nothing() -> None:
     """The fork server has imported everything already."""
 
@@ -111,8 +107,6 @@ def _nothing() -> None:
 class Subject:
     """One scene with what its first view should look like."""
 
-    name: str
-    """In the named set."""
     scene: Scene
     """With one camera."""
     reference_rgb: NDArray[np.float32]
@@ -149,24 +143,27 @@ class Workshop:
 
     @functools.cached_property
     def sources(self) -> tuple[Path, ...]:
-        """Files of objects of LARGE faces or more, the largest first."""
-        paths = {record.uid: record.path for record in object_records(self.options)}
-        faces = self.call(faces_by_uid)
-        large = sorted((-faces[uid], uid) for uid in faces if faces[uid] >= LARGE and uid in paths)
-        return tuple(Path(paths[uid]) for _, uid in large[: self.effort.objects])
+        """Files of objects of LARGE faces or more, the largest first; TrilightError for none."""
+        sizes = clean_sizes(self.mesh_child, object_records(self.options))
+        large = [path for path, faces in sizes.items() if faces >= LARGE]
+        if not large:
+            raise TrilightError(
+                f"objects {', '.join(map(safe_url, self.options.objects))}: none of {len(sizes)} "
+                f"usable ones has {LARGE} faces; expected at least one, to be made coarser."
+            )
+        return tuple(large[: self.effort.objects])
 
     @functools.cached_property
     def subjects(self) -> tuple[Subject, ...]:
-        """Scenes from all over the named set."""
+        """Scenes from all over the named set, whose references and words are published."""
         from train.data.resolution import block_mean
 
-        every = named_set(self.options.scenes)
+        every = named_set(None)
         chosen = [
             every[row * len(every) // self.effort.scenes] for row in range(self.effort.scenes)
         ]
         return tuple(
             Subject(
-                name=named.name,
                 scene=named.make(self.child),
                 reference_rgb=block_mean(
                     make_reference(named, self.child).radiance_rgb[None], self.effort.resolution

@@ -1,9 +1,15 @@
-"""At which number of samples a path tracer is as good as something else, and what that takes."""
+"""At which number of samples a path tracer is as good as something else, and what that takes.
+
+Of one picture, or of the worst of many with costs shared out: the sums are the same.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
+
+Bound = Literal["exactly", "at most", "more than"]
+"""`at most` where the cheapest is better already, `more than` where none is as good."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,8 +28,8 @@ class Priced:
 class EqualError:
     """The path tracer at the error of another picture."""
 
-    bound: Literal["exactly", "at most", "more than"]
-    """`at most` where its cheapest picture is better already, `more than` where none is as good."""
+    bound: Bound
+    """Whether it has that error."""
     spp: float
     """Samples per pixel, between measured levels."""
     core_s: float
@@ -45,7 +51,8 @@ def at_error(levels: Sequence[Priced], db: float) -> EqualError:
         return EqualError(bound="more than", spp=levels[-1].spp, core_s=levels[-1].core_s)
     above = levels[row]
     if row == 0:
-        return EqualError(bound="at most", spp=above.spp, core_s=above.core_s)
+        bound: Bound = "exactly" if above.db == db else "at most"
+        return EqualError(bound=bound, spp=above.spp, core_s=above.core_s)
     below = levels[row - 1]
     share = (db - below.db) / (above.db - below.db)
     spp = below.spp * 2 ** (share * math.log2(above.spp / below.spp))
