@@ -2,7 +2,7 @@
 
 Scenes differ in cost by orders of magnitude (a hard view takes a hundred times the samples of an
 easy one), so a mean of few has a wide interval: it is the bootstrap's, from the measured scenes.
-The scenes are the first ones of the dataset itself, of its own distribution.
+The scenes are the first ones of the dataset itself, in its own shards and splits.
 """
 
 import dataclasses
@@ -21,10 +21,12 @@ from pipeline.flows.make_task import ShardJob, close_children, make_task
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.pieces import MOST_TASKS, TASK_S, Piece
 from pipeline.flows.settings import BuildSettings
-from storage.manifest import ShardEntry
-from storage.scene_log import read_scene_logs
+from storage.layout import DatasetFolder
+from storage.manifest import index_shard
+from storage.sample import sample_key
 from storage.seeds import rng_for
-from storage.splits import planned_scenes, shards_for
+from storage.splits import planned_scenes, shard_name, shards_for
+from storage.staging import read_staged_scene
 
 _DRAWS = 2000
 _BYTES_PER_TASK_RUN = 16_000
@@ -56,9 +58,9 @@ class MeasuredScenes:
     """What some scenes took."""
 
     core_s: tuple[float, ...]
-    """Core-seconds of each."""
+    """Core-seconds of each, in the order in which they were made."""
     num_bytes: tuple[int, ...]
-    """Bytes of each."""
+    """Bytes of each, in the same order."""
     num_views: int
     """Views of a scene."""
 
@@ -108,9 +110,8 @@ def measure_scenes(
     Raises:
         TrilightError: as `prepare_dataset`.
     """
-    alone = {**order.changes, "splits.scenes_per_shard": 1}  # so that each has a size of its own
     with tempfile.TemporaryDirectory(prefix="trilight-plan-") as place:
-        run = prepare_dataset(dataclasses.replace(order, out=place, scenes=count, changes=alone))
+        run = prepare_dataset(dataclasses.replace(order, out=place, scenes=count))
         job = ShardJob(
             folder=run.publication.folder,
             settings=run.settings,
@@ -119,17 +120,19 @@ def measure_scenes(
             lock_sha256=run.publication.manifest.objects_lock_sha256,
             num_at_once=1,
         )
-        sizes = []
+        splits = run.settings.splits
+        core_s, sizes = [], []
         try:
             for scene in range(count):
-                made = make_task(job, (Piece(shard_index=scene, first=scene, last=scene + 1),))
-                sizes += [_tar_bytes(shard) for shard in made.shards]
+                shard = scene // splits.scenes_per_shard
+                made = make_task(job, (Piece(shard_index=shard, first=scene, last=scene + 1),))
+                core_s.append(made.core_s)
+                sizes.append(_scene_bytes(job.folder, shard_name(shard, splits), scene))
                 scene_done()
         finally:
             close_children()
-        core_s = tuple(row.seconds * row.cores for row in read_scene_logs(job.folder))
     return MeasuredScenes(
-        core_s=core_s, num_bytes=tuple(sizes), num_views=run.settings.scenes.num_views
+        core_s=tuple(core_s), num_bytes=tuple(sizes), num_views=run.settings.scenes.num_views
     )
 
 
@@ -191,9 +194,18 @@ def _settings(order: DatasetOrder) -> BuildSettings:
     )
 
 
-def _tar_bytes(shard: ShardEntry) -> int:
-    """Return what members add to a tar: a header each, and their bytes in blocks of 512."""
-    return sum(512 + -(-num_bytes // 512) * 512 for _, _, num_bytes in shard.members)
+def _scene_bytes(folder: DatasetFolder, shard: str, scene: int) -> int:
+    """Return what a scene adds to its shard: a header for each member, its bytes in blocks of 512.
+
+    The last scene of a shard is packed already, and the others wait for it.
+    """
+    if folder.shard(shard).exists():
+        members = index_shard(folder.shard(shard)).index.get(sample_key(scene), {})
+        sizes = [num_bytes for _, num_bytes in members.values()]
+    else:
+        staged = read_staged_scene(folder.staged_shard(shard), scene)
+        sizes = [len(member) for member in staged.members.values()]
+    return sum(512 + -(-num_bytes // 512) * 512 for num_bytes in sizes)
 
 
 def _total(each: Sequence[float], times: float) -> Interval:

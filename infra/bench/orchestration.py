@@ -64,14 +64,14 @@ def run(options: Options, round_done: Callable[[], None]) -> Orchestration:
     sleep_s, count = (10.0, 2 * WINDOW) if options.quick else (60.0, 3 * WINDOW)
     quiet_prefect()
     with prefect_server():
-        sleeping = _sleeping_flow()
+        sleeping = sleeping_flow()
         idle_cores = _cores_of_server(_IDLE_S)
         round_done()
-        sleeping(0.0, WINDOW)  # imports, connections
-        slept_s = _timed(lambda: sleeping(sleep_s, count))
+        sleeping(0.0, WINDOW, WINDOW)  # imports, connections
+        slept_s = timed(lambda: sleeping(sleep_s, count, WINDOW))
         round_done()
         before = _recorded()
-        noop_s = _timed(lambda: sleeping(0.0, MOST_TASKS))
+        noop_s = timed(lambda: sleeping(0.0, MOST_TASKS, WINDOW))
         recorded_s, recorded = _until_recorded(before + MOST_TASKS)
         round_done()
         return Orchestration(
@@ -89,8 +89,11 @@ def run(options: Options, round_done: Callable[[], None]) -> Orchestration:
         )
 
 
-def _sleeping_flow() -> Callable[[float, int], None]:
-    """Return a flow of tasks that sleep; Prefect is imported when its server is up."""
+def sleeping_flow() -> Callable[[float, int, int], None]:
+    """Return a flow of tasks that sleep, called with seconds of each, their number and the window.
+
+    They are handed out as `PrefectRunner` does. Prefect is imported when its server is up.
+    """
     from prefect import flow, task
 
     @task(name="pause", persist_result=False)
@@ -98,13 +101,13 @@ def _sleeping_flow() -> Callable[[float, int], None]:
         time.sleep(seconds)
 
     @flow(name="bench-orchestration", persist_result=False)
-    def tasks_of(seconds: float, number: int) -> None:
+    def tasks_of(seconds: float, number: int, window: int) -> None:
         for _ in in_window(
             range(number),
             submit=lambda _: pause.submit(seconds),
             first_done=_first_done,
             result=lambda future: future.result(),
-            window=WINDOW,
+            window=window,
         ):
             pass
 
@@ -153,7 +156,8 @@ def _first_done(running: Iterable[Any]) -> Any:
     return next(iter(as_completed(list(running))))
 
 
-def _timed(call: Callable[[], None]) -> float:
+def timed(call: Callable[[], None]) -> float:
+    """Return the seconds that a call takes."""
     started = time.perf_counter()
     call()
     return time.perf_counter() - started

@@ -53,7 +53,8 @@ def bench(
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help="render: frontier, throughput, cost; model: cases, growth; may be repeated [all]"
+            help="render: frontier, throughput, cost; model: cases, growth; orchestration: "
+            "overhead, workers; may be repeated [all]"
         ),
     ] = None,
     scenes: Annotated[
@@ -159,9 +160,10 @@ def _named(name: str) -> list[_Benchmark[Any]]:
     if name == "model":
         return _model_parts()
     if name == "orchestration":
-        from infra.bench import orchestration
+        from infra.bench import orchestration, workers
 
-        return [_whole(orchestration, orchestration)]
+        overhead = _whole(orchestration, orchestration, "overhead")
+        return [overhead, _whole(workers, workers, "workers")]
     if name == "render":
         return _render_parts()
     if name == "scenes":

@@ -28,6 +28,8 @@ RUN apt-get update \
     && install --directory --owner trilight /data /cache
 COPY --from=build --chown=root:root /opt/venv /opt/venv
 COPY --from=build --chown=root:root /opt/trilight /opt/trilight
+# what is called data/mine goes to the volume, whoever runs it
+RUN ln --symbolic /data /opt/trilight/data
 ENV PATH="/opt/venv/bin:$PATH" TRILIGHT_CACHE=/cache DO_NOT_TRACK=1 PYTHONUNBUFFERED=1 \
     NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics
 USER 10001

@@ -12,6 +12,8 @@ from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry
 from storage.objects_lock import encode_objects_lock
 from storage.records import LockedObject
+from storage.remote.bucket import Bucket
+from storage.remote.url import RemoteUrl, parse_url
 from storage.splits import SplitSettings, shard_name
 
 
@@ -93,7 +95,8 @@ def begin_dataset(
     Call while taking part in the folder (`joined`).
 
     Raises:
-        TrilightError: as `begin`; the bucket cannot be listed, read or written.
+        TrilightError: as `begin`; the bucket cannot be listed, read or written, or its server
+            would let two makers create the same file.
     """
 
     def begun() -> Publication:
@@ -107,6 +110,9 @@ def begin_dataset(
     names = mirror.names()
     if "manifest.json" not in names:
         require_free(folder, names)
+        url = parse_url(folder.bucket, what="out")
+        assert isinstance(url, RemoteUrl)
+        Bucket(url).require_create()
     publication = begun()
     if "manifest.json" not in names and not mirror.begin():  # another machine was first
         mirror.adopt()

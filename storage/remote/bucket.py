@@ -18,6 +18,8 @@ WRITABLE = ("s3", "gs")
 _PART_BYTES = 32 << 20
 _PARTS_AT_ONCE = 4
 """Together they bound what an upload holds in memory."""
+_PROBE = ".staging/once"
+"""Says whether the server creates a file only once; it may stay."""
 
 
 class Bucket:
@@ -71,6 +73,16 @@ class Bucket:
             return True
 
         return self._tried(put, "written")
+
+    def require_create(self) -> None:
+        """Raise TrilightError where the server writes a file again that it was to create once."""
+        if self.create(_PROBE, b"\n") and self.create(_PROBE, b"\n"):
+            raise TrilightError(
+                f"{self.url.what} {self.url.shown!r}: the server does not know conditional writes "
+                "(If-None-Match, or ifGenerationMatch), so two makers could replace each other's "
+                "files; expected one that refuses to create a file twice. Use another server, or "
+                "a folder."
+            )
 
     def _put(self, name: str, content: Path | bytes, *, mode: str) -> None:
         driver, target = shared_driver(self.url), self.url.child(name).root

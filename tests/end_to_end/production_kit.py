@@ -69,6 +69,15 @@ class Postgres:
     def stop(self) -> None:
         self._run("pg_ctl", "stop", "--mode", "immediate", "--pgdata", str(self.folder / "db"))
 
+    def dump(self) -> str:
+        """Return every row of every table of Prefect's, as SQL."""
+        where = ["--host", "127.0.0.1", "--port", str(self.port), "--username", "me"]
+        done = subprocess.run(
+            [_tools("pg_dump")[0], *where, "--data-only", "prefect"],
+            check=True, timeout=START_S, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+        )  # fmt: skip
+        return done.stdout
+
     def _run(self, *arguments: str) -> None:
         tool = next(iter(_tools(arguments[0])), arguments[0])
         subprocess.run(

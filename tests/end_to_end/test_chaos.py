@@ -1,10 +1,12 @@
 """Seeded kills of everything that takes part, and a database that goes away: still one digest."""
 
 import contextlib
+import json
 import os
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,7 +29,9 @@ WORDS = {
 }
 """By what a process is known among those that carry the test's mark."""
 SHARES = {"child": 0.5, "flow": 0.3, "worker": 0.1, "server": 0.1}
-"""A worker or server takes half a minute to come back."""
+"""Of the victims after one of each kind; a worker or server takes half a minute to come back."""
+LOOK_S = 0.1
+"""Between two looks for a victim that is not there yet, such as a child of a flow that starts."""
 RUN_S = 600
 
 
@@ -39,19 +43,25 @@ def _parameters(out: Path) -> list[str]:
 
 
 def _kill_one(kind: str, mark: str, rng: np.random.Generator) -> bool:
-    """Kill one process of a kind, if there is any."""
+    """Kill one living process of a kind; say whether there was any."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            carries = mark.encode() in (folder / "environ").read_bytes()
+            carries = mark.encode() in (folder / "environ").read_bytes()  # the dead have none
             line = (folder / "cmdline").read_bytes().replace(b"\0", b" ")
             if carries and WORDS[kind].encode() in line:
                 found.append(int(folder.name))
-    if not found:
-        return False
-    with contextlib.suppress(ProcessLookupError):
+    try:
         os.kill(int(rng.choice(sorted(found))), signal.SIGKILL)
+    except (ValueError, ProcessLookupError):  # nobody to choose from, or just ended
+        return False
     return True
+
+
+def _next_kind(killed: Counter[str], rng: np.random.Generator) -> str:
+    """Return each kind once, those that only work brings first, and then kinds by their shares."""
+    left = [kind for kind in SHARES if not killed[kind]]
+    return left[0] if left else str(rng.choice(list(SHARES), p=list(SHARES.values())))
 
 
 @contextlib.contextmanager
@@ -92,17 +102,20 @@ def test_kills_of_everything_end_in_the_same_digest(tmp_path: Path) -> None:
         _watched(out, tmp_path / "whole") as wrong,
         served(tmp_path, database.url, 1, marked) as environment,
     ):
-        killed = 0
-        while killed < KILLS:
+        killed: Counter[str] = Counter()
+        while killed.total() < KILLS:
             call(run, environment, RUN_S)
             deadline = time.monotonic() + 60  # then what was killed may not have been the flow
-            while killed < KILLS and time.monotonic() < deadline:
-                time.sleep(rng.uniform(0.5, 6.0))
-                kind = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+            pause_s = rng.uniform(0.5, 6.0)
+            while killed.total() < KILLS and time.monotonic() < deadline:
+                time.sleep(pause_s)
+                kind = _next_kind(killed, rng)
                 if not _kill_one(kind, mark, rng):
+                    pause_s = LOOK_S
                     continue
-                killed += 1
-                if killed == KILLS // 2:
+                killed[kind] += 1
+                pause_s = rng.uniform(0.5, 6.0)
+                if killed.total() == KILLS // 2:
                     database.stop()
                     time.sleep(rng.uniform(1.0, 5.0))
                     database.start()
@@ -118,9 +131,17 @@ def test_kills_of_everything_end_in_the_same_digest(tmp_path: Path) -> None:
     assert not wrong
     assert open_dataset(str(out)).digest == expected
     assert verify_dataset(out).problems == []
-    rows = [line for path in (out / "logs").iterdir() for line in path.open()]
-    assert SCENES <= len(rows) <= SCENES + KILLS  # one scene in flight at each kill, at most
+    assert set(killed) >= set(list(SHARES)[:KILLS]), killed  # a kill is too few to be of each kind
+    _nothing_was_made_twice(out)
     _wait_until_nobody_is_left(mark)
+
+
+def _nothing_was_made_twice(out: Path) -> None:
+    """A scene gets its row after it was staged for good: one in flight at a kill has none yet, and
+    the kill may come between the two, so that at most one row for each kill is missing."""
+    rows = [json.loads(line)["scene"] for path in (out / "logs").iterdir() for line in path.open()]
+    assert [scene for scene, number in Counter(rows).items() if number > 1] == []
+    assert SCENES - KILLS <= len(rows) <= SCENES
 
 
 def _wait_until_nobody_is_left(mark: str) -> None:

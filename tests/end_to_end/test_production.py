@@ -10,14 +10,17 @@ import pytest
 from model.neural_renderer import NeuralRenderer
 from storage.dataset import open_dataset
 from storage.verify import verify_dataset
-from tests.end_to_end.production_kit import call, dask_cluster, postgres, served
+from tests.end_to_end.production_kit import Postgres, call, dask_cluster, postgres, served
 
-SMALL = {"objects": "builtin:", "scenes": "12", "resolution": "64", "noise_floor_db": "20"}
-"""Three shards of four tiny scenes, as wide as the smoke run's pictures."""
-OPTIONS = ("--objects", "builtin:", "--scenes", "12", "--resolution", "64", "--noise-floor", "20")
+MANY, FEW = 40, 12
+"""Scenes, four to a shard: so many that a second worker, which looks for work every ten seconds and
+then starts a process, comes before the first has made them all; and three shards."""
+SMALL = {"objects": "builtin:", "scenes": str(MANY), "resolution": "64", "noise_floor_db": "20"}
+"""Tiny scenes, as wide as the smoke run's pictures."""
+OPTIONS = ("--objects", "builtin:", "--resolution", "64", "--noise-floor", "20")
 CANARY = "CANARY-51b2"
 RUN_S = 900
-"""A run takes half a minute; on busy machines many times that."""
+"""A run takes a minute; on busy machines many times that."""
 
 
 def _run_deployment(name: str, out: Path, environment: dict[str, str], **more: str) -> str:
@@ -27,8 +30,9 @@ def _run_deployment(name: str, out: Path, environment: dict[str, str], **more: s
     return call(prefect, environment, RUN_S)
 
 
-def _generate(out: Path, *more: str) -> None:
-    call(["-m", "infra.cli.app", "generate", "smoke", *OPTIONS, "--out", str(out), *more],
+def _generate(out: Path, scenes: int, *more: str) -> None:
+    size = (*OPTIONS, "--scenes", str(scenes))
+    call(["-m", "infra.cli.app", "generate", "smoke", *size, "--out", str(out), *more],
          dict(os.environ), RUN_S)  # fmt: skip
 
 
@@ -41,19 +45,26 @@ def _verified(out: Path) -> str:
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_four_ways_one_digest(tmp_path: Path) -> None:
-    _generate(tmp_path / "plain")
+    _generate(tmp_path / "plain", MANY)
     digests = {"plain": _verified(tmp_path / "plain")}
     with postgres() as database, served(tmp_path, database.url, workers=2) as environment:
         _run_deployment("generate-scenes/local", tmp_path / "one", environment)
         digests["one worker"] = _verified(tmp_path / "one")
         _run_deployment("build-dataset/local", tmp_path / "two", environment, flow_runs="2")
         digests["two workers"] = _verified(tmp_path / "two")
+        assert len(_makers(tmp_path / "two")) >= 2
         _trains(tmp_path, environment)
-        _refuses_secrets(tmp_path, environment)
+        _refuses_secrets(tmp_path, environment, database)
     with dask_cluster(tmp_path, 2) as address:
-        _generate(tmp_path / "dask", "--runner", "dask", "--address", address)
+        _generate(tmp_path / "dask", MANY, "--runner", "dask", "--address", address)
         digests["dask"] = _verified(tmp_path / "dask")
+    assert len(_makers(tmp_path / "dask")) >= 2
     assert len(set(digests.values())) == 1, digests
+
+
+def _makers(out: Path) -> set[int]:
+    """Return the processes that made scenes of a dataset."""
+    return {json.loads(line)["pid"] for path in (out / "logs").iterdir() for line in path.open()}
 
 
 def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
@@ -76,13 +87,18 @@ def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
     assert NeuralRenderer.load(tmp_path / "run").trained.resolution == 64
 
 
-def _refuses_secrets(tmp_path: Path, environment: dict[str, str]) -> None:
-    """Neither the database's log nor ours ever sees what was refused, and the rest names it."""
+def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Postgres) -> None:
+    """Neither the database, its log nor ours ever sees what was refused, and the rest names it."""
     with pytest.raises(AssertionError, match="Validation failed for field 'objects'"):
         _run_deployment(
             "generate-scenes/local", tmp_path / "no", environment,
             objects=f"https://me:{CANARY}@host/folder",
         )  # fmt: skip
+    rows = database.dump()
+    assert str(tmp_path / "one") in rows  # parameters are in what is looked through, and so are
+    assert "packed, 4 scenes" in rows  # the lines of logs
+    assert CANARY not in rows
+    assert CANARY not in (database.folder / "log").read_text()
     for place in (tmp_path / "state", tmp_path / "prefect"):
         for path in place.rglob("*"):
             assert not path.is_file() or CANARY.encode() not in path.read_bytes(), path
@@ -93,13 +109,14 @@ def test_ranges_at_the_same_time_and_who_is_last_finishes(tmp_path: Path) -> Non
     import subprocess
 
     command = [sys.executable, "-m", "infra.cli.app", "generate", "smoke", *OPTIONS]
+    command += ["--scenes", str(FEW)]
     runs = [
         subprocess.Popen([*command, "--out", str(tmp_path / "set"), "--shards", shards])
         for shards in ("0:2", "1:3")
     ]
     assert [run.wait(RUN_S) for run in runs] == [0, 0]
-    _generate(tmp_path / "plain")
+    _generate(tmp_path / "plain", FEW)
     assert _verified(tmp_path / "set") == _verified(tmp_path / "plain")
     # nothing was made twice
     rows = [line for path in (tmp_path / "set" / "logs").iterdir() for line in path.open()]
-    assert len(rows) == 12
+    assert len(rows) == FEW

@@ -1,14 +1,18 @@
 """Images and manifests cannot be built or applied here: they are linted, validated and compared."""
 
+import asyncio
 import json
 import subprocess
 import sys
+import uuid
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from prefect.client.schemas.objects import FlowRun
 
+from pipeline.flows.served.orders import DatasetInRuns
 from tests.conftest import ROOT
 
 IMAGES, MANIFESTS = ROOT / "infra" / "images", ROOT / "infra" / "kubernetes"
@@ -46,7 +50,8 @@ def test_manifests_validate(path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_every_container_has_requests_limits_and_no_rights() -> None:
+def _containers() -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
+    """Return name, pod and container of everything that runs, the flows' jobs last."""
     containers = [
         (row["metadata"]["name"], pod, container)
         for row in _documents()
@@ -54,13 +59,20 @@ def test_every_container_has_requests_limits_and_no_rights() -> None:
         for pod in [row["spec"]["template"]["spec"]]
         for container in pod["containers"]
     ]
-    template = json.loads(
-        next(row for row in _documents() if row["kind"] == "ConfigMap")["data"]["job.json"]
-    )
-    pod = template["job_configuration"]["job_manifest"]["spec"]["template"]["spec"]
-    containers.append(("job template", pod, pod["containers"][0]))
+    pod = _job_template()["job_configuration"]["job_manifest"]["spec"]["template"]["spec"]
+    return [*containers, ("job template", pod, pod["containers"][0])]
+
+
+def _job_template() -> Any:
+    found = next(row for row in _documents() if row["kind"] == "ConfigMap")
+    return json.loads(found["data"]["job.json"])
+
+
+def test_every_container_has_requests_limits_and_no_rights() -> None:
+    containers = _containers()
     assert len(containers) == 4
     for name, pod, container in containers:
+        assert container["imagePullPolicy"] == "IfNotPresent", name  # no registry has the image
         assert set(container["resources"]["requests"]) == {"cpu", "memory"}, name
         assert set(container["resources"]["limits"]) == {"cpu", "memory"}, name
         assert pod["securityContext"]["runAsNonRoot"], name
@@ -72,11 +84,100 @@ def test_no_password_stands_in_a_file_and_every_port_is_on_loopback() -> None:
     for name, service in compose["services"].items():
         assert all(port.startswith("127.0.0.1:") for port in service.get("ports", ())), name
         for key, value in service.get("environment", {}).items():
-            if any(word in key for word in ("PASSWORD", "AUTH", "CONNECTION_URL")):
-                assert "${" in value, f"{name}: {key}"
+            if any(word in key for word in ("PASSWORD", "AUTH", "CONNECTION_URL", "KEY", "AWS")):
+                # refused where it is not set; a default would be a password in a file
+                assert "${" in value and ":?" in value, f"{name}: {key}"
     for line in (IMAGES / "passwords.example").read_text().splitlines():
         assert line.endswith("=")
     assert "PREFECT_SERVER_API_AUTH_STRING" in compose["services"]["server"]["environment"]
+    # where they are, no copy of the checkout takes them along
+    for name in (".dockerignore", ".gitignore"):
+        assert {".env", "**/.env"} <= set((ROOT / name).read_text().splitlines()), name
+
+
+def test_images_can_write_buckets_and_locks_hold_each_other() -> None:
+    locked = {
+        name: set((ROOT / "requirements" / f"{name}.txt").read_text().split("\n\n")[0].split())
+        for name in ("dataset", "served", "all")
+    }
+    assert locked["dataset"] < locked["served"] < locked["all"]
+    assert {name.partition("==")[0] for name in locked["served"]} >= {"s3fs", "gcsfs"}
+    for path in IMAGES.glob("*.Dockerfile"):
+        assert "--requirement requirements/served.txt" in path.read_text(), path.name
+    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())
+    names = {"AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_ENDPOINT_URL"}
+    has = {
+        name
+        for name, row in compose["services"].items()
+        if names <= set(row.get("environment", {}))
+    }
+    assert has == {"worker"}  # who needs no key has none
+    (source,) = _containers()[-1][2]["envFrom"]
+    assert source["secretRef"]["name"] == "trilight-bucket"
+
+
+def test_flows_write_to_volumes_whatever_their_form_says() -> None:
+    """`out` is data/smoke by default, below the checkout, which belongs to root in the images."""
+    assert DatasetInRuns().out.startswith("data/")
+    for path in IMAGES.glob("*.Dockerfile"):
+        assert "ln --symbolic /data /opt/trilight/data" in path.read_text(), path.name
+    found = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
+    for row in found:
+        function, given = row["entrypoint"].split(":")[1], row.get("parameters", {})
+        if row["name"] == "docker":
+            mounted = {
+                volume.partition(":")[2] for volume in row["work_pool"]["job_variables"]["volumes"]
+            }
+            assert mounted == {"/data", "/cache"}
+        if function == "build_dataset":  # its ranges go to the pool that it is in
+            deployment = given.get("deployment", DatasetInRuns().deployment)
+            assert deployment == f"generate-scenes/{row['name']}"
+        if function == "train_model" and row["name"] != "local":
+            assert given["out"].startswith("/data/")
+    mounts = {mount["mountPath"] for mount in _containers()[-1][2]["volumeMounts"]}
+    assert mounts == {"/data", "/cache"}
+
+
+def test_prefect_takes_the_job_template() -> None:
+    """Its worker makes a job of it for each flow run, and refuses one that lacks anything."""
+    worker = pytest.importorskip("prefect_kubernetes.worker", reason="make setup-all")
+    values = {
+        "image": "trilight:1",
+        "env": {"DO_NOT_TRACK": "1"},
+        "command": "prefect",
+        "name": "x",
+    }
+    kind = worker.KubernetesWorkerJobConfiguration
+    made = asyncio.run(kind.from_template_and_values(_job_template(), values, client=None))
+    made.prepare_for_flow_run(FlowRun(flow_id=uuid.uuid4(), name="x"))
+    (container,) = made.job_manifest["spec"]["template"]["spec"]["containers"]
+    ours = _containers()[-1][2]
+    kept = ("imagePullPolicy", "envFrom", "workingDir", "resources", "volumeMounts")
+    assert {name: container[name] for name in kept} == {name: ours[name] for name in kept}
+    assert (container["image"], container["args"]) == ("trilight:1", ["prefect"])
+    assert {"name": "DO_NOT_TRACK", "value": "1"} in container["env"]
+
+
+def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Prefect's own settings read what the manifest says: a name that it does not know is lost."""
+    kubernetes = pytest.importorskip("prefect_kubernetes.settings", reason="make setup-all")
+    containers = {name: container for name, _, container in _containers()}
+    for entry in containers["trilight-worker"]["env"]:
+        if entry["name"].startswith("PREFECT_INTEGRATIONS_"):
+            monkeypatch.setenv(entry["name"], entry["value"])
+    read = kubernetes.KubernetesSettings()
+    assert read.observer.namespaces == {"trilight"}
+    password = next(
+        row
+        for row in containers["trilight-worker"]["env"]
+        if row["name"] == "PREFECT_API_AUTH_STRING"
+    )
+    assert password["valueFrom"]["secretKeyRef"] == {
+        "name": read.worker.api_auth_string_secret_name,
+        "key": read.worker.api_auth_string_secret_key,
+    }
 
 
 def test_deployments_name_flows_that_are_there() -> None:

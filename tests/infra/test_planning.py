@@ -1,12 +1,17 @@
 """Predictions: the arithmetic of means and intervals, and what is said before it is too late."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
-from infra.planning import MeasuredScenes, predict
+from infra.planning import MeasuredScenes, measure_scenes, predict
+from pipeline.flows.dataset_run import make_dataset
+from pipeline.flows.machine import cores_owned
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.pieces import MOST_TASKS
+from storage.dataset import open_dataset
+from tests.flows.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
 def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> MeasuredScenes:
@@ -53,3 +58,44 @@ def test_two_million_scenes_come_with_warnings() -> None:
     assert any("flow runs" in note for note in found.notes)
     fewer = predict(measured, dataclasses.replace(order, scenes=500), cores=1, usd_per_core_hour=1)
     assert not any("manifest.json" in note for note in fewer.notes)
+
+
+class _Clock:
+    """Stands still while nobody works."""
+
+    now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten scenes reach the third shard, which is for validation. The clock moves on by 1000 s for
+    the first scene, which a prediction leaves out, and by its number for each other one."""
+    clock = _Clock()
+    monkeypatch.setattr("pipeline.flows.make_task.time", clock)
+
+    def work(scene: int) -> None:
+        clock.now += scene or 1000
+
+    scenes = without_rendering(monkeypatch, work)
+    order = tiny_order(out=str(tmp_path / "set"), scenes=24)
+    measured = measure_scenes(order, 10, lambda: None)
+    assert not (tmp_path / "set").exists()
+    cores = cores_owned()
+    assert measured.core_s == tuple(cores * seconds for seconds in (1000, *range(1, 10)))
+    sampled = list(scenes)
+    scenes.clear()
+    make_dataset(order, Undocumented())
+    assert sampled == scenes[:10]
+    members = [shard.index for shard in open_dataset(str(tmp_path / "set")).manifest.shards]
+    by_key = {key: row for index in members for key, row in index.items()}
+    expected = [
+        sum(512 + -(-num_bytes // 512) * 512 for _, num_bytes in by_key[key].values())
+        for key in sorted(by_key)
+    ]
+    assert measured.num_bytes == tuple(expected[:10])
+    found = predict(measured, order, cores=1, usd_per_core_hour=1)
+    assert found.core_hours.value == pytest.approx(24 * cores * 5 / 3600)  # floating point only

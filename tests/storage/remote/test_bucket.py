@@ -40,6 +40,22 @@ def test_large_files_come_in_parts_and_only_once(
     assert place.names() == {"part-0001/large"}
 
 
+def test_a_server_that_ignores_conditions_is_refused(
+    bucket: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = remote_bucket.Bucket(RemoteUrl(what="out", scheme="s3", root="shards/set"))
+    place.require_create()
+    place.require_create()  # what is left of the first time says nothing
+    put = remote_bucket.Bucket._put
+    monkeypatch.setattr(
+        remote_bucket.Bucket,
+        "_put",
+        lambda self, name, content, mode: put(self, name, content, mode="overwrite"),
+    )
+    with pytest.raises(TrilightError, match="^out 's3://shards/set': .* conditional writes"):
+        place.require_create()
+
+
 @pytest.mark.parametrize(
     ("out", "message"),
     [
