@@ -182,7 +182,9 @@ def _make_missing(run: Run, runner: Runner, watch: Watcher) -> None:
         index for index in publication.missing_shards() if wanted is None or index in wanted
     ]:
         made = 0
-        for outcome in runner.run(tasks.cut(missing, run.settings.splits, sizes), job):
+        at_once = runner.window or num_at_once
+        cut = tasks.cut(missing, run.settings.splits, sizes, at_once=at_once)
+        for outcome in runner.run(cut, job):
             made += outcome.scenes + len(outcome.shards)
             if outcome.scenes:
                 sizes.measured(outcome.scenes, outcome.seconds)

@@ -43,11 +43,17 @@ class TaskSizes:
         self._scenes += scenes
         self._seconds += seconds
 
-    def next_size(self, scenes_left: int, tasks_left: int) -> int:
-        """Return a number of scenes, at least 1."""
+    def next_size(self, scenes_left: int, tasks_left: int, at_once: int = 1) -> int:
+        """Return a number of scenes, at least 1.
+
+        Of several at once nobody gets more than half of an equal share of what is left, so that
+        all have work until the end (guided self-scheduling, Polychronopoulos and Kuck 1987).
+        """
         wanted: float = _FIRST_SCENES
         if self._scenes:
             wanted = TASK_S * self._scenes / max(self._seconds, 1e-3)
+        if at_once > 1:
+            wanted = min(wanted, scenes_left / (2 * at_once))
         return max(1, int(wanted), -(-scenes_left // max(1, tasks_left)))
 
 
@@ -58,7 +64,7 @@ class TasksLeft:
         self._left = MOST_TASKS
 
     def cut(
-        self, shards: Sequence[int], splits: SplitSettings, sizes: TaskSizes
+        self, shards: Sequence[int], splits: SplitSettings, sizes: TaskSizes, *, at_once: int
     ) -> Iterator[tuple[Piece, ...]]:
         """Yield as `cut_tasks`, but keep a tenth of what is left for rounds that may follow.
 
@@ -70,13 +76,19 @@ class TasksLeft:
                 f"this run has handed out its {MOST_TASKS} tasks, and others were at what is still "
                 "missing. What was finished is safe: run the same command again."
             )
-        for task in cut_tasks(shards, splits, sizes, most=self._left - self._left // 10):
+        most = self._left - self._left // 10
+        for task in cut_tasks(shards, splits, sizes, most=most, at_once=at_once):
             self._left -= 1
             yield task
 
 
 def cut_tasks(
-    shards: Sequence[int], splits: SplitSettings, sizes: TaskSizes, *, most: int = MOST_TASKS
+    shards: Sequence[int],
+    splits: SplitSettings,
+    sizes: TaskSizes,
+    *,
+    most: int = MOST_TASKS,
+    at_once: int = 1,
 ) -> Iterator[tuple[Piece, ...]]:
     """Yield the tasks that make some shards, each of the size that is right when it is asked for.
 
@@ -85,10 +97,11 @@ def cut_tasks(
         splits: how many scenes they have.
         sizes: what is known of the time that scenes take.
         most: tasks to yield at most.
+        at_once: tasks that are handed out at the same time.
     """
     scenes_left = sum(len(scenes_of_shard(index, splits)) for index in shards)
     pieces: list[Piece] = []
-    room, yielded = sizes.next_size(scenes_left, most), 0
+    room, yielded = sizes.next_size(scenes_left, most, at_once), 0
     for index in shards:
         scenes = scenes_of_shard(index, splits)
         at = scenes.start
@@ -99,6 +112,6 @@ def cut_tasks(
             if room == 0:
                 yield tuple(pieces)
                 pieces, yielded = [], yielded + 1
-                room = sizes.next_size(scenes_left, most - yielded)
+                room = sizes.next_size(scenes_left, most - yielded, at_once)
     if pieces:
         yield tuple(pieces)

@@ -22,7 +22,11 @@ class Runner(Protocol):
 
     @property
     def num_at_once(self) -> int | None:
-        """Tasks at a time, or None where the order says."""
+        """Tasks at a time in one process, or None where the order says."""
+
+    @property
+    def window(self) -> int | None:
+        """Tasks that are handed out at a time, or None where that is `num_at_once`."""
 
     def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
         """Yield what became of each task, in the order in which they end.
@@ -39,6 +43,7 @@ class ThreadRunner:
     """Threads of this process, each with its render child; no server, no scheduler."""
 
     num_at_once = None
+    window = None
 
     def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
         pool = ThreadPoolExecutor(job.num_at_once)

@@ -56,6 +56,19 @@ def test_sizes_follow_what_is_measured_on_the_way() -> None:
     assert len(_scenes([next(tasks)])) == TASK_S
 
 
+@pytest.mark.parametrize("at_once", [2, 8])
+def test_several_at_once_all_have_work_until_the_end(at_once: int) -> None:
+    """Fast scenes, of which one task could take all: nobody gets more than half of a share."""
+    sizes = TaskSizes()
+    sizes.measured(4, 1.0)
+    left = 256
+    for task in cut_tasks(range(64), SplitSettings(scenes_per_shard=4), sizes, at_once=at_once):
+        size = len(_scenes([task]))
+        assert size <= max(1, left / (2 * at_once))
+        left -= size
+    assert left == 0
+
+
 def test_two_million_slow_scenes_are_at_most_a_thousand_tasks() -> None:
     sizes = TaskSizes()
     sizes.measured(1, 100.0)
@@ -67,7 +80,7 @@ def test_all_rounds_of_a_run_are_at_most_a_thousand_tasks() -> None:
     splits, left, rounds = SplitSettings(scenes_per_shard=1), TasksLeft(), list[int]()
     with pytest.raises(EnvironmentFailure, match="run the same command again"):
         while True:
-            rounds.append(sum(1 for _ in left.cut(range(5000), splits, TaskSizes())))
+            rounds.append(sum(1 for _ in left.cut(range(5000), splits, TaskSizes(), at_once=1)))
     assert rounds[:2] == [900, 90]
     assert sum(rounds) == MOST_TASKS
 

@@ -31,6 +31,7 @@ class Idle:
     """A runner that finds everything taken, and counts."""
 
     num_at_once = 1
+    window = None
 
     def __init__(self) -> None:
         self.rounds: list[int] = []

@@ -78,7 +78,7 @@ class PrefectRunner:
                 run at once here.
             num_at_once: tasks at a time in one process; by default what the order says.
         """
-        self._window = window
+        self.window = window
         self.num_at_once = num_at_once
 
     def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
@@ -88,7 +88,7 @@ class PrefectRunner:
             submit=lambda pieces: make_scenes.submit(_named(pieces), Sealed(job, pieces)),
             first_done=_first_done,
             result=lambda future: future.result(),
-            window=self._window or job.num_at_once,
+            window=self.window or job.num_at_once,
         )
 
     def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
