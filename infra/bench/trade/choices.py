@@ -105,6 +105,6 @@ CHOICES: tuple[Choice, ...] = (
         how="`trilight render --engine neural`",
         knob="engines",
         setting="network",
-        despite="the path tracer comes to the same error for less",
+        despite="one denoised sample of the path tracer is nearer; a film of one scene costs less",
     ),
 )
