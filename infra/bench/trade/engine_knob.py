@@ -181,8 +181,8 @@ KNOBS = (
         because="the path tracer: the error of its picture is chosen and measured, that of a "
         "network is what its training left. The published factor of about 50 compares seconds on "
         "a graphics card with a fixed, high number of samples; at equal error the path tracer is "
-        "asked for far fewer. A network is worth it where one scene is shown from many sides, since "
-        "it is encoded once, and its error will do.",
+        "asked for far fewer. A network is worth it where one scene is shown from many sides, "
+        "since it is encoded once, and where its error will do.",
         measure=measure_engines,
         needs=("torch",),
     ),
