@@ -61,12 +61,14 @@ JUDGE = Recipe(
         "renders.noise_floor_db": 46.0,
         "renders.max_spp": 1024,
         "splits.scenes_per_shard": 48,
+        "splits.shards_per_cycle": 8,
     },
 )
 """What every training is judged on."""
 
-JUDGE_ARGUMENTS = ("--seed", "1000", "--shards", "2:3")
-"""The third shard of a build is its first one for validation, whose objects no training sees."""
+JUDGE_ARGUMENTS = ("--seed", "1000", "--shards", "802:803")
+"""The third shard of a cycle is for validation, whose objects no training sees; one far behind, so
+that no sample has the key of one that is learned from."""
 
 
 def _json_like(value: object) -> str:

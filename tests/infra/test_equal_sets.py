@@ -79,7 +79,7 @@ def test_a_set_grows_is_learned_from_and_is_kept(
     monkeypatch.setitem(training_jobs.PLANS, "cpu", plan)
     cheap = {"renders.resolution": 16, "renders.max_spp": 32}
     monkeypatch.setattr(equal_sets, "RECIPES", {"usual": Recipe(words="tiny", changes=cheap)})
-    few = {**cheap, "splits.scenes_per_shard": 2}
+    few = {**cheap, "splits.scenes_per_shard": 2, "splits.shards_per_cycle": 8}
     monkeypatch.setattr(equal_sets, "JUDGE", Recipe(words="tiny", changes=few))
     table = tmp_path / "table.jsonl"
     for _ in range(2):  # what is there is kept
