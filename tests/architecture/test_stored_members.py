@@ -120,7 +120,7 @@ def _changes() -> dict[str, Change]:
         f"{RECORD} {'.'.join(map(str, path))}": _change_record(path)
         for path in _leaves(json.loads(members[RECORD]))
     }
-    changes |= {f"{ARRAYS} {name}": _change_array(name) for name in load(members[ARRAYS])}
+    changes |= {f"{ARRAYS} {name}": _change_array(name) for name in sorted(load(members[ARRAYS]))}
     return changes | {"1.exr": _brighter_picture, "1.lights.exr": _brighter_light}
 
 
