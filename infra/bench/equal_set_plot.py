@@ -8,6 +8,7 @@ import matplotlib.figure
 import numpy as np
 
 from infra.bench.equal_set_recipes import RECIPES
+from infra.bench.training_plot import seed_bars
 
 
 def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -23,10 +24,7 @@ def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         ]
         if not own:
             continue
-        means = np.array([np.mean(found) for found in errors])
-        ends = [means - [min(found) for found in errors], [max(found) for found in errors] - means]
-        beside = np.array(prices) * 1.03**place  # so that bars do not hide each other
-        axes.errorbar(beside, means, yerr=ends, marker="o", capsize=3, label=name)
+        seed_bars(axes, prices, errors, label=name, place=place)
     median = np.mean([row["median_scores"]["log_l1"] for row in rows])
     axes.axhline(median, color="grey", linestyle=":", label="median picture")
     axes.set(xscale="log", xlabel="core-seconds that the set took", ylabel="held-out log L1")

@@ -39,11 +39,18 @@ def _panel(axes: Any, rows: Sequence[Mapping[str, Any]]) -> None:
         errors = [
             [row["scores"]["log_l1"] for row in own if row["scenes"] == count] for count in counts
         ]
-        means = np.array([np.mean(found) for found in errors])
-        ends = [means - [min(found) for found in errors], [max(found) for found in errors] - means]
-        beside = np.array(counts) * 1.03**index  # so that bars do not hide each other
-        axes.errorbar(beside, means, yerr=ends, marker="o", capsize=3, label=change)
+        seed_bars(axes, counts, errors, label=change, place=index)
     median = np.mean([row["median_scores"]["log_l1"] for row in rows])
     axes.axhline(median, color="grey", linestyle=":", label="median picture")
     axes.set(xscale="log", xlabel="training scenes", ylabel="held-out log L1")
     axes.legend(fontsize="small")
+
+
+def seed_bars(
+    axes: Any, x: Sequence[float], errors: Sequence[Sequence[float]], *, label: str, place: int
+) -> None:
+    """Draw means over seeds with bars from the best to the worst, beside those of other places."""
+    means = np.array([np.mean(found) for found in errors])
+    ends = [means - [min(found) for found in errors], [max(found) for found in errors] - means]
+    beside = np.array(x) * 1.03**place  # so that bars do not hide each other
+    axes.errorbar(beside, means, yerr=ends, marker="o", capsize=3, label=label)

@@ -1,7 +1,6 @@
 """Two makers in one bucket, one of them late: nothing that the first has said is lost."""
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,32 +16,14 @@ from storage.records import Failure
 from storage.sample import sample_key
 from storage.staging import stage_scene
 from storage.verify import verify_dataset
-from tests.flows.bucket_kit import OUT, Machines, empty_bucket
+from tests.flows.bucket_kit import OUT, Machines
 from tests.flows.test_publication import _dataset, _locked, make_tiny_shard
-from tests.s3_server import s3_server
 from tests.scenes_by_hand import tiny_sample
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
 pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
 
 FIRST = "train-000000.tar"
-
-
-@pytest.fixture(scope="module")
-def moto() -> Iterator[int]:
-    with s3_server() as port:
-        yield port
-
-
-@pytest.fixture
-def bucket(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    with empty_bucket(moto, monkeypatch) as driver:
-        yield driver
-
-
-@pytest.fixture
-def machines(bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machines:
-    return Machines(tmp_path, monkeypatch)
 
 
 def _failures(bucket: Any, name: str) -> list[Failure]:

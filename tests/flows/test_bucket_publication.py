@@ -1,7 +1,6 @@
 """A dataset made in a bucket by machines that share nothing else: one digest, whoever dies when."""
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,9 @@ from storage.remote import bucket as remote_bucket
 from storage.sample import sample_key
 from storage.staging import is_staged, stage_scene
 from storage.verify import verify_dataset
-from tests.flows.bucket_kit import OUT, Machines, empty_bucket
+from tests.flows.bucket_kit import OUT, Machines
 from tests.flows.test_publication import _build, _dataset, _locked, make_tiny_shard
-from tests.s3_server import control, s3_server
+from tests.s3_server import control
 from tests.scenes_by_hand import tiny_sample
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
@@ -29,23 +28,6 @@ FIRST, SECOND = "train-000000.tar", "train-000001.tar"
 
 class Killed(BaseException):
     """Ends a maker between two requests, as SIGKILL would: locks go with it, and nothing else."""
-
-
-@pytest.fixture(scope="module")
-def moto() -> Iterator[int]:
-    with s3_server() as port:
-        yield port
-
-
-@pytest.fixture
-def bucket(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    with empty_bucket(moto, monkeypatch) as driver:
-        yield driver
-
-
-@pytest.fixture
-def machines(bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machines:
-    return Machines(tmp_path, monkeypatch)
 
 
 def make(publication: Publication, *shards: int) -> None:
