@@ -139,7 +139,13 @@ class NeuralRenderer:
 
     @torch.inference_mode()
     def view(
-        self, prepared: PreparedScene, c2w: ArrayLike, fov_deg: float, resolution: int
+        self,
+        prepared: PreparedScene,
+        c2w: ArrayLike,
+        fov_deg: float,
+        resolution: int,
+        *,
+        skip_empty_bundles: bool = False,
     ) -> NDArray[np.float32]:
         """Return the picture [R, R, 3] of one camera, linear radiance of at least 0.
 
@@ -148,16 +154,18 @@ class NeuralRenderer:
             c2w: [4, 4] camera to world.
             fov_deg: full field of view in degrees.
             resolution: as in `render`.
+            skip_empty_bundles: compute no bundle that no triangle can reach, and leave it black;
+                the others see fewer of their kind then, and change (docs/tradeoffs.md).
 
         Raises:
-            TrilightError: the resolution is none for this network.
+            TrilightError: the resolution is none for this network, or its windows have to be whole.
         """
         self.require_resolution(resolution)
         c2w_44 = torch.as_tensor(np.asarray(c2w, np.float32), device=self.device)
         angle = torch.tensor(fov_deg, dtype=torch.float32, device=self.device)
         total = torch.zeros(resolution, resolution, 3, dtype=torch.float64)
         for encoded, share in prepared.groups:
-            log10_RR3 = _decode(self._model, encoded, c2w_44, angle, resolution)
+            log10_RR3 = _decode(self._model, encoded, c2w_44, angle, resolution, skip_empty_bundles)
             total += share * radiance(log10_RR3.double().cpu()).clamp(min=0)
         picture: NDArray[np.float32] = total.numpy().astype(np.float32)
         return picture
@@ -221,11 +229,16 @@ def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> EncodedS
 
 
 def _decode(
-    model: RenderFormer, encoded: EncodedScene, c2w_44: Tensor, fov_deg: Tensor, resolution: int
+    model: RenderFormer,
+    encoded: EncodedScene,
+    c2w_44: Tensor,
+    fov_deg: Tensor,
+    resolution: int,
+    skip_empty_bundles: bool,
 ) -> Tensor:
     """Return log10(1 + radiance) [R, R, 3] from one camera."""
     camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
-    return model.decode(encoded, camera, resolution)[0, 0]
+    return model.decode(encoded, camera, resolution, skip_empty_bundles=skip_empty_bundles)[0, 0]
 
 
 def _trained_range(source: str) -> TrainedRange | None:

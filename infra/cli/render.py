@@ -63,6 +63,9 @@ def render(
     lights_per_pass: Annotated[
         int, typer.Option(help="neural: most emitting triangles at once; groups are added up")
     ] = 8,
+    skip_empty_bundles: Annotated[
+        bool, typer.Option(help="neural: leave black what no triangle reaches; faster, less exact")
+    ] = False,
     seed: Annotated[int, typer.Option(help="mitsuba: seed of the samples")] = 0,
     threads: Annotated[
         int | None, typer.Option(help="processor threads, all cores by default")
@@ -89,6 +92,7 @@ def render(
         tone_map=tone_map,
         precision=precision,
         lights_per_pass=lights_per_pass,
+        skip_empty_bundles=skip_empty_bundles,
         seed=seed,
         threads=threads,
     )

@@ -87,6 +87,7 @@ class NeuralEngine:
         precision: str,
         resolution: int,
         lights_per_pass: int,
+        skip_empty_bundles: bool,
     ) -> None:
         """Take a network.
 
@@ -96,6 +97,7 @@ class NeuralEngine:
             precision: in which it was loaded (model.precision).
             resolution: width of pictures.
             lights_per_pass: most emitting triangles of a group (model.light_groups).
+            skip_empty_bundles: whether what no triangle reaches stays black (model.empty_bundles).
 
         Raises:
             TrilightError: the resolution is none for this network.
@@ -105,6 +107,7 @@ class NeuralEngine:
         renderer.require_resolution(resolution)
         self._renderer = renderer
         self._resolution, self._lights_per_pass = resolution, lights_per_pass
+        self._skip_empty_bundles = skip_empty_bundles
         self.identity: Mapping[str, Any] = {
             "checkpoint": Path(checkpoint).name,
             "network_sha256": renderer.digest,
@@ -112,6 +115,7 @@ class NeuralEngine:
                 "precision": precision,
                 "resolution": resolution,
                 "lights_per_pass": lights_per_pass,
+                "skip_empty_bundles": skip_empty_bundles,
             },
             "environment": {"torch": torch.__version__, "device": renderer.device.type},
         }
@@ -122,7 +126,13 @@ class NeuralEngine:
         return of_scene + self._renderer.resolution_notes(self._resolution)
 
     def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> Rendered:
-        picture = self._renderer.view(self._prepared, c2w, fov_deg, self._resolution)
+        picture = self._renderer.view(
+            self._prepared,
+            c2w,
+            fov_deg,
+            self._resolution,
+            skip_empty_bundles=self._skip_empty_bundles,
+        )
         too_bright = int((picture > HALF_FLOAT_MAX).any(axis=-1).sum())
         facts: dict[str, Fact] = {
             "passes": len(self._prepared.groups),

@@ -68,6 +68,8 @@ class Asked:
     """A name of model.precision."""
     lights_per_pass: Annotated[int, Within(1, 65_535, unit="triangles")]
     """Most emitting triangles of a group (model.light_groups)."""
+    skip_empty_bundles: bool
+    """Whether the network leaves what no triangle reaches black (model.empty_bundles)."""
     seed: Seed
     """Of samples."""
     threads: Annotated[int | None, Within(1, 1024, unit="threads")]
@@ -250,6 +252,7 @@ def _neural(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
         precision=asked.precision,
         resolution=settings.resolution,
         lights_per_pass=asked.lights_per_pass,
+        skip_empty_bundles=asked.skip_empty_bundles,
     )
 
 

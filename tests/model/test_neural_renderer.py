@@ -89,7 +89,12 @@ def _light_of(model: RenderFormer, scene: Scene, device: torch.device) -> Tensor
 
 
 def _flat_picture(
-    model: RenderFormer, light_3: Tensor, c2w_44: Tensor, fov_deg: Tensor, resolution: int
+    model: RenderFormer,
+    light_3: Tensor,
+    c2w_44: Tensor,
+    fov_deg: Tensor,
+    resolution: int,
+    skip_empty_bundles: bool,
 ) -> Tensor:
     """Stand for its second stage: every pixel shows that light."""
     return torch.log10(1 + light_3).expand(resolution, resolution, 3)

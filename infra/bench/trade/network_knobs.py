@@ -197,7 +197,7 @@ KNOBS = (
     Knob(
         name="bundles",
         title="Empty ray bundles",
-        covers=(),
+        covers=("render.skip_empty_bundles",),
         cost="core-seconds of the view stage",
         error="psnr_log_db, dB",
         better="higher",
