@@ -138,7 +138,9 @@ def plot(result: Soak, path: Path) -> None:
         strict=True,
     ):
         axes.plot(tenths, values, "o-")
-        axes.set(xlabel=f"tenth of {result.num_scenes} scenes", ylabel=label, ylim=(0, None))
+        axes.set(
+            xlabel=f"tenth of {result.num_scenes} scenes", ylabel=label, ylim=(0, 1.1 * max(values))
+        )
     figure.savefig(path, dpi=120)
 
 
