@@ -1,5 +1,6 @@
 """`trilight evaluate`: a trained network against the pictures of a dataset."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -42,7 +43,6 @@ def evaluate(
 ) -> None:
     """Judge a network; writes evaluation.json, evaluation.md and sheets of pictures."""
     try:
-        from model.weights import network_digest
         from storage.training_data import open_training_data
         from train.evaluation.evaluate import judged_views
         from train.evaluation.report import markdown, record
@@ -65,17 +65,7 @@ def evaluate(
     with progress_bars() as bars:
         task = bars.add_task("scenes", total=None, note="")
         views = judged_views(contest, lambda: bars.advance(task))
-    about = {
-        "network": Path(checkpoint).name,
-        "network sha256": network_digest(contest.network),
-        "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],  # no path of this machine
-        "build": opened.build or "unknown",
-        "data digest": opened.digest,
-        "split": split,
-        "resolution": contest.resolution,
-        "scenes": len({view.key for view in views}),
-    }
-    found = record(views, about)
+    found = record(views, _about(checkpoint, opened, contest, split, views))
     write_atomically(out / "evaluation.json", _encoded(found))
     write_atomically(out / "evaluation.md", markdown(found).encode())
     _write_pictures(out, contest, views)
@@ -83,6 +73,28 @@ def evaluate(
         print_json({name: found[name] for name in ("about", "contestants")})
     else:
         _report(found, out)
+
+
+def _about(
+    checkpoint: str,
+    opened: "TrainingData",
+    contest: "Contest",
+    split: str,
+    views: "Sequence[JudgedView]",
+) -> dict[str, str | int]:
+    """Return what the report says of itself; no path of this machine."""
+    from model.weights import network_digest
+
+    return {
+        "network": Path(checkpoint).name,
+        "network sha256": network_digest(contest.network),
+        "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],
+        "build": opened.build or "unknown",
+        "data digest": opened.digest,
+        "split": split,
+        "resolution": contest.resolution,
+        "scenes": len({view.key for view in views}),
+    }
 
 
 def _contest(
