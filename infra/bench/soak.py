@@ -127,16 +127,12 @@ def plot(result: Soak, path: Path) -> None:
     """Draw time and memory by tenths."""
     figure = matplotlib.figure.Figure(figsize=(8, 3), layout="constrained")
     tenths = np.arange(1, PARTS + 1)
-    for axes, label, values in zip(
-        figure.subplots(1, 3),
-        ("milliseconds a scene", "megabytes of all processes", "open files"),
-        (
-            [1000 * part.seconds_a_scene for part in result.parts],
-            [part.megabytes for part in result.parts],
-            [part.open_files for part in result.parts],
-        ),
-        strict=True,
-    ):
+    columns: list[tuple[str, list[float]]] = [
+        ("milliseconds a scene", [1000 * part.seconds_a_scene for part in result.parts]),
+        ("megabytes of all processes", [part.megabytes for part in result.parts]),
+        ("open files", [part.open_files for part in result.parts]),
+    ]
+    for axes, (label, values) in zip(figure.subplots(1, len(columns)), columns, strict=True):
         axes.plot(tenths, values, "o-")
         axes.set(
             xlabel=f"tenth of {result.num_scenes} scenes", ylabel=label, ylim=(0, 1.1 * max(values))
