@@ -13,7 +13,7 @@ from infra.bench import training_jobs, training_table
 from infra.bench.power_law import fit_power_law
 from infra.bench.training_jobs import BASELINE, CHANGES, SCENES, SEEDS, Job, Plan, all_jobs
 from infra.bench.training_plot import plot
-from infra.bench.training_report import PAPER, reached, report_lines
+from infra.bench.training_report import PAPER, of_newest_data, reached, report_lines
 from infra.bench.training_table import read_table, run_jobs
 from storage.errors import TrilightError
 from storage.seeds import rng_for
@@ -113,7 +113,7 @@ def test_steps_saved_are_read_off_the_curves() -> None:
 def test_the_picture_has_a_panel_for_each_network(tmp_path: Path) -> None:
     base = {
         "plan": "cpu", "change": BASELINE, "seed": 0, "scores": {"log_l1": 0.05},
-        "median_scores": {"log_l1": 0.07},
+        "median_scores": {"log_l1": 0.07}, "data_digest": "0" * 64,
     }  # fmt: skip
     sizes = (("small", 1000), ("large", 5000))
     rows = [
@@ -125,6 +125,14 @@ def test_the_picture_has_a_panel_for_each_network(tmp_path: Path) -> None:
     plot(rows[:2], tmp_path / "one.png")
     with Image.open(tmp_path / "two.png") as two, Image.open(tmp_path / "one.png") as one:
         assert two.width == 2 * one.width
+
+
+def test_only_the_set_that_was_used_last_is_compared() -> None:
+    rows = [
+        {"plan": plan, "data_digest": digest, "row": row}
+        for row, (plan, digest) in enumerate((("cpu", "a"), ("gpu", "a"), ("cpu", "b")))
+    ]
+    assert [row["row"] for row in of_newest_data(rows)] == [1, 2]
 
 
 def test_a_table_without_results_says_so(tmp_path: Path) -> None:
