@@ -75,7 +75,7 @@ def test_the_table_compares_with_the_usual_set_of_the_same_price() -> None:
 def test_a_set_grows_is_learned_from_and_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = Plan(sizes={"small": TINY_MODEL}, resolution=16, num_steps=20, scenes_per_step=2)
+    plan = Plan(sizes={"small": TINY_MODEL}, resolution=16, num_steps=100, scenes_per_step=2)
     monkeypatch.setitem(training_jobs.PLANS, "cpu", plan)
     cheap = {"renders.resolution": 16, "renders.max_spp": 32}
     monkeypatch.setattr(equal_sets, "RECIPES", {"usual": Recipe(words="tiny", changes=cheap)})
