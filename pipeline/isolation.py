@@ -28,6 +28,7 @@ Result = TypeVar("Result")
 _PR_SET_PDEATHSIG = 1
 _F_SETSIG = 10  # Linux; Python's fcntl module does not name it
 _START_UP_S = 180.0
+_LAUNCHES = 3
 
 
 class ChildFailed(Exception):
@@ -124,11 +125,7 @@ class IsolatedChild:
 
     def _start(self) -> None:
         self._stop()
-        context = multiprocessing.get_context("forkserver")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self._limits), daemon=True)
-        self._process.start()
-        theirs.close()
+        self._process, self._connection = _launched(self._limits)
         self._calls_left = self._limits.calls_per_child
         try:
             self._exchange(self._setup, _START_UP_S)
@@ -171,6 +168,31 @@ class IsolatedChild:
                 f"crashed_signal_{-code}", f"native code ended by {signal.Signals(-code).name}"
             )
         return ChildFailed("crashed", f"the child ended with status {code}")
+
+
+def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
+    """Return a new child and the way to it; where the fork server was killed, by a new one.
+
+    Raises:
+        EnvironmentFailure: no process can be started.
+    """
+    context = multiprocessing.get_context("forkserver")
+    for tries_left in reversed(range(_LAUNCHES)):
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, limits), daemon=True)
+        try:
+            process.start()
+        except (EOFError, OSError) as error:
+            ours.close()
+            if not tries_left:
+                raise EnvironmentFailure(
+                    f"a child process cannot be started ({error}); see `trilight doctor`."
+                ) from error
+        else:
+            return process, ours
+        finally:
+            theirs.close()
+    raise AssertionError("unreachable: the last try returns or raises")
 
 
 def preload(modules: list[str]) -> None:

@@ -9,12 +9,13 @@ import textwrap
 import threading
 import time
 from collections.abc import Iterator
+from multiprocessing import popen_forkserver
 from pathlib import Path
 
 import pytest
 
 from pipeline.isolation import ChildClosed, ChildFailed, ChildLimits, IsolatedChild
-from storage.errors import Rejected, TrilightError
+from storage.errors import EnvironmentFailure, Rejected, TrilightError
 from tests.conftest import ROOT
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=2, calls_per_child=3)
@@ -108,6 +109,29 @@ def test_a_child_that_cannot_be_set_up_stops_the_run(tmp_path: Path) -> None:
     child = IsolatedChild(limits=LIMITS, setup=_prepare, setup_args=(str(tmp_path / "nowhere"),))
     with pytest.raises(TrilightError, match=r"cannot be set up.*FileNotFoundError.*doctor"):
         child.call(double, 1)
+    child.close()
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_a_fork_server_that_is_killed_is_replaced(
+    child: IsolatedChild, monkeypatch: pytest.MonkeyPatch, times: int
+) -> None:
+    """Its end is seen while it should answer with the number of the new process."""
+    real = popen_forkserver.Popen._launch  # type: ignore[attr-defined]
+    left = [times]
+
+    def launch(popen: popen_forkserver.Popen, process: object) -> None:
+        if left[0]:
+            left[0] -= 1
+            raise EOFError("unexpected EOF")
+        real(popen, process)
+
+    monkeypatch.setattr(popen_forkserver.Popen, "_launch", launch)
+    if times < 3:
+        assert child.call(double, 4) == 8
+    else:
+        with pytest.raises(EnvironmentFailure, match="cannot be started"):
+            child.call(double, 4)
     child.close()
 
 
