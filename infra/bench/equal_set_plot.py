@@ -28,5 +28,8 @@ def plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     median = np.mean([row["median_scores"]["log_l1"] for row in rows])
     axes.axhline(median, color="grey", linestyle=":", label="median picture")
     axes.set(xscale="log", xlabel="core-seconds that the set took", ylabel="held-out log L1")
+    prices = sorted({row["price_core_s"] for row in rows})
+    axes.set_xticks(prices, [f"{price:.0f}" for price in prices])
+    axes.minorticks_off()
     axes.legend(fontsize="small", ncols=2)
     figure.savefig(path, dpi=110)
