@@ -19,10 +19,21 @@ START_S = 300
 """A server that makes its database on two busy cores took 137 s."""
 
 
+_PORTS = iter(range(20_000 + os.getpid() % 10_000, 32_000))
+
+
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """Return a port that nobody listens at, another one each time.
+
+    It lies below those that the kernel lends to clients. A client that tries to reach a server
+    which is down, again and again, is lent that server's own port one day: it is then connected to
+    itself, and the server cannot start.
+    """
+    for port in _PORTS:
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError("no port is free below 32,000")
 
 
 class Postgres:
