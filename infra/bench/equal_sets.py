@@ -68,6 +68,11 @@ def main(
             grown = grow_set(RECIPES[name], work / name, core_seconds)
             for share in SHARES if not sets_only else ():
                 bought = cut_set(grown, share * core_seconds)
+                if not bought.shards:
+                    raise TrilightError(
+                        f"--core-seconds {core_seconds:g}: {share:.0%} of it pays for no shard of "
+                        f"{name}, whose first one takes a compilation too. Give more."
+                    )
                 for seed in SEEDS:
                     job = Job(
                         plan="cpu",

@@ -83,12 +83,12 @@ def test_a_set_grows_is_learned_from_and_is_kept(
     monkeypatch.setattr(equal_sets, "JUDGE", Recipe(words="tiny", changes=few))
     table = tmp_path / "table.jsonl"
     for _ in range(2):  # what is there is kept
-        equal_sets.main(work=tmp_path / "work", core_seconds=4.0, table=table)
+        equal_sets.main(work=tmp_path / "work", core_seconds=60.0, table=table)
         rows = read_table(table)
         assert [(row["price_core_s"], row["seed"]) for row in rows] == [
-            (1.0, 0), (1.0, 1), (4.0, 0), (4.0, 1),
+            (15.0, 0), (15.0, 1), (60.0, 0), (60.0, 1),
         ]  # fmt: skip
     with Image.open(table.with_suffix(".png")) as picture:
         assert picture.width > picture.height > 300
     assert 0 < rows[0]["num_scenes"] < rows[2]["num_scenes"]
-    assert rows[0]["core_s"] <= 1.0 and rows[2]["core_s"] <= 4.0
+    assert rows[0]["core_s"] <= 15 and rows[2]["core_s"] <= 60
