@@ -35,6 +35,7 @@ _DISK_SLOTS = 2
 """Runs that write documents at the same time: each reads its whole dataset."""
 _MARK = "TRILIGHT_SERVED"
 _END_S = 20.0
+_RELEASE_S = 5.0
 _DEFAULT_PORT = 4200
 _MOST = {"TRILIGHT_PORT": 65535, "TRILIGHT_WORKERS": 1024}
 
@@ -184,6 +185,18 @@ def _require_password(host: str) -> None:
         )
 
 
+def _refusal(host: str, port: int) -> str | None:
+    """Return why nobody can listen there, or None."""
+    try:
+        with socket.socket() as probe:
+            # as servers do: connections of one that was stopped just now are no obstacle
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
+
+
 def _require_free(host: str, port: int) -> None:
     """Refuse an address that is none of ours, or where somebody listens, be it another Prefect."""
     if ":" in host:
@@ -191,17 +204,16 @@ def _require_free(host: str, port: int) -> None:
             f"make serve: TRILIGHT_HOST is {host!r}; expected a name or an address of IPv4, such "
             "as 127.0.0.1."
         )
-    try:
-        with socket.socket() as probe:
-            # as servers do: connections of one that was stopped just now are no obstacle
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-    except OSError as error:
+    # a process that ends loses its environment, by which it is known, before its sockets
+    deadline = time.monotonic() + _RELEASE_S
+    while (refused := _refusal(host, port)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    if refused:
         raise TrilightError(
-            f"make serve: {host}:{port} cannot be had ({error.strerror}); expected an address of "
+            f"make serve: {host}:{port} cannot be had ({refused}); expected an address of "
             "this machine and a port at which nobody listens. Set TRILIGHT_PORT to another port, "
             "or mend TRILIGHT_HOST."
-        ) from error
+        )
 
 
 def _share(number: int, workers: int) -> dict[str, str]:

@@ -25,9 +25,8 @@ _PORTS = iter(range(20_000 + os.getpid() % 10_000, 32_000))
 def free_port() -> int:
     """Return a port that nobody listens at, another one each time.
 
-    It lies below those that the kernel lends to clients. A client that tries to reach a server
-    which is down, again and again, is lent that server's own port one day: it is then connected to
-    itself, and the server cannot start.
+    It lies below those that the kernel lends to clients: one that tries to reach a server which is
+    down may be lent that server's own port, and the server cannot start.
     """
     for port in _PORTS:
         with socket.socket() as probe, contextlib.suppress(OSError):
