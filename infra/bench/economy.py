@@ -19,6 +19,7 @@ from infra.bench.economy_counts import SceneCosts, scene_costs
 from infra.bench.harness import ROOT
 from infra.bench.marked_block import write_block
 from infra.bench.model.workloads import PUBLISHED_LENGTH
+from infra.bench.trade.figures import shown
 from infra.cli.console import console
 from model.config import base
 from model.costs import Workload, flops
@@ -80,7 +81,7 @@ def table(dataset: Dataset, found: Sequence[SceneCosts]) -> list[str]:
         *_bytes(dataset, found, px),
     ]
     rows = [
-        f"| {line.part} | {line.everything} | {line.kept} | {line.factor:.3g} x | {line.error} |"
+        f"| {line.part} | {line.everything} | {line.kept} | {shown(line.factor)} x | {line.error} |"
         for line in lines
     ]
     return [
@@ -106,7 +107,7 @@ def _geometry(found: Sequence[SceneCosts], px: int) -> list[Line]:
             everything=f"{sources / scenes:.0f} in their sources",
             kept=f"{objects / scenes:.0f}",
             factor=sources / max(objects, 1),
-            error="p99 distance at most 3 % of an object, mostly below 1 %",
+            error="p99 distance at most 3 % of an object, the bound of the mesh stage",
         ),
         Line(
             part="FLOPs of all views (Base)",
@@ -118,9 +119,9 @@ def _geometry(found: Sequence[SceneCosts], px: int) -> list[Line]:
         Line(
             part="ray bundles that see nothing",
             everything="all are computed",
-            kept=f"{100 * (1 - empty):.1f} % see geometry; the rest is skipped on request only",
-            factor=1 / (1 - empty),
-            error="none while it is off, the default",
+            kept=f"all; --skip-empty-bundles would leave out {100 * empty:.0f} %",
+            factor=1.0,
+            error="none; much where they are left out (docs/tradeoffs.md)",
         ),
     ]
 
@@ -145,11 +146,12 @@ def _smallest(found: Sequence[SceneCosts], px: int) -> list[Line]:
 
 def _samples(found: Sequence[SceneCosts], most: int) -> Line:
     spent = np.array([spp for one in found for spp in one.spp], np.float64)
+    at_cap = np.mean([capped for one in found for capped in one.at_cap])
     floors = np.array([floor for one in found for floor in one.floors_db])
     return Line(
         part="samples of a pixel",
         everything=f"{most}, the cap, in every view",
-        kept=f"{spent.mean():.0f}; {100 * np.mean(spent >= most):.0f} % of the views at the cap",
+        kept=f"{spent.mean():.0f}; {100 * at_cap:.0f} % of the views end at the cap",
         factor=most / float(spent.mean()),
         error=f"stated per view: median floor {np.median(floors):.1f} dB, 5th percentile "
         f"{np.percentile(floors, 5):.1f}",

@@ -31,6 +31,8 @@ class SceneCosts:
     """Of the same objects in the scene."""
     spp: tuple[int, ...]
     """By view."""
+    at_cap: tuple[bool, ...]
+    """By view: whether sampling ended at the cap before the target was reached."""
     floors_db: tuple[float, ...]
     """By view."""
     array_bytes: int
@@ -78,6 +80,7 @@ def _costs(
         source_faces=sum(faces_of_uid[scene.objects[row].uid] for row in known),
         object_faces=int(counts[known].sum()),
         spp=tuple(view.spp for view in record.views),
+        at_cap=tuple(view.at_cap for view in record.views),
         floors_db=tuple(view.noise_floor_db for view in record.views),
         array_bytes=sum(size for suffix, size in sizes.items() if suffix.startswith("scene.")),
         record_bytes=sizes["json"],
