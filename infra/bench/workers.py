@@ -36,7 +36,7 @@ VIEWS = 4
 """Of a scene of `smoke`."""
 TASKS_EACH = 4
 """Sleeping tasks of each worker."""
-QUICK, CAREFUL = (16, 2.0), (64, 10.0)
+QUICK, CAREFUL = (16, 2.0), (48, 5.0)
 """Scenes to render, and seconds to sleep."""
 
 Sleeping = Callable[[float, int, int], None]
@@ -48,7 +48,7 @@ def num_rounds(options: Options) -> int:
 
 
 def run(options: Options, round_done: Callable[[], None]) -> Comparison:
-    """Measure; quickly 16 scenes once and sleeps of 2 s, otherwise 64 scenes and 10 s, 3 times."""
+    """Measure; quickly 16 scenes once and sleeps of 2 s, otherwise 48 scenes and 5 s, twice."""
     num_scenes, sleep_s = QUICK if options.quick else CAREFUL
     quiet_prefect()
     with prefect_server():
@@ -139,7 +139,7 @@ def plot(result: Comparison, path: Path) -> None:
 
 
 def _repeats(options: Options) -> int:
-    return 1 if options.quick else 3
+    return 1 if options.quick else 2
 
 
 def _wait(sleeping: Sleeping, sleep_s: float, workers: int) -> Mapping[str, float]:

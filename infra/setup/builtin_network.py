@@ -88,6 +88,7 @@ def _card(
     command: str,
 ) -> str:
     settings, model = about["settings"], about["settings"]["model"]
+    swapped = judged["swapped scenes"]
     most = dataset.manifest.settings["scenes"]["max_triangles"]
     shape = (
         f"{summary['num_parameters']} parameters ({model['encoder_layers']} and "
@@ -109,6 +110,9 @@ def _card(
         "beyond either it warns and gets worse",
         "",
         *_scores(judged),
+        "",
+        f"With the triangles of another scene it loses {swapped['median_db']:.2f} dB of "
+        f"psnr_log_db in the median and {swapped['mean_db']:.2f} dB on average.",
         "",
         "```json",
         json.dumps(settings, indent=1, sort_keys=True),

@@ -17,6 +17,7 @@ from model.weights import encode_weights
 from pipeline.flows.judging_builds import JUDGING_BUILDS
 from storage.dataset import Dataset
 from storage.errors import TrilightError
+from storage.metrics import psnr_log_db
 from storage.scene import Scene
 from storage.seeds import rng_for
 from storage.training_data import open_training_data
@@ -33,7 +34,7 @@ from train.evaluation.evaluate import (
 )
 from train.evaluation.grouped_lights import GROUPED, grouped_pictures
 from train.evaluation.groups import by_group, summary
-from train.evaluation.judge import median_picture, predict
+from train.evaluation.judge import judged_scene, median_picture, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
 from train.evaluation.picture_scores import MEANING, hdr_flip, picture_scores
 from train.evaluation.published import BENCHMARK
@@ -183,6 +184,28 @@ def test_a_summary_shows_the_bad_ones_and_the_noise() -> None:
     assert found["near_floor"] == pytest.approx(4 / 11)  # 37 to 40 dB of 40
     partly = [*rows, row(11, scores={NETWORK: rows[0].scores[NETWORK] | {"lpips": 0.5}})]
     assert summary(partly)["lpips"]["median"] is None, "never a median of another set"
+
+
+def test_another_scenes_triangles_through_the_same_cameras(dataset: Dataset) -> None:
+    judging = contest(dataset)
+    rows, samples = judged_views(judging, lambda: None), list(judging.samples())
+    assert [row.swapped_psnr_log_db is None for row in rows] == [True] * 2 + [False] * 4
+    before, judged = samples[1], judged_scene(samples[2], judging.resolution)
+    seen = before.scene.with_cameras(samples[2].scene.c2w, samples[2].scene.fov_deg)
+    mixed = training_scene(dataclasses.replace(samples[2], scene=seen), judging.resolution)
+    shown = predict(judging.network, mixed)
+    for row, picture, target in zip(rows[4:], shown, judged.target_VRR3, strict=True):
+        assert row.swapped_psnr_log_db == psnr_log_db(picture, target)
+
+
+def test_what_swapping_costs_is_told_view_by_view() -> None:
+    swapped = [None, 28.0, 20.0, 34.0]
+    rows = [row(0, swapped_psnr_log_db=value) for value in swapped]
+    loss = record(rows, {})["swapped scenes"]
+    assert loss["views"] == 3 and loss["median_db"] == 2.0  # 30 less 28, 20 and 34
+    assert loss["mean_db"] == pytest.approx(8 / 3) and loss["share_lost"] == pytest.approx(2 / 3)
+    assert "loses 2.00 dB" in markdown(record(rows, {}))
+    assert record(rows[:1], {})["swapped scenes"] is None
 
 
 def test_worst_median_and_excursions_are_found() -> None:

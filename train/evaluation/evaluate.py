@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.renderformer import RenderFormer
+from model.scene_tensors import SceneTensors
 from storage.conventions import radiance_from_log10
 from storage.errors import TrilightError
+from storage.metrics import psnr_log_db
 from storage.ranges import Within, check_ranges
 from storage.sample import Sample
 from storage.shard_set import ShardSet
@@ -23,6 +25,7 @@ from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
 from train.evaluation.picture_scores import floors_of, picture_scores
 from train.evaluation.rivals import Rivals
 from train.evaluation.sheet import SheetView
+from train.evaluation.swapped_scene import swapped_pictures
 from train.loss.lpips import Lpips
 
 RIVAL_SCENES = 256
@@ -77,16 +80,19 @@ def judged_views(contest: Contest, scene_done: Callable[[], None]) -> list[Judge
             scene at all.
     """
     rows: list[JudgedView] = []
+    before: SceneTensors | None = None
     for sample in contest.samples():
         judged = judged_scene(sample, contest.resolution)
         contestants = {NETWORK: predict(contest.network, judged.scene)}
         grouped = grouped_pictures(contest.network, sample.scene, contest.resolution)
         if grouped is not None:
             contestants[GROUPED] = grouped
-        rows += [
+        found = [
             _judged(contest, sample, judged, view, contestants)
             for view in range(len(judged.target_VRR3))
         ]
+        rows += found if before is None else _with_swapped(found, contest.network, judged, before)
+        before = judged.scene.tensors
         scene_done()
     if not rows:
         raise TrilightError("evaluate: the split holds no scene; expected at least one.")
@@ -113,6 +119,16 @@ def _judged(
             for name, shown in pictures.items()
         },
     )
+
+
+def _with_swapped(
+    rows: Sequence[JudgedView], network: RenderFormer, judged: JudgedScene, other: SceneTensors
+) -> list[JudgedView]:
+    pictures_VRR3 = swapped_pictures(network, judged.scene, other)
+    return [
+        dataclasses.replace(row, swapped_psnr_log_db=psnr_log_db(picture, target))
+        for row, picture, target in zip(rows, pictures_VRR3, judged.target_VRR3, strict=True)
+    ]
 
 
 def sheet_views(contest: Contest, chosen: Sequence[JudgedView]) -> list[SheetView]:

@@ -36,6 +36,8 @@ class JudgedView:
     """What the target's noise alone would score (picture_scores.floors_of)."""
     scores: dict[str, dict[str, float | None]]
     """By contestant and metric; None is n/a. Not every view has every contestant."""
+    swapped_psnr_log_db: float | None = None
+    """Of the network shown the triangles of the scene before; None for the first scene."""
 
     def gap(self, metric: str, contestant: str = NETWORK) -> float | None:
         """Return how much worse the picture is than the noise of its target; below 0: not worse."""

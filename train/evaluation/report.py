@@ -9,6 +9,7 @@ from train.evaluation.groups import NEAR_DB, by_group, summary
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.picture_scores import DECIMALS, HIGHER_IS_BETTER, MEANING
 from train.evaluation.published import PUBLISHED_WHERE, published_beside
+from train.evaluation.swapped_scene import loss_by_swapping
 
 NOT_AVAILABLE = "n/a"
 
@@ -28,6 +29,7 @@ def record(views: Sequence[JudgedView], about: Mapping[str, Any]) -> dict[str, A
             for name in views[0].scores
             if all(name in view.scores for view in views)
         },
+        "swapped scenes": loss_by_swapping(views),
         "light passes": passes_compared(views),
         "published": published_beside(views, about),
         "groups": by_group(views),
@@ -43,6 +45,7 @@ def markdown(found: Mapping[str, Any]) -> str:
     lines += _contestants(found["contestants"])
     network = found["contestants"][NETWORK]
     lines += ["", *_against_noise(network)]
+    lines += _swapped(found["swapped scenes"])
     lines += _published(found["published"]) + _light_passes(found["light passes"])
     for split, parts in found["groups"].items():
         lines += ["", f"## By {split}", "", *_parts(parts)]
@@ -73,6 +76,17 @@ def _against_noise(network: Mapping[str, Any]) -> list[str]:
         "",
         f"{network['near_floor']:.1%} of {network['views']} views are within {NEAR_DB:g} dB of "
         "their floor.",
+    ]
+
+
+def _swapped(loss: Mapping[str, Any] | None) -> list[str]:
+    if loss is None:
+        return []
+    return [
+        "",
+        f"With the triangles of another scene the network loses {loss['median_db']:.2f} dB of "
+        f"psnr_log_db in the median and {loss['mean_db']:.2f} dB on average, and is worse in "
+        f"{loss['share_lost']:.1%} of {loss['views']} views. What looks at no scene loses nothing.",
     ]
 
 
