@@ -101,10 +101,19 @@ def stop() -> int:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
         deadline = time.monotonic() + _END_S
-        while running() and time.monotonic() < deadline:
+        while not _all_ended() and time.monotonic() < deadline:
             time.sleep(0.1)
     _mark_file().unlink(missing_ok=True)
     return len(ours)
+
+
+def _all_ended() -> bool:
+    """Look twice: while a process becomes another program (execve), it shows no environment."""
+    for _ in range(2):
+        if running():
+            return False
+        time.sleep(0.05)
+    return True
 
 
 def running(*, without: str | None = None) -> list[int]:

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -37,6 +38,13 @@ def test_an_open_address_needs_a_password(host: str) -> None:
     assert running() == []
 
 
+def _until_seen(number: int) -> None:
+    """Wait: a process that has just begun shows no environment for an instant."""
+    deadline = time.monotonic() + 10
+    while len(running()) < number and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
 def test_stop_ends_what_was_started_and_no_stranger(cache: Path) -> None:
     cache.write_text("ours")
     marks = ("ours", "ours-too", "other")
@@ -45,6 +53,7 @@ def test_stop_ends_what_was_started_and_no_stranger(cache: Path) -> None:
         for mark in marks
     ]
     try:
+        _until_seen(1)
         with pytest.raises(TrilightError, match="runs already"):
             start(host="127.0.0.1", port=4321, workers=1)
         assert stop() == 1
@@ -65,6 +74,7 @@ def test_stop_leaves_it_to_the_starter_to_tell_what_may_save(
     cache.write_text("ours")
     environment = {**os.environ, "TRILIGHT_SERVED": "ours", TOLD_BY_ITS_STARTER: "1"}
     with subprocess.Popen(SLEEP, env=environment, start_new_session=True) as process:
+        _until_seen(1)
         assert stop() == 1
         assert process.wait(30) == -signal.SIGKILL
 
