@@ -130,7 +130,7 @@ def plot(result: Comparison, path: Path) -> None:
             panel.set_xlabel(words)
             panel.grid(alpha=0.3)
             panel.xaxis.set_minor_locator(plt.NullLocator())
-            panel.set_xticks(x, [f"{value:.0f}" for value in x])
+            panel.set_xticks(x, [f"{value:.0f}" for value in x], rotation=40)
             plain_log(panel.yaxis)
     grid[0, 0].set_ylabel("core-seconds")
     grid[1, 0].set_ylabel("MB beyond the weights")
