@@ -104,7 +104,9 @@ def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
         assert row.floors["psnr_log_db"] == 100.0 and row.floors["log_l1"] == pytest.approx(1e-5)
         score = row.scores[NETWORK]["psnr_log_db"]
         assert score is not None and row.gap("psnr_log_db") == pytest.approx(100 - score)
-        assert row.gap("ssim") is None
+        similarity = row.scores[NETWORK]["ssim"]
+        assert similarity is not None and row.gap("ssim") == pytest.approx(1 - similarity, abs=1e-6)
+        assert row.gap("lpips") is None
     few = dataclasses.replace(contest(dataset), most_scenes=1)
     assert len(judged_views(few, lambda: None)) == 2
     with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):

@@ -15,6 +15,7 @@ from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.ranges import Within, check_ranges
 from storage.sample import Sample
+from storage.seeds import rng_for
 from storage.shard_set import ShardSet
 from train.data.scenes import TrainingScene, training_scene
 from train.data.splits import first_samples
@@ -22,7 +23,8 @@ from train.data.unusable import Unusable
 from train.evaluation.grouped_lights import GROUPED, grouped_pictures
 from train.evaluation.judge import JudgedScene, judged_scene, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
-from train.evaluation.picture_scores import floors_of, picture_scores
+from train.evaluation.noise_floors import noise_floors
+from train.evaluation.picture_scores import picture_scores
 from train.evaluation.rivals import Rivals
 from train.evaluation.sheet import SheetView
 from train.evaluation.swapped_scene import swapped_pictures
@@ -113,7 +115,13 @@ def _judged(
     return JudgedView(
         **facts_of(sample),
         view=view,
-        floors=floors_of(dataclasses.asdict(sample.views[view])),
+        floors=noise_floors(
+            sample.views[view],
+            target,
+            hits,
+            contest.lpips,
+            rng_for(0, f"noise of {sample.key}", view),
+        ),
         scores={
             name: picture_scores(shown, target, hits, contest.lpips)
             for name, shown in pictures.items()

@@ -33,7 +33,7 @@ class JudgedView:
     excursion: tuple[str, float] | None
     """Axis and value by which the scene leaves the usual range, if it does."""
     floors: dict[str, float]
-    """What the target's noise alone would score (picture_scores.floors_of)."""
+    """What the target's noise alone would score (evaluation.noise_floors)."""
     scores: dict[str, dict[str, float | None]]
     """By contestant and metric; None is n/a. Not every view has every contestant."""
     swapped_psnr_log_db: float | None = None

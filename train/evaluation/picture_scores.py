@@ -1,8 +1,5 @@
 """Every figure that one picture is judged by, with what each of them is."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -74,20 +71,6 @@ def hdr_flip(radiance_rgb: NDArray, target_rgb: NDArray) -> float | None:
     pictures = [np.ascontiguousarray(p, np.float32) for p in (target_rgb, radiance_rgb)]
     _, mean, _ = flip_evaluator.evaluate(*pictures, "HDR", applyMagma=False)
     return float(mean)
-
-
-def floors_of(view: Mapping[str, Any]) -> dict[str, float]:
-    """Return what the target's own noise would score, of those metrics of which that is known.
-
-    Measured for the three PSNRs, at the resolution that is stored: fewer pixels have less noise.
-    For log_l1 it is an upper bound, since a mean absolute error is at most the root mean square.
-    """
-    return {
-        "psnr_log_db": view["noise_floor_db"],
-        "object_psnr_log_db": view["object_noise_floor_db"],
-        "psnr_linear_db": view["noise_floor_linear_db"],
-        "log_l1": 10 ** (-view["noise_floor_db"] / 20),
-    }
 
 
 def _tone_mapped(radiance_rgb: NDArray) -> Tensor:

@@ -69,8 +69,9 @@ def _against_noise(network: Mapping[str, Any]) -> list[str]:
         gap = network[metric]["median_worse_than_noise"]
         rows.append([metric, _shown(metric, gap)])
     return [
-        "Median of how much worse the network's picture is than the noise of its own target (n/a: "
-        "the noise was not measured in that metric; log_l1 against an upper bound):",
+        "Median of how much worse the network's picture is than the noise of its own target. The "
+        "noise of the PSNRs was measured, at the resolution of the data; log_l1 stands against an "
+        "upper bound of it, ssim, lpips and hdr_flip against independent noise of that size:",
         "",
         *_table(["metric", "worse than noise"], rows),
         "",
