@@ -5,12 +5,11 @@ import platform
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from model.renderformer import RenderFormer, count_parameters
+from model.renderformer import count_parameters
 from model.weights import decode_config, encode_weights
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
@@ -34,22 +33,10 @@ from train.networks import open_network
 from train.progress import Progress, Silent
 from train.result import TrainResult, finished, pretty_json
 from train.settings import TrainSettings, settings_record
+from train.start import Start
 
 MEDIAN_SCENES = 256
 """Training scenes of which the median picture is taken; more would not move it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Start:
-    """How a run begins or goes on."""
-
-    resume: bool = False
-    """Go on from the folder's newest checkpoint; the weights come out the same to the bit on the
-    CPU, for the same number of threads and processes. A finished run is judged again."""
-    begin_with: str | None = None
-    """Network whose weights and configuration a run with `from_weights` takes over."""
-    lpips: str | None = None
-    """Where LPIPS' weights are (loss.lpips_weights)."""
 
 
 def train_run(
@@ -170,7 +157,8 @@ def _begin(
             f"{folder.root}: holds a run already; add --resume to go on with it, or choose "
             "another --out."
         )
-    network = _network_to_begin_with(settings, start)
+    start.check(settings)
+    network = None if start.begin_with is None else open_network(start.begin_with)
     if network is not None:
         settings = dataclasses.replace(settings, model=network.config)
     if crew.is_first:
@@ -184,20 +172,6 @@ def _begin(
         }
         write_atomically(folder.settings, pretty_json(record))
     return settings, new_state(settings, crew.device, network)
-
-
-def _network_to_begin_with(settings: TrainSettings, start: Start) -> RenderFormer | None:
-    if settings.from_weights and start.begin_with is None:
-        raise TrilightError(
-            f"run {settings.run}: begins with a trained network; name one with --from, or say "
-            "--set from_weights=false to begin with random weights."
-        )
-    if start.begin_with is not None and not settings.from_weights:
-        raise TrilightError(
-            f"run {settings.run}: begins with random weights, but --from names "
-            f"{start.begin_with}; add --set from_weights=true to begin with those."
-        )
-    return None if start.begin_with is None else open_network(start.begin_with)
 
 
 def _note_other_crew(checkpoint: Checkpoint, crew: Crew, progress: Progress) -> None:

@@ -7,10 +7,12 @@ replacement, and the loss behind the ELU. `pretrain` and `finetune` are ours.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from model.config import base as base_model
 from model.config import smoke as smoke_model
+from storage.changes import changed
 from storage.errors import TrilightError
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
@@ -149,3 +151,28 @@ def named_run(name: str) -> TrainSettings:
             f"run {name!r}: no such run; expected one of {', '.join(sorted(RUNS))}."
         )
     return RUNS[name]()
+
+
+def changed_run(
+    name: str,
+    changes: Mapping[str, Any],
+    *,
+    steps: int | None = None,
+    most_unusable: int | None = None,
+) -> TrainSettings:
+    """Return the settings of a run, with what a person wants otherwise.
+
+    Args:
+        name: of the run.
+        changes: values by dotted name, as `storage.changes` takes them.
+        steps: replaces the number of steps, after the changes.
+        most_unusable: replaces that setting, likewise.
+
+    Raises:
+        TrilightError: no such run or setting, or a value that is refused; the message names it.
+    """
+    settings = changed(named_run(name), changes)
+    last: dict[str, Any] = {"num_steps": steps, "most_unusable": most_unusable}
+    return dataclasses.replace(
+        settings, **{field: value for field, value in last.items() if value is not None}
+    )

@@ -1,4 +1,4 @@
-"""Training runs: one frozen description of everything that decides the weights.
+"""Training runs: one frozen description of everything that decides the weights. Without torch.
 
 A run is a Python function that returns the whole description (train.runs); the command line picks
 one and may replace fields. What is not here cannot be changed.
@@ -9,15 +9,11 @@ import json
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args
 
-import torch
-
 from model.config import ModelConfig
 from storage.errors import TrilightError
 from storage.ranges import Seed, Share, Within, check_ranges
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
-
-PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 Precision = Literal["float32", "bfloat16"]
 """Of the network's products. Positions, losses, weights and AdamW's memories stay float32."""

@@ -26,8 +26,9 @@ from train.folder import RunFolder
 from train.loop.checkpoints import saved_steps
 from train.loop.crew import join_crew
 from train.loop.metrics_log import read_rows
-from train.run import Start, train_run
+from train.run import train_run
 from train.settings import TrainSettings
+from train.start import Start
 
 TABLE = RESULTS / "training_table.jsonl"
 

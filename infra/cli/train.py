@@ -1,10 +1,9 @@
 """`trilight train`: a named run on the shards of a dataset, alone or under torchrun."""
 
-import dataclasses
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import Progress as Bars
@@ -13,12 +12,10 @@ from rich.text import Text
 
 from infra.cli.changes import parse_changes
 from infra.cli.console import console, print_rows, progress_bars
-from storage.changes import changed
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
     from train.result import TrainResult
-    from train.settings import TrainSettings
 
 
 class _BarProgress:
@@ -102,12 +99,14 @@ def train(
     """
     try:
         from train.loop.crew import join_crew
-        from train.run import Start, train_run
+        from train.run import train_run
+        from train.runs import changed_run
+        from train.start import Start
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
         raise TrilightError("train: torch is not installed; run `make setup-all`.") from error
-    settings = _settings(run, steps, skip_unusable, parse_changes(set_ or ()))
+    settings = changed_run(run, parse_changes(set_ or ()), steps=steps, most_unusable=skip_unusable)
     start = Start(resume=resume, begin_with=from_, lpips=lpips)
     with join_crew(device) as crew, progress_bars() as bars:
         result = train_run(
@@ -125,19 +124,6 @@ def train(
         sys.stdout.write(result.folder.summary.read_text())
     else:
         _report(result)
-
-
-def _settings(
-    run: str, steps: int | None, skip_unusable: int | None, changes: Mapping[str, Any]
-) -> "TrainSettings":
-    from train.runs import named_run
-
-    settings = changed(named_run(run), changes)
-    if steps is not None:
-        settings = dataclasses.replace(settings, num_steps=steps)
-    if skip_unusable is not None:
-        settings = dataclasses.replace(settings, most_unusable=skip_unusable)
-    return settings
 
 
 def _report(result: "TrainResult") -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 from infra.rendering.session import Asked
+from infra.serving.train_model import TrainOrder
 from pipeline.documents.markdown import table
 from pipeline.flows.served.orders import DatasetInRuns
 from pipeline.flows.served.schema import field_docs
-from pipeline.flows.served.train_model import TrainOrder
 from pipeline.flows.settings import BuildSettings
 from storage.ranges import Declared, declared_ranges, shown_number
 from storage.scene import Scene

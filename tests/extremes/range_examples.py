@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from infra.rendering.session import Asked
+from infra.serving.train_model import TrainOrder
 from infra.setup.ranges import ROOTS, reachable
 from model.config import ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.flows.builds import named_build
 from pipeline.flows.served.orders import DatasetInRuns
-from pipeline.flows.served.train_model import TrainOrder
 from pipeline.flows.settings import BuildSettings
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from scene_templates.contents.cameras import CameraSettings

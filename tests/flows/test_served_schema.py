@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from prefect.exceptions import ParameterTypeError
 
+from infra.serving.train_model import train_model
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.served.build_dataset import build_dataset
 from pipeline.flows.served.generate_scenes import generate_scenes
@@ -13,7 +14,6 @@ from pipeline.flows.served.orders import dataset_order
 from pipeline.flows.served.prepare_assets import prepare_assets
 from pipeline.flows.served.runner import may_pass
 from pipeline.flows.served.schema import BuildChanges, changed_values, field_docs
-from pipeline.flows.served.train_model import TrainOrder, train_model
 from pipeline.flows.settings import BuildSettings
 from storage.errors import EnvironmentFailure, TrilightError
 
@@ -98,8 +98,9 @@ def test_secrets_are_refused_before_a_run_exists(source: str) -> None:
     """The server checks the same schema when a run is made, so that it never stores one."""
     with pytest.raises(ParameterTypeError, match="objects"):
         generate_scenes.validate_parameters({"objects": source})
-    with pytest.raises(ParameterTypeError, match="data"):
-        train_model.validate_parameters({"data": [source]})
+    for parameter, given in (("data", [source]), ("begin_with", source), ("lpips", source)):
+        with pytest.raises(ParameterTypeError, match=parameter):
+            train_model.validate_parameters({parameter: given})
     for harmless in ("builtin:500", "https://host/folder", "s3://b/f", "env:SOURCE", "a/b c", None):
         generate_scenes.validate_parameters({"objects": harmless})
 
@@ -138,18 +139,3 @@ def test_only_what_can_pass_is_tried_again() -> None:
         )
     }
     assert list(outcomes.values()) == [True, True, False, False]
-
-
-def test_training_is_launched_by_torchrun_where_there_are_several_processes() -> None:
-    one = TrainOrder(data=("a", "b"), resume=True, steps=5).command()
-    assert (
-        one[1:]
-        == (
-            "-m infra.cli.app train smoke --out runs/smoke --workers 1 --data a --data b --resume "
-            "--steps 5"
-        ).split()
-    )
-    two = TrainOrder(processes=2).command()
-    assert two[1:5] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    with pytest.raises(TrilightError, match="processes is 0"):
-        TrainOrder(processes=0)

@@ -9,8 +9,9 @@ from model.config import ModelConfig
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
 from train.result import TrainResult
-from train.run import Start, train_run
+from train.run import train_run
 from train.settings import TrainSettings
+from train.start import Start
 
 TINY_MODEL = ModelConfig(
     width=36,

@@ -13,8 +13,9 @@ from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
 from train.loss.settings import LossSettings
 from train.networks import open_network
-from train.run import Start, train_run
+from train.run import train_run
 from train.settings import TrainSettings
+from train.start import Start
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
     run(second, dataset, tmp_path / "second", Start(resume=True))
     with pytest.raises(TrilightError, match="begins with a trained network; name one with --from"):
         run(second, dataset, tmp_path / "third", Start())
-    with pytest.raises(TrilightError, match="add --set from_weights=true"):
+    with pytest.raises(TrilightError, match="to begin with those: --set from_weights=true"):
         run(tiny_run(), dataset, tmp_path / "third", Start(begin_with=place))
     with pytest.raises(TrilightError, match="no such file or folder"):
         run(second, dataset, tmp_path / "third", Start(begin_with=str(tmp_path / "none")))

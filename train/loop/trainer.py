@@ -4,6 +4,8 @@ import math
 import time
 from collections.abc import Iterator
 
+import torch
+
 from storage.errors import TrilightError
 from train.data.buckets import bucket_scenes
 from train.data.scenes import TrainingScene
@@ -19,8 +21,10 @@ from train.loop.state import TrainState
 from train.loop.step import Stepper, StepReport
 from train.loop.window import Window
 from train.loss.objective import Objective
-from train.settings import PRODUCTS, TrainSettings
+from train.settings import TrainSettings
 
+PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+"""Types of the network's products, by `precision`."""
 MOST_SKIPPED_IN_A_ROW = 10
 """A few steps may overflow; this many say that the weights themselves are lost."""
 

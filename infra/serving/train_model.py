@@ -1,6 +1,7 @@
 """The flow `train-model`: a training run as a process, or as several by torchrun.
 
-Making and learning meet only through files, so nothing of `train` is imported here.
+It stands in `infra`, where making and learning may both be seen: the form has every setting of
+`train.settings`, and what a run refuses is refused before its process exists, without torch.
 """
 
 import contextlib
@@ -8,7 +9,7 @@ import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from prefect import flow
 from prefect.concurrency.sync import concurrency
@@ -17,9 +18,17 @@ from prefect.logging import get_run_logger
 from pipeline.flows.machine import visible_gpus
 from pipeline.flows.served.process import run_to_end
 from pipeline.flows.served.runner import GPU_LIMIT
-from pipeline.flows.served.schema import PublicUrl, parameters_of
+from pipeline.flows.served.schema import PublicUrl, changed_values, changes_form, parameters_of
 from storage.errors import TrilightError
 from storage.ranges import Within, check_ranges
+from train.runs import RUNS, changed_run, smoke
+from train.settings import TrainSettings
+from train.start import Start
+
+RunName = Literal[tuple(RUNS)]  # type: ignore[valid-type]
+"""A list to choose from."""
+RunChanges = changes_form(TrainSettings, smoke())
+"""Every setting of a run; what stays empty is as the run has it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +43,14 @@ class TrainOrder:
     """Folder of the run, as the worker sees it."""
     resume: bool = False
     """Go on from the last checkpoint."""
+    begin_with: str | None = None
+    """Folder of a run, or checkpoint, whose weights a finetune run begins with."""
+    lpips: str | None = None
+    """Folder of LPIPS' weights, or hub to download them; otherwise what TRILIGHT_LPIPS says."""
     steps: Annotated[int | None, Within(1, 10**9, unit="steps")] = None
     """Replaces the run's number of steps."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Any other setting of the run by its dotted name, such as loss.perceptual."""
+    """Any other setting of the run, such as perceptual in the group loss."""
     workers: Annotated[int, Within(1, 1024, unit="threads")] = 1
     """Threads that decode samples."""
     processes: Annotated[int, Within(1, 1024, unit="processes")] = 1
@@ -57,20 +70,46 @@ class TrainOrder:
         options = ["--out", self.out, "--workers", str(self.workers)]
         options += [part for place in self.data for part in ("--data", place)]
         options += ["--resume"] if self.resume else []
+        options += [] if self.begin_with is None else ["--from", self.begin_with]
+        options += [] if self.lpips is None else ["--lpips", self.lpips]
         options += [] if self.steps is None else ["--steps", str(self.steps)]
         for name, value in sorted(self.changes.items()):
             options += ["--set", f"{name}={json.dumps(value)}"]
         return [sys.executable, *launch, "train", self.run, *options]
 
 
+TRAIN_FORMS: Mapping[str, Any] = {
+    "run": RunName,
+    "data": list[PublicUrl],
+    "begin_with": PublicUrl | None,
+    "lpips": PublicUrl | None,
+    "changes": RunChanges | None,
+}
+"""Types of parameters that are narrower in a form than in an order."""
+
+
+def train_order(parameters: Mapping[str, Any]) -> TrainOrder:
+    """Return the order that the flow's parameters state.
+
+    Raises:
+        TrilightError: a value that no schema can refuse, such as one that does not fit another
+            setting of the run; the message names it.
+    """
+    given = {"data": tuple(parameters["data"]), "changes": changed_values(parameters["changes"])}
+    order = TrainOrder(**{**parameters, **given})
+    settings = changed_run(order.run, order.changes, steps=order.steps)
+    Start(resume=order.resume, begin_with=order.begin_with).check(settings, "begin_with")
+    return order
+
+
 @flow(name="train-model", persist_result=False)
-@parameters_of(TrainOrder, data=list[PublicUrl])
+@parameters_of(TrainOrder, **TRAIN_FORMS)
 def train_model(**parameters: Any) -> None:
     """Train a model on a dataset, in processes of its own; a run that is cancelled is saved.
 
     Prefect waits for half a minute then; `resume` goes on from there.
     """
-    order = TrainOrder(**{**parameters, "data": tuple(parameters["data"])})
+    order = train_order(parameters)
     log = get_run_logger()
     cards = len(visible_gpus())
     limit = (

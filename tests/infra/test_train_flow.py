@@ -1,0 +1,124 @@
+"""The flow `train-model`: a form of the runs and their settings, which says what is wrong."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect.exceptions import ParameterTypeError
+
+from infra.serving.train_model import RunChanges, TrainOrder, train_model, train_order
+from storage.errors import TrilightError
+from tests.conftest import ROOT
+from train.runs import RUNS, named_run
+from train.settings import TrainSettings
+
+SECOND_STAGES = sorted(name for name in RUNS if named_run(name).from_weights)
+
+
+def _parameters(**given: Any) -> dict[str, Any]:
+    """Return what the flow is called with where nothing else is filled in."""
+    plain = {field.name: field.default for field in dataclasses.fields(TrainOrder)}
+    return {**plain, "data": ["a"], "changes": None, **given}
+
+
+def test_training_is_launched_by_torchrun_where_there_are_several_processes() -> None:
+    one = TrainOrder(data=("a", "b"), resume=True, steps=5).command()
+    assert (
+        one[1:]
+        == (
+            "-m infra.cli.app train smoke --out runs/smoke --workers 1 --data a --data b --resume "
+            "--steps 5"
+        ).split()
+    )
+    two = TrainOrder(processes=2).command()
+    assert two[1:5] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    with pytest.raises(TrilightError, match="processes is 0"):
+        TrainOrder(processes=0)
+
+
+def test_the_form_has_every_run_and_every_setting() -> None:
+    schema = train_model.parameters.model_dump()
+    assert schema["properties"]["run"]["enum"] == list(RUNS)
+    groups = schema["definitions"]
+    settings = groups["TrainSettingsChanges"]["properties"]
+    assert set(settings) == {field.name for field in dataclasses.fields(TrainSettings)}
+    assert settings["learning_rate"]["anyOf"][0]["exclusiveMinimum"] == 0
+    assert groups["LossSettingsChanges"]["properties"]["perceptual"]["anyOf"][0]["enum"] == [
+        "lpips", "ms_ssim", "none",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"run": "pretain"}, "run"),
+        ({"changes": {"warm_up": 3}}, "changes.warm_up"),
+        ({"changes": {"loss": {"perceptual": "vgg"}}}, "changes.loss.perceptual"),
+        ({"changes": {"model": {"width": 0}}}, "changes.model.width"),
+        ({"changes": {"betas": [0.9, 1.0]}}, "changes.betas.1"),
+        ({"changes": {"loss.perceptual": "none"}}, "changes.loss.perceptual"),
+    ],
+)
+def test_a_wrong_form_is_refused_before_a_run_exists(
+    parameters: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ParameterTypeError, match=message):
+        train_model.validate_parameters(parameters)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"changes": {"resolution": 60}}, "resolution is 60; expected a multiple of 8"),
+        ({"changes": {"validate_every": 7}}, "validate_every is 7; expected a multiple"),
+        ({"steps": 50}, "warmup_steps is 50; expected 0 to 49"),
+        ({"run": "finetune"}, "name one with begin_with"),
+        ({"run": "pretrain", "begin_with": "runs/x"}, "begin_with names runs/x"),
+    ],
+)
+def test_laws_between_settings_are_checked_before_the_command(
+    given: dict[str, Any], message: str
+) -> None:
+    """No schema can say them; the order is made in the flow's first moment."""
+    form = RunChanges(**given.pop("changes")) if "changes" in given else None
+    with pytest.raises(TrilightError, match=message):
+        train_order(_parameters(**given, changes=form))
+
+
+@pytest.mark.parametrize("run", SECOND_STAGES)
+def test_a_second_stage_begins_with_the_first(run: str) -> None:
+    form = RunChanges(**{"loss": {"perceptual_weight": 0.1}, "num_steps": 9000})
+    given = {"run": run, "begin_with": "runs/pretrain", "lpips": "hub", "changes": form}
+    command = train_order(_parameters(**given)).command()
+    words = " ".join(command[command.index("train") :])
+    assert words == (
+        f"train {run} --out runs/smoke --workers 1 --data a --from runs/pretrain --lpips hub "
+        "--set loss.perceptual_weight=0.1 --set num_steps=9000"
+    )
+    again = TrainOrder(run=run, resume=True).command()
+    assert "--resume" in again and "--from" not in again
+
+
+def test_the_command_line_takes_every_option_of_the_command(tmp_path: Path) -> None:
+    """It comes as far as the data, which is not there: after its options and the run's settings."""
+    order = TrainOrder(
+        run="finetune", data=(str(tmp_path / "none"),), out=str(tmp_path / "run"), steps=9000,
+        begin_with="runs/x", lpips="hub", changes={"loss.perceptual": "none"},
+    )  # fmt: skip
+    done = subprocess.run(order.command(), cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert str(tmp_path / "none") in done.stderr
+    assert "no such option" not in done.stderr.lower()
+
+
+def test_serving_the_flow_needs_no_torch() -> None:
+    """A worker may have only what making data needs, and a wrong form need not wait for torch."""
+    code = "import sys, json, infra.serving.train_model; print(json.dumps('torch' in sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert json.loads(done.stdout.splitlines()[-1]) is False
