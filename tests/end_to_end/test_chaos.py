@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shutil
 import signal
 import threading
 import time
@@ -14,13 +15,16 @@ import numpy as np
 import pytest
 
 from storage.dataset import open_dataset
+from storage.manifest import shard_row
 from storage.verify import verify_dataset
+from tests.documents.dataset_by_hand import five_scenes
 from tests.end_to_end.conftest import marked_environment, processes_with
 from tests.end_to_end.production_kit import call, postgres, served, start_served, stop_served
 
 KILLS = int(os.environ.get("TRILIGHT_CHAOS_KILLS", "8"))
 """Eight take ten minutes; 30, which the variable asks for, take half an hour and more."""
-SCENES = 2 * KILLS
+SCENES = 4 * -(-KILLS // 2)
+"""Two for each kill, in whole shards of four."""
 WORDS = {
     "flow": "prefect.engine",
     "child": "multiprocessing.forkserver",
@@ -32,6 +36,8 @@ SHARES = {"child": 0.5, "flow": 0.3, "worker": 0.1, "server": 0.1}
 """Of the victims after one of each kind; a worker or server takes half a minute to come back."""
 LOOK_S = 0.1
 """Between two looks for a victim that is not there yet, such as a child of a flow that starts."""
+LOOK_EVERY_S = 0.2
+"""Between two looks of the watcher."""
 RUN_S = 600
 
 
@@ -66,17 +72,19 @@ def _next_kind(killed: Counter[str], rng: np.random.Generator) -> str:
 
 @contextlib.contextmanager
 def _watched(out: Path, whole: Path) -> Iterator[list[str]]:
-    """Compare what is visible under a final name with what it must be, all the time."""
+    """Compare what is visible under a final name with what it must be, all the time.
+
+    Whatever goes wrong in the thread is told too: a watcher that died would have seen nothing.
+    """
     wrong: list[str] = []
     ended = threading.Event()
 
     def look() -> None:
-        while not ended.wait(0.2):
-            wrong.extend(
-                shard.name
-                for shard in out.glob("*.tar")
-                if shard.read_bytes() != (whole / shard.name).read_bytes()
-            )
+        while not ended.wait(LOOK_EVERY_S):
+            try:
+                wrong.extend(_wrong_now(out, whole))
+            except Exception as error:
+                wrong.append(repr(error))
 
     watcher = threading.Thread(target=look)
     watcher.start()
@@ -85,6 +93,53 @@ def _watched(out: Path, whole: Path) -> Iterator[list[str]]:
     finally:
         ended.set()
         watcher.join()
+
+
+def _wrong_now(out: Path, whole: Path) -> Iterator[str]:
+    """Yield what is visible and is not as it must be; raises for what cannot be read at all."""
+    listed = open_dataset(str(out)).manifest.shards if (out / "manifest.json").exists() else ()
+    expected = {shard.name: shard for shard in open_dataset(str(whole)).manifest.shards}
+    for shard in out.glob("*.tar"):
+        if shard.read_bytes() != (whole / shard.name).read_bytes():
+            yield shard.name
+    for entry in listed:  # read before: a shard is there before the manifest says so
+        if not (out / entry.name).exists():
+            yield f"{entry.name} is listed and not there"
+        if shard_row(entry) != shard_row(expected[entry.name]):
+            yield f"{entry.name} is listed as another one"
+    for path in out.glob("*.json"):
+        json.loads(path.read_text())
+    for path in out.glob("*.jsonl"):
+        for line in path.read_text().splitlines():
+            json.loads(line)
+
+
+DAMAGES: dict[str, tuple[str, bytes | None]] = {
+    "FileNotFoundError": ("train-000009.tar", b""),
+    "train-000000.tar": ("train-000000.tar", b"half"),
+    "train-000000.tar is listed and not there": ("train-000000.tar", None),
+    "not a readable manifest": ("manifest.json", b"{"),
+    "JSONDecodeError": ("failures.jsonl", b'{"stage"'),
+}
+"""What must never be seen, by what the watcher says of it: a file, and its bytes, if any."""
+
+
+@pytest.mark.parametrize("told", ["", *DAMAGES])
+def test_the_watcher_tells_what_must_not_be_seen(tmp_path: Path, told: str) -> None:
+    out, whole = tmp_path / "set", tmp_path / "whole"
+    five_scenes(whole)
+    shutil.copytree(whole, out)
+    if told:
+        name, content = DAMAGES[told]
+        (out / name).unlink(missing_ok=True)
+        if content is not None:
+            (out / name).write_bytes(content)
+    with _watched(out, whole) as wrong:
+        deadline = time.monotonic() + (60 if told else 3 * LOOK_EVERY_S)
+        while not wrong and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert bool(wrong) == bool(told)
+    assert all(told in line for line in wrong), wrong
 
 
 @pytest.mark.slow
