@@ -19,6 +19,7 @@ import uuid
 from collections.abc import Mapping
 from pathlib import Path
 
+from infra.serving.limits import ROOT, call_prefect, make_limits
 from pipeline.flows.machine import cores_owned, visible_gpus
 from pipeline.flows.prefect_server import (
     TOLD_BY_ITS_STARTER,
@@ -29,10 +30,7 @@ from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.errors import TrilightError
 
-ROOT = Path(__file__).parents[2]
 POOL = "local"
-_DISK_SLOTS = 2
-"""Runs that write documents at the same time: each reads its whole dataset."""
 _MARK = "TRILIGHT_SERVED"
 _END_S = 20.0
 _RELEASE_S = 5.0
@@ -143,26 +141,8 @@ def _prepare(environment: Mapping[str, str]) -> None:
         ["work-pool", "create", POOL, "--type", "process", "--overwrite"],
         ["deploy", "--name", f"*/{POOL}"],
     ):
-        _call(arguments, environment)
-    for name, limit in (("trilight-disk", _DISK_SLOTS), ("trilight-gpu", len(visible_gpus()) or 1)):
-        action = "update" if _call(["gcl", "inspect", name], environment, check=False) else "create"
-        _call(["gcl", action, name, "--limit", str(limit)], environment)
-
-
-def _call(arguments: list[str], environment: Mapping[str, str], *, check: bool = True) -> bool:
-    done = subprocess.run(
-        ["prefect", "--no-prompt", *arguments],
-        cwd=ROOT,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if check and done.returncode:
-        last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:]
-        raise TrilightError(f"make serve: prefect {' '.join(arguments)} failed: {' '.join(last)}")
-    return done.returncode == 0
+        call_prefect(arguments, environment)
+    make_limits(environment)
 
 
 def _launch(

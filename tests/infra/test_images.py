@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import shlex
 import subprocess
 import sys
 import uuid
@@ -136,6 +137,20 @@ def test_flows_write_to_volumes_whatever_their_form_says() -> None:
             assert given["out"].startswith("/data/")
     mounts = {mount["mountPath"] for mount in _containers()[-1][2]["volumeMounts"]}
     assert mounts == {"/data", "/cache"}
+
+
+def test_what_deploys_the_flows_makes_their_limits_first() -> None:
+    """Without its limit a flow takes as many graphics cards as there are runs."""
+    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]["deploy"]
+    shell = shlex.split(compose["command"])
+    assert shell[:2] == ["sh", "-ec"]
+    (job,) = (part for name, _, part in _containers() if name == "trilight-deploy")
+    given = {row["name"] for row in job["env"]}
+    for script, variables in ((shell[2], set(compose["environment"])), (job["command"][2], given)):
+        commands = [line.strip() for line in script.replace("&&", "\n").splitlines()]
+        made = commands.index("python -m infra.serving.limits")
+        assert made < next(at for at, line in enumerate(commands) if " deploy " in line)
+        assert "TRILIGHT_CARDS" in variables  # where they are made, there is no card
 
 
 def test_prefect_takes_the_job_template() -> None:
