@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 import typer
 
 from infra.cli.console import console, print_rows, progress_bars
+from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
 
@@ -63,7 +64,7 @@ def bench(
     cycles: Annotated[
         str, typer.Option(help="render: Cycles at these samples too, as 128,4096; installs Blender")
     ] = "",
-    price: Annotated[float, typer.Option(help="render: USD per core-hour")] = 0.04,
+    price: Annotated[float, typer.Option(help="render: USD per core-hour")] = USD_PER_CORE_HOUR,
     resume: Annotated[
         bool, typer.Option(help="render, trade: go on with the same run where it was interrupted")
     ] = False,
@@ -90,7 +91,7 @@ def bench(
         allowed_licences=(*DEFAULT_ALLOWED, *(allow_licence or ())),
         scenes=scenes,
         cycles_spp=_samples(cycles),
-        usd_per_core_hour=price,
+        usd_per_core_hour=CorePrice(price=price).price,
         resume=resume,
         knobs=tuple(knob or ()),
         checkpoint=checkpoint,

@@ -8,6 +8,7 @@ import typer
 from infra.cli.changes import parse_changes
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from pipeline.flows.order import DatasetOrder
+from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
 
 
 def plan(
@@ -16,7 +17,7 @@ def plan(
     objects: Annotated[str | None, typer.Option(help="as for generate [builtin:]")] = None,
     samples: Annotated[int, typer.Option(min=4, help="scenes to measure")] = 12,
     cores: Annotated[int, typer.Option(min=1, help="cores of the fleet, all of them")] = 64,
-    price: Annotated[float, typer.Option(help="USD per core-hour")] = 0.04,
+    price: Annotated[float, typer.Option(help="USD per core-hour")] = USD_PER_CORE_HOUR,
     resolution: Annotated[int | None, typer.Option(help="picture width in pixels")] = None,
     noise_floor: Annotated[
         float | None, typer.Option("--noise-floor", help="target in dB (psnr_log_db)")
@@ -29,6 +30,7 @@ def plan(
     """Measure a few scenes and predict time, cores, bytes and cost, each with an interval."""
     from infra.planning import measure_scenes, predict  # slow: every stage
 
+    core_price = CorePrice(price=price)
     order = DatasetOrder(
         build=build,
         objects=objects,
@@ -40,7 +42,7 @@ def plan(
     with progress_bars() as bars:
         task = bars.add_task("scenes", total=samples, note="", visible=not json)
         measured = measure_scenes(order, samples, lambda: bars.advance(task))
-    found = predict(measured, order, cores=cores, usd_per_core_hour=price)
+    found = predict(measured, order, cores=cores, usd_per_core_hour=core_price.price)
     if json:
         print_json(dataclasses.asdict(found))
         return

@@ -7,17 +7,19 @@ from typing import Annotated
 import typer
 
 from infra.cli.console import console, print_json, print_rows
+from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
 from storage.dataset_status import DatasetStatus, read_status
 
 
 def status(
     dataset: Annotated[str, typer.Argument(help="the dataset, a folder or a URL")],
-    price: Annotated[float, typer.Option(help="USD per core-hour")] = 0.04,
+    price: Annotated[float, typer.Option(help="USD per core-hour")] = USD_PER_CORE_HOUR,
     json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
 ) -> None:
     """Say how far a dataset is, when it will be done, and what failed; needs no server."""
+    core_price = CorePrice(price=price)
     found = read_status(dataset)
-    cost = None if found.core_hours is None else found.core_hours * price
+    cost = None if found.core_hours is None else found.core_hours * core_price.price
     if json:
         row = {**dataclasses.asdict(found), "next": found.next_command, "cost_usd": cost}
         print_json(row)

@@ -11,6 +11,7 @@ from typing import Any, get_args
 from infra.rendering.session import Asked
 from infra.serving.train_model import TrainOrder
 from pipeline.documents.markdown import table
+from pipeline.flows.price import CorePrice
 from pipeline.flows.served.orders import DatasetInRuns
 from pipeline.flows.served.schema import field_docs
 from pipeline.flows.settings import BuildSettings
@@ -25,6 +26,7 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Scene": (Scene,),
     "Generate": (DatasetInRuns, BuildSettings),
     "Render": (Asked,),
+    "Plan": (CorePrice,),
     "Train": (TrainOrder, TrainSettings),
     "Evaluate": (Contest,),
 }

@@ -13,6 +13,7 @@ from infra.setup.ranges import ROOTS, reachable
 from model.config import ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.flows.builds import named_build
+from pipeline.flows.price import CorePrice
 from pipeline.flows.served.orders import DatasetInRuns
 from pipeline.flows.settings import BuildSettings
 from pipeline.renders.settings import MAX_SPP, RenderSettings
@@ -67,6 +68,7 @@ EXAMPLES: dict[type, Any] = {
     RenderSettings: SMOKE.renders,
     SplitSettings: SMOKE.splits,
     Asked: ASKED,
+    CorePrice: CorePrice(),
     TrainOrder: TrainOrder(),
     TrainSettings: RUN,
     ModelConfig: tiny(),

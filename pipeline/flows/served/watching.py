@@ -22,13 +22,12 @@ from prefect.logging import get_run_logger
 from pipeline.flows.dataset_run import Outcome, Run
 from pipeline.flows.make_task import TaskOutcome
 from pipeline.flows.order import DatasetOrder
+from pipeline.flows.price import PRICES, USD_PER_CORE_HOUR
 from storage.errors import TrilightError
 from storage.failures import count_by_reason, read_failures
 from storage.output import dataset_folder
 from storage.safe_url import safe_text
 
-USD_PER_CORE_HOUR = 0.04
-"""What TRILIGHT_USD_PER_CORE_HOUR says otherwise."""
 _EVERY_S = 15.0
 """Between two tables; each is a row of Prefect's database."""
 
@@ -144,16 +143,16 @@ def usd_per_core_hour() -> float:
     """Return what an hour of a core costs.
 
     Raises:
-        TrilightError: TRILIGHT_USD_PER_CORE_HOUR is not a number from 0.
+        TrilightError: TRILIGHT_USD_PER_CORE_HOUR is no price.
     """
     text = os.environ.get("TRILIGHT_USD_PER_CORE_HOUR", str(USD_PER_CORE_HOUR))
     try:
         price = float(text)
     except ValueError:
-        price = -1.0
-    if not 0 <= price < float("inf"):
+        price = float("nan")
+    if not PRICES.holds(price):
         raise TrilightError(
-            f"TRILIGHT_USD_PER_CORE_HOUR is {text!r}; expected a number from 0, such as 0.04."
+            f"TRILIGHT_USD_PER_CORE_HOUR is {text!r}; expected a number {PRICES}, such as 0.04."
         )
     return price
 
