@@ -29,10 +29,11 @@ from storage.splits import planned_scenes, shard_name, shards_for
 from storage.staging import read_staged_scene
 
 _DRAWS = 2000
-_BYTES_PER_TASK_RUN = 16_000
-"""Of Prefect's database: three states and three events (measured, DECISIONS.md)."""
+_BYTES_PER_TASK_RUN = 19_400
+"""Of Prefect's database: states, events and indices (`trilight bench orchestration`; figures in
+docs/tradeoffs.md, How far the records keep up)."""
 _BYTES_PER_MEMBER = 65
-"""Of the manifest: name, offset and size of one member (measured)."""
+"""Of the manifest: name, offset and size of one member (measured, in the same place)."""
 _LARGE_MANIFEST_MB = 512
 _LONG_TASK_MINUTES = 10
 

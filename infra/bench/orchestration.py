@@ -5,7 +5,9 @@ exactly. A thousand tasks without work are the largest flow run that we make; th
 their records after the flow has ended, and how long that takes is the limit on what it can show.
 """
 
+import contextlib
 import os
+import sqlite3
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -50,8 +52,12 @@ class Orchestration(Result):
     """Cores that the waiting server keeps busy."""
     server_mb: float
     """Its memory then."""
+    flow_cores: float
+    """Cores that the flow's process keeps busy while its tasks sleep, their ends included."""
     flow_mb: float
     """Memory of the flow's process after all its tasks."""
+    bytes_per_task_run: float
+    """What the server's database grew by with the tasks without work, over their number."""
 
 
 def num_rounds(options: Options) -> int:
@@ -68,9 +74,11 @@ def run(options: Options, round_done: Callable[[], None]) -> Orchestration:
         idle_cores = _cores_of_server(_IDLE_S)
         round_done()
         sleeping(0.0, WINDOW, WINDOW)  # imports, connections
+        cpu_s = _cpu_s(os.getpid())
         slept_s = timed(lambda: sleeping(sleep_s, count, WINDOW))
+        flow_cores = (_cpu_s(os.getpid()) - cpu_s) / slept_s
         round_done()
-        before = _recorded()
+        before, bytes_before = _recorded(), _database_bytes()
         noop_s = timed(lambda: sleeping(0.0, MOST_TASKS, WINDOW))
         recorded_s, recorded = _until_recorded(before + MOST_TASKS)
         round_done()
@@ -85,7 +93,9 @@ def run(options: Options, round_done: Callable[[], None]) -> Orchestration:
             recorded=recorded - before,
             server_idle_cores=idle_cores,
             server_mb=_megabytes(_server()),
+            flow_cores=flow_cores,
             flow_mb=_megabytes(os.getpid()),
+            bytes_per_task_run=(_database_bytes() - bytes_before) / MOST_TASKS,
         )
 
 
@@ -131,7 +141,8 @@ def rows(result: Orchestration) -> list[tuple[str, str]]:
             f"{result.recorded} there {result.recorded_s:.0f} s after the end of the flow",
         ),
         ("idle server", f"{result.server_idle_cores:.1%} of a core, {result.server_mb:.0f} MB"),
-        ("flow", f"{result.flow_mb:.0f} MB"),
+        ("flow while tasks sleep", f"{result.flow_cores:.1%} of a core, {result.flow_mb:.0f} MB"),
+        ("database", f"{result.bytes_per_task_run / 1000:.1f} kB a task run"),
     ]
 
 
@@ -183,6 +194,17 @@ def _until_recorded(number: int) -> tuple[float, int]:
             return -1.0, found
         time.sleep(0.5)
     return time.perf_counter() - started, found
+
+
+def _database_bytes() -> int:
+    """Return what rows and indices take in the database of our private server."""
+    place = Path(os.environ["PREFECT_HOME"]) / "prefect.db"
+    with contextlib.closing(sqlite3.connect(f"file:{place}?mode=ro", uri=True)) as database:
+        pages, free, size = (
+            database.execute(f"PRAGMA {name}").fetchone()[0]
+            for name in ("page_count", "freelist_count", "page_size")
+        )
+    return int((pages - free) * size)
 
 
 def _server() -> int:

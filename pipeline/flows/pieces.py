@@ -12,7 +12,7 @@ from storage.errors import EnvironmentFailure
 from storage.splits import SplitSettings, scenes_of_shard
 
 MOST_TASKS = 1000
-"""Task runs of one flow run: Prefect's server takes in about 20 a second, of 16 kB each."""
+"""Task runs of one flow run: Prefect's server takes in about 20 a second, of 19 kB each."""
 TASK_S = 240.0
 """Seconds that a task should take."""
 _FIRST_SCENES = 4
