@@ -3,8 +3,9 @@
 The layers of both stages and the head may be rounded. Always float32, whatever is chosen:
 positions and rotary angles with their sines, the rotation itself, ray directions and their layer,
 normals and their octaves, materials, the learned tokens, and a head's last layers, whose rounding
-would be seen as bands. All of that is a hundredth of the work. `trilight model NAME --errors`
-measures what is left, layer by layer.
+would be seen as bands. All of that is a hundredth of the work; rounding it too cost 7 dB on a
+trained network (docs/tradeoffs.md has every part alone). `trilight model NAME --errors` measures
+what is left, layer by layer.
 
 Weights are rounded once, when the network is made ready, and not at every use (autocast): equally
 fast, half the memory. Training in few bits is another matter and needs float32 weights.
@@ -42,7 +43,8 @@ PRECISIONS = {
     "tf32": Precision(dtype=torch.float32, tf32=True, needs_cuda=True),
     "float16": Precision(dtype=torch.float16, needs_cuda=True),
 }
-"""Every choice by name. Errors and speeds of each: DECISIONS.md."""
+"""Every choice by name. docs/tradeoffs.md has speeds and errors of bfloat16, and the errors that
+float16's numbers make; how fast float16 is, and all of tf32, was not measured."""
 
 
 def rounded_parts(model: "RenderFormer") -> list[nn.Module]:

@@ -1,8 +1,9 @@
 """The sides of the benchmark, with the same weights: the published forward pass, and ours.
 
-Weights are random, since none are shipped. The last layer is scaled so that pictures have the
-spread of rendered ones: an error in dB with peak 1 would otherwise say what the weights happen to
-be.
+Weights are random: none of Base's size are shipped, and neither seconds nor bytes depend on them.
+Errors do; those of a trained network are measured by `precision_parts`. The last layer is scaled so
+that pictures have the spread of rendered ones: an error in dB with peak 1 would otherwise say what
+the weights happen to be.
 """
 
 import copy

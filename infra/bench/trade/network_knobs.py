@@ -1,7 +1,8 @@
 """The network with random weights: its precision, its attention, what it leaves out, its size.
 
-Weights are random, as in `trilight bench model`: what rounding does is nearly the same for trained
-ones (DECISIONS.md), what a size is worth is not, and comes from the table of small trainings.
+Weights are random, as in `trilight bench model`, since costs do not depend on them. Errors do: what
+rounding does to a trained network is measured by infra.bench.model.precision_parts, and what a size
+is worth comes from the table of small trainings.
 """
 
 import json
@@ -177,7 +178,8 @@ KNOBS = (
         better="higher",
         against="the same network in float32 (100 dB is the same picture)",
         because="float32, for references and small networks; bfloat16 from Base up, whose rounding "
-        "is far below what any network gets wrong. tf32 and float16 exist on CUDA only.",
+        "is far below what any network gets wrong, trained ones too (Network: structure and "
+        "precision). tf32 and float16 exist on CUDA only.",
         measure=measure_precision,
         needs=("torch",),
     ),
