@@ -76,13 +76,23 @@ def num_rounds(options: Options) -> int:
 
 def run(options: Options, round_done: Callable[[], None]) -> Soak:
     """Make the scenes and return what was seen."""
-    num_scenes = 200 if options.quick else 3000
+    result = soaked(options.objects[0], 200 if options.quick else 3000)
+    round_done()
+    return result
+
+
+def soaked(objects: str, num_scenes: int) -> Soak:
+    """Return what was seen of a run of so many tiny scenes; of 20 or more, two to each tenth.
+
+    Raises:
+        RuntimeError: `generate` failed.
+    """
     with tempfile.TemporaryDirectory() as folder:
         temporary, out = Path(folder, "tmp"), Path(folder, "set")
         temporary.mkdir()
         started = time.monotonic()
         process = subprocess.Popen(
-            _command(options, out, num_scenes),
+            _command(objects, out, num_scenes),
             env={**os.environ, "TMPDIR": str(temporary)},
             stdout=subprocess.DEVNULL,
             stdin=subprocess.DEVNULL,
@@ -97,7 +107,7 @@ def run(options: Options, round_done: Callable[[], None]) -> Soak:
             _end(process)
         if process.returncode:
             raise RuntimeError(f"generate ended with {process.returncode}")
-        result = Soak(
+        return Soak(
             name=NAME,
             num_scenes=num_scenes,
             seconds=time.monotonic() - started,
@@ -105,8 +115,6 @@ def run(options: Options, round_done: Callable[[], None]) -> Soak:
             processes_left=_left(process.pid),
             files_left=sum(path.is_file() for path in temporary.rglob("*")),
         )
-    round_done()
-    return result
 
 
 def rows(result: Soak) -> list[tuple[str, str]]:
@@ -140,7 +148,7 @@ def plot(result: Soak, path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _command(options: Options, out: Path, num_scenes: int) -> list[str]:
+def _command(objects: str, out: Path, num_scenes: int) -> list[str]:
     settings = {
         "scenes.num_views": 1,
         "splits.scenes_per_shard": 50,
@@ -149,7 +157,7 @@ def _command(options: Options, out: Path, num_scenes: int) -> list[str]:
         "renders.min_mean_radiance": 0.0,
     }
     words = [sys.executable, "-m", "infra.cli.app", "generate", "smoke", "--out", str(out)]
-    words += ["--objects", options.objects[0], "--scenes", str(num_scenes)]
+    words += ["--objects", objects, "--scenes", str(num_scenes)]
     words += ["--resolution", "16", "--noise-floor", "10"]
     return words + [
         word for name, value in settings.items() for word in ("--set", f"{name}={value}")
