@@ -2,6 +2,8 @@
 
 import contextlib
 import os
+import re
+import shlex
 import shutil
 import socket
 import subprocess
@@ -15,6 +17,9 @@ import pytest
 
 from tests.conftest import ROOT
 
+README = (ROOT / "README.md").read_text()
+START, STOP = (["-m", "infra.serving.local", action] for action in ("start", "stop"))
+"""What `make serve` and `make stop` run, as arguments of Python."""
 START_S = 300
 """A server that makes its database on two busy cores took 137 s."""
 
@@ -115,6 +120,34 @@ def postgres() -> Iterator[Postgres]:
             database.stop()
 
 
+def readme_block() -> list[str]:
+    """Return the lines with which the README shows how flows are served and run."""
+    (block,) = re.findall(r"```\n(make serve\n.*?)```", README, re.DOTALL)
+    return str(block).splitlines()
+
+
+def readme_run(flow: str = "", **replaced: object) -> list[str]:
+    """Return the README's command that runs a flow, as arguments of Python.
+
+    Args:
+        flow: another flow, of those that the README names below.
+        replaced: values of its parameters that a test has smaller, or elsewhere; others are added.
+    """
+    _, line, _ = readme_block()
+    command, *words = shlex.split(line)
+    assert command == "prefect"
+    places = [at for at, word in enumerate(words) if word == "-p"]
+    names = {words[at + 1].partition("=")[0] for at in places}
+    kept = [word for at, word in enumerate(words) if at not in places and at - 1 not in places]
+    if flow:
+        assert f"`{flow}`" in README
+        kept = [word.replace("generate-scenes", flow) for word in kept]
+    else:
+        assert names <= set(replaced), "the README's sizes and folders are not a test's"
+    given = [word for name, value in replaced.items() for word in ("-p", f"{name}={value}")]
+    return ["-m", "prefect", *kept, *given]
+
+
 @contextlib.contextmanager
 def served(
     tmp_path: Path, database_url: str, workers: int, base: Mapping[str, str] = os.environ
@@ -141,12 +174,12 @@ def served(
 
 def start_served(environment: Mapping[str, str]) -> None:
     """Run what `make serve` runs."""
-    call(["-m", "infra.serving.local", "start"], environment, timeout=2 * START_S)
+    call(START, environment, timeout=2 * START_S)
 
 
 def stop_served(environment: Mapping[str, str]) -> None:
     """Run what `make stop` runs."""
-    call(["-m", "infra.serving.local", "stop"], environment, timeout=120)
+    call(STOP, environment, timeout=120)
 
 
 def call(arguments: list[str], environment: Mapping[str, str], timeout: float) -> str:

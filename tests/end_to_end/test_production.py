@@ -1,33 +1,40 @@
-"""The README's production path, literally: one dataset by four ways has one digest."""
+"""The README's production path, in its own words: one dataset by four ways has one digest."""
 
 import json
 import os
+import shlex
+import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from model.neural_renderer import NeuralRenderer
 from storage.dataset import open_dataset
 from storage.verify import verify_dataset
-from tests.end_to_end.production_kit import Postgres, call, dask_cluster, postgres, served
+from tests.conftest import ROOT
+from tests.end_to_end.production_kit import (
+    START,
+    STOP,
+    Postgres,
+    call,
+    dask_cluster,
+    postgres,
+    readme_block,
+    readme_run,
+    served,
+)
 
 MANY, FEW = 40, 12
 """Scenes, four to a shard: so many that a second worker, which looks for work every ten seconds and
 then starts a process, comes before the first has made them all; and three shards."""
-SMALL = {"objects": "builtin:", "scenes": str(MANY), "resolution": "64", "noise_floor_db": "20"}
+SMALL: dict[str, Any] = {"scenes": MANY, "resolution": 64, "noise_floor_db": 20}
 """Tiny scenes, as wide as the smoke run's pictures."""
 OPTIONS = ("--objects", "builtin:", "--resolution", "64", "--noise-floor", "20")
 CANARY = "CANARY-51b2"
 RUN_S = 900
 """A run takes a minute; on busy machines many times that."""
-
-
-def _run_deployment(name: str, out: Path, environment: dict[str, str], **more: str) -> str:
-    parameters = {**SMALL, "out": str(out), **more}
-    words = [word for key, value in parameters.items() for word in ("-p", f"{key}={value}")]
-    prefect = ["-m", "prefect", "deployment", "run", name, "--watch", *words]
-    return call(prefect, environment, RUN_S)
 
 
 def _generate(out: Path, scenes: int, *more: str) -> None:
@@ -42,15 +49,27 @@ def _verified(out: Path) -> str:
     return open_dataset(str(out)).digest
 
 
+def test_the_readme_serves_runs_and_stops_as_is_done_here() -> None:
+    """`served` runs what `make serve` and `make stop` run; the line between is run below."""
+    serve, run, stop = readme_block()
+    assert run.startswith("prefect deployment run generate-scenes/local ")
+    for line, last in ((serve, START), (stop, STOP)):
+        make = ["make", "--dry-run", "--old-file", "setup", *shlex.split(line)[1:]]
+        done = subprocess.run(make, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert done.stdout.splitlines()[-1].split() == ["python", *last]
+    assert readme_run("build-dataset", scenes=1, out="a", flow_runs=2)[4] == "build-dataset/local"
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_four_ways_one_digest(tmp_path: Path) -> None:
     _generate(tmp_path / "plain", MANY)
     digests = {"plain": _verified(tmp_path / "plain")}
     with postgres() as database, served(tmp_path, database.url, workers=2) as environment:
-        _run_deployment("generate-scenes/local", tmp_path / "one", environment)
+        call(readme_run(**SMALL, out=tmp_path / "one"), environment, RUN_S)
         digests["one worker"] = _verified(tmp_path / "one")
-        _run_deployment("build-dataset/local", tmp_path / "two", environment, flow_runs="2")
+        several = readme_run("build-dataset", **SMALL, out=tmp_path / "two", flow_runs=2)
+        call(several, environment, RUN_S)
         digests["two workers"] = _verified(tmp_path / "two")
         assert len(_makers(tmp_path / "two")) >= 2
         _trains(tmp_path, environment)
@@ -75,25 +94,21 @@ def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
         "views_per_scene": 1,
         "validation_scenes": 1,
     }
-    where = {
+    where: dict[str, Any] = {
         "data": json.dumps([str(tmp_path / "one")]),
         "out": str(tmp_path / "run"),
-        "steps": "4",
+        "steps": 4,
         "changes": json.dumps(changes),
     }
-    words = [word for key, value in where.items() for word in ("-p", f"{key}={value}")]
-    prefect = ["-m", "prefect", "deployment", "run", "train-model/local", "--watch", *words]
-    call(prefect, environment, RUN_S)
+    call(readme_run("train-model", **where), environment, RUN_S)
     assert NeuralRenderer.load(tmp_path / "run").trained.resolution == 64
 
 
 def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Postgres) -> None:
     """Neither the database, its log nor ours ever sees what was refused, and the rest names it."""
     with pytest.raises(AssertionError, match="Validation failed for field 'objects'"):
-        _run_deployment(
-            "generate-scenes/local", tmp_path / "no", environment,
-            objects=f"https://me:{CANARY}@host/folder",
-        )  # fmt: skip
+        secret = f"https://me:{CANARY}@host/folder"
+        call(readme_run(**SMALL, out=tmp_path / "no", objects=secret), environment, RUN_S)
     rows = database.dump()
     assert str(tmp_path / "one") in rows  # parameters are in what is looked through, and so are
     assert "packed, 4 scenes" in rows  # the lines of logs
@@ -106,8 +121,6 @@ def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Post
 
 @pytest.mark.slow
 def test_ranges_at_the_same_time_and_who_is_last_finishes(tmp_path: Path) -> None:
-    import subprocess
-
     command = [sys.executable, "-m", "infra.cli.app", "generate", "smoke", *OPTIONS]
     command += ["--scenes", str(FEW)]
     runs = [
