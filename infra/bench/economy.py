@@ -8,7 +8,6 @@ The sources' triangles are looked up in this machine's asset store: make the set
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -16,38 +15,20 @@ import numpy as np
 import typer
 
 from infra.bench.economy_counts import SceneCosts, scene_costs
+from infra.bench.economy_line import Line, base_flops
+from infra.bench.economy_totals import HALF_BYTES, PASSES, in_all, passes
 from infra.bench.harness import ROOT
 from infra.bench.marked_block import write_block
 from infra.bench.model.workloads import PUBLISHED_LENGTH
 from infra.bench.trade.figures import shown
 from infra.cli.console import console
-from model.config import base
-from model.costs import Workload, flops
 from storage.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
 from storage.renderformer_h5 import CELLS, CHANNELS, write_renderformer_h5
 
 MARK = "economy"
-_HDF5_SCENES = 6
+_HDF5_SCENES = 24
 """Written in the published form: half a second each."""
-_PICTURE_CHANNELS = 3
-_HALF_BYTES = 2
-
-
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """One part of a scene."""
-
-    part: str
-    """What it is."""
-    everything: str
-    """What it would take with nothing left out."""
-    kept: str
-    """What it takes."""
-    factor: float
-    """How many times less."""
-    error: str
-    """What leaving it out adds."""
 
 
 def main(
@@ -74,11 +55,15 @@ def table(dataset: Dataset, found: Sequence[SceneCosts]) -> list[str]:
         f"{px} each; means per scene, from manifest, samples and asset store (`python -m "
         "infra.bench.economy SET --write`)."
     )
+    renders = manifest.settings["renders"]
+    published, same = _published_bytes(dataset, found)
     lines = [
         *_geometry(found, px),
         *_smallest(found, px),
-        _samples(found, int(manifest.settings["renders"]["max_spp"])),
-        *_bytes(dataset, found, px),
+        passes(found, renders),
+        _samples(found, int(renders["max_spp"])),
+        *_bytes(dataset, found, px, (published, same)),
+        *in_all(found, manifest.settings, published_bytes=published),
     ]
     rows = [
         f"| {line.part} | {line.everything} | {line.kept} | {shown(line.factor)} x | {line.error} |"
@@ -97,8 +82,8 @@ def _geometry(found: Sequence[SceneCosts], px: int) -> list[Line]:
     sources = sum(one.source_faces for one in found)
     objects = sum(one.object_faces for one in found)
     views = len(found[0].spp)
-    padded = _flops(PUBLISHED_LENGTH.get(px, max(PUBLISHED_LENGTH.values())), views, px)
-    counted = float(np.mean([_flops(one.triangles, views, px) for one in found]))
+    padded = base_flops(PUBLISHED_LENGTH.get(px, max(PUBLISHED_LENGTH.values())), views, px)
+    counted = float(np.mean([base_flops(one.triangles, views, px) for one in found]))
     empty = float(np.mean([one.empty_share for one in found]))
     scenes = len(found)
     return [
@@ -130,7 +115,7 @@ def _smallest(found: Sequence[SceneCosts], px: int) -> list[Line]:
     """Return what the least scene of the set takes of the most."""
     least = min(found, key=lambda one: one.triangles)
     most = max(found, key=lambda one: one.triangles)
-    costs = [_flops(one.triangles, len(one.spp), px) / 1e9 for one in (most, least)]
+    costs = [base_flops(one.triangles, len(one.spp), px) / 1e9 for one in (most, least)]
     sizes = [one.array_bytes / 1e3 for one in (most, least)]
     return [
         Line(
@@ -158,12 +143,14 @@ def _samples(found: Sequence[SceneCosts], most: int) -> Line:
     )
 
 
-def _bytes(dataset: Dataset, found: Sequence[SceneCosts], px: int) -> list[Line]:
+def _bytes(
+    dataset: Dataset, found: Sequence[SceneCosts], px: int, hdf5: tuple[float, float]
+) -> list[Line]:
     arrays = float(np.mean([one.array_bytes + one.record_bytes for one in found]))
     pictures = float(np.mean([one.picture_bytes for one in found]))
-    published, same = _published_bytes(dataset, found)
-    texture = np.mean([one.triangles for one in found]) * CHANNELS * CELLS**2 * _HALF_BYTES
-    raw = len(found[0].spp) * px * px * _PICTURE_CHANNELS * _HALF_BYTES
+    published, same = hdf5
+    texture = np.mean([one.triangles for one in found]) * CHANNELS * CELLS**2 * HALF_BYTES
+    raw = len(found[0].spp) * px * px * PASSES["colour"] * HALF_BYTES
     profile = dataset.manifest.settings["storage"]["profile"]
     added = "none" if profile == "lossless" else "at most a tenth of each view's own noise"
     return [
@@ -211,11 +198,6 @@ def _published_bytes(dataset: Dataset, found: Sequence[SceneCosts]) -> tuple[flo
                 total, count = total + path.stat().st_size, count + 1
     same = [one.array_bytes + one.record_bytes for one in found[:count]]
     return total / count, float(np.mean(same))
-
-
-def _flops(triangles: int, views: int, px: int) -> int:
-    workload = Workload(triangles=triangles, views=views, resolution=px)
-    return sum(flops(base(), workload).values())
 
 
 if __name__ == "__main__":
