@@ -173,6 +173,15 @@ def test_the_page_says_what_the_results_say(tmp_path: Path) -> None:
         assert f"\n### {knob.title}\n" in text and knob.because in text
 
 
+def test_what_was_only_measured_quickly_says_so(tmp_path: Path) -> None:
+    _write(tmp_path, "trade-quick", "2026-01-02", "guides", 2)
+    assert "**Not run: careful**, for all knobs. Their figures" in page.block(tmp_path)
+    _write(tmp_path, "trade-roulette", "2026-01-02", "roulette", 2)
+    assert "**Not run: careful**, for `guides`. Their figures" in page.block(tmp_path)
+    _write(tmp_path, "trade", "2026-01-02", "guides", 2)
+    assert "Not run: careful" not in page.block(tmp_path)
+
+
 def test_the_documentation_is_what_the_results_say() -> None:
     """`trilight bench trade --write-docs` was run after the last benchmark."""
     written = read_block(ROOT / "docs" / "tradeoffs.md", page.MARK)
@@ -224,6 +233,7 @@ def test_knobs_of_the_network(name: str, monkeypatch: pytest.MonkeyPatch, tmp_pa
         assert (errors["fused"] or 1) < 1e-5 < (errors["fused, bfloat16"] or 0) < 0.1
     if name == "size":
         assert set(errors.values()) == {None}
+        assert all(set(point.further) == {"M parameters"} for point in curve.points)
 
 
 def knob_config():  # type: ignore[no-untyped-def]
@@ -235,19 +245,21 @@ def knob_config():  # type: ignore[no-untyped-def]
 def test_errors_of_sizes_come_from_the_table(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from infra.bench.trade.network_knobs import trained_errors
+    from infra.bench.trade.network_knobs import trained_scores
 
     monkeypatch.setattr(harness, "RESULTS", tmp_path)
     rows = [
         {"plan": plan, "change": change, "scenes": scenes, "size": "small",
-         "scores": {"log_l1": score}}
+         "num_steps": 400, "scores": {"log_l1": score, "psnr_log_db_median": 1000 * score}}
         for plan, change, scenes, score in (
             ("cpu", "ours", 960, 0.02), ("cpu", "ours", 960, 0.04), ("cpu", "ours", 60, 0.9),
             ("cpu", "ema", 960, 0.9), ("gpu", "ours", 960, 0.9),
         )
     ]  # fmt: skip
     (tmp_path / "training_table.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
-    assert trained_errors() == {"table, small": pytest.approx(0.03)}
+    (found,) = trained_scores().items()
+    assert found[0] == "table, small" and found[1].steps == 400
+    assert (found[1].log_l1, found[1].psnr_log_db) == pytest.approx((0.03, 30))
 
 
 def test_the_codec_knob_on_samples_by_hand() -> None:

@@ -104,11 +104,33 @@ def test_the_default_budget_of_an_object_fits_into_a_scene(monkeypatch: pytest.M
         figures = {"error_p99": 0.01, "error_mean": 0.01, "cpu_s": 1.0}
         return {name: {**figures, "faces": budget} for name, (_, budget) in sides.items()}
 
+    class Meshes:
+        """Gives names for meshes; one object crashes."""
+
+        def call(self, function: Any, path: Path, budgets: Any, method: str) -> list[str]:
+            if path.name == "crashing":
+                raise ChildFailed("killed", "by hand")
+            return [path.name, *map(str, budgets)]
+
+    def pictures(meshes: list[str], renders: Any) -> list[float]:
+        first = {"a": 20.0, "b": 30.0, "c": 90.0}[meshes[0]]
+        return [first + row for row in range(len(meshes))]
+
     monkeypatch.setattr(mesh_knobs, "_remeshed", remeshed)
-    shop = _Here(None)
-    shop.__dict__["sources"] = (Path("a"),)
-    (default,) = (point for point in knob_named("budget").measure(shop).points if point.default)
+    shop = _Here(pictures)
+    shop.__dict__["mesh_child"] = Meshes()
+    shop.__dict__["sources"] = tuple(map(Path, ("a", "crashing", "b", "c")))
+    curve = knob_named("budget").measure(shop)
+    (default,) = (point for point in curve.points if point.default)
     assert default.setting == "512 triangles" and default.cost == 1024 <= 1536
+    # of the first three objects those two that did not fail; the fourth is not looked at
+    column = [point.further["picture, psnr_log_db"] for point in curve.points]
+    assert column == [25, 26, 27, 28, 29]
+    assert "median of the 2 largest objects" in curve.measured_on
+    assert "with other samples has 30.0 dB" in curve.measured_on
+    shop.__dict__["sources"] = (Path("crashing"),)
+    with pytest.raises(TrilightError, match="knob budget: none of 1 objects could be rendered"):
+        knob_named("budget").measure(shop)
 
 
 def test_only_large_objects_are_made_coarser(monkeypatch: pytest.MonkeyPatch) -> None:

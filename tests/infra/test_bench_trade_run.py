@@ -26,7 +26,9 @@ from tests.infra.trade_kit import TINY
 
 pytestmark = pytest.mark.slow
 
-WITH_CHILDREN = ("samples", "profile", "scene-budget", "detail", "views", "bundles", "pipeline")
+WITH_CHILDREN = (
+    "samples", "budget", "profile", "scene-budget", "detail", "views", "bundles", "pipeline",
+)  # fmt: skip
 
 
 def test_knobs_with_children_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -46,6 +48,9 @@ def test_knobs_with_children_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert set(json.loads(path.read_bytes())["curves"]) == {*WITH_CHILDREN, "engines"}
     for name, saved in saved_curves(tmp_path / "results").items():
         assert any(one.on_front for one in judged(knob_named(name), saved.curve))
+    budget = saved_curves(tmp_path / "results")["budget"].curve
+    pictures = [point.further["picture, psnr_log_db"] for point in budget.points]
+    assert pictures[-1] > pictures[0]  # 1024 triangles look more like the source than 64
     engines = saved_curves(tmp_path / "results")["engines"].curve
     assert len({point.error for point in engines.points}) == 1  # equal error on all sides
     assert len(engines.details) == TINY.scenes

@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from infra.bench import remeshing
 from infra.bench.assets import CURVE, medians_side
+from infra.bench.mesh_pictures import coarser, picture_db
+from infra.bench.renders.fixed_samples import fixed_samples
 from infra.bench.trade.curves import Curve, Knob, Point
 from infra.bench.trade.workshop import LARGE, Workshop
 from pipeline.assets.settings import AssetSettings
@@ -21,6 +24,8 @@ from storage.seeds import rng_for
 
 OBJECTS = 2
 """In the scene that the budget of one object is priced in."""
+PICTURED = 3
+"""Objects that are path traced at every budget: some seconds each."""
 PROFILE_BUDGET = 512
 EPSILONS = (None, 0.02, 0.01, 0.005, 0.0025)
 SCENE_BUDGETS = (768, 1024, 1536, 2048, 4096)
@@ -36,9 +41,27 @@ def _remeshed(shop: Workshop, sides: Mapping[str, tuple[str, int]]) -> dict[str,
     return shop.in_turns("trade-meshes", runs)
 
 
+def _picture_errors(shop: Workshop) -> NDArray[np.float64]:
+    """Return psnr_log_db to the source [objects, budgets and the source again] of a few objects.
+
+    An object that fails counts for none; there may be no row.
+    """
+    px, spp, rows = shop.effort.picture_px, shop.effort.fixed_spp, []
+    for path in shop.sources[:PICTURED]:
+        with contextlib.suppress(Rejected, ChildFailed):
+            meshes = shop.mesh_child.call(coarser, path, CURVE, remeshing.METHODS["faithful"])
+            rows.append(shop.call(picture_db, meshes, fixed_samples(px, spp)))
+    return np.array(rows).reshape(-1, len(CURVE) + 1)
+
+
 def measure_budget(shop: Workshop) -> Curve:
-    """Measure geometric error at budgets of one object, and the network's time for a scene."""
+    """Measure error of geometry and picture at budgets of one object, and the network's time."""
     found = _remeshed(shop, {f"{budget}": ("faithful", budget) for budget in CURVE})
+    pictures = _picture_errors(shop)
+    if not len(pictures):
+        count = min(PICTURED, len(shop.sources))
+        raise TrilightError(f"knob budget: none of {count} objects could be rendered.")
+    median_db = np.median(pictures, axis=0)
     room = pretrain_256().scenes.max_triangles
     default = max(budget for budget in CURVE if OBJECTS * budget <= room)
     points = [
@@ -49,15 +72,21 @@ def measure_budget(shop: Workshop) -> Curve:
             default=budget == default,
             further={
                 "mean error %": 100 * found[f"{budget}"]["error_mean"],
+                "picture, psnr_log_db": float(median_db[column]),
                 "making it, core-ms": 1000 * found[f"{budget}"]["cpu_s"],
             },
         )
-        for budget in CURVE
+        for column, budget in enumerate(CURVE)
     ]
-    words = (
-        f"{len(shop.sources)} objects, {OBJECTS} in a scene; the network is {shop.effort.network}"
+    effort = shop.effort
+    words = f"{len(shop.sources)} objects, {OBJECTS} in a scene; the network is {effort.network}"
+    return Curve(
+        points=tuple(points),
+        measured_on=f"{words}, {effort.network_px} pixels. The picture: path traced beside the "
+        f"cleaned source, median of the {len(pictures)} largest objects, each alone on a floor "
+        f"under a lamp, {effort.picture_px} x {effort.picture_px}, {effort.fixed_spp} samples; the "
+        f"source with other samples has {median_db[-1]:.1f} dB",
     )
-    return Curve(points=tuple(points), measured_on=f"{words}, {shop.effort.network_px} pixels")
 
 
 def measure_profile(shop: Workshop) -> Curve:

@@ -13,6 +13,7 @@ from infra.bench.trade.figures import FIGURES, shown, shown_error
 from infra.bench.trade.knobs import KNOBS, knob_named
 from infra.bench.trade.saved import SavedCurve, saved_curves
 from infra.bench.trade.without_curve import WITHOUT_CURVE
+from infra.bench.trade.workshop import CAREFUL, QUICK
 from storage.errors import TrilightError
 
 MARK = "trade"
@@ -42,10 +43,27 @@ def _head(curves: Mapping[str, SavedCurve]) -> Iterator[str]:
         "the line is the front, the default is ringed, a triangle at the lower edge has no known "
         "error, and a cross is no setting."
     )
+    yield from _not_run(curves)
     for file in sorted({saved.file for saved in curves.values()}):
         saved = next(one for one in curves.values() if one.file == file)
         yield ""
         yield f"`{file}`: {saved.processor}."
+
+
+def _not_run(curves: Mapping[str, SavedCurve]) -> Iterator[str]:
+    """Say for which knobs the careful measurement is still to be made."""
+    quick = [knob.name for knob in KNOBS if knob.name in curves and curves[knob.name].quick]
+    if not quick:
+        return
+    yield ""
+    which = "all knobs" if len(quick) == len(curves) else ", ".join(f"`{name}`" for name in quick)
+    yield (
+        f"**Not run: careful**, for {which}. Their figures come from `--quick`: {QUICK.scenes} "
+        f"scenes or fewer and {QUICK.objects} objects a knob, {QUICK.repeats} counted round of "
+        f"what takes turns, where a careful run has {CAREFUL.scenes}, {CAREFUL.objects} and "
+        f"{CAREFUL.repeats}. Differences of a decibel or of a tenth of the cost may be those of "
+        "the few scenes."
+    )
 
 
 def _section(knob: Knob, saved: SavedCurve | None) -> Iterator[str]:

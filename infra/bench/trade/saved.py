@@ -22,6 +22,11 @@ class SavedCurve:
     processor: str
     """On what."""
 
+    @property
+    def quick(self) -> bool:
+        """Whether it comes from `--quick`."""
+        return _is_quick(self.file.removesuffix(".json")[:-11])
+
 
 def saved_curves(folder: Path) -> dict[str, SavedCurve]:
     """Return the curves by knob: the latest day's, of one day the careful before the quick one.
@@ -45,8 +50,12 @@ def saved_curves(folder: Path) -> dict[str, SavedCurve]:
 def _rank(path: Path) -> tuple[str, bool, bool, str]:
     """Return the order of results, the ones to believe last."""
     stem, date = path.stem[:-11], path.stem[-10:]
-    quick = stem.endswith("-quick")
-    return date, not quick, stem.removesuffix("-quick") != "trade", stem
+    return date, not _is_quick(stem), stem.removesuffix("-quick") != "trade", stem
+
+
+def _is_quick(stem: str) -> bool:
+    """Return whether the name of a result, without its date, is that of a quick run."""
+    return stem.endswith("-quick")
 
 
 def curve_of(record: Mapping[str, Any]) -> Curve:
