@@ -54,7 +54,9 @@ def test_the_readme_serves_runs_and_stops_as_is_done_here() -> None:
     serve, run, stop = readme_block()
     assert run.startswith("prefect deployment run generate-scenes/local ")
     for line, last in ((serve, START), (stop, STOP)):
-        make = ["make", "--dry-run", "--old-file", "setup", *shlex.split(line)[1:]]
+        # under `make test` a make that is called says in which folder it works
+        make = ["make", "--dry-run", "--no-print-directory", "--old-file", "setup"]
+        make += shlex.split(line)[1:]
         done = subprocess.run(make, cwd=ROOT, capture_output=True, text=True, check=True)
         assert done.stdout.splitlines()[-1].split() == ["python", *last]
     assert readme_run("build-dataset", scenes=1, out="a", flow_runs=2)[4] == "build-dataset/local"
