@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.flows.machine import visible_gpus
+from pipeline.flows.served.limits import DISK_LIMIT, GPU_LIMIT
 from storage.errors import TrilightError
 
 ROOT = Path(__file__).parents[2]
-DISK_LIMIT, GPU_LIMIT = "trilight-disk", "trilight-gpu"
-"""As flows call them (pipeline.flows.served.runner, whose import would be Prefect's)."""
 _DISK_SLOTS = 2
 """Runs that write documents at the same time: each reads its whole dataset."""
 _MOST_CARDS = 100_000

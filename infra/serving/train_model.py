@@ -16,8 +16,8 @@ from prefect.concurrency.sync import concurrency
 from prefect.logging import get_run_logger
 
 from pipeline.flows.machine import visible_gpus
+from pipeline.flows.served.limits import GPU_LIMIT
 from pipeline.flows.served.process import run_to_end
-from pipeline.flows.served.runner import GPU_LIMIT
 from pipeline.flows.served.schema import PublicUrl, changed_values, changes_form, parameters_of
 from storage.errors import TrilightError
 from storage.ranges import Within, check_ranges

@@ -14,6 +14,7 @@ from pipeline.flows.children import ChildPool
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.served import build_dataset as building
 from pipeline.flows.served import on_dask, runner
+from pipeline.flows.served.limits import GPU_LIMIT
 from pipeline.flows.served.orders import DatasetInRuns, dataset_in_runs
 from pipeline.isolation import IsolatedChild
 from storage.errors import TrilightError
@@ -77,7 +78,7 @@ def test_rendering_on_a_card_takes_its_limit(
 
     @contextlib.contextmanager
     def limit(name: str, *, occupy: int, strict: bool) -> Iterator[None]:
-        assert name == runner.GPU_LIMIT
+        assert name == GPU_LIMIT
         taken.append(occupy)
         yield
 

@@ -19,7 +19,7 @@ from infra.serving import limits, local
 from infra.serving.limits import make_limits
 from infra.serving.local import running, start, stop
 from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER, wait_until_healthy
-from pipeline.flows.served.runner import DISK_LIMIT, GPU_LIMIT
+from pipeline.flows.served.limits import DISK_LIMIT, GPU_LIMIT
 from storage.errors import TrilightError
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(120)"]

@@ -18,13 +18,11 @@ from prefect.tasks import Task, exponential_backoff
 from pipeline.flows.make_task import ShardJob, TaskOutcome, make_task
 from pipeline.flows.pieces import Piece
 from pipeline.flows.runners import in_window
+from pipeline.flows.served.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.renders.variant import choose_variant
 from storage.errors import EnvironmentFailure
 from storage.statistics import Statistics
 
-DISK_LIMIT = "trilight-disk"
-GPU_LIMIT = "trilight-gpu"
-"""Names of limits in Prefect; `make serve` makes them. Without them nothing is limited."""
 _RETRIES = 3
 _FIRST_DELAY_S = 10
 
