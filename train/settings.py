@@ -16,7 +16,7 @@ from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
 
 Precision = Literal["float32", "bfloat16"]
-"""Of the network's products. Positions, losses, weights and AdamW's memories stay float32."""
+"""Of the network's products. Positions, losses, weights and optimisers' memories stay float32."""
 
 Count = Annotated[int, Within(1, 10**9)]
 """Of steps or of scenes; a billion is never reached."""
@@ -56,7 +56,9 @@ class TrainSettings:
     precision: Precision = "float32"
     """Of the network's products."""
     learning_rate: Annotated[float, Within(0, 1, low_open=True)]
-    """Peak learning rate of AdamW."""
+    """Peak learning rate."""
+    muon_rate: Annotated[float, Within(0, 100, unit="x learning_rate")] = 0.0
+    """Rate of Muon, which then moves the matrices; 0: AdamW moves every weight."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear rise to the peak."""
     final_rate_share: Share = 0.05
@@ -102,10 +104,26 @@ class TrainSettings:
             _wrong("precision", self.precision, " or ".join(get_args(Precision)))
 
 
+GROUPS = {"model": ModelConfig, "loss": LossSettings, "augmentation": AugmentationSettings}
+"""The settings that have fields of their own."""
+
+
 def settings_record(settings: TrainSettings) -> dict[str, Any]:
     """Return the settings as JSON values."""
     record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(settings)))
     return record
+
+
+def stated_record(settings: TrainSettings) -> dict[str, Any]:
+    """Return the settings that are not at their default.
+
+    A digest of these stays what it is when a field is added, with what was done before as default.
+    """
+    record = settings_record(settings)
+    stated = _without(record, _defaults(TrainSettings))
+    for name, kind in GROUPS.items():
+        stated[name] = _without(record[name], _defaults(kind))
+    return stated
 
 
 def completed_record(record: dict[str, Any]) -> dict[str, Any]:
@@ -113,8 +131,7 @@ def completed_record(record: dict[str, Any]) -> dict[str, Any]:
 
     A field came with a default that is what was done before.
     """
-    groups = {"model": ModelConfig, "loss": LossSettings, "augmentation": AugmentationSettings}
-    completed = {name: _defaults(kind) | record.get(name, {}) for name, kind in groups.items()}
+    completed = {name: _defaults(kind) | record.get(name, {}) for name, kind in GROUPS.items()}
     return _defaults(TrainSettings) | record | completed
 
 
@@ -126,6 +143,10 @@ def _defaults(settings: type) -> dict[str, Any]:
     }
     record: dict[str, Any] = json.loads(json.dumps(given))
     return record
+
+
+def _without(record: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in record.items() if (name, value) not in defaults.items()}
 
 
 def _wrong(name: str, got: object, expected: str) -> None:

@@ -10,7 +10,7 @@ from storage.errors import TrilightError
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
 from train.runs import smoke
-from train.settings import TrainSettings, settings_record
+from train.settings import TrainSettings, stated_record
 
 BASELINE = "ours"
 
@@ -73,8 +73,8 @@ class Job:
         return CHANGES[self.change](base)
 
     def digest(self) -> str:
-        """Return what a result is known by: the settings in full."""
-        return sha256_hex(canonical_json(settings_record(self.settings())))
+        """Return what a result is known by: all settings, those at their default unsaid."""
+        return sha256_hex(canonical_json(stated_record(self.settings())))
 
 
 def _network(width: int, layers: int) -> ModelConfig:
@@ -126,6 +126,7 @@ CHANGES: Mapping[str, Callable[[TrainSettings], TrainSettings]] = {
     "light-scale": lambda base: _with(
         base, augmentation=dataclasses.replace(base.augmentation, light_scale=2.0)
     ),
+    "muon": lambda base: _with(base, muon_rate=3.0),
     "ema": lambda base: _with(base, ema_decay=0.995),
     "ms-ssim": lambda base: _with(base, loss=LossSettings(perceptual="ms_ssim")),
     "noise-weights": lambda base: _with(

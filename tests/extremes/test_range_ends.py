@@ -222,11 +222,11 @@ def test_the_largest_networks_can_be_described() -> None:
 STEPS: dict[str, dict[str, Any]] = {
     "lows": {
         "learning_rate": 5e-324, "final_rate_share": 0.0, "weight_decay": 0.0, "betas": (0.0, 0.0),
-        "grad_clip": 5e-324, "ema_decay": 0.0,
+        "grad_clip": 5e-324, "ema_decay": 0.0, "muon_rate": 5e-324,
         "loss": LossSettings(perceptual="ms_ssim", perceptual_weight=0.0, noise_half=0.0),
     },
     "highs": {
-        "learning_rate": 1.0, "final_rate_share": 1.0, "weight_decay": 10.0,
+        "learning_rate": 1.0, "final_rate_share": 1.0, "weight_decay": 10.0, "muon_rate": 100.0,
         "betas": (float(np.nextafter(1, 0)),) * 2, "grad_clip": 1e9,
         "ema_decay": float(np.nextafter(1, 0)),
         "loss": LossSettings(perceptual="ms_ssim", perceptual_weight=1000.0, noise_half=10.0),

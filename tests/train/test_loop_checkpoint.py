@@ -41,6 +41,11 @@ def one_step(state: TrainState, batch: TrainingBatch) -> None:
     state.step += 1
 
 
+def equal_weights(one: TrainState, other: TrainState) -> bool:
+    ours, theirs = one.model.state_dict(), other.model.state_dict()
+    return all(torch.equal(ours[key], theirs[key]) for key in ours)
+
+
 def save(path: Path, state: TrainState, settings: TrainSettings | None = None) -> None:
     save_checkpoint(path, state, settings or tiny_run(), data_digest=DIGEST, world_size=1)
 
@@ -59,8 +64,7 @@ def test_a_loaded_state_goes_on_to_the_bit(tmp_path: Path, steps: int) -> None:
     batch = make_batch([training_scene(toy_sample(1), 16)])
     for each in (state, loaded):
         one_step(each, batch)
-    ours, theirs = state.model.state_dict(), loaded.model.state_dict()
-    assert all(torch.equal(ours[key], theirs[key]) for key in ours)
+    assert equal_weights(state, loaded)
 
 
 def test_equal_states_give_equal_bytes(tmp_path: Path) -> None:
@@ -89,7 +93,11 @@ def test_skipped_steps_do_not_count_as_updates(tmp_path: Path) -> None:
     state.step, state.skipped_steps = 5, 3
     save(tmp_path / "c", state)
     loaded = load(tmp_path / "c")
-    assert {float(memory["step"]) for memory in loaded.optimizer.state.values()} == {2.0}
+    batch = make_batch([training_scene(toy_sample(1), 16)])
+    one_step(loaded, batch)
+    one_step(state, batch)
+    # AdamW's steps are the longer the fewer it believes to have done
+    assert equal_weights(loaded, state)
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def test_several_processes_that_are_stopped_go_on_to_the_bit(
 
     Three, because the sum of two numbers has but one order.
     """
-    longer = {"num_steps": 60, "validate_every": 60, "checkpoint_every": 60}
+    longer = {"num_steps": 60, "validate_every": 60, "checkpoint_every": 60, "muon_rate": 3.0}
     out, whole = tmp_path / "stopped", tmp_path / "whole"
     started = subprocess.Popen(
         command(dataset, out, processes, **longer),

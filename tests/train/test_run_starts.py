@@ -70,11 +70,15 @@ def test_a_dead_start_is_said_early_and_once(dataset: Dataset, tmp_path: Path) -
     run(alive, dataset, tmp_path / "alive", Start())
 
 
-def test_resumed_after_every_step_is_uninterrupted(dataset: Dataset, tmp_path: Path) -> None:
+@pytest.mark.parametrize("muon_rate", [0.0, 3.0])
+def test_resumed_after_every_step_is_uninterrupted(
+    dataset: Dataset, tmp_path: Path, muon_rate: float
+) -> None:
     """With a running mean, every symmetry that toy scenes have, and a perceptual term."""
     settings = tiny_run(
         num_steps=6,
         ema_decay=0.9,
+        muon_rate=muon_rate,
         loss=LossSettings(perceptual="ms_ssim", noise_half=0.01),
         log_every=1,
         validate_every=6,

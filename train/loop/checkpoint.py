@@ -27,19 +27,14 @@ from train.settings import TrainSettings, completed_record, settings_record
 HEADER_KEY = "trilight_checkpoint"
 """Metadata entry with counters, damage met, settings, digest of the data, number of processes."""
 
-MOMENTS = ("exp_avg", "exp_avg_sq")
-"""AdamW's memories per weight; its step count is the same for all."""
-
 
 def save_checkpoint(
     path: Path, state: TrainState, settings: TrainSettings, *, data_digest: str, world_size: int
 ) -> None:
     """Write the checkpoint; raises TrilightError where the folder is full or cannot be written."""
-    tensors: dict[str, Tensor] = {}
+    tensors = state.updater.memories()
     for name, weight in state.model.named_parameters():
         tensors[f"model/{name}"] = weight.detach()
-        for moment in MOMENTS if state.optimizer.state else ():
-            tensors[f"{moment}/{name}"] = state.optimizer.state[weight][moment]
     if state.mean_model is not None:
         for name, weight in state.mean_model.named_parameters():
             tensors[f"mean/{name}"] = weight
@@ -106,22 +101,10 @@ def resumed_state(
     load_tensors(state.model, _part(checkpoint.arrays, "model"))
     if state.mean_model is not None:
         load_tensors(state.mean_model, _part(checkpoint.arrays, "mean"))
-    _load_moments(state, checkpoint.arrays, device)
+    if updates := state.step - state.skipped_steps:
+        tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
+        state.updater.remember(tensors, updates)
     return state
-
-
-def _load_moments(
-    state: TrainState, arrays: Mapping[str, NDArray], device: torch.device | None
-) -> None:
-    updates = state.step - state.skipped_steps
-    if updates == 0:
-        return
-    parts = {moment: _part(arrays, moment) for moment in MOMENTS}
-    for name, weight in state.model.named_parameters():
-        state.optimizer.state[weight] = {
-            "step": torch.tensor(float(updates)),
-            **{moment: parts[moment][name].to(device) for moment in MOMENTS},
-        }
 
 
 def _part(arrays: Mapping[str, NDArray], prefix: str) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""What changes while a run goes on: weights, their mean, AdamW's memories, counters, damage met.
+"""What changes while a run goes on: weights, mean, the updater's memories, counters, damage met.
 
 Everything else (order, augmentation, learning rate) is a function of the settings and the step;
 nothing asks a generator that would have to be remembered.
@@ -12,7 +12,7 @@ import torch
 from model.renderformer import RenderFormer
 from storage.seeds import seed_for
 from train.data.unusable import Unusable
-from train.loop.optim import make_optimizer
+from train.loop.optim import Updater
 from train.settings import TrainSettings
 
 
@@ -22,8 +22,8 @@ class TrainState:
 
     model: RenderFormer
     """The network."""
-    optimizer: torch.optim.AdamW
-    """Over the weights of `model`."""
+    updater: Updater
+    """Moves the weights of `model`."""
     unusable: Unusable
     """The damaged data that was met so far, and how much there may be."""
     mean_model: RenderFormer | None = None
@@ -78,7 +78,7 @@ def new_state(
         mean_model = copy.deepcopy(model).requires_grad_(False)
     return TrainState(
         model=model,
-        optimizer=make_optimizer(model, settings),
+        updater=Updater(model, settings),
         unusable=Unusable(settings.most_unusable),
         mean_model=mean_model,
     )

@@ -57,7 +57,7 @@ class Stepper:
         Every process must hold equally many views.
         """
         state = self._state
-        state.optimizer.zero_grad(set_to_none=True)
+        state.updater.zero_grad()
         num_views = sum(batch.noise_BV.numel() for batch in batches)
         sums = torch.zeros(4, dtype=torch.float64)
         for index, batch in enumerate(batches):
@@ -68,9 +68,7 @@ class Stepper:
         grad_norm = nn.utils.clip_grad_norm_(state.model.parameters(), self._settings.grad_clip)
         applied = bool(torch.isfinite(grad_norm)) and math.isfinite(loss)
         if applied:
-            for group in state.optimizer.param_groups:
-                group["lr"] = learning_rate
-            state.optimizer.step()
+            state.updater.step(learning_rate)
             state.follow_with_mean(self._settings.ema_decay)
         return StepReport(
             loss=loss,

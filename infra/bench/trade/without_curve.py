@@ -89,7 +89,7 @@ _BY_REASON: tuple[tuple[str, tuple[str, ...]], ...] = (
         "judges it by the held-out error of whole trainings.",
         (
             *_named("train.augmentation.", "rotation mirror channels vertex_order"),
-            *_named("train.", "learning_rate warmup_steps final_rate_share betas"),
+            *_named("train.", "learning_rate warmup_steps final_rate_share betas muon_rate"),
         ),
     ),
     (

@@ -1,0 +1,110 @@
+"""Laws of what moves the weights: AdamW is torch's own, and Muon's steps are near orthogonal."""
+
+import copy
+import math
+
+import pytest
+import torch
+
+from model.renderformer import RenderFormer
+from tests.train.kit import tiny_run
+from train.loop.optim import Updater
+from train.loop.state import new_state
+
+RATE = 1e-3
+
+
+def with_gradients(seed: int = 0) -> RenderFormer:
+    """Return a network whose gradients are random, the rarest direction a hundredth as long."""
+    model = new_state(tiny_run()).model
+    generator = torch.Generator().manual_seed(seed)
+    for weight in model.parameters():
+        gradient = torch.randn(weight.shape, generator=generator)
+        if weight.ndim == 2 and min(weight.shape) > 1:
+            u, s, vt = torch.linalg.svd(gradient, full_matrices=False)
+            gradient = u @ torch.diag(torch.logspace(0, -2, len(s))) @ vt
+        weight.grad = gradient
+    return model
+
+
+def moved(model: RenderFormer, updater: Updater) -> dict[str, torch.Tensor]:
+    """Return how far every weight moved in one step."""
+    before = {name: weight.detach().clone() for name, weight in model.named_parameters()}
+    updater.step(RATE)
+    return {name: weight.detach() - before[name] for name, weight in model.named_parameters()}
+
+
+def test_without_muon_it_is_torchs_adamw() -> None:
+    model = with_gradients()
+    twin = copy.deepcopy(model)
+    for ours, theirs in zip(model.parameters(), twin.parameters(), strict=True):
+        theirs.grad = None if ours.grad is None else ours.grad.clone()
+    settings = tiny_run(weight_decay=0.1)
+    updater = Updater(model, settings)
+    adamw = torch.optim.AdamW(twin.parameters(), betas=settings.betas, weight_decay=0.1)
+    for rate in (RATE, 3 * RATE):
+        updater.step(rate)
+        adamw.param_groups[0]["lr"] = rate
+        adamw.step()
+    for ours, theirs in zip(model.parameters(), twin.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_muon_moves_every_direction_of_a_matrix_about_as_far() -> None:
+    model = with_gradients()
+    gradients = {name: weight.grad for name, weight in model.named_parameters()}
+    matrices = 0
+    for name, step in moved(model, Updater(model, tiny_run(muon_rate=3.0, weight_decay=0))).items():
+        gradient = gradients[name]
+        assert gradient is not None
+        if step.ndim != 2 or min(step.shape) == 1:
+            continue
+        matrices += 1
+        u, _, vt = torch.linalg.svd(gradient, full_matrices=False)
+        seen = -(u.T @ step @ vt.T) / (3 * RATE * 0.2 * math.sqrt(max(step.shape)))
+        lengths = seen.diagonal()
+        # five of Muon's iterations take a hundredth of the length to between 0.3 and 1.2 of the
+        # whole (their polynomial, by hand); what they leave beside the diagonal is bfloat16's
+        assert 0.3 < lengths.min() and lengths.max() < 1.25, name
+        assert (seen - torch.diag(lengths)).abs().max() < 0.05, name
+    assert matrices > 10
+
+
+@pytest.mark.parametrize("muon_rate", [0.0, 3.0])
+def test_without_a_gradient_every_weight_shrinks_by_its_rate(muon_rate: float) -> None:
+    model = with_gradients()
+    for weight in model.parameters():
+        weight.grad = torch.zeros_like(weight)
+    before = [weight.detach().clone() for weight in model.parameters()]
+    Updater(model, tiny_run(muon_rate=muon_rate, weight_decay=0.5)).step(RATE)
+    for ours, old in zip(model.parameters(), before, strict=True):
+        # float32 rounding of one product
+        rate = muon_rate * RATE if muon_rate and old.ndim == 2 else RATE
+        torch.testing.assert_close(ours.detach(), (1 - 0.5 * rate) * old, rtol=1e-6, atol=0)
+
+
+def test_with_muon_vectors_are_moved_as_without() -> None:
+    with_muon = moved(model := with_gradients(), Updater(model, tiny_run(muon_rate=3.0)))
+    without = moved(model := with_gradients(), Updater(model, tiny_run()))
+    vectors = [name for name, step in without.items() if step.ndim == 1]
+    assert vectors and all(torch.equal(with_muon[name], without[name]) for name in vectors)
+
+
+@pytest.mark.parametrize("muon_rate", [0.0, 3.0])
+def test_what_is_remembered_can_be_taken_over(muon_rate: float) -> None:
+    settings = tiny_run(muon_rate=muon_rate)
+    model = with_gradients()
+    updater = Updater(model, settings)
+    assert updater.memories() == {}
+    updater.step(RATE)
+    twin = copy.deepcopy(model)
+    other = Updater(twin, settings)
+    other.remember(updater.memories(), 1)
+    kinds = {name.split("/")[0] for name in updater.memories()}
+    assert kinds == {"exp_avg", "exp_avg_sq"} | ({"momentum_buffer"} if muon_rate else set())
+    for network, own in ((model, updater), (twin, other)):
+        for weight, like in zip(network.parameters(), with_gradients(1).parameters(), strict=True):
+            weight.grad = like.grad
+        own.step(RATE)
+    for ours, theirs in zip(model.parameters(), twin.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
