@@ -110,6 +110,12 @@ def _with(settings: TrainSettings, **changes: object) -> TrainSettings:
     return dataclasses.replace(settings, **changes)  # type: ignore[arg-type]
 
 
+def _half(settings: TrainSettings) -> TrainSettings:
+    """Return half the steps, all of the schedule."""
+    halved = ("num_steps", "warmup_steps", "log_every", "validate_every", "checkpoint_every")
+    return _with(settings, **{name: getattr(settings, name) // 2 for name in halved})
+
+
 CHANGES: Mapping[str, Callable[[TrainSettings], TrainSettings]] = {
     BASELINE: lambda base: base,
     "no-symmetry": lambda base: _with(base, augmentation=AugmentationSettings()),
@@ -127,13 +133,14 @@ CHANGES: Mapping[str, Callable[[TrainSettings], TrainSettings]] = {
         base, augmentation=dataclasses.replace(base.augmentation, light_scale=2.0)
     ),
     "muon": lambda base: _with(base, muon_rate=3.0),
+    "muon-half": lambda base: _half(_with(base, muon_rate=3.0)),
     "ema": lambda base: _with(base, ema_decay=0.995),
     "ms-ssim": lambda base: _with(base, loss=LossSettings(perceptual="ms_ssim")),
     "noise-weights": lambda base: _with(
         base, loss=LossSettings(perceptual="none", noise_half=0.01)
     ),
 }
-"""One change at a time. The first three are the least that the table must hold."""
+"""One change at a time, and one of them in half the steps. The first three are the least."""
 
 
 def all_jobs(plan: str) -> list[Job]:

@@ -5,8 +5,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
 
-from infra.bench.power_law import fit_power_law
+from infra.bench.power_law import CONFIDENCE, fit_power_law
 from infra.bench.training_jobs import BASELINE
 
 PAPER = "paper-schedule"
@@ -38,7 +39,7 @@ def report_lines(rows: Rows) -> list[str]:
     lines += [
         f"- data {digest}, {count} scenes: {score:.4f}" for digest, count, score in sorted(rivals)
     ]
-    return lines + _steps_saved(rows)
+    return lines + _against_paper(rows)
 
 
 def of_newest_data(rows: Rows) -> Rows:
@@ -47,22 +48,58 @@ def of_newest_data(rows: Rows) -> Rows:
     return [row for row in rows if row["data_digest"] == newest[row["plan"]]]
 
 
-def _steps_saved(rows: Rows) -> list[str]:
-    """Return when `ours` was as good as the paper's schedule at its end, job by job."""
+def _against_paper(rows: Rows) -> list[str]:
+    """Return what each change makes of the paper's schedule: same network, scenes and seed."""
     ends = {_place(row): row for row in rows if row["change"] == PAPER}
-    shares = [
-        reached(row["curve"], ends[_place(row)]["scores"]["log_l1"]) / row["num_steps"]
-        for row in rows
-        if row["change"] == BASELINE and _place(row) in ends
-    ]
-    if not shares:
-        return []
-    spread = f"{min(shares):.0%} to {max(shares):.0%} over {len(shares)} pairs"
-    return [
+    lines = []
+    for change in sorted({row["change"] for row in rows} - {PAPER}):
+        pairs = [
+            (row, ends[_place(row)])
+            for row in rows
+            if row["change"] == change and _place(row) in ends
+        ]
+        if pairs:
+            lines.append(f"| {change} | {' | '.join(_cells_against_paper(pairs))} |")
+    head = [
         "",
-        f"`{BASELINE}` is as good as `{PAPER}` at its end after {np.median(shares):.0%} of the "
-        f"steps ({spread}; read off every tenth of a run whose own schedule goes on; inf: never).",
+        f"Against `{PAPER}` with the same network, scenes and seed, at the end of both; and the",
+        "share of its steps after which the change was as good as it is at its end, in the median,",
+        "read off every tenth of a run whose own schedule goes on.",
+        "",
+        "| change | pairs | steps | error, ratio (95 %) | as good after |",
+        "|---|---|---|---|---|",
     ]
+    return [*head, *lines] if lines else []
+
+
+def _cells_against_paper(pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[str]:
+    ratios = [row["scores"]["log_l1"] / paper["scores"]["log_l1"] for row, paper in pairs]
+    steps = {row["num_steps"] / paper["num_steps"] for row, paper in pairs}
+    shares = [
+        reached(row["curve"], paper["scores"]["log_l1"]) / paper["num_steps"]
+        for row, paper in pairs
+    ]
+    ratio, low, high = mean_ratio(ratios)
+    return [
+        str(len(pairs)),
+        " or ".join(f"{share:.0%}" for share in sorted(steps)),
+        f"{ratio:.3f} ({low:.3f} to {high:.3f})",
+        f"{_share(float(np.median(shares)))} ({_share(min(shares))} to {_share(max(shares))})",
+    ]
+
+
+def _share(of_steps: float) -> str:
+    return "never" if math.isinf(of_steps) else f"{of_steps:.0%}"
+
+
+def mean_ratio(ratios: Sequence[float]) -> tuple[float, float, float]:
+    """Return the geometric mean and its 95 % interval (Student's t); nan with one."""
+    logs = np.log(np.asarray(ratios, float))
+    half = math.nan
+    if len(logs) > 1:
+        deviation = float(logs.std(ddof=1)) / math.sqrt(len(logs))
+        half = float(student.ppf(0.5 + CONFIDENCE / 2, len(logs) - 1)) * deviation
+    return math.exp(logs.mean()), math.exp(logs.mean() - half), math.exp(logs.mean() + half)
 
 
 def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:

@@ -13,7 +13,7 @@ from infra.bench import training_jobs, training_table
 from infra.bench.power_law import fit_power_law
 from infra.bench.training_jobs import BASELINE, CHANGES, SCENES, SEEDS, Job, Plan, all_jobs
 from infra.bench.training_plot import plot
-from infra.bench.training_report import PAPER, of_newest_data, reached, report_lines
+from infra.bench.training_report import PAPER, mean_ratio, of_newest_data, reached, report_lines
 from infra.bench.training_table import read_table, run_jobs
 from storage.errors import TrilightError
 from storage.seeds import rng_for
@@ -37,7 +37,9 @@ def test_every_change_changes_something_and_only_that() -> None:
         record = settings_record(job(change=change).settings())
         differing = {name for name in base if record[name] != base[name]}
         assert differing, change
-        assert len(differing) == 1 or change == "paper-schedule"
+        assert len(differing) == 1 or change in ("paper-schedule", "muon-half")
+    muon, half = (job(change=change).settings() for change in ("muon", "muon-half"))
+    assert half.num_steps == muon.num_steps / 2 and half.muon_rate == muon.muon_rate
     with pytest.raises(TrilightError, match="plan 'tpu': no such plan; expected cpu or gpu"):
         all_jobs("tpu")
 
@@ -106,8 +108,20 @@ def test_steps_saved_are_read_off_the_curves() -> None:
         "scores": {"log_l1": 0.05}, "median_scores": {"log_l1": 0.07}, "data_digest": "0" * 64,
     }  # fmt: skip
     paper = {**row, "scores": {"log_l1": 0.0555}}
-    lines = report_lines([{**row, "change": BASELINE}, {**paper, "change": PAPER}])
-    assert any("at its end after 50% of the steps (50% to 50% over 1 pairs" in x for x in lines)
+    never = {**row, "change": "ema", "scores": {"log_l1": 0.06}, "curve": [[400, 0.06]]}
+    lines = report_lines([{**row, "change": BASELINE}, {**paper, "change": PAPER}, never])
+    assert "| ours | 1 | 100% | 0.901 (nan to nan) | 50% (50% to 50%) |" in lines
+    assert "| ema | 1 | 100% | 1.081 (nan to nan) | never (never to never) |" in lines
+
+
+def test_a_mean_ratio_holds_the_truth_as_often_as_it_says() -> None:
+    rng = rng_for(0, "ratios")
+    held = 0
+    for _ in range(1000):
+        _, low, high = mean_ratio(list(0.9 * np.exp(rng.normal(0, 0.05, 6))))
+        held += low <= 0.9 <= high
+    assert 920 < held < 980  # 950 expected, standard deviation 7: four of them
+    assert mean_ratio([0.8, 1.25])[0] == pytest.approx(1.0)
 
 
 def test_the_picture_has_a_panel_for_each_network(tmp_path: Path) -> None:
