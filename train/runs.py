@@ -112,6 +112,7 @@ def pretrain() -> TrainSettings:
         ),
         num_steps=250_000,
         learning_rate=3e-4,
+        muon_rate=3.0,
         warmup_steps=2_000,
         final_rate_share=0.02,
         betas=(0.9, 0.99),

@@ -30,7 +30,7 @@ _HEAD = (
     f"# The network that comes with Trilight (`{BUILTIN}`)",
     "",
     "What `trilight render --engine neural` uses where no other is named: small enough to ship and "
-    "to train on one processor core, and as blurred as that makes it. It shows that everything "
+    "to train on two processor cores, and as blurred as that makes it. It shows that everything "
     "works, and is something to beat; it does not replace the path tracer.",
     "",
 )

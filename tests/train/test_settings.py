@@ -64,7 +64,7 @@ def test_the_paper_runs_are_the_papers() -> None:
         assert (run.loss.perceptual, run.loss.perceptual_weight) == ("lpips", 0.05)
         assert (run.betas, run.weight_decay, run.grad_clip) == ((0.9, 0.999), 0.01, 1.0)
         assert (run.augmentation.rotation, run.augmentation.translation) == ("recipe", 0.25)
-        assert run.ema_decay == 0 and not run.augmentation.mirror
+        assert run.ema_decay == run.muon_rate == 0 and not run.augmentation.mirror
     assert second.from_weights and not first.from_weights
 
 
