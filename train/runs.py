@@ -38,7 +38,7 @@ def smoke() -> TrainSettings:
 
 
 def builtin() -> TrainSettings:
-    """Return the run that the network shipped with Trilight comes from: an hour on two CPU cores."""
+    """Return the run that the shipped network comes from: an hour on two CPU cores."""
     return dataclasses.replace(
         smoke(),
         run="builtin",
