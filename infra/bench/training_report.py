@@ -80,10 +80,11 @@ def _cells_against_paper(pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, A
         for row, paper in pairs
     ]
     ratio, low, high = mean_ratio(ratios)
+    interval = "no interval" if math.isnan(low) else f"{low:.3f} to {high:.3f}"
     return [
         str(len(pairs)),
         " or ".join(f"{share:.0%}" for share in sorted(steps)),
-        f"{ratio:.3f} ({low:.3f} to {high:.3f})",
+        f"{ratio:.3f} ({interval})",
         f"{_share(float(np.median(shares)))} ({_share(min(shares))} to {_share(max(shares))})",
     ]
 

@@ -110,8 +110,8 @@ def test_steps_saved_are_read_off_the_curves() -> None:
     paper = {**row, "scores": {"log_l1": 0.0555}}
     never = {**row, "change": "ema", "scores": {"log_l1": 0.06}, "curve": [[400, 0.06]]}
     lines = report_lines([{**row, "change": BASELINE}, {**paper, "change": PAPER}, never])
-    assert "| ours | 1 | 100% | 0.901 (nan to nan) | 50% (50% to 50%) |" in lines
-    assert "| ema | 1 | 100% | 1.081 (nan to nan) | never (never to never) |" in lines
+    assert "| ours | 1 | 100% | 0.901 (no interval) | 50% (50% to 50%) |" in lines
+    assert "| ema | 1 | 100% | 1.081 (no interval) | never (never to never) |" in lines
 
 
 def test_a_mean_ratio_holds_the_truth_as_often_as_it_says() -> None:
