@@ -22,8 +22,8 @@ class Updater:
     Muon (Jordan et al. 2024) makes the step of a matrix near orthogonal, so that its rare
     directions move as far as the frequent ones. Its steps are scaled to the size of AdamW's (Liu et
     al. 2025), so one learning rate serves both. What it cannot do: work without rounding; the
-    orthogonal matrix is found in bfloat16, so sums in another order move a weight by up to a
-    hundredth of a step.
+    orthogonal matrix is found in bfloat16, so where sums in another order cross a rounding, a
+    weight moves otherwise, by up to a tenth of a typical step.
     """
 
     def __init__(self, model: nn.Module, settings: TrainSettings) -> None:
