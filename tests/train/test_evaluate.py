@@ -264,7 +264,8 @@ def test_the_benchmark_stands_beside_the_paper() -> None:
     assert record([row(0)], {"build": "smoke"})["published"] is None
     page = markdown(record([row(0)], {"build": BENCHMARK}))
     assert BENCHMARK in JUDGING_BUILDS
-    assert "| psnr_linear_db | 29.8 | 30.00 |" in page and "| lpips | 0.055 | n/a |" in page
+    assert "| psnr_linear_db | 29.77 | 30.00 |" in page and "| lpips | 0.0551 | n/a |" in page
+    assert "400 scenes" in page and "256 x 256" in page
 
 
 def test_facts_come_from_the_scene() -> None:
