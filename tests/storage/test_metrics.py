@@ -17,7 +17,8 @@ def test_a_tenth_of_a_decade_is_twenty_db() -> None:
 
 
 def test_linear_sees_nothing_above_one() -> None:
-    assert psnr_linear_db(np.full(9, 1.0), np.full(9, 500.0)) == MAX_DB
+    # Twelve and seven: one side clamped elsewhere would still pass with a value of 1 on the other.
+    assert psnr_linear_db(np.full(9, 12.0), np.full(9, 7.0)) == MAX_DB
     assert psnr_linear_db(np.full(9, 0.5), np.full(9, 0.6)) == pytest.approx(20)
 
 
@@ -39,3 +40,4 @@ def test_symmetry() -> None:
     rng = np.random.default_rng(1)
     a, b = rng.random((2, 6, 6, 3)) * 100
     assert psnr_log_db(a, b) == psnr_log_db(b, a)
+    assert psnr_linear_db(a, b) == psnr_linear_db(b, a)
