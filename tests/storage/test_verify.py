@@ -73,6 +73,24 @@ def test_a_key_in_two_shards_is_named(dataset: Dataset) -> None:
 
 
 @pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize(
+    ("lock", "fault"),
+    [(lambda old: old[:-2] + b" }\n", "sha256 differs from the manifest"), (None, "missing")],
+    ids=["the same rows in other bytes", "gone"],
+)
+def test_the_lock_is_compared(
+    dataset: Dataset, fast: bool, lock: Callable[[bytes], bytes] | None, fault: str
+) -> None:
+    path = dataset.folder.objects_lock
+    if lock is None:
+        path.unlink()
+    else:
+        path.write_bytes(lock(path.read_bytes()))
+    found = verify_dataset(dataset.folder.root, fast=fast)
+    assert f"objects.lock.jsonl: {fault}" in found.problems, found.problems
+
+
+@pytest.mark.parametrize("fast", [False, True])
 def test_sizes_counts_and_members_are_compared(dataset: Dataset, fast: bool) -> None:
     root = dataset.folder.root
     shards = json.loads(dataset.folder.manifest.read_text())["shards"]
