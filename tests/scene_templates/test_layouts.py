@@ -9,7 +9,7 @@ from scene_templates.contents.cameras import CameraSettings, camera_rand
 from scene_templates.contents.materials import MaterialSettings, surface_rand
 from scene_templates.contents.placement import TOUCHING
 from scene_templates.families.renderformer_v1 import stage_1_families
-from scene_templates.layout import Layout
+from scene_templates.layout import Layout, Pose
 from scene_templates.settings import SceneSettings
 from scene_templates.shell.rooms import plane_of
 from scene_templates.templates.registry import TEMPLATES
@@ -92,6 +92,20 @@ def test_a_shape_decides_what_meets() -> None:
     settings = template_settings("plane", {"families.num_objects": [3, 3]})
     ghosts = drawn(settings, 40, shape=Ghost())
     assert sum(min(_gaps(one)) < 0 for one in ghosts) > 20
+
+
+def test_the_largest_object_is_placed_first() -> None:
+    """A small one finds room beside a large one more often than the other way round."""
+    later_is_smaller = []
+
+    class Watched(Ball):
+        def meets(self, pose: Pose, other: Ball, its_pose: Pose) -> bool:
+            later_is_smaller.append(pose.radius <= its_pose.radius)
+            return super().meets(pose, other, its_pose)
+
+    changes = {"families.num_objects": [3, 3], "placement.overlap_share": 0.0}
+    drawn(template_settings("plane", changes), 20, shape=Watched())
+    assert len(later_is_smaller) >= 60 and all(later_is_smaller)
 
 
 def test_objects_of_very_different_sizes_do_not_meet() -> None:
