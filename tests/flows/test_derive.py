@@ -145,6 +145,16 @@ def test_a_selection_keeps_keys_and_bytes(
     assert samples_of(chosen) == {sample_key(key): whole[sample_key(key)] for key in keys}
 
 
+def test_a_merge_after_a_selection_gives_no_key_twice(tmp_path: Path) -> None:
+    """A selection keeps its keys, which then go beyond its number of scenes."""
+    a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
+    derive = Derive(operation="select", selection=Selection(split="test"))
+    chosen = shards_made(tmp_path / "c", derive, a)
+    merged = shards_made(tmp_path / "d", MERGE, chosen.folder.root, b)
+    test_part = {"test-000002.tar": scenes(0)["test-000002.tar"]}
+    assert samples_of(merged) == given(test_part) | given(scenes(1), 6)
+
+
 def test_a_selection_keeps_only_the_rights_of_what_it_holds(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", scenes(0))
     derive = Derive(operation="select", selection=Selection(split="train"))
