@@ -37,6 +37,12 @@ from storage.conventions import DIFFUSE, EMISSION, HALF_FLOAT_MAX, ROUGHNESS, SP
 from storage.errors import TrilightError
 from storage.scene import Scene
 
+CARRIED = frozenset(
+    {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg"}
+    | {f"materials.{name}" for name in ("diffuse", "specular", "roughness", "emission")}
+)
+"""Of a scene (storage.carried)."""
+
 CHANNELS, CELLS = 13, 32
 """Of a texture; it has CELLS x CELLS cells."""
 TEXTURE_EMISSION = slice(10, 13)
@@ -117,6 +123,13 @@ def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating
     lower = np.nextafter(half[:, :6], np.float16(0))
     half[:, :6] = np.where(over & (half[:, :6] > rows[:, :6]), lower, half[:, :6])
     return half[scene.material_index]
+
+
+def reflecting_emitters(scene: Scene) -> tuple[str, ...]:
+    """Return what a file says otherwise, for people: what emitters reflect, where they do."""
+    emits = (scene.materials[:, EMISSION] > 0).any(axis=1)
+    reflects = (scene.materials[emits][:, : SPECULAR.stop] > 0).any(axis=1)
+    return (f"what {int(reflects.sum())} emitting materials reflect",) if reflects.any() else ()
 
 
 def _write(file: Any, name: str, values: NDArray) -> None:

@@ -11,6 +11,9 @@ _SECRET_FIELD = re.compile(
 _SECRET_WORD = re.compile(
     r"(?i)\b(?:(bearer|basic)\s+[\w.~+/=-]{6,}|hf_\w{16,}|(?:AKIA|ASIA)\w{12,})"
 )
+_SECRET_QUERY = re.compile(
+    r"(?i)[?&#;][\w.-]*(?:token|secret|passw|sig|credential|key|auth|session)[\w.-]*="
+)
 HIDDEN = "..."
 """Stands for what was taken out."""
 
@@ -30,6 +33,21 @@ def safe_url(url: str) -> str:
     if colon and port and not port.isdecimal():
         return f"{scheme}://{HIDDEN}"
     return f"{scheme}://{host}{path}"
+
+
+def public_text(text: str) -> str:
+    """Return text that a catalogue states, with nothing in its URLs that opens a place.
+
+    Unlike `safe_text`, for what is published and followed: a query stays, since it may name the
+    page (`?id=7`), unless one of its fields is called like a secret.
+    """
+    return _URL_IN_TEXT.sub(lambda match: _public_url(match[0]), text)
+
+
+def _public_url(url: str) -> str:
+    parts, safe = _PARTS.match(url), safe_url(url)
+    rest = url[parts.end() :] if parts else ""
+    return safe if safe.endswith(f"://{HIDDEN}") or _SECRET_QUERY.search(rest) else safe + rest
 
 
 def safe_text(text: str) -> str:

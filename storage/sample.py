@@ -11,6 +11,7 @@ reads names.
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +28,15 @@ from storage.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
 from storage.safe_read import read_safetensors
 from storage.scene import ARRAY_FIELDS, Scene
 from storage.scene_file import encode_arrays, scene_objects, scene_provenance, scene_record
+
+_FAR = 1000.0
+"""Beyond any noise floor in dB and any share."""
+
+_EXPECTED: Mapping[Any, str] = {
+    int: "a whole number",
+    bool: "true or false",
+    float: f"a number between {-_FAR:.0f} and {_FAR:.0f}",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +90,28 @@ class Sample:
     """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`; their
     sum is the picture (storage.lights). None where the build keeps lights together."""
 
+    def check(self) -> None:
+        """Raise TrilightError at the first broken law of what can be learnt from, named by key.
+
+        Scene.check, as many square pictures and records as cameras, and radiance that is finite
+        and not negative: one value that is not would reach every weight in one step.
+        """
+        try:
+            self.scene.check()
+        except TrilightError as error:
+            raise TrilightError(f"sample {self.key}: {error}") from error
+        count, height, width = self.radiance_rgb.shape[:3]
+        views = self.scene.num_views
+        if not (count == len(self.views) == views and height == width > 0):
+            raise TrilightError(
+                f"sample {self.key}: {count} pictures of {height} x {width} pixels and "
+                f"{len(self.views)} records; expected {views} of both, as many as cameras, square."
+            )
+        _check_radiance(self.key, "", self.radiance_rgb)
+        apart = () if self.lights_rgb is None else np.moveaxis(self.lights_rgb, 1, 0)
+        for light, radiance_rgb in enumerate(apart):
+            _check_radiance(self.key, f" light {light}", radiance_rgb)
+
 
 def sample_key(scene_index: int) -> str:
     """Return the key of a scene: its index in nine digits, so that names sort as numbers."""
@@ -116,8 +148,8 @@ def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
     """Return the sample of its members (suffix to bytes).
 
     Raises:
-        TrilightError: a member is missing, unreadable or of another schema version. The laws of
-            the scene are not checked here: readers trust what `trilight verify` has passed.
+        TrilightError: a member is missing, unreadable or of another schema version. Laws are not
+            checked here; `Sample.check` does that for whoever learns from a sample.
     """
     record = decode_scene(key, members)
     try:
@@ -159,7 +191,7 @@ def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
         raise TrilightError(f"sample {key}: member {key}.json is missing.")
     record = _decode_record(key, members["json"])
     try:
-        views = tuple(ViewRecord(**view) for view in record["views"])
+        views = tuple(_view(view, row) for row, view in enumerate(record["views"]))
         objects = scene_objects(record["objects"])
         arrays, _ = read_safetensors(unpack_arrays(members))
         fields = {name: arrays[name] for name in ARRAY_FIELDS}
@@ -175,8 +207,34 @@ def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
 def _decode_record(key: str, data: bytes) -> dict[str, Any]:
     try:
         record = json.loads(data)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise TrilightError(f"sample {key}: member {key}.json is not JSON ({error}).") from error
     version = record.get("schema_version") if isinstance(record, dict) else None
     require_readable(version, f"sample {key}")
     return record
+
+
+def _view(value: Mapping[str, Any], row: int) -> ViewRecord:
+    """Return the record of a view; raises ValueError for a field that is no usable number."""
+    record = ViewRecord(**value)
+    for field in dataclasses.fields(ViewRecord):
+        number = getattr(record, field.name)
+        if type(number) is field.type and field.type is not float:
+            continue
+        if field.type is not float or type(number) not in (int, float) or not -_FAR < number < _FAR:
+            raise ValueError(
+                f"views[{row}].{field.name} is {number!r:.40}; expected {_EXPECTED[field.type]}."
+            )
+    return record
+
+
+def _check_radiance(key: str, which: str, radiance_rgb: NDArray[np.float32]) -> None:
+    if radiance_rgb.min() >= 0 and radiance_rgb.max() < math.inf:  # NaN is neither
+        return
+    wrong = np.argwhere(~(np.isfinite(radiance_rgb) & (radiance_rgb >= 0)))
+    view, row, column, channel = (int(index) for index in wrong[0])
+    value = radiance_rgb[view, row, column, channel]
+    raise TrilightError(
+        f"sample {key}: view {view}{which} has radiance {value} at pixel ({row}, {column}); "
+        "expected finite values from 0. Run `trilight verify` on the dataset."
+    )

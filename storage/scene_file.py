@@ -33,6 +33,9 @@ MAX_FILE_BYTES = 256 << 20
 MAX_HEADER_BYTES = 8 << 20
 """An object takes 150 bytes and its attribution; there are at most 65,536."""
 
+CARRIED = frozenset({*ARRAY_FIELDS, "objects", "provenance"})
+"""Of a scene (storage.carried): all, whatever a material or an object may come to hold."""
+
 _METADATA = "trilight_scene"
 _DTYPE_NAMES: Mapping[type, str] = {np.float32: "F32", np.uint32: "U32", np.uint16: "U16"}
 

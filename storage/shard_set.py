@@ -51,14 +51,16 @@ class OpenShard:
         }
 
     def sample(self, row: int) -> Sample:
-        """Return a sample.
+        """Return a sample that passes `Sample.check`.
 
         Raises:
-            TrilightError: it is not whole or not readable; names shard and sample.
+            TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
         """
         key, _ = self._samples[row]
         try:
-            return decode_sample(key, self.members(row))
+            sample = decode_sample(key, self.members(row))
+            sample.check()
+            return sample
         except TrilightError as error:
             raise TrilightError(f"{self.name}: {error}") from error
 

@@ -20,6 +20,8 @@ class Fault:
     """Answered instead of the content."""
     cut_after: int | None = None
     """Bytes after which the connection ends."""
+    trickle: tuple[int, float] | None = None
+    """Bytes that come at once, and seconds before the next ones."""
     stall_after: int | None = None
     """Bytes after which nothing more comes."""
     silent: bool = False
@@ -195,7 +197,11 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command == "HEAD":
             return
         body = data[first:][:stop]
-        self.wfile.write(body)
+        step, pause_s = fault.trickle or (max(len(body), 1), 0.0)
+        for start in range(0, len(body), step):
+            self.wfile.write(body[start : start + step])
+            if self.site.closing.wait(pause_s):
+                break
         with self.site.lock:
             self.site.sent += len(body)
         if fault.stall_after is not None:

@@ -4,7 +4,7 @@ USD holds many scenes in one file. The other forms hold one: many become `NAME.K
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +14,25 @@ from numpy.typing import NDArray
 from pipeline.flows.file_child import file_child
 from pipeline.flows.scene_source import LoadedScene, SceneSource, load_source, source_keys
 from pipeline.isolation import ChildFailed
+from pipeline.scenes import renderformer_json_write
 from pipeline.scenes.renderformer_json_write import described_files
+from storage import renderformer_h5, scene_file
 from storage.atomic import write_atomically
+from storage.carried import lost_members
 from storage.errors import TrilightError
-from storage.renderformer_h5 import write_renderformer_h5
+from storage.renderformer_h5 import reflecting_emitters, write_renderformer_h5
 from storage.scene import Scene
 from storage.scene_file import encode_scene
+from storage.usd import export as usd
 from storage.usd.export import SUFFIXES, write_usd, write_usd_shard
+
+_CARRIED = {
+    **dict.fromkeys(SUFFIXES, usd.CARRIED),
+    ".json": renderformer_json_write.CARRIED,
+    ".h5": renderformer_h5.CARRIED,
+    ".safetensors": scene_file.CARRIED,
+}
+"""What each form holds of a scene, by the suffix that chooses it."""
 
 _EXPECTED = "expected the name of a file: .usda .usdc .usdz, .json, .h5 or .safetensors"
 
@@ -53,7 +65,7 @@ def convert_scene(
             written.
     """
     suffix = target.suffix.lower()
-    if suffix not in (*SUFFIXES, ".json", ".h5", ".safetensors") or target.is_dir():
+    if suffix not in _CARRIED or target.is_dir():
         raise TrilightError(f"{target}: cannot be written as a scene; {_EXPECTED}.")
     child = file_child()
     try:
@@ -95,22 +107,28 @@ def write_scene(
         TrilightError: the form cannot hold it, or it cannot be written.
     """
     suffix = target.suffix.lower()
+    lost = lost_members(scene, _CARRIED[suffix])
     if suffix in SUFFIXES:
         write_usd(target, scene)
     elif suffix == ".json":
-        return _write_json(target, scene)
+        return (*lost, *_write_json(target, scene))
     elif suffix == ".h5":
         write_renderformer_h5(target, scene, radiance_rgb)
+        return (*lost, *reflecting_emitters(scene))
     else:
         write_atomically(target, encode_scene(scene))
-    return ()
+    return lost
 
 
 def _one(source: SceneSource, target: Path, budget: int | None) -> Converted:
     loaded = _loaded(source, budget, pictures=target.suffix.lower() == ".h5")
     lost = write_scene(target, loaded.scene, loaded.radiance_rgb)
-    notes = (*loaded.notes, *(f"{target.name}: cannot hold {text}" for text in lost))
+    notes = (*loaded.notes, *_said(target, lost))
     return Converted(files=(target,), triangles=loaded.scene.num_triangles, notes=notes)
+
+
+def _said(target: Path, lost: Iterable[str]) -> Iterator[str]:
+    return (f"{target.name}: cannot hold {text}" for text in lost)
 
 
 def _many_to_usd(
@@ -123,7 +141,8 @@ def _many_to_usd(
         for key in keys:
             loaded = _loaded(dataclasses.replace(source, key=key), budget)
             triangles += loaded.scene.num_triangles
-            notes.extend(loaded.notes)
+            lost = lost_members(loaded.scene, usd.CARRIED)
+            notes.extend((*loaded.notes, *_said(target, lost)))
             yield _variant_name(str(key)), loaded.scene
 
     write_usd_shard(target, scenes())

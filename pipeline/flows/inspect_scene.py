@@ -16,7 +16,7 @@ from pipeline.isolation import ChildFailed
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.atomic import write_atomically
-from storage.conventions import look_at_c2w, preview_srgb8
+from storage.conventions import EMISSION, look_at_c2w, preview_srgb8
 from storage.errors import Rejected, TrilightError
 from storage.lights import num_lights
 from storage.scene import Scene
@@ -79,7 +79,7 @@ def _facts(source: SceneSource) -> InspectedScene:
         "cameras": ", ".join(f"{angle:.1f} deg" for angle in scene.fov_deg[:8]),
         "views": scene.num_views,
         "extent_m": " x ".join(f"{size:.3g}" for size in (high - low)),
-        "greatest_radiance": float(scene.materials[:, 7:].max()),
+        "greatest_radiance": float(scene.materials[:, EMISSION].max()),
         "licences": ", ".join(f"{count} {name}" for name, count in sorted(licences.items())),
         "made_by": str(scene.provenance.get("template", "unknown")),
         "scene_digest": scene_digest(scene),

@@ -1,10 +1,10 @@
 """A `Scene` as RenderFormer's scene JSON (version 1.0), with an OBJ file per mesh that it names.
 
 An object of the file has one material, so that an object of ours becomes as many as it has
-materials. Meshes stand in world space and are not normalised. What the form cannot say, and
-`DescribedFiles.lost` lists where it matters: uids, rights and provenance; which triangles of
-several colours were one object; shading normals other than flat ones and those that its readers
-make (smooth across edges of up to 30 degrees).
+materials. Meshes stand in world space and are not normalised. `CARRIED` says what the form holds;
+of that, `DescribedFiles.lost` lists what does not come back whole: which triangles of several
+colours were one object; shading normals other than flat ones and those that its readers make
+(smooth across edges of up to 30 degrees).
 """
 
 import json
@@ -26,7 +26,13 @@ from pipeline.scenes.renderformer_json import (
 from pipeline.scenes.shading import face_normals, smooth_shaded
 from storage.conventions import DIFFUSE, EMISSION, HALF_FLOAT_MAX, ROUGHNESS, SPECULAR
 from storage.errors import TrilightError
-from storage.scene import Scene
+from storage.scene import ARRAY_FIELDS, Scene
+
+CARRIED = frozenset(
+    {*ARRAY_FIELDS, "objects.name", "objects.kind"} - {"materials"}
+    | {f"materials.{name}" for name in ("diffuse", "specular", "roughness", "emission")}
+)
+"""Of a scene (storage.carried)."""
 
 _FLAT = 1e-5
 """Most that a float32 normal of a flat face lies from its geometric one."""
@@ -47,7 +53,7 @@ class DescribedFiles:
     meshes: dict[str, bytes]
     """OBJ files by path relative to it."""
     lost: tuple[str, ...]
-    """What the form does not hold, for people."""
+    """What of the members in CARRIED does not come back, for people."""
 
 
 def described_files(scene: Scene, stem: str) -> DescribedFiles:
@@ -189,10 +195,11 @@ def _comes_back(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float
 
 
 def _losses(scene: Scene) -> list[str]:
-    found = ["uids, licences, attributions and provenance"]
-    shown = [entry for entry in scene.objects if entry.uid or entry.attribution or entry.source_url]
-    if not shown and not scene.provenance:
-        found = []
+    found: list[str] = []
+    parts = np.bincount([row for row, _, _ in _parts(scene)])
+    whole, split = int((parts > 1).sum()), int(parts[parts > 1].sum())
+    if whole:
+        found.append(f"that {split} of its objects were {whole}, of several materials")
     solid = len(without_slivers(scene.vertex_positions, scene.faces))
     if solid < scene.num_triangles:
         found.append(f"{scene.num_triangles - solid} triangles without an area, which readers drop")

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from storage.errors import TrilightError
+from storage.remote.pace import PATIENCE, Pace
 from storage.remote.tries import Interrupted, TransferFailed, with_tries
-from storage.remote.url import RemoteUrl, shared_driver
+from storage.remote.url import RemoteUrl, shared_driver, transfer_timeout
 
 PIECE_BYTES = 8 << 20
 """What is asked of a bucket at once, and held in memory."""
@@ -67,22 +68,24 @@ def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_byt
         max_bytes: how many there may be, where it is not.
 
     Raises:
-        TransferFailed: as `facts_of`, it has another size than `num_bytes`, or it breaks off again
-            and again without moving on.
+        TransferFailed: as `facts_of`, it has another size than `num_bytes`, it breaks off again and
+            again without moving on, or comes too slowly (storage.remote.pace).
         TrilightError: the driver's package is missing, or the disk is full.
     """
     driver = shared_driver(url)
     fill = _fill_http if url.is_http else _fill_bucket
-    expected = _Expected(num_bytes, max_bytes if num_bytes is None else num_bytes)
-    with_tries(lambda: fill(driver, url, stream, expected), position=stream.tell)
+    pace = Pace(stream.tell)
+    expected = _Expected(num_bytes, max_bytes if num_bytes is None else num_bytes, pace)
+    with_tries(lambda: fill(driver, url, stream, expected), pace=pace)
 
 
 class _Expected:
-    """What is known of a file before it has come."""
+    """What is known of a file before it has come, and how fast it comes."""
 
-    def __init__(self, exact: int | None, most: int) -> None:
+    def __init__(self, exact: int | None, most: int, pace: Pace) -> None:
         self.exact = exact
         self.most = most
+        self.pace = pace
         self.version: dict[str, str] | None = None
 
     def require(self, found: int) -> None:
@@ -115,13 +118,17 @@ def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expec
     expected.require(num_bytes)
     if not expected.is_same(version_of(facts)):
         _start_over(stream)
+    # Drivers that are asynchronous take a limit for the whole answer; the others have one a read.
+    most_s = PATIENCE.window_s + PIECE_BYTES / PATIENCE.least_bytes_per_s
+    limit = {"timeout": most_s} if driver.async_impl else {}
     while stream.tell() < num_bytes:
         start = stream.tell()
         end = min(start + PIECE_BYTES, num_bytes)
-        piece = driver.cat_file(url.root, start=start, end=end)
+        piece = driver.cat_file(url.root, start=start, end=end, **limit)
         if len(piece) != end - start:
             raise Interrupted from EOFError(f"got {len(piece)} of {end - start} bytes")
         stream.write(piece)
+        expected.pace.require()
     if num_bytes > PIECE_BYTES and not expected.is_same(version_of(_fresh_info(driver, url))):
         _start_over(stream)
         raise Interrupted from EOFError("the file changed while it was read")
@@ -138,7 +145,8 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
     session = await driver.set_session()
     start = stream.tell()
     headers = {"Range": f"bytes={start}-"} if start else {}
-    async with session.get(driver.encode_url(url.root), headers=headers, **driver.kwargs) as answer:
+    options = {**driver.kwargs, "headers": headers, "timeout": transfer_timeout()}
+    async with session.get(driver.encode_url(url.root), **options) as answer:
         if start and answer.status == 416:  # it has become shorter
             _start_over(stream)
             raise Interrupted from EOFError("the file changed while it was read")
@@ -158,6 +166,7 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
         async for chunk in answer.content.iter_chunked(_CHUNK_BYTES):
             expected.bound(stream.tell() + len(chunk))
             stream.write(chunk)
+            expected.pace.require()
     expected.require_all(stream.tell())
 
 

@@ -4,15 +4,18 @@ import errno
 import os
 import time
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.safe_url import printable, safe_text
 
+if TYPE_CHECKING:
+    from storage.remote.pace import Pace
+
 Result = TypeVar("Result")
 
 TRIES = 5
-"""In a row without any progress."""
+"""In a row without progress at the least rate (storage.remote.pace)."""
 PAUSE_S = 0.5
 """Before the second try; doubled before each further one, up to MAX_PAUSE_S."""
 MAX_PAUSE_S = 20.0
@@ -41,9 +44,7 @@ class Interrupted(Exception):
     """A transfer ended early, for the reason that is its `__cause__`."""
 
 
-def with_tries(
-    function: Callable[[], Result], *, position: Callable[[], int] = lambda: 0
-) -> Result:
+def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) -> Result:
     """Call a function again while what goes wrong may pass by itself, after longer and longer.
 
     The pause before try n is PAUSE_S 2^(n-1), at most MAX_PAUSE_S, times a random factor between a
@@ -51,14 +52,15 @@ def with_tries(
 
     Args:
         function: what to try.
-        position: how far the transfer is; where it has moved on since the last error, the tries
-            are counted anew.
+        pace: of the file that is on its way; where it came at the least rate since the last error,
+            the tries are counted anew.
 
     Raises:
-        TransferFailed: as the function raised it, or `download_failed` for any other exception.
+        TransferFailed: as the function raised it, or `download_failed` for any other exception, or
+            the file comes too slowly.
         TrilightError: as the function raised it, or the disk is full (an EnvironmentFailure).
     """
-    number, reached = 0, position()
+    number = 0
     for _ in range(_MOST_TRIES):
         try:
             return function()
@@ -71,9 +73,11 @@ def with_tries(
                     "the disk is full. What was finished is safe: free some space and run the same "
                     "command again."
                 ) from error
-            number, reached = (0 if position() > reached else number) + 1, position()
+            number = 1 if pace is not None and pace.has_moved_on() else number + 1
             if number == TRIES or not may_pass(cause):
                 raise TransferFailed("download_failed", describe(cause)) from error
+            if pace is not None:
+                pace.require()
             time.sleep(min(PAUSE_S * 2 ** (number - 1), MAX_PAUSE_S) * (0.5 + _chance()))
     raise TransferFailed("download_failed", f"it was interrupted {_MOST_TRIES} times")
 

@@ -29,8 +29,8 @@ _BRACKETED_HOST = re.compile(r"\[[0-9A-Fa-f:.]*\]")
 _ADMITTED = "expected a path, or a URL of http, https, s3, gs, hf or file"
 _CONNECT_S = 20.0
 _SILENCE_S = 60.0
-_WHOLE_FILE_S = 3600.0
-"""However slowly the bytes of one file trickle, it ends then."""
+_ANSWER_S = 300.0
+"""For all of an answer that is no file, such as a listing, however slowly its bytes trickle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +134,13 @@ def _driver_of(access: RemoteUrl, process: int) -> Any:
     return open_driver(access)
 
 
+def transfer_timeout() -> Any:
+    """Return the limits of a request for a file, which storage.remote.pace bounds as a whole."""
+    import aiohttp
+
+    return aiohttp.ClientTimeout(connect=_CONNECT_S, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)
+
+
 def _http_options(url: RemoteUrl) -> dict[str, Any]:
     import aiohttp
 
@@ -146,7 +153,7 @@ def _http_options(url: RemoteUrl) -> dict[str, Any]:
         headers["Authorization"] = f"Basic {access}"
     client = {
         "timeout": aiohttp.ClientTimeout(
-            total=_WHOLE_FILE_S,
+            total=_ANSWER_S,
             connect=_CONNECT_S,
             sock_connect=_CONNECT_S,
             sock_read=_SILENCE_S,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import MATERIAL_WIDTH, require_readable
+from storage.conventions import MATERIAL_COLUMNS, MATERIAL_WIDTH, require_readable
 from storage.errors import TrilightError
 from storage.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.scene_file import scene_digest, scene_provenance
@@ -26,12 +26,6 @@ from storage.usd.meshes import MESH, SUBSET, object_attributes
 _PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
 """What may stand on a prim without changing what it shows."""
 _ARRAYS = {"points", "normals", "extent", "faceVertexCounts", "faceVertexIndices"}
-_MATERIAL_COLUMNS = (
-    (names.DIFFUSE_ALBEDO, slice(0, 3)),
-    (names.SPECULAR_ALBEDO, slice(3, 6)),
-    (names.ROUGHNESS_VALUE, 6),
-    (names.EMITTED_RADIANCE, slice(7, 10)),
-)
 
 _OUTPUTS: Mapping[str, Mapping[str, str | None]] = {
     "": {
@@ -136,8 +130,8 @@ def _materials(folder: Any) -> NDArray[np.float32]:
     prims = _numbered(folder, names.material_name)
     rows = np.zeros((len(prims), MATERIAL_WIDTH), np.float32)
     for row, prim in enumerate(prims):
-        for name, columns in _MATERIAL_COLUMNS:
-            rows[row, columns] = prim.attributes[name].default
+        for column, name in names.MATERIAL_ATTRIBUTES.items():
+            rows[row, MATERIAL_COLUMNS[column]] = prim.attributes[name].default
         _children(prim, {PREVIEW, OPENPBR})
         for place, table in material_tables(rows[row]).items():
             part = prim.nameChildren[place.removeprefix("/")] if place else prim

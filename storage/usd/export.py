@@ -15,7 +15,7 @@ from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json
 from storage.errors import TrilightError
-from storage.scene import Scene
+from storage.scene import ARRAY_FIELDS, Scene
 from storage.scene_file import scene_digest
 from storage.usd.authoring import Attributes, add_attributes, add_prim
 from storage.usd.cameras import add_cameras
@@ -23,6 +23,8 @@ from storage.usd.materials import add_materials
 from storage.usd.meshes import add_objects
 from storage.usd.names import (
     DIGEST,
+    MATERIAL_ATTRIBUTES,
+    OBJECT_TEXTS,
     PROVENANCE,
     ROOT,
     SHARD_ROOT,
@@ -35,6 +37,13 @@ from storage.usd.names import (
 from storage.usd.package import packaged
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
+
+CARRIED = frozenset(
+    {*ARRAY_FIELDS, "provenance"} - {"materials"}
+    | {f"objects.{field}" for field in OBJECT_TEXTS}
+    | {f"materials.{column}" for column in MATERIAL_ATTRIBUTES}
+)
+"""Of a scene (storage.carried)."""
 
 
 def write_usd(path: Path, scene: Scene) -> None:

@@ -41,7 +41,13 @@ DIFFUSE_ALBEDO = NAMESPACE + "diffuseAlbedo"
 SPECULAR_ALBEDO = NAMESPACE + "specularAlbedo"
 ROUGHNESS_VALUE = NAMESPACE + "roughness"
 EMITTED_RADIANCE = NAMESPACE + "emittedRadiance"
-"""On a material."""
+MATERIAL_ATTRIBUTES = {
+    "diffuse": DIFFUSE_ALBEDO,
+    "specular": SPECULAR_ALBEDO,
+    "roughness": ROUGHNESS_VALUE,
+    "emission": EMITTED_RADIANCE,
+}
+"""On a material, by the names of its columns (storage.conventions)."""
 
 FOV_DEG = NAMESPACE + "fovDeg"
 """On a camera; its pose is the transform, in doubles that hold single precision exactly."""

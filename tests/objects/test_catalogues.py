@@ -38,6 +38,17 @@ def listed(folder: Path, **options: Any) -> list[ObjectRecord]:
     return list(found.records)
 
 
+def test_passwords_of_a_catalogue_are_not_published(tmp_path: Path) -> None:
+    touch(tmp_path, "a.obj")
+    url = "https://ada:s3cret@host/a?id=7"
+    write_catalogue(
+        tmp_path,
+        {"uid": "a", "path": "a.obj", "licence": "MIT", "attribution": url, "source_url": url},
+    )
+    (record,) = listed(tmp_path)
+    assert (record.source_url, record.attribution) == ("https://host/a?id=7",) * 2
+
+
 def test_an_empty_catalogue_holds_no_object(tmp_path: Path) -> None:
     touch(tmp_path, "a.obj")
     (tmp_path / "objects.jsonl").write_text("\n")

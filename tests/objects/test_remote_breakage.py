@@ -9,7 +9,9 @@ import pytest
 
 from pipeline.objects.remote import source as remote_source
 from storage.errors import TrilightError
+from storage.remote import pace
 from storage.remote import url as remote_url
+from storage.remote.pace import Patience
 from tests.http_server import Fault, Site
 from tests.objects.find_kit import find, reasons
 
@@ -64,6 +66,17 @@ def test_one_dead_link_costs_one_object(
     assert "s3cret" not in text and "ada" not in text and "Traceback" not in text
     assert not list(Path(found.records[0].path).parent.glob("b.obj*"))
     assert breaks is not grow or not site.gets()["/b.obj"]
+
+
+def test_an_object_that_trickles_costs_itself(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pace, "PATIENCE", Patience(window_s=0.5, least_bytes_per_s=1000.0))
+    site.put("a.obj", "content of a")
+    site.put("b.obj", "v 0 0 0\n" * 1000)
+    site.always["/b.obj"] = Fault(trickle=(1, 0.02))
+    found = find(site.url)
+    assert [record.uid for record in found.records] == ["a"]
+    assert "too slow" in found.failures[0].message
+    assert site.gets()["/b.obj"] == 1
 
 
 def test_what_may_pass_is_tried_again(site: Site) -> None:
@@ -143,9 +156,9 @@ def test_a_listing_without_end_is_left(site: Site, monkeypatch: pytest.MonkeyPat
 def test_a_full_disk_ends_the_run(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     site.put("a.obj")
 
-    def full(*args: object, **options: object) -> None:
+    async def full(*args: object, **options: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("fsspec.implementations.http.HTTPFileSystem.get_file", full)
+    monkeypatch.setattr("fsspec.implementations.http.HTTPFileSystem._get_file", full)
     with pytest.raises(TrilightError, match="disk is full"):
         find(site.url)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from storage.safe_url import safe_text, safe_url
+from storage.safe_url import public_text, safe_text, safe_url
 
 
 @pytest.mark.parametrize(
@@ -59,3 +59,20 @@ def test_messages_lose_their_secrets(text: str) -> None:
 def test_plain_messages_stay() -> None:
     for text in ("Connection reset by peer", "expected 12 bytes, got 7", "https://host/a: gone"):
         assert safe_text(text) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "published"),
+    [
+        ("https://ada:s3cret@host/a?id=7#top", "https://host/a?id=7#top"),
+        ("see https://ada:s3cret@host/a, and more", "see https://host/a, and more"),
+        ("https://host/a?X-Amz-Signature=s3cret&id=7", "https://host/a"),
+        ("https://host/a?id=7&sig=s3cret", "https://host/a"),
+        ("https://host/a#access_token=s3cret", "https://host/a"),
+        ("https://ada:s3cret?x@host/a", "https://..."),
+        ("https://host/thing?id=7", "https://host/thing?id=7"),
+        ("Ada Lovelace", "Ada Lovelace"),
+    ],
+)
+def test_what_is_published_opens_nothing(text: str, published: str) -> None:
+    assert public_text(text) == published

@@ -1,5 +1,7 @@
 """USD files of strangers: what is outside, circular, too large or broken is one clear line."""
 
+import os
+import socket
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,22 +22,6 @@ HEAD = "#usda 1.0\n"
 def prims_of(path: Path) -> list[str]:
     stage = quietly(path, OpenedUsd(path).compose)
     return [str(prim.GetPath()) for prim in stage.Traverse()]
-
-
-def bomb() -> str:
-    """Twelve levels of ten references each: 10^12 prims in 2 kB."""
-    levels = "".join(
-        f'def "L{i}" {{'
-        + "".join(f'def "c{j}" (references = </L{i + 1}>) {{}}\n' for j in range(10))
-        + "}\n"
-        for i in range(12)
-    )
-    return f'{HEAD}{levels}def "L12" {{}}'
-
-
-def chain(length: int) -> str:
-    arcs = "".join(f'def "L{i}" (references = </L{i + 1}>) {{}}\n' for i in range(length))
-    return f'{HEAD}{arcs}def "L{length}" {{}}'
 
 
 VARIANT = (
@@ -72,10 +58,114 @@ def test_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
     assert str(caught.value).startswith("file.usda: ")
 
 
+OPENERS = {
+    "reference": 'def "x" (references = @F@</A>) {}',
+    "prepended": 'def "x" (prepend references = @F@</A>) {}',
+    "appended": 'def "x" (append references = @F@</A>) {}',
+    "added": 'def "x" (add references = @F@</A>) {}',
+    "payload": 'def "x" (payload = @F@</A>) {}',
+    "of an over": 'over "x" (references = @F@</A>) {}',
+    "inactive": 'def "x" (active = false\nreferences = @F@</A>) {}',
+    "in a variant": 'def "x" (variantSets = "v") {\nvariantSet "v" = {\n"a" {\n'
+    'def "y" (payload = @F@</A>) {}\n}\n}\n}',
+    "of an ancestor": 'def "B" (references = @F@</A>) {\ndef "C" {}\n}\n'
+    'def "x" (references = </B/C>) {}',
+}
+"""Every way in which a layer names a file for composition; F is the file."""
+
+
+@pytest.mark.parametrize("way", OPENERS)
+@pytest.mark.parametrize("place", ["root", "sublayer", "referenced by an ancestor"])
+def test_no_way_leads_out(tmp_path: Path, way: str, place: str) -> None:
+    """In the root layer, or in a layer of which only the child of a prim is referenced."""
+    (tmp_path / "secret.usda").write_text(f'{HEAD}def "A" {{\ndef "C" {{}}\n}}')
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    out = HEAD + OPENERS[way].replace("F", str(tmp_path / "secret.usda"))
+    (folder / "lib.usda").write_text(out)
+    root = {
+        "root": out,
+        "sublayer": "#usda 1.0\n(subLayers = [@./lib.usda@])\n",
+        "referenced by an ancestor": f'{HEAD}def "A" (references = @./lib.usda@</x/C>) {{}}',
+    }[place]
+    (folder / "a.usda").write_text(root)
+    with pytest.raises(TrilightError, match="which is outside of its folder"):
+        prims_of(folder / "a.usda")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '(expressionVariables = {string X = "../secret"}\nsubLayers = [@`"${X}.usda"`@])',
+        '(expressionVariables = {string X = "../secret"})\n'
+        'def "x" (references = @`"${X}.usda"`@</A>) {}',
+        'def "x" (payload = @`"../secret.usda"`@</A>) {}',
+    ],
+)
+def test_variable_expressions_name_no_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    (tmp_path / "secret.usda").write_text(f'{HEAD}def "A" {{}}')
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    monkeypatch.chdir(folder)  # where a person who converts a file often is
+    (folder / "a.usda").write_text(f"#usda 1.0\n{text}\n")
+    with pytest.raises(TrilightError, match="a variable expression; expected the name of a file"):
+        prims_of(folder / "a.usda")
+
+
+def test_a_package_leads_out_no_more_than_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "secret.usda").write_text(f'{HEAD}def "B" {{}}')
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    with zipfile.ZipFile(folder / "a.usdz", "w") as archive:
+        archive.writestr("s.usda", f'{HEAD}def "x" (references = @./lib.usda@</A/L>) {{}}')
+        outer = f"references = @{tmp_path / 'secret.usda'}@</B>"
+        archive.writestr("lib.usda", f'{HEAD}def "A" ({outer}) {{\ndef "L" {{}}\n}}')
+    with pytest.raises(TrilightError, match="which is outside of its folder"):
+        prims_of(folder / "a.usdz")
+
+
+def test_arguments_of_a_file_format_hide_no_layer(tmp_path: Path) -> None:
+    (tmp_path / "lib.usda").write_text(f'{HEAD}def "A" {{}}')
+    arc = "@./lib.usda:SDF_FORMAT_ARGS:x=1@</A>"
+    (tmp_path / "a.usda").write_text(f'{HEAD}def "A" (references = {arc}) {{}}')
+    with pytest.raises(TrilightError, match="with arguments for its file format"):
+        prims_of(tmp_path / "a.usda")
+
+
+@pytest.mark.parametrize("kind", ["fifo", "socket", "folder"])
+def test_what_is_no_plain_file_is_not_opened(tmp_path: Path, kind: str) -> None:
+    odd = tmp_path / "odd.usda"
+    if kind == "fifo":
+        os.mkfifo(odd)
+    elif kind == "folder":
+        odd.mkdir()
+    else:
+        with socket.socket(socket.AF_UNIX) as bound:
+            bound.bind(str(odd))
+    (tmp_path / "a.usda").write_text(f'{HEAD}def "A" (references = @./odd.usda@</A>) {{}}')
+    with pytest.raises(TrilightError, match="'./odd.usda', which is no plain file"):
+        prims_of(tmp_path / "a.usda")
+
+
+def test_the_stage_is_compared_with_the_folder_at_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second lock, should USD learn a way to name files that its own list of names lacks."""
+    (tmp_path / "secret.usda").write_text(f'{HEAD}def "A" {{}}')
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    (folder / "a.usda").write_text(f'{HEAD}def "A" (references = @../secret.usda@</A>) {{}}')
+    monkeypatch.setattr(OpenedUsd, "_open_all", lambda self: None)
+    with pytest.raises(TrilightError, match="uses 'secret.usda' of another folder"):
+        prims_of(folder / "a.usda")
+
+
 def test_layers_in_a_circle(tmp_path: Path) -> None:
     for one, other in ("ab", "ba"):
         (tmp_path / f"{one}.usda").write_text(f"#usda 1.0\n(subLayers = [@./{other}.usda@])\n")
-    with pytest.raises(TrilightError, match="name one another in a circle"):
+    with pytest.raises(TrilightError, match="refers to itself in a circle"):
         prims_of(tmp_path / "a.usda")
 
 
@@ -102,32 +192,6 @@ def test_the_working_directory_is_no_place_to_look(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(TrilightError, match="outside of its folder"):
         prims_of(folder / "a.usda")
-
-
-def test_what_references_multiply_is_counted_before_it_is_made(tmp_path: Path) -> None:
-    (tmp_path / "bomb.usda").write_text(bomb())
-    with pytest.raises(TrilightError, match=r"would make \d{13} prims"):
-        prims_of(tmp_path / "bomb.usda")
-
-
-def test_the_count_is_never_below_what_composition_makes(tmp_path: Path) -> None:
-    (tmp_path / "b.usda").write_text(
-        f'{HEAD}def "P" {{\ndef "a" {{}}\ndef "b" {{}}\n}}\n'
-        'def "Q" (references = </P>) {\ndef "c" (references = </P>) {}\n}\n'
-        'def "R" (inherits = </Q>) {\nover "c" {\ndef "d" {}\n}\n}\n'
-    )
-    opened = OpenedUsd(tmp_path / "b.usda")
-    counted = opening._Walk(opened).size(opened.root, "/", 0)
-    stage = opened.compose()
-    made = len(list(stage.Traverse()))
-    assert made == 16
-    assert made <= counted <= 2 * made
-
-
-def test_depth(tmp_path: Path) -> None:
-    (tmp_path / "chain.usda").write_text(chain(opening.MAX_DEPTH + 1))
-    with pytest.raises(TrilightError, match="deep"):
-        prims_of(tmp_path / "chain.usda")
 
 
 def test_what_is_missing_is_noted(tmp_path: Path) -> None:

@@ -47,7 +47,10 @@ def test_a_bad_target_is_refused_by_name(bad: float) -> None:
     radiance = sample.radiance_rgb.copy()
     radiance[1, 2, 3, 0] = bad
     with pytest.raises(TrilightError, match=r"sample 000000004: view 1 .* at pixel \(2, 3\)"):
-        training_scene(dataclasses.replace(sample, radiance_rgb=radiance), 8)
+        dataclasses.replace(sample, radiance_rgb=radiance).check()
+    lights = np.stack([sample.radiance_rgb, radiance], axis=1)
+    with pytest.raises(TrilightError, match=r"view 1 light 1 has .* at pixel \(2, 3\)"):
+        dataclasses.replace(sample, lights_rgb=lights).check()
 
 
 def test_targets_are_log10_of_one_plus_radiance() -> None:

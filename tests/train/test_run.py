@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 from collections.abc import Mapping
 from pathlib import Path
@@ -195,12 +196,16 @@ class Poison(Silent):
     def __init__(self, spared: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
         self.spared = spared
         self.poisoned = False
+        self.notes: list[str] = []
         original = Norm.forward
 
         def forward(module: Norm, x: torch.Tensor) -> torch.Tensor:
             return original(module, x) * (torch.nan if self.poisoned else 1)
 
         monkeypatch.setattr(Norm, "forward", forward)
+
+    def noted(self, text: str) -> None:
+        self.notes.append(text)
 
     def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
         self.poisoned = step + 1 not in self.spared
@@ -220,6 +225,8 @@ def test_a_run_that_recovers_goes_on_and_counts(
     settings = tiny_run(num_steps=20, validate_every=20)
     result = run(settings, dataset, tmp_path, progress=poison)
     assert result.skipped_steps == 16
+    named = [re.search(r"step (\d+) was left out.* scenes were 0+\d+, ", n) for n in poison.notes]
+    assert [int(match[1]) for match in named if match] == [*range(2, 10), *range(11, 19)]
     losses = {row["step"]: row["loss"] for row in read_rows(result.folder.metrics) if "loss" in row}
     assert losses[4] is None and losses[10] > 0, "a row without a finite step has no loss"
 

@@ -1,7 +1,6 @@
 """`Sample` -> `TrainingScene`: the tensors that one scene contributes to a step."""
 
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 import torch
@@ -43,23 +42,20 @@ def training_scene(
     """Return a sample at the resolution of the run.
 
     Args:
-        sample: what to return.
+        sample: what to return; it passes `Sample.check`.
         resolution: pixels across the pictures.
         most_triangles: scenes with more are refused; 0: none is.
         lights_apart: whether each light's own pictures are wanted.
 
     Raises:
-        TrilightError: the resolution is no divisor of the sample's, the scene has too many
-            triangles or keeps its lights together, or a picture holds a value that is not finite
-            or is negative. Such a value would reach every weight in one step.
+        TrilightError: the resolution is no divisor of the sample's, or the scene has too many
+            triangles or keeps its lights together.
     """
     if 0 < most_triangles < sample.scene.num_triangles:
         raise TrilightError(
             f"sample {sample.key}: {sample.scene.num_triangles} triangles; the run takes at most "
             f"{most_triangles}. Set most_triangles, or skip such samples."
         )
-    if not (sample.radiance_rgb.min() >= 0 and sample.radiance_rgb.max() < np.inf):
-        _refuse(sample)
     radiance_VRR3 = block_mean(sample.radiance_rgb, resolution)
     floors_db = np.array([view.noise_floor_db for view in sample.views], np.float32)
     return TrainingScene(
@@ -87,13 +83,3 @@ def _lights_apart(sample: Sample, resolution: int) -> Tensor:
         )
     smaller = [block_mean(lights, resolution) for lights in sample.lights_rgb]
     return torch.from_numpy(np.stack(smaller))
-
-
-def _refuse(sample: Sample) -> NoReturn:
-    wrong = np.argwhere(~(np.isfinite(sample.radiance_rgb) & (sample.radiance_rgb >= 0)))
-    view, row, column, channel = (int(index) for index in wrong[0])
-    value = sample.radiance_rgb[view, row, column, channel]
-    raise TrilightError(
-        f"sample {sample.key}: view {view} has radiance {value} at pixel ({row}, {column}); "
-        "expected finite values from 0. Run `trilight verify` on the dataset."
-    )

@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -18,7 +18,7 @@ import numpy as np
 from storage.errors import TrilightError
 from storage.sample import Sample
 from storage.seeds import rng_for
-from storage.shard_set import ShardSet
+from storage.shard_set import OpenShard, ShardSet
 from train.data.augment import augmented, with_views
 from train.data.augmentation import AugmentationSettings
 from train.data.open_shards import OpenShards
@@ -36,8 +36,6 @@ from train.data.unusable import Unusable
 
 PREFETCHED_SCENES = 16
 """Scenes decoded ahead of the network, at least one batch."""
-MOST_REPLACED = 1000
-"""Unusable samples in a row, after which nothing more is looked for."""
 
 Item = TypeVar("Item")
 
@@ -158,6 +156,7 @@ class _SceneMaker:
         self._opened = opened
         self._settings = settings
         self._unusable = unusable
+        self._given_up: set[int] = set()
 
     def scene(self, place: Place) -> TrainingScene:
         """Return the scene that is seen at a place of the order."""
@@ -168,44 +167,45 @@ class _SceneMaker:
         return augmented(with_views(scene, np.sort(views)), settings.augmentation, rng)
 
     def _usable(self, place: Place) -> TrainingScene:
-        shard, row = place.shard, place.row
-        for _ in range(MOST_REPLACED):
-            try:
-                found, num_samples = self._read(shard, row, planned=shard == place.shard)
-            except TrilightError as error:
-                self._unusable.add(self._shards.names[shard], lost_with(self._shards, shard), error)
-                shard = (shard + 1) % len(self._shards.names)
+        count = len(self._shards.names)
+        for number in ((place.shard + step) % count for step in range(count)):
+            if number in self._given_up:
                 continue
-            if isinstance(found, TrainingScene):
+            planned = number == place.shard
+            try:
+                shard = self._opened.read(number) if planned else self._shards.open(number)
+            except TrilightError as error:
+                lost = lost_with(self._shards, number)
+                self._unusable.add(self._shards.names[number], lost, error)
+                continue
+            with nullcontext() if planned else closing(shard):
+                found = self._first_usable(shard, place.row)
+            if found is not None:
                 return found
-            row = (row + 1) % max(num_samples, 1)
+            self._given_up.add(number)
         raise TrilightError(
-            f"{self._shards.names[place.shard]}: {MOST_REPLACED} samples in a row are unusable."
+            f"data: all samples of {count} shards are unusable. The last: "
+            f"{self._unusable.messages[-1]}"
         )
 
-    def _read(self, number: int, row: int, *, planned: bool) -> tuple[TrainingScene | None, int]:
-        """Return a scene, or None where it is unusable, and how many samples its shard holds.
-
-        Raises:
-            TrilightError: the shard cannot be opened.
-        """
-        shard = self._opened.read(number) if planned else self._shards.open(number)
-        try:
-            keys = shard.keys
-            if not keys:
-                raise TrilightError(f"{shard.name}: holds no sample; expected at least one.")
+    def _first_usable(self, shard: OpenShard, row: int) -> TrainingScene | None:
+        """Return the first scene of a shard that is usable, from a row on and around; or None."""
+        keys = shard.keys
+        for at in ((row + step) % len(keys) for step in range(len(keys))):
             try:
-                return self._made(shard.sample(row % len(keys))), len(keys)
+                return self._made(shard.sample(at))
             except TrilightError as error:
-                key = keys[row % len(keys)]
-                self._unusable.add(f"{shard.name}: sample {key}", 1, _named(shard.name, error))
-                return None, len(keys)
-        finally:
-            if not planned:
-                shard.close()
+                named = _named(shard.name, error)
+                self._unusable.add(f"{shard.name}: sample {keys[at]}", 1, named)
+        return None
 
     def _made(self, sample: Sample) -> TrainingScene:
         settings = self._settings
+        if sample.scene.num_views < settings.views_per_scene:
+            raise TrilightError(
+                f"sample {sample.key}: {sample.scene.num_views} views; the run draws "
+                f"{settings.views_per_scene} of each scene."
+            )
         return training_scene(
             sample,
             settings.resolution,

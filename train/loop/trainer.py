@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 
@@ -102,11 +102,17 @@ class Trainer:
         if report.applied:
             self.skipped_in_a_row = 0
         else:
-            self._skip()
+            self._skip([scene.key for scene in drawn])
         return report
 
-    def _skip(self) -> None:
+    def _skip(self, keys: Sequence[str]) -> None:
+        """Count a step that was left out, and name its scenes; other processes had others."""
         self.state.skipped_steps += 1
+        if self.recorder is not None:
+            self.recorder.progress.noted(
+                f"step {self.state.step} was left out, since its loss or gradient was not finite; "
+                f"its scenes were {', '.join(keys)}"
+            )
         self.skipped_in_a_row += 1
         if self.skipped_in_a_row == MOST_SKIPPED_IN_A_ROW:
             raise TrilightError(

@@ -13,7 +13,7 @@ from pipeline.objects.licences import UNKNOWN
 from pipeline.objects.local.catalogue_rows import csv_rows, jsonl_rows
 from storage.errors import TrilightError
 from storage.records import ObjectRecord
-from storage.safe_url import printable
+from storage.safe_url import printable, public_text
 
 CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")
 
@@ -72,12 +72,17 @@ def _record(root: Path, row: dict[str, Any], place: str, name: str) -> ObjectRec
     return ObjectRecord(
         uid=uid,
         path=str(_inside(root, path, place)),
-        title=printable(_text(row, "title", place, uid)),
-        licence=printable(_text(row, "licence", place, UNKNOWN)),
-        licence_source=printable(_text(row, "licence_source", place, name)),
-        attribution=printable(_text(row, "attribution", place, "")),
-        source_url=printable(_text(row, "source_url", place, "")),
+        title=_published(row, "title", place, uid),
+        licence=_published(row, "licence", place, UNKNOWN),
+        licence_source=_published(row, "licence_source", place, name),
+        attribution=_published(row, "attribution", place, ""),
+        source_url=_published(row, "source_url", place, ""),
     )
+
+
+def _published(row: dict[str, Any], field: str, place: str, default: str) -> str:
+    """Return a text that stands in the dataset's documents: printable, without passwords."""
+    return printable(public_text(_text(row, field, place, default)))
 
 
 def _text(row: dict[str, Any], field: str, place: str, default: str | None = None) -> str:

@@ -11,9 +11,11 @@ import json
 import os
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from fsspec.asyn import sync
 from fsspec.callbacks import Callback
 
 from pipeline.objects.remote.folder import RemoteFolder
@@ -21,7 +23,9 @@ from pipeline.objects.remote.gltf_buffers import buffer_names
 from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_atomically
 from storage.errors import TrilightError
 from storage.remote.fetch import version_of
+from storage.remote.pace import Pace
 from storage.remote.tries import Interrupted, TransferFailed, with_tries
+from storage.remote.url import transfer_timeout
 from storage.safe_url import printable
 
 _MAX_NAME_BYTES = 220
@@ -97,7 +101,8 @@ class RemoteFiles:
             if outcome.path is None and outcome.error is None:
                 try:
                     outcome.path = self.path(name)
-                    with_tries(lambda: self._refresh(name, self.path(name)))
+                    limit = _Limit(self._check_size, self.stop)
+                    with_tries(lambda: self._refresh(name, self.path(name), limit))
                 except TransferFailed as error:
                     outcome.error = error
         if outcome.error is not None:
@@ -105,7 +110,7 @@ class RemoteFiles:
         assert outcome.path is not None
         return outcome.path
 
-    def _refresh(self, name: str, path: Path) -> None:
+    def _refresh(self, name: str, path: Path, limit: "_Limit") -> None:
         """Fetch a file unless what is here is what the server has."""
         facts = self._folder.facts(name)
         if facts.get("type") == "directory":
@@ -118,24 +123,28 @@ class RemoteFiles:
         note = self._versions / f"{hashlib.sha256(os.fsencode(name)).hexdigest()}.json"
         if version and _is_here(path, note, version):
             return
-        self._transfer(name, path, size)
+        self._transfer(name, path, size, limit)
         write_atomically(note, json.dumps(version, sort_keys=True).encode())
 
-    def _transfer(self, name: str, path: Path, size: int | None) -> None:
+    def _transfer(self, name: str, path: Path, size: int | None, limit: "_Limit") -> None:
         try:
             with atomic_writer(path) as stream:
-                self._fill(name, Path(stream.name), size)
+                self._fill(name, Path(stream.name), size, limit)
         except TrilightError as error:
             if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NAME_ERRORS:
                 message = f"the name {printable(name)[:100]!r} clashes with another one here"
                 raise TransferFailed("unsafe_name", message) from error
             raise
 
-    def _fill(self, name: str, temporary: Path, size: int | None) -> None:
+    def _fill(self, name: str, temporary: Path, size: int | None, limit: "_Limit") -> None:
         """Write the bytes of a file to a temporary name, which is open for its last sync."""
-        limit = _Limit(self._check_size, self.stop)
+        limit.value = 0  # every try begins anew
+        driver, address = self._folder.driver, self._folder.address(name)
+        get = driver.get_file
+        if self._folder.url.is_http:  # `get_file` would take the limits for its own
+            get = partial(sync, driver.loop, partial(driver._get_file, timeout=transfer_timeout()))
         try:
-            self._folder.driver.get_file(self._folder.address(name), str(temporary), callback=limit)
+            get(address, str(temporary), callback=limit)
         except OSError as error:
             if error.errno in _DISK_ERRORS:
                 raise
@@ -162,12 +171,13 @@ class _Outcome:
 
 
 class _Limit(Callback):
-    """Ends a transfer that grows too large, or that nobody waits for any more."""
+    """Ends a transfer that grows too large, comes too slowly, or is not waited for any more."""
 
     def __init__(self, check: Any, stop: threading.Event) -> None:
         super().__init__()
         self._check = check
         self._stop = stop
+        self._pace = Pace(lambda: self.value)
 
     def set_size(self, size: int | None) -> None:
         self._check(size or 0)
@@ -175,6 +185,7 @@ class _Limit(Callback):
     def relative_update(self, inc: int = 1) -> None:
         super().relative_update(inc)
         self._check(self.value)
+        self._pace.require()
         if self._stop.is_set():
             raise TransferFailed("download_failed", "the run was ended")
 

@@ -44,14 +44,16 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
         if triangles > MAX_TRIANGLES:
             raise TrilightError(f"more than {MAX_TRIANGLES} triangles.")
         pieces += found
+        if len(pieces) > MAX_ROWS:
+            raise TrilightError(f"more than {MAX_ROWS} objects.")
     if not any(piece.entry.kind == "emitter" for piece in pieces):
         raise TrilightError(
             "no light that can be carried over; expected an emissive material, or a rectangle, "
             "disk, sphere or mesh light."
         )
-    most = max(len(pieces), sum(len(piece.materials) for piece in pieces))
-    if most > MAX_ROWS:
-        raise TrilightError(f"{most} objects or materials; expected at most {MAX_ROWS}.")
+    materials = sum(len(piece.materials) for piece in pieces)
+    if materials > MAX_ROWS:
+        raise TrilightError(f"{materials} materials; expected at most {MAX_ROWS}.")
     return _scene(pieces, placed, time, opened)
 
 

@@ -12,6 +12,8 @@ from storage.errors import TrilightError
 
 MAX_PLACED = 100_000
 """Most prims that are looked at, instances counted each."""
+MAX_NESTED = 300
+"""Most prims within prims, through prototypes too."""
 
 _READ = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight")
 _SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "SkelRoot", "")
@@ -33,12 +35,13 @@ def placed_prims(stage: Any, time: Any, lost: list[str]) -> list[Placed]:
     Invisible prims, guides and proxies are left out; kinds of prims that cannot be read are noted.
 
     Raises:
-        TrilightError: more than MAX_PLACED prims with all instances, or a place that is not finite.
+        TrilightError: more than MAX_PLACED prims with all instances, prims or prototypes that are
+            nested more than MAX_NESTED deep, or a place that is not finite.
     """
     found: list[Placed] = []
     unread: Counter[str] = Counter()
     visits = 0
-    for prim, to_world in _visited(stage.GetPseudoRoot(), _base(stage), time):
+    for prim, to_world in _visited(stage.GetPseudoRoot(), _base(stage), time, 0):
         visits += 1
         if visits > MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
@@ -65,10 +68,14 @@ def _base(stage: Any) -> NDArray[np.float64]:
 
 
 def _visited(
-    prim: Any, above: NDArray[np.float64], time: Any
+    prim: Any, above: NDArray[np.float64], time: Any, depth: int
 ) -> Iterator[tuple[Any, NDArray[np.float64]]]:
     from pxr import Usd, UsdGeom
 
+    if depth > MAX_NESTED:
+        raise TrilightError(
+            f"{prim.GetPath()}: nested more than {MAX_NESTED} deep, prototypes counted."
+        )
     to_world = above
     if not prim.IsPseudoRoot():
         seen = UsdGeom.Imageable(prim)
@@ -80,10 +87,10 @@ def _visited(
         to_world = _moved(prim, above, time)
         yield prim, to_world
     if prim.IsA(UsdGeom.PointInstancer):
-        yield from _instances(prim, to_world, time)
+        yield from _instances(prim, to_world, time, depth)
         return
     for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies()):
-        yield from _visited(child, to_world, time)
+        yield from _visited(child, to_world, time, depth + 1)
 
 
 def _moved(prim: Any, above: NDArray[np.float64], time: Any) -> NDArray[np.float64]:
@@ -98,13 +105,17 @@ def _moved(prim: Any, above: NDArray[np.float64], time: Any) -> NDArray[np.float
 
 
 def _instances(
-    prim: Any, to_world: NDArray[np.float64], time: Any
+    prim: Any, to_world: NDArray[np.float64], time: Any, depth: int
 ) -> Iterator[tuple[Any, NDArray[np.float64]]]:
     from pxr import UsdGeom
 
     instancer = UsdGeom.PointInstancer(prim)
     targets = instancer.GetPrototypesRel().GetForwardedTargets()
     which = instancer.GetProtoIndicesAttr().Get(time) or []
+    if len(which) > MAX_PLACED:  # before their places are computed
+        raise TrilightError(
+            f"{prim.GetPath()}: {len(which)} instances; expected at most {MAX_PLACED}."
+        )
     moves = instancer.ComputeInstanceTransformsAtTime(
         time, time, UsdGeom.PointInstancer.ExcludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
     )
@@ -115,4 +126,4 @@ def _instances(
         prototype = prim.GetStage().GetPrimAtPath(targets[index])
         if prototype:
             place = np.einsum("ij,jk->ik", to_world, np.array(move).T)
-            yield from _visited(prototype, place, time)
+            yield from _visited(prototype, place, time, depth + 1)

@@ -116,7 +116,12 @@ def _frames(stage: Any) -> Iterator[str]:
         return
     times = np.array(sampled)
     if stage.HasAuthoredTimeCodeRange():
-        times = np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1)
+        first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+        if not last - first < MAX_FRAMES:  # not a number neither
+            raise TrilightError(
+                f"time codes from {first:g} to {last:g}; expected at most {MAX_FRAMES}."
+            )
+        times = np.arange(first, last + 1)
     if len(times) > MAX_FRAMES:
         raise TrilightError(f"{len(times)} time codes; expected at most {MAX_FRAMES}.")
     for time in times:

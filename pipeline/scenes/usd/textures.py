@@ -131,33 +131,39 @@ def _get(shader: Any, name: str, time: Any, default: Any) -> Any:
 
 def _pixels(resolved: str) -> NDArray[np.float32] | None:
     """Return a picture [H, W, C] of values in [0, 1]; None where it is none."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
-    outer, _, member = resolved.partition("[")
+    name = Path(resolved).name
+    data = _bytes(resolved, name)
+    if data is None:
+        return None
     try:
-        if member:
-            with zipfile.ZipFile(outer) as archive:
-                data = archive.read(member.rstrip("]"))
-        else:
-            if Path(outer).stat().st_size > MAX_BYTES:
-                raise TrilightError(f"{Path(outer).name}: expected at most {MAX_BYTES} bytes.")
-            data = Path(outer).read_bytes()
         with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF", "BMP", "TGA")) as image:
             if image.width * image.height > MAX_PIXELS:
-                raise TrilightError(f"{Path(outer).name}: expected at most {MAX_PIXELS} pixels.")
+                raise TrilightError(f"{name}: expected at most {MAX_PIXELS} pixels.")
             if image.mode.startswith("I;16") or image.mode == "I":
                 return (np.asarray(image, np.float32) / np.float32(65535))[..., None]
             mode = image.mode if image.mode in ("L", "RGB", "RGBA") else "RGB"
             values = np.asarray(image.convert(mode), np.float32) / np.float32(255)
-    except (
-        OSError,
-        UnidentifiedImageError,
-        KeyError,
-        zipfile.BadZipFile,
-        Image.DecompressionBombError,
-    ):
-        return None
+    except TrilightError:
+        raise
+    except (OSError, SyntaxError, ValueError, LookupError, Image.DecompressionBombError):
+        return None  # PIL says so in all of these ways
     return values if values.ndim == 3 else values[..., None]
+
+
+def _bytes(resolved: str, name: str) -> bytes | None:
+    """Return the bytes of a plain file, or of a member of an archive; None where there are none."""
+    outer, _, member = resolved.partition("[")
+    try:
+        if member:
+            with zipfile.ZipFile(outer) as archive:
+                return archive.read(member.rstrip("]"))
+        if Path(outer).stat().st_size > MAX_BYTES:
+            raise TrilightError(f"{name}: expected at most {MAX_BYTES} bytes.")
+        return Path(outer).read_bytes()
+    except (OSError, KeyError, zipfile.BadZipFile):
+        return None
 
 
 def _linear(encoded: NDArray[np.float32]) -> NDArray[np.float32]:

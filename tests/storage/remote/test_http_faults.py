@@ -7,6 +7,8 @@ import pytest
 
 from storage.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
+from storage.remote import pace
+from storage.remote.pace import Patience
 from storage.sample import Sample, encode_sample
 from storage.shard_places import listed_shards
 from tests.http_server import Fault, Site
@@ -57,10 +59,16 @@ def test_a_dataset_is_the_same_through_a_server(server: Site, local: Dataset) ->
 )
 @pytest.mark.parametrize("ranges", [True, False])
 def test_what_passes_by_itself_is_outlived(
-    server: Site, local: Dataset, cache: Path, faults: list[Fault], ranges: bool
+    server: Site,
+    local: Dataset,
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    faults: list[Fault],
+    ranges: bool,
 ) -> None:
     if len(faults) > 4 and not ranges:
         pytest.skip("without ranges, a line that always breaks gets nowhere")
+    monkeypatch.setattr(pace, "PATIENCE", Patience(least_bytes_per_s=0.0))  # of a busy machine
     server.faults[PATH], server.ranges = list(faults), ranges
     assert [encode_sample(sample) for sample in read(server.url)] == expected(local)
     assert not server.faults[PATH]
