@@ -7,10 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, is_passing
+from pipeline.isolation import (
+    ChildFailed,
+    ChildLimits,
+    IsolatedChild,
+    call_with_retries,
+    is_passing,
+)
 from pipeline.isolation.deaths import ENDS
 from storage.errors import EnvironmentFailure
-from tests.flows.test_isolation import LIMITS, crash, divide, double, kill_itself
+from tests.flows.test_isolation import crash, divide, double, kill_itself
+
+LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
 
 
 def die_by(number: int) -> None:

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 from collections.abc import Iterator
@@ -75,38 +74,40 @@ def test_a_child_that_is_continued_in_time_answers_itself(
 
 
 PROGRAM = """
-import sys
+import os, sys, time
 sys.path.insert(0, {root!r})
-from pipeline.isolation import ChildLimits, IsolatedChild, waiting
-from tests.flows.test_isolation import burn, process_id
+from pipeline.isolation import ChildLimits, IsolatedChild
+
+def wait_for(path):
+    while not os.path.exists(path):
+        time.sleep(0.02)
+    return os.getpid()
 
 if __name__ == "__main__":
-    waiting.LOOK_S, waiting.LOOKS_BEFORE_WORDS = 0.1, 3
     limits = ChildLimits(memory_bytes=2 << 30, wall_s=5, calls_per_child=9)
     child = IsolatedChild(limits=limits, setup=int)
-    print(child.call(process_id), flush=True)
-    print(child.call(burn, 0.5), flush=True)
+    print(child.call(wait_for, __file__), flush=True)
+    print(child.call(wait_for, __file__ + ".go"), flush=True)
 """
 
 
 def test_a_command_that_is_stopped_as_a_whole_goes_on_where_it_was(tmp_path: Path) -> None:
     """As by Ctrl-Z and `fg`: the pause is longer than the child's wall time, and nobody is told."""
     program = tmp_path / "program.py"
-    program.write_text(textwrap.dedent(PROGRAM.format(root=str(ROOT))))
-    command = [sys.executable, str(program)]
+    program.write_text(PROGRAM.format(root=str(ROOT)))
     with subprocess.Popen(
-        command,
+        [sys.executable, str(program)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         process_group=0,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
     ) as process:
         assert process.stdout is not None
         first = process.stdout.readline()
         os.killpg(process.pid, signal.SIGTSTP)
         time.sleep(6)
         assert waiting._is_stopped(process.pid) and waiting._is_stopped(int(first))
+        (tmp_path / "program.py.go").touch()
         os.killpg(process.pid, signal.SIGCONT)
         second, errors = process.communicate(timeout=120)
     assert (second, errors) == (first, "")
