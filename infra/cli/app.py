@@ -24,6 +24,7 @@ from infra.cli import (
     train,
     verify,
 )
+from infra.cli.console import console
 from storage.errors import TrilightError
 
 app = typer.Typer(
@@ -59,14 +60,16 @@ def main() -> None:
 
 
 def _interrupted(signal_number: int, frame: FrameType | None) -> None:
+    console.show_cursor()  # progress bars hide it, and nothing is unwound
     _leave("trilight: interrupted. What was finished is safe; the same command goes on.", 130)
 
 
 def _leave(message: str, status: int) -> NoReturn:
     """End at once: every child ends with its parent, and every file is whole or absent."""
     sys.stdout.flush()
-    sys.stderr.write(f"\n{message}\n")
-    sys.stderr.flush()
+    errors = sys.__stderr__ or sys.stderr  # progress bars would draw themselves again below it
+    errors.write(f"\n{message}\n")
+    errors.flush()
     os._exit(status)
 
 

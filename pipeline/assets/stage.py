@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.store import AssetStore
-from pipeline.isolation import ChildFailed, IsolatedChild
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from storage.asset import Asset, Level, decode_asset
 from storage.digests import sha256_hex
 from storage.errors import Rejected
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from pipeline.assets.prepare import AssetAttempt
 
 BorrowChild = Callable[[], AbstractContextManager[IsolatedChild]]
-
-_MAY_PASS = ("killed", "out_of_memory", "timeout_wall", "crashed", "exception")
-"""What may go better on another day or machine, so that it is not remembered of the object."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,25 +82,21 @@ def _prepare_once(
     methods: tuple[str, ...],
     borrow_child: BorrowChild,
 ) -> PreparedAsset:
-    """Find or make the outcome of an object; raises Rejected where it is a refusal."""
+    """Find or make the outcome of an object; raises Rejected where there is no asset."""
     source = Path(record.path)
-    try:
-        key = store.key(source, settings)
-    except OSError as error:
-        raise Rejected("unreadable_file", f"cannot be read ({error.strerror})") from error
+    key = _key(source, settings, store)
     path = store.asset_path(key)
     with store.making(key):
         if refusal := store.refusal(key):
             raise refusal
         if not path.exists():
-            try:
-                with borrow_child() as child:
-                    asset = _by_any_method(child, source, settings, methods)
-            except (Rejected, ChildFailed) as error:
-                if error.reason not in _MAY_PASS:
-                    store.refuse(key, error.reason, error.message)
-                raise Rejected(error.reason, error.message) from error
-            store.keep(key, asset)
+            outcome = _outcome(source, settings, methods, borrow_child)
+            if _key(source, settings, store) != key:
+                raise Rejected("unreadable_file", "it changed while it was being prepared")
+            if isinstance(outcome, Rejected):
+                store.refuse(key, outcome.reason, outcome.message)
+                raise outcome
+            store.keep(key, outcome)
     data = path.read_bytes()
     return PreparedAsset(
         record=record,
@@ -111,6 +104,33 @@ def _prepare_once(
         asset_sha256=sha256_hex(data),
         geometry_sha256=decode_asset(data).geometry_sha256,
     )
+
+
+def _key(source: Path, settings: AssetSettings, store: AssetStore) -> str:
+    try:
+        return store.key(source, settings)
+    except OSError as error:
+        raise Rejected("unreadable_file", f"cannot be read ({error.strerror})") from error
+
+
+def _outcome(
+    source: Path, settings: AssetSettings, methods: tuple[str, ...], borrow_child: BorrowChild
+) -> Asset | Rejected:
+    """Return what is to be kept of an object: its asset, or the verdict on it.
+
+    Raises:
+        Rejected: the environment failed; nothing is to be kept, and the next run tries again.
+    """
+    try:
+        with borrow_child() as child:
+            return _by_any_method(child, source, settings, methods)
+    except Rejected as rejection:
+        return rejection
+    except ChildFailed as failure:
+        rejection = Rejected(failure.reason, failure.message)
+        if failure.is_verdict:
+            return rejection
+        raise rejection from failure
 
 
 def _by_any_method(
@@ -121,7 +141,8 @@ def _by_any_method(
     Raises:
         Rejected: the object is unusable, or no level passed the gate: then as the first method
             failed at the largest budget.
-        ChildFailed: every method killed its child.
+        ChildFailed: every method crashed its child or used up its processor time; or a child was
+            ended by something else, which says nothing about the method and leads to no other.
     """
     asset: Asset | None = None
     levels: list[Level] = []
@@ -135,8 +156,10 @@ def _by_any_method(
             settings, budgets=missing, epsilon=settings.epsilon if finest else None
         )
         try:
-            attempt = child.call(attempt_in_child, source, wanted, method)
+            attempt = call_with_retries(child, attempt_in_child, source, wanted, method)
         except ChildFailed as failure:
+            if not failure.is_verdict:
+                raise
             death = failure
             continue
         asset = attempt.asset

@@ -1,5 +1,6 @@
 """From a source of objects to the frozen list that scenes draw from."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,14 +9,18 @@ from pipeline.flows.prepare_isolated import prepare_isolated
 from pipeline.flows.publication import Publication
 from pipeline.flows.scene_files import SceneFiles
 from pipeline.flows.settings import BuildSettings
+from pipeline.isolation import is_passing
 from pipeline.objects.sources import find_objects
 from storage.conventions import SPLITS
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
+from storage.failures import count_by_reason
 from storage.objects_lock import read_objects_lock
 from storage.progress import announce_downloads, announce_objects, count_object
-from storage.records import LockedObject
+from storage.records import Failure, LockedObject
 from storage.safe_url import safe_url
 from storage.splits import require_objects, split_of_object, split_of_shard
+
+log = logging.getLogger("trilight.objects")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +47,7 @@ def accept_objects(
     Raises:
         TrilightError: the source is unusable, no object is accepted, a split has none, or the
             objects are not those that the dataset was begun with.
+        EnvironmentFailure: one of those could not be prepared this time.
     """
     folder = publication.folder
     found = find_objects(
@@ -60,10 +66,14 @@ def accept_objects(
     prepared, rejected = prepare_isolated(
         allowed, settings.assets, workers=workers, done=lambda: count_object(folder)
     )
+    passing = [failure for failure in rejected if is_passing(failure.reason)]
+    if frozen is not None:
+        _require_tried(shown, passing)
     publication.add_failures([*found.failures, *rejected])
     locked = [_locked(asset, settings) for asset in prepared]
     if frozen is None:
         _require_enough(locked, settings, publication, shown)
+        _warn_of(shown, passing)
         publication.lock_objects(locked)
     else:
         _require_same_objects(shown, frozen, locked)
@@ -106,6 +116,29 @@ def _require_enough(
     require_objects(
         {split: sum(entry.split == split for entry in locked) for split in SPLITS}, needed
     )
+
+
+def _require_tried(source: str, passing: list[Failure]) -> None:
+    """Refuse to judge an object of the dataset where the environment has kept it from us."""
+    for failure in passing:
+        raise EnvironmentFailure(
+            f"objects {source!r}: {failure.item!r}, of which the dataset was begun, could not be "
+            f"prepared this time ({failure.reason}: {failure.message}). Nothing has changed; run "
+            "the same command again."
+        )
+
+
+def _warn_of(source: str, passing: list[Failure]) -> None:
+    if passing:
+        counts = ", ".join(f"{count} x {why}" for _, why, count in count_by_reason(passing))
+        log.warning(
+            "objects %r: %d could not be prepared this time (%s), each after several tries, and "
+            "the dataset is begun without them; failures.jsonl names them. A dataset begun later "
+            "tries them again.",
+            source,
+            len(passing),
+            counts,
+        )
 
 
 def _require_same_objects(

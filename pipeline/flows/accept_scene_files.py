@@ -12,7 +12,7 @@ from pipeline.flows.scene_files import SceneFiles, SceneFolder, build_scene
 from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.objects.licences import StatedLicence, stated_licence
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
 from storage.progress import announce_objects, count_object
 from storage.records import LockedObject
 from storage.splits import JUDGED_SPLIT
@@ -93,8 +93,13 @@ def _digests(
             child, digests_of_scene, root, name, settings.assets, settings.scenes.num_views
         )
     except ChildFailed as failure:
-        raise TrilightError(
-            f"{name}: its meshes cannot be read ({failure}); mend or remove the file."
+        if failure.is_verdict:
+            raise TrilightError(
+                f"{name}: its meshes cannot be read ({failure}); mend or remove the file."
+            ) from failure
+        raise EnvironmentFailure(
+            f"{name}: its meshes could not be read this time ({failure}). Run the same command "
+            "again; if that does not help, see `trilight doctor`."
         ) from failure
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.flows.file_child import file_child
 from pipeline.flows.scene_source import LoadedScene, SceneSource, load_source, source_keys
-from pipeline.isolation import ChildFailed
+from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.scenes import renderformer_json_write
 from pipeline.scenes.renderformer_json_write import described_files
 from storage import renderformer_h5, scene_file
@@ -69,18 +69,18 @@ def convert_scene(
         raise TrilightError(f"{target}: cannot be written as a scene; {_EXPECTED}.")
     child = file_child()
     try:
-        keys = child.call(source_keys, source)
+        keys = call_with_retries(child, source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
         if suffix in SUFFIXES and len(keys) > 1:
-            found = [child.call(_many_to_usd, source, keys, target, budget)]
+            found = [call_with_retries(child, _many_to_usd, source, keys, target, budget)]
             done(1, 1)
         else:
             found = []
             for key in keys:
                 wanted = source if key is None else dataclasses.replace(source, key=key)
                 out = target if len(keys) == 1 else target.with_suffix(f".{key}{target.suffix}")
-                found.append(child.call(_one, wanted, out, budget))
+                found.append(call_with_retries(child, _one, wanted, out, budget))
                 done(len(found), len(keys))
     except ChildFailed as failure:
         raise TrilightError(f"{source.name}: could not be converted ({failure}).") from failure

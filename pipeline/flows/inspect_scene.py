@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.flows.file_child import file_child
 from pipeline.flows.scene_source import SceneSource, load_source
-from pipeline.isolation import ChildFailed
+from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.atomic import write_atomically
@@ -49,11 +49,11 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
         raise TrilightError(f"--turntable is {turntable}; expected the name of a file X.png.")
     child = file_child()
     try:
-        found = child.call(_facts, source)
+        found = call_with_retries(child, _facts, source)
         if turntable is not None:
             from pipeline.documents.png import encode_png
 
-            sheet = child.call(_turntable, source, choose_variant())
+            sheet = call_with_retries(child, _turntable, source, choose_variant())
             write_atomically(turntable, encode_png(sheet))
     except ChildFailed as failure:
         raise TrilightError(f"{source.name}: cannot be looked at ({failure}).") from failure

@@ -16,7 +16,7 @@ from pipeline.assets.stage import PreparedAsset
 from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.flows.prepare_isolated import asset_child, prepare_isolated
-from pipeline.isolation import ChildFailed
+from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.objects.sources import find_objects
 from storage.asset import Level, decode_asset
 from storage.asset_rows import AssetRow
@@ -237,7 +237,9 @@ def _pairs(
             for i in indices:
                 path = prepared[i].record.path
                 with contextlib.suppress(ChildFailed):  # a picture less is no reason to stop
-                    pair = child.call(_pair_in_child, path, settings, levels[i], rows[i])
+                    pair = call_with_retries(
+                        child, _pair_in_child, path, settings, levels[i], rows[i]
+                    )
                     pairs[name].append(pair)
     finally:
         child.close()

@@ -15,7 +15,7 @@ from pipeline.flows.scene_source import (
     load_source,
     source_keys,
 )
-from pipeline.isolation import ChildFailed, Result
+from pipeline.isolation import ChildFailed, Result, call_with_retries
 from storage.errors import TrilightError
 
 
@@ -57,6 +57,6 @@ class SceneReader:
 
     def _call(self, function: Callable[[SceneSource], Result], source: SceneSource) -> Result:
         try:
-            return self._child.call(function, source)
+            return call_with_retries(self._child, function, source)
         except ChildFailed as failure:
             raise TrilightError(f"{source.name}: could not be read ({failure}).") from failure

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.flows.environment import environment
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.renders.renderer import RenderedView, Sampling, SceneRenderer, set_threads
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate
@@ -21,7 +21,7 @@ from storage.scene import Scene
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=1 << 30)
 """One call takes the scene, each of the others is one pass of samples; the child keeps its state,
-so it is never replaced."""
+so it is replaced only where it died."""
 
 
 class PathTracer:
@@ -52,6 +52,7 @@ class PathTracer:
             "environment": environment(variant),
         }
         """All that decides a picture beside scene and camera, as JSON values."""
+        self._is_open = False
         self._child = IsolatedChild(
             limits=_LIMITS, setup=_set_up_child, setup_args=(variant, threads)
         )
@@ -66,7 +67,8 @@ class PathTracer:
         Raises:
             TrilightError: it cannot be rendered.
         """
-        self._call(name, _open_scene, scene, self._settings)
+        self._scene = scene
+        self._call(name, self._open)
 
     def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> RenderedView:
         """Return the picture of one camera.
@@ -79,19 +81,33 @@ class PathTracer:
         Raises:
             TrilightError: there is none.
         """
-        self._call(name, _begin_view, c2w, fov_deg, self._seed)
-        while isinstance(step := self._call(name, _advance), Sampling):
-            self._sampled(step)
-        rendered: RenderedView = step
-        return rendered
+        return self._call(name, lambda: self._picture(c2w, fov_deg))
 
     def close(self) -> None:
         """End the child."""
         self._child.close()
 
-    def _call(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
+    def _open(self) -> None:
+        self._is_open = False
+        self._child.call(_open_scene, self._scene, self._settings)
+        self._is_open = True
+
+    def _picture(self, c2w: NDArray[np.float32], fov_deg: float) -> RenderedView:
+        if not self._is_open:  # a child that died took the scene and the samples with it
+            self._open()
         try:
-            return self._child.call(function, *args)
+            self._child.call(_begin_view, c2w, fov_deg, self._seed)
+            while isinstance(step := self._child.call(_advance), Sampling):
+                self._sampled(step)
+        except ChildFailed:
+            self._is_open = False
+            raise
+        rendered: RenderedView = step
+        return rendered
+
+    def _call(self, name: str, step: Callable[[], Result]) -> Result:
+        try:
+            return with_retries(step)
         except Rejected as rejection:
             raise TrilightError(
                 f"{name} cannot be rendered ({rejection}); expected a scene with surfaces, "

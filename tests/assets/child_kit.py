@@ -38,7 +38,11 @@ def recorded_attempt(source: Path, settings: AssetSettings, method: str) -> Asse
     with (source.parent / CALLS).open("a") as stream:
         stream.write(json.dumps({**call, "epsilon": settings.epsilon}) + "\n")
     plan: dict[str, str] = json.loads((source.parent / PLAN).read_text())
-    _ACTIONS[plan.get(method, "work")]()
+    action, _, once = plan.get(method, "work").partition(" ")
+    marker = source.parent / f"{method} {action}"
+    if not (once and marker.exists()):
+        marker.touch()
+        _ACTIONS[action](source)
     attempt = prepare_asset(source, settings, method)
     missed = plan.get(f"{method} misses")
     return _without(attempt, int(missed)) if missed else attempt
@@ -56,45 +60,54 @@ def _without(attempt: AssetAttempt, below: int) -> AssetAttempt:
     return dataclasses.replace(attempt, asset=asset, missed={**attempt.missed, **gone})
 
 
-def crash() -> None:
+def crash(source: Path) -> None:
     ctypes.string_at(0)
 
 
-def burn() -> None:
+def burn(source: Path) -> None:
     while True:
         pass
 
 
-def sleep() -> None:
+def sleep(source: Path) -> None:
     time.sleep(600)
 
 
-def eat() -> None:
+def eat(source: Path) -> None:
     bytearray(64 << 30)
 
 
-def die() -> None:
+def die(source: Path) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def leave() -> None:
+def leave(source: Path) -> None:
     os._exit(3)
 
 
-def fail() -> None:
+def fail(source: Path) -> None:
     raise ZeroDivisionError
 
 
-def refuse() -> None:
+def refuse(source: Path) -> None:
     raise Rejected("degenerate", "planned")
 
 
-def mistake() -> None:
+def vanish(source: Path) -> None:
+    source.unlink()
+
+
+def grow(source: Path) -> None:
+    with source.open("a") as stream:
+        stream.write("# more\n")
+
+
+def mistake(source: Path) -> None:
     raise TrilightError("planned mistake.")
 
 
-_ACTIONS: Mapping[str, Callable[[], None]] = {
-    "work": nothing,
+_ACTIONS: Mapping[str, Callable[[Path], None]] = {
+    "work": lambda source: None,
     "crash": crash,
     "burn": burn,
     "sleep": sleep,
@@ -103,6 +116,8 @@ _ACTIONS: Mapping[str, Callable[[], None]] = {
     "leave": leave,
     "fail": fail,
     "refuse": refuse,
+    "vanish": vanish,
+    "grow": grow,
     "mistake": mistake,
 }
 
@@ -122,7 +137,7 @@ class Bench:
         self.child = IsolatedChild(limits=self.limits, setup=nothing)
 
     def set(self, **plan: str) -> None:
-        """Say what children do: an action by method."""
+        """Say what children do: an action by method, such as `die` or `die once`."""
         (self.root / PLAN).write_text(json.dumps(plan))
 
     @contextmanager

@@ -17,7 +17,7 @@ def codes() -> set[str]:
         text = path.read_text()
         found.update(_RAISED.findall(text))
         found.update(code for pair in _CHOSEN.findall(text) for code in pair)
-    isolation = (ROOT / "pipeline" / "isolation.py").read_text()
+    isolation = "".join(p.read_text() for p in (ROOT / "pipeline" / "isolation").glob("*.py"))
     found.update(_FAILED.findall(isolation))
     found.update(_ANSWERED.findall(isolation))
     return found

@@ -7,44 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.assets import stage
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings, GateSettings
-from pipeline.assets.stage import PreparedAsset, _rising, prepare_assets
+from pipeline.assets.stage import _rising, prepare_assets
 from pipeline.assets.store import AssetStore
-from storage.asset import Asset, decode_asset
 from storage.errors import TrilightError
-from storage.records import Failure
-from tests.assets.child_kit import LIMITS, Bench
+from tests.assets.child_kit import Bench
 from tests.assets.meshes_by_hand import knot, write_obj
-
-FIRST, SECOND, THIRD = "pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"
-SETTINGS = AssetSettings(budgets=(1000, 500, 340))
-
-
-def run(
-    bench: Bench, *names: str, settings: AssetSettings = SETTINGS
-) -> tuple[list[PreparedAsset], list[Failure]]:
-    """Prepare objects with the store beside the sources."""
-    return prepare_assets(
-        [bench.record(name) for name in names],
-        settings,
-        AssetStore(bench.root.parent / "store"),
-        borrow_child=bench.borrow,
-        workers=1,
-        done=lambda: None,
-    )
-
-
-def made(bench: Bench, settings: AssetSettings = SETTINGS) -> Asset:
-    (prepared,), failures = run(bench, "knot.obj", settings=settings)
-    assert not failures
-    return decode_asset(prepared.path.read_bytes())
-
-
-def methods(asset: Asset) -> list[tuple[int, str]]:
-    return [(level.record.budget, level.record.method) for level in asset.levels]
+from tests.assets.stage_kit import FIRST, SECOND, SETTINGS, THIRD, made, methods, run
 
 
 @pytest.fixture(autouse=True)
@@ -61,10 +32,9 @@ def test_the_first_method_is_enough_where_it_works(bench: Bench) -> None:
 def test_the_next_method_starts_in_a_new_child_where_one_crashed(bench: Bench) -> None:
     bench.set(pymeshlab_collapse="crash")
     assert methods(made(bench)) == [(1000, SECOND), (500, SECOND), (340, SECOND)]
-    first, second = bench.calls
-    assert (first["method"], second["method"]) == (FIRST, SECOND)
-    assert first["pid"] != second["pid"]
-    assert first["budgets"] == second["budgets"] == [1000, 500, 340]
+    assert [call["method"] for call in bench.calls] == [FIRST, FIRST, SECOND]
+    assert len({call["pid"] for call in bench.calls}) == 3
+    assert [call["budgets"] for call in bench.calls] == 3 * [[1000, 500, 340]]
 
 
 def test_the_next_method_makes_only_what_the_first_one_missed(bench: Bench) -> None:
@@ -126,55 +96,6 @@ def test_an_unusable_object_is_tried_once(bench: Bench) -> None:
     _, (failure,) = run(bench, "knot.obj")
     assert failure.reason == "degenerate"
     assert len(bench.calls) == 1
-
-
-@pytest.mark.parametrize(
-    ("action", "reason", "remembered"),
-    [
-        ("crash", "crashed_signal_11", True),
-        ("fail", "exception", False),
-        ("die", "killed", False),
-        ("eat", "out_of_memory", False),
-        ("leave", "crashed", False),
-        ("refuse", "degenerate", True),
-    ],
-)
-def test_only_what_is_the_objects_own_fault_is_remembered(
-    bench: Bench, action: str, reason: str, remembered: bool
-) -> None:
-    bench.set(**dict.fromkeys((FIRST, SECOND, THIRD), action))
-    _, (failure,) = run(bench, "knot.obj")
-    assert failure.reason == reason
-    tried = len(bench.calls)
-    bench.set()
-    prepared, failures = run(bench, "knot.obj")
-    if remembered:
-        assert (failures, prepared) == ([failure], [])
-        assert len(bench.calls) == tried
-    else:
-        assert [asset.record.uid for asset in prepared] == ["knot.obj"]
-
-
-@pytest.mark.parametrize(
-    ("action", "reason", "remembered"),
-    [("burn", "timeout_cpu", True), ("sleep", "timeout_wall", False)],
-)
-def test_time_that_was_worked_is_the_objects_fault_and_time_that_passed_is_not(
-    bench: Bench, action: str, reason: str, remembered: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(stage, "methods_of", lambda profile: (FIRST,))
-    limits = dataclasses.replace(LIMITS, **({"cpu_s": 1} if remembered else {"wall_s": 1.0}))
-    hurried = Bench(bench.root, limits=limits)
-    bench.set(**{FIRST: action})
-    try:
-        prepared, (failure,) = run(hurried, "knot.obj")
-        assert (prepared, failure.reason) == ([], reason)
-        assert len(bench.calls) == 1
-    finally:
-        hurried.child.close()
-    bench.set()
-    prepared, failures = run(bench, "knot.obj")
-    assert (len(prepared), failures) == ((0, [failure]) if remembered else (1, []))
 
 
 def test_a_mistake_of_the_user_stops_the_run(bench: Bench) -> None:

@@ -1,12 +1,15 @@
 """The command line as a process, and who of its descendants is left over."""
 
+import contextlib
 import os
+import signal
 import subprocess
 import sys
 import uuid
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 Trilight = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -52,3 +55,28 @@ def processes_with(mark: str) -> list[str]:
         except OSError:
             continue
     return found
+
+
+def kill_one(word: str, mark: str, rng: np.random.Generator) -> bool:
+    """Kill one living process that carries the mark and has a word in its command line.
+
+    Returns:
+        Whether there was any.
+    """
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            carries = mark.encode() in (folder / "environ").read_bytes()  # the dead have none
+            line = (folder / "cmdline").read_bytes().replace(b"\0", b" ")
+            if carries and word.encode() in line:
+                found.append(int(folder.name))
+    try:
+        os.kill(int(rng.choice(sorted(found))), signal.SIGKILL)
+    except (ValueError, ProcessLookupError):  # nobody to choose from, or just ended
+        return False
+    return True
+
+
+def num_meshes(cache: Path) -> int:
+    """Return how many meshes are finished in a cache."""
+    return len(list((cache / "assets").glob("*/*.safetensors")))

@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import shutil
-import signal
 import threading
 import time
 from collections import Counter
@@ -18,7 +17,7 @@ from storage.dataset import open_dataset
 from storage.manifest import shard_row
 from storage.verify import verify_dataset
 from tests.documents.dataset_by_hand import five_scenes
-from tests.end_to_end.conftest import marked_environment, processes_with
+from tests.end_to_end.conftest import kill_one, marked_environment, num_meshes, processes_with
 from tests.end_to_end.production_kit import call, postgres, served, start_served, stop_served
 
 KILLS = int(os.environ.get("TRILIGHT_CHAOS_KILLS", "8"))
@@ -46,22 +45,6 @@ def _parameters(out: Path) -> list[str]:
         "objects": "builtin:", "scenes": SCENES, "resolution": 32, "noise_floor_db": 20, "out": out,
     }  # fmt: skip
     return [word for key, value in parameters.items() for word in ("-p", f"{key}={value}")]
-
-
-def _kill_one(kind: str, mark: str, rng: np.random.Generator) -> bool:
-    """Kill one living process of a kind; say whether there was any."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            carries = mark.encode() in (folder / "environ").read_bytes()  # the dead have none
-            line = (folder / "cmdline").read_bytes().replace(b"\0", b" ")
-            if carries and WORDS[kind].encode() in line:
-                found.append(int(folder.name))
-    try:
-        os.kill(int(rng.choice(sorted(found))), signal.SIGKILL)
-    except (ValueError, ProcessLookupError):  # nobody to choose from, or just ended
-        return False
-    return True
 
 
 def _next_kind(killed: Counter[str], rng: np.random.Generator) -> str:
@@ -147,10 +130,13 @@ def test_the_watcher_tells_what_must_not_be_seen(tmp_path: Path, told: str) -> N
 def test_kills_of_everything_end_in_the_same_digest(tmp_path: Path) -> None:
     size = ["--scenes", str(SCENES), "--resolution", "32", "--noise-floor", "20"]
     plain = ["-m", "infra.cli.app", "generate", "smoke", "--objects", "builtin:", *size]
-    call([*plain, "--out", str(tmp_path / "whole")], dict(os.environ), RUN_S)
+    warm = {**os.environ, "TRILIGHT_CACHE": str(tmp_path / "cache-whole")}
+    call([*plain, "--out", str(tmp_path / "whole")], warm, RUN_S)
     expected = open_dataset(str(tmp_path / "whole")).digest
     rng, out = np.random.default_rng(0), tmp_path / "set"
     mark, marked = marked_environment()
+    cold = tmp_path / "cache"
+    marked["TRILIGHT_CACHE"] = str(cold)
     run = ["-m", "prefect", "deployment", "run", "generate-scenes/local", *_parameters(out)]
     with (
         postgres() as database,
@@ -161,11 +147,16 @@ def test_kills_of_everything_end_in_the_same_digest(tmp_path: Path) -> None:
         while killed.total() < KILLS:
             call(run, environment, RUN_S)
             deadline = time.monotonic() + 60  # then what was killed may not have been the flow
-            pause_s = rng.uniform(0.5, 6.0)
+            pause_s = rng.uniform(0.5, 6.0) if killed else LOOK_S
             while killed.total() < KILLS and time.monotonic() < deadline:
                 time.sleep(pause_s)
+                if not killed:  # while meshes are made
+                    if not num_meshes(cold):
+                        pause_s = LOOK_S
+                        continue
+                    assert num_meshes(cold) < num_meshes(tmp_path / "cache-whole")
                 kind = _next_kind(killed, rng)
-                if not _kill_one(kind, mark, rng):
+                if not kill_one(WORDS[kind], mark, rng):
                     pause_s = LOOK_S
                     continue
                 killed[kind] += 1

@@ -1,17 +1,29 @@
 """A run that is killed at any moment ends, when run again, in the digest of one that was not."""
 
+import contextlib
 import os
+import pty
 import signal
 import subprocess
+import threading
 import time
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.isolation import is_passing
 from storage.dataset import open_dataset
 from storage.verify import verify_dataset
-from tests.end_to_end.conftest import command, marked_environment, processes_with
+from tests.end_to_end.conftest import (
+    command,
+    kill_one,
+    marked_environment,
+    num_meshes,
+    processes_with,
+)
 
 ARGUMENTS = (
     "generate", "smoke", "--objects", "builtin:", "--scenes", "24",
@@ -38,19 +50,38 @@ def _wait_until_nobody_is_left(mark: str) -> None:
     assert not left
 
 
+def _undisturbed(folder: Path) -> str:
+    """Return the digest of the dataset that nobody disturbs, made with a cache of its own."""
+    environment = {**os.environ, "TRILIGHT_CACHE": str(folder / "cache-whole")}
+    assert _start(folder / "whole", 1, environment).wait() == 0
+    return open_dataset(str(folder / "whole")).digest
+
+
+def _wait_until(run: "subprocess.Popen[bytes]", reached: Callable[[], bool]) -> None:
+    while not reached():
+        assert run.poll() is None
+        time.sleep(0.02)
+
+
 @pytest.mark.slow
 def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path) -> None:
     started = time.monotonic()
-    assert _start(tmp_path / "whole", 1, dict(os.environ)).wait() == 0
+    expected = _undisturbed(tmp_path)
     whole_s = time.monotonic() - started
-    expected = open_dataset(str(tmp_path / "whole")).digest
 
     rng = np.random.default_rng(0)
     mark, environment = marked_environment()
-    for _ in range(KILLS):
+    cache = tmp_path / "cache"
+    environment["TRILIGHT_CACHE"] = str(cache)
+    for number in range(KILLS):
         run = _start(tmp_path / "killed", 2, environment)
+        pause_s = rng.uniform(0.1, 0.5) * whole_s
+        if number == 0:  # while meshes are made
+            _wait_until(run, lambda: num_meshes(cache) > 5)
+            assert num_meshes(cache) < num_meshes(tmp_path / "cache-whole")
+            pause_s = 0.0
         try:
-            run.wait(timeout=rng.uniform(0.1, 0.5) * whole_s)
+            run.wait(timeout=pause_s)
             break  # it was quicker than its killer
         except subprocess.TimeoutExpired:
             run.kill()
@@ -70,24 +101,67 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_says_what_to_do_and_leaves_nobody(tmp_path: Path) -> None:
+def test_kills_of_children_end_in_the_same_digest(tmp_path: Path) -> None:
+    """While meshes are made, with an empty store, and while pictures are; fork servers too."""
+    expected = _undisturbed(tmp_path)
+    rng, out, cache = np.random.default_rng(0), tmp_path / "killed", tmp_path / "cache"
+    mark, environment = marked_environment()
+    environment["TRILIGHT_CACHE"] = str(cache)
+
+    def num_scenes() -> int:
+        return sum(len(log.read_text().splitlines()) for log in (out / "logs").glob("*.jsonl"))
+
+    run, killed = _start(out, 2, environment), Counter[str]()
+    moments = [("meshes", at) for at in (6, 18, 30, 42)] + [("scenes", at) for at in (1, 5, 9, 13)]
+    for what, at in moments:
+        while (num_meshes(cache) if what == "meshes" else num_scenes()) < at:
+            if run.poll() is not None:  # three kills of one set-up end a run; it goes on
+                run = _start(out, 2, environment)
+            time.sleep(0.02)
+        if what == "meshes":
+            assert num_meshes(cache) < num_meshes(tmp_path / "cache-whole")
+        killed[what] += kill_one("multiprocessing.forkserver", mark, rng)
+    run.wait()
+    assert _start(out, 2, environment).wait() == 0
+    assert min(killed["meshes"], killed["scenes"]) > 0
+    assert open_dataset(str(out)).digest == expected
+    assert [row for row in open_dataset(str(out)).failures() if is_passing(row.reason)] == []
+    _wait_until_nobody_is_left(mark)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["meshes", "scenes"])
+def test_ctrl_c_says_what_to_do_and_leaves_nobody(tmp_path: Path, moment: str) -> None:
+    """On a terminal, where progress bars hide the cursor: it is back, and the words come last."""
     mark, environment = marked_environment()
     environment.pop("PREFECT_API_URL", None)
+    environment |= {"TRILIGHT_CACHE": str(tmp_path / "cache"), "TERM": "xterm"}
+    ours, theirs = pty.openpty()
     run = subprocess.Popen(
         command(*ARGUMENTS, "--out", str(tmp_path / "set")),
         env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
+        stdout=theirs,
+        stderr=theirs,
     )
-    while not list((tmp_path / "set" / ".staging" / "samples").glob("*/*.tar")):
-        assert run.poll() is None
-        time.sleep(0.2)
+    os.close(theirs)
+    shown = bytearray()
+    reader = threading.Thread(target=_read_all, args=(ours, shown))
+    reader.start()
+    staged = tmp_path / "set" / ".staging" / "samples"
+    if moment == "meshes":
+        _wait_until(run, lambda: num_meshes(tmp_path / "cache") > 5)
+    else:
+        _wait_until(run, lambda: bool(list(staged.glob("*/*.tar"))))
     run.send_signal(signal.SIGINT)
-    _, errors = run.communicate(timeout=30)
-    assert run.returncode == 130
-    assert (
-        errors.strip()
-        == "trilight: interrupted. What was finished is safe; the same command goes on."
-    )
+    assert run.wait(timeout=30) == 130
+    reader.join()
+    words = b"trilight: interrupted. What was finished is safe; the same command goes on."
+    assert bytes(shown).rstrip().endswith(words)
+    assert shown.rfind(b"\x1b[?25h") > shown.rfind(b"\x1b[?25l") > 0
     _wait_until_nobody_is_left(mark)
+
+
+def _read_all(terminal: int, shown: bytearray) -> None:
+    with contextlib.suppress(OSError), open(terminal, "rb", buffering=0) as stream:
+        while data := stream.read(1 << 16):
+            shown.extend(data)

@@ -5,6 +5,7 @@ These functions run in the child processes of `make_dataset`, whose own modules 
 
 import ctypes
 import os
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 OBJECT = "poison.obj"
 """Its mesh ends whoever reads it."""
+VICTIM, DEATHS = "knot0.obj", "deaths"
+"""Its child is killed, as often as the file says that lies beside it."""
 SCENE = 1
 """Its first attempt ends whoever renders it."""
 LOST_SCENE = 2
@@ -27,6 +30,18 @@ def prepare_or_crash(source: Path, settings: AssetSettings, method: str) -> "Ass
     """Read address 0 as a broken mesh library does, or prepare the object."""
     if source.name == OBJECT:
         ctypes.string_at(0)
+    return attempt_in_child(source, settings, method)
+
+
+def prepare_or_die(source: Path, settings: AssetSettings, method: str) -> "AssetAttempt":
+    """Be killed as often as the file DEATHS beside the source says, or prepare the object.
+
+    The file counts down.
+    """
+    deaths = source.parent / DEATHS
+    if source.name == VICTIM and (left := int(deaths.read_text())):
+        deaths.write_text(str(left - 1))
+        os.kill(os.getpid(), signal.SIGKILL)
     return attempt_in_child(source, settings, method)
 
 

@@ -1,14 +1,19 @@
 """Pieces of shards by several makers: every scene once, one packer, nothing taken from others."""
 
+import contextlib
 import dataclasses
 import threading
 from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
+
+from pipeline.flows import make_shard
 from pipeline.flows.builds import named_build
 from pipeline.flows.make_scene import SceneAttempt
-from pipeline.flows.make_shard import make_piece
+from pipeline.flows.make_shard import is_free, make_piece
 from pipeline.flows.pieces import Piece
 from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import ChildFailed, IsolatedChild
@@ -18,7 +23,7 @@ from storage.layout import DatasetFolder
 from storage.manifest import ShardEntry, index_shard
 from storage.sample import sample_key
 from storage.shard_writer import write_shard
-from storage.staging import read_staged_scene
+from storage.staging import is_staged, read_staged_scene
 from tests.scenes_by_hand import tiny_sample
 
 NAME = "train-000000.tar"
@@ -84,6 +89,59 @@ def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:
         assert _make(tmp_path, 0, 4, made) is None
     assert made == {0: 1, 2: 1, 3: 1}
     assert _make(tmp_path, 0, 4, made) is not None  # they died; now it is free
+
+
+def test_a_shard_that_is_packed_while_one_looks_is_not_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its scenes leave the staging then: they are neither staged nor claimed, and yet not free."""
+    folder, build = DatasetFolder(tmp_path), _build()
+    assert is_free(folder, build, 0)
+
+    def packed_meanwhile(staged: Path, scene_index: int) -> bool:
+        seen = is_staged(staged, scene_index)
+        monkeypatch.setattr(make_shard, "is_staged", is_staged)
+        assert _make(tmp_path, 0, 4, Counter()) is not None
+        return seen
+
+    monkeypatch.setattr(make_shard, "is_staged", packed_meanwhile)
+    assert not is_free(folder, build, 0)
+
+
+def _somebody_quicker(
+    monkeypatch: pytest.MonkeyPatch, claim_name: str, work: Callable[[], object]
+) -> None:
+    """Let somebody else do `work` just before this process asks for a claim."""
+
+    @contextlib.contextmanager
+    def claimed_late(claim: Path) -> Iterator[bool]:
+        if claim.name == claim_name:
+            monkeypatch.setattr(make_shard, "claimed", claimed)
+            work()
+        with claimed(claim) as ours:
+            yield ours
+
+    monkeypatch.setattr(make_shard, "claimed", claimed_late)
+
+
+def test_a_scene_that_somebody_made_before_the_claim_is_not_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: Counter[int] = Counter()
+    _somebody_quicker(monkeypatch, f"{sample_key(0)}.claim", lambda: _make(tmp_path, 0, 1, made))
+    _make(tmp_path, 0, 1, made)
+    assert made == {0: 1}
+
+
+def test_a_shard_that_somebody_packed_before_the_claim_has_one_packer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: Counter[int] = Counter()
+    packed: list[ShardEntry | None] = []
+    _somebody_quicker(monkeypatch, "pack.claim", lambda: packed.append(_make(tmp_path, 0, 4, made)))
+    packed.append(_make(tmp_path, 0, 4, made))
+    assert [entry is not None for entry in packed] == [True, False]
+    assert made.total() == 4
 
 
 def test_a_scene_that_crashes_its_child_costs_an_attempt(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ All through the real `make_dataset`: meshes, children, renders, shards, document
 """
 
 import os
+import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.flows import make_shard
-from pipeline.flows.dataset_run import Outcome, make_dataset
+from pipeline.flows.dataset_run import Outcome, make_dataset, prepare_dataset
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.runners import ThreadRunner
 from storage.dataset import open_dataset
@@ -43,10 +44,7 @@ def order(folder: Path, out: Path | str, **changes: object) -> DatasetOrder:
     return DatasetOrder(
         objects=str(folder / "objects"),
         out=str(out),
-        scenes=8,
-        resolution=32,
-        noise_floor_db=20.0,
-        **changes,  # type: ignore[arg-type]
+        **{"scenes": 8, "resolution": 32, "noise_floor_db": 20.0, **changes},  # type: ignore[arg-type]
     )
 
 
@@ -74,6 +72,49 @@ def test_a_mesh_that_crashes_its_child_is_one_failure(
         row for row in open_dataset(str(tmp_path / "set")).failures() if row.stage == "assets"
     ]
     assert [(row.item, row.reason) for row in rejected] == [("poison", "crashed_signal_11")]
+
+
+@pytest.fixture
+def cold(workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with a cache in which no mesh is; the children of one object are killed."""
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_die)
+    (workshop / "objects" / poison.DEATHS).write_text("0")
+    yield tmp_path
+    (workshop / "objects" / poison.DEATHS).unlink()
+
+
+def test_a_mesh_child_that_is_killed_twice_changes_no_object(workshop: Path, cold: Path) -> None:
+    """The lock holds the digest of every mesh, and all pictures follow from it."""
+    (workshop / "objects" / poison.DEATHS).write_text("2")
+    begun = prepare_dataset(order(workshop, cold / "set"))
+    assert (workshop / "objects" / poison.DEATHS).read_text() == "0"
+    undisturbed = open_dataset(str(workshop / "plain")).manifest
+    assert begun.publication.manifest.objects_lock_sha256 == undisturbed.objects_lock_sha256
+
+
+def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
+    workshop: Path, cold: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A dataset begun without it says so; one that was begun with it waits for it."""
+    deaths, small = workshop / "objects" / poison.DEATHS, {"scenes": 4}
+    deaths.write_text("3")
+    begun = prepare_dataset(order(workshop, cold / "without", **small))
+    assert len(begun.accepted.objects) == 7
+    (failure,) = open_dataset(str(cold / "without")).failures()
+    assert (failure.item, failure.reason) == ("knot0", "killed")
+    (record,) = caplog.records
+    assert "1 could not be prepared this time (1 x killed)" in record.getMessage()
+    begun = prepare_dataset(order(workshop, cold / "with", **small))
+    assert len(begun.accepted.objects) == 8
+    shutil.rmtree(cold / "cache")
+    deaths.write_text("3")
+    with pytest.raises(
+        EnvironmentFailure, match="'knot0', of which .* begun.*killed.*run the same"
+    ):
+        prepare_dataset(order(workshop, cold / "with", **small))
+    assert open_dataset(str(cold / "with")).failures() == []
+    assert prepare_dataset(order(workshop, cold / "with", **small)).accepted == begun.accepted
 
 
 def test_scenes_that_abort_their_child_are_counted(

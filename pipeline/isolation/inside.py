@@ -1,0 +1,94 @@
+"""What happens inside a child: it keeps its limits, answers calls, and dies with its owner."""
+
+import ctypes
+import fcntl
+import math
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+from storage.errors import Rejected, TrilightError
+
+_PR_SET_PDEATHSIG = 1
+_F_SETSIG = 10  # Linux; Python's fcntl module does not name it
+
+
+def die_with_parent() -> None:
+    """Ask the kernel to kill this process when its parent ends, whatever ends it (Linux only)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _die_with_owner() -> None:
+    """Ask the kernel to kill this child when the process that owns it ends.
+
+    A child's direct parent is the fork server, which lives on while it has children, so that
+    `die_with_parent` would wait for ever. What ends with the owner is the sentinel pipe that
+    multiprocessing gives every child: its end sends SIGIO, which is turned into SIGKILL here.
+    Elsewhere than on Linux a child only notices its owner's end when its call returns.
+    """
+    if sys.platform != "linux":
+        return
+    owner = multiprocessing.parent_process()
+    assert owner is not None
+    sentinel = owner.sentinel
+    fcntl.fcntl(sentinel, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(sentinel, _F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(sentinel, fcntl.F_SETFL, fcntl.fcntl(sentinel, fcntl.F_GETFL) | os.O_ASYNC)
+    if not owner.is_alive():
+        os._exit(1)
+
+
+def serve(connection: Connection, memory_bytes: int, cpu_s: int | None) -> None:
+    """Answer calls until the owner closes the connection; ignores Ctrl-C: the owner decides.
+
+    Args:
+        connection: to the owner.
+        memory_bytes: most address space.
+        cpu_s: most processor seconds of one call, or None for no limit.
+    """
+    _die_with_owner()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    while True:
+        try:
+            function, args = connection.recv()
+        except EOFError:
+            os._exit(0)  # the parent is gone: nobody waits for destructors of native libraries
+        _allow_cpu(cpu_s)
+        connection.send(_answer(function, args))
+
+
+def _allow_cpu(seconds: int | None) -> None:
+    """Let this process use so much more processor time; the kernel ends it then, in any code."""
+    if seconds is None:
+        return
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    soft = math.ceil(used.ru_utime + used.ru_stime) + seconds
+    resource.setrlimit(resource.RLIMIT_CPU, (soft, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+
+
+def _answer(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, ...]:
+    try:
+        return ("result", function(*args))
+    except Rejected as rejection:
+        return ("rejected", rejection.reason, rejection.message)
+    except TrilightError as mistake:
+        return ("mistake", str(mistake))
+    except MemoryError:
+        return ("out_of_memory", "an allocation went over the limit of the child")
+    except Exception:
+        return ("exception", _last_error())
+
+
+def _last_error() -> str:
+    """Return the last lines of the current traceback, the innermost call and the error."""
+    lines = traceback.format_exc(limit=-1).strip().splitlines()
+    return " | ".join(line.strip() for line in lines[1:])

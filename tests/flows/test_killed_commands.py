@@ -1,0 +1,104 @@
+"""Commands on one scene whose child is killed: they do the same again, and say the same."""
+
+import dataclasses
+import multiprocessing
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.flows import inspect_scene as inspecting
+from pipeline.flows.convert_scene import convert_scene
+from pipeline.flows.inspect_scene import inspect_scene
+from pipeline.flows.read_scenes import SceneReader
+from pipeline.flows.render_scene import PathTracer
+from pipeline.flows.scene_source import SceneSource
+from pipeline.renders.settings import RenderSettings
+from pipeline.renders.variant import Variant, choose_variant
+from storage.profiles import PROFILES
+from storage.sample import encode_sample, sample_key
+from storage.scene_file import encode_scene
+from storage.shard_writer import write_shard
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+
+def kill_children() -> int:
+    """Kill every child of this process; return how many there were."""
+    children = multiprocessing.active_children()
+    for child in children:
+        child.kill()
+        child.join()
+    return len(children)
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> SceneSource:
+    path = tmp_path / "scene.safetensors"
+    path.write_bytes(encode_scene(tiny_scene()))
+    return SceneSource(path=path, key=None)
+
+
+def test_reading(source: SceneSource) -> None:
+    with SceneReader() as reader:
+        before = reader.load(source).scene
+        assert kill_children()
+        assert encode_scene(reader.load(source).scene) == encode_scene(before)
+
+
+def test_converting(tmp_path: Path) -> None:
+    """Two scenes of a shard; the child is killed between them."""
+    shard, profile = tmp_path / "train-000000.tar", PROFILES[0]
+    samples = [dataclasses.replace(tiny_sample(seed=n), key=sample_key(n)) for n in range(2)]
+    write_shard(shard, [(sample.key, encode_sample(sample, profile)) for sample in samples])
+
+    def converted(folder: Path, between: Callable[[], int]) -> list[bytes]:
+        folder.mkdir()
+        target = folder / "scene.safetensors"
+        source = SceneSource(path=shard, key=None)
+        found = convert_scene(source, target, budget=None, done=lambda n, of: between())
+        return [path.read_bytes() for path in found.files]
+
+    whole = converted(tmp_path / "whole", lambda: 0)
+    assert len(whole) == 2
+    assert converted(tmp_path / "killed", kill_children) == whole
+
+
+def test_inspecting(source: SceneSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The child is killed between the facts and the pictures."""
+
+    def kill_and_choose() -> Variant:
+        assert kill_children()
+        return choose_variant()
+
+    monkeypatch.setattr(inspecting, "choose_variant", kill_and_choose)
+    monkeypatch.setattr(inspecting, "_turntable", _grey)
+    assert inspect_scene(source, tmp_path / "sheet.png").facts["views"] > 0
+    assert (tmp_path / "sheet.png").exists()
+
+
+def _grey(source: SceneSource, variant: Variant) -> "np.ndarray":
+    return np.full((2, 4, 3), 128, np.uint8)
+
+
+def test_rendering() -> None:
+    """The child is killed before the picture, and once more between two passes of samples."""
+    scene, kills = tiny_scene(), [0]
+    settings = RenderSettings(resolution=16, min_spp=16, max_spp=64, noise_floor_db=99.0)
+
+    def sampled(step: object) -> None:
+        if kills[0] == 1:
+            kills[0] += kill_children()
+
+    def picture() -> "np.ndarray":
+        return tracer.render(scene.c2w[0], float(scene.fov_deg[0]), "a view").radiance_rgb
+
+    tracer = PathTracer(settings, seed=0, variant=choose_variant(), threads=1, sampled=sampled)
+    try:
+        tracer.open(scene, "a scene")
+        undisturbed = picture()
+        kills[0] += kill_children()
+        assert np.array_equal(picture(), undisturbed)
+        assert kills[0] == 2
+    finally:
+        tracer.close()
