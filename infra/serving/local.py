@@ -14,8 +14,8 @@ flow's form, and no parameter names a program. A parameter does name places: `ou
 that the worker may write, `objects` and `data` any that it may read.
 
 What is started carries a mark in its environment, which flow runs and their children inherit, so
-that `stop` ends exactly those, also where a worker was killed, and never a stranger. Several workers
-share the cores and the graphics cards evenly. The database is SQLite, or what
+that `stop` ends exactly those, also where a worker was killed, and never a stranger. Several
+workers share the cores and the graphics cards evenly. The database is SQLite, or what
 PREFECT_API_DATABASE_CONNECTION_URL says.
 """
 
@@ -46,7 +46,7 @@ from storage.cache import open_private
 from storage.errors import TrilightError
 
 POOL = "local"
-_TEMPLATE = ROOT / "infra" / "serving" / "pool.json"
+_TEMPLATE = ("--base-job-template", "infra/serving/pool.json")
 _FLOWS = {
     "PREFECT_LOGGING_EXTRA_LOGGERS": "trilight",
     "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",
@@ -164,8 +164,7 @@ def running(*, without: str | None = None) -> list[int]:
 def _prepare(environment: Mapping[str, str]) -> None:
     """Make pool, limits and deployments; what is there already is replaced."""
     for arguments in (
-        ["work-pool", "create", POOL, "--type", "process", "--overwrite"]
-        + ["--base-job-template", str(_TEMPLATE)],
+        ["work-pool", "create", POOL, "--type", "process", "--overwrite", *_TEMPLATE],
         ["deploy", "--name", f"*/{POOL}"],
     ):
         call_prefect(arguments, environment)

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -152,7 +153,10 @@ def readme_run(flow: str = "", **replaced: object) -> list[str]:
 def served(
     tmp_path: Path, database_url: str, workers: int, base: Mapping[str, str] = os.environ
 ) -> Iterator[dict[str, str]]:
-    """What `make serve` starts, with state and port of its own; gives a client's environment."""
+    """What `make serve` starts, with state and port of its own; gives a client's environment.
+
+    The password is a new one at each start, which `start_served` puts into the environment.
+    """
     port = str(free_port())
     environment = {
         **base,
@@ -172,9 +176,11 @@ def served(
         stop_served(environment)
 
 
-def start_served(environment: Mapping[str, str]) -> None:
-    """Run what `make serve` runs."""
+def start_served(environment: dict[str, str]) -> None:
+    """Run what `make serve` runs, and let clients know the password."""
     call(START, environment, timeout=2 * START_S)
+    settings = tomllib.loads((Path(environment["TRILIGHT_STATE"]) / "prefect.toml").read_text())
+    environment["PREFECT_API_AUTH_STRING"] = settings["api"]["auth_string"]
 
 
 def stop_served(environment: Mapping[str, str]) -> None:

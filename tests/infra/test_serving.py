@@ -1,4 +1,4 @@
-"""`make serve`: a password as soon as it is not loopback; `make stop`: exactly what was started."""
+"""`make serve`: a part that fails takes the others along; `make stop`: exactly what was started."""
 
 import contextlib
 import http.server
@@ -31,13 +31,6 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.delenv("PREFECT_SERVER_API_AUTH_STRING", raising=False)
     (tmp_path / "serve").mkdir()
     return tmp_path / "serve" / "mark"
-
-
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "10.0.0.7", "my-host"])
-def test_an_open_address_needs_a_password(host: str) -> None:
-    with pytest.raises(TrilightError, match="expected a password"):
-        start(host=host, port=4321, workers=1)
-    assert running() == []
 
 
 def _until_seen(number: int) -> None:
@@ -134,13 +127,6 @@ def test_wrong_variables_are_named(
     monkeypatch.setenv(variable, value)
     with pytest.raises(SystemExit, match=rf"{variable} is '{value}'; expected"):
         local.main(["start"])
-
-
-def test_what_to_do_next_reaches_the_server_that_was_started() -> None:
-    plain = "prefect deployment run generate-scenes/local --watch"
-    assert local.next_command("http://127.0.0.1:4200/api") == plain
-    other = "http://127.0.0.1:4300/api"
-    assert local.next_command(other) == f"PREFECT_API_URL={other} {plain}"
 
 
 def test_workers_share_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
