@@ -14,11 +14,11 @@ import os
 import shlex
 from pathlib import Path
 
-from infra.serving.limits import ROOT
 from pipeline.flows.prefect_server import CLIENT_PASSWORD, PASSWORD, new_password
 from storage.cache import cache_folder, open_private, private_folder
 from storage.errors import TrilightError
 
+ROOT = Path(__file__).parents[2]
 LINK = ROOT / "prefect.toml"
 """Where Prefect's commands look in the checkout; git ignores it."""
 

@@ -31,8 +31,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from infra.serving.access import grant, next_command, revoke, settings_file, state_folder
-from infra.serving.limits import ROOT, call_prefect, make_limits
+from infra.serving.access import ROOT, grant, next_command, revoke, settings_file, state_folder
 from pipeline.flows.guarded_server import NAMES
 from pipeline.flows.machine import cores_owned, visible_gpus
 from pipeline.flows.prefect_server import (
@@ -81,13 +80,12 @@ def start(*, host: str, port: int, workers: int) -> str:
     url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}/api"
     environment = {**os.environ, **grant(url), **_surroundings(host)}
     try:
-        _say(f"Prefect's server starts at {url.removesuffix('/api')}; this takes up to a minute")
+        _say(f"starting Prefect's server at {url.removesuffix('/api')}; all takes about a minute")
         server = [*SERVER, "--host", host, "--port", str(port)]
         process = _launch("server", server, environment)
         wait_until_healthy(url, process, _log("server"))
-        _say("the pool, its limits and the deployments are made")
         _prepare(environment)
-        _say(f"{workers} worker{'s' if workers > 1 else ''} of the pool `{POOL}` start")
+        _say(f"starting {workers} worker{'s' if workers > 1 else ''}")
         for number, share in enumerate(shares):
             name = f"worker-{number}"
             worker = ["worker", "start", "--pool", POOL, "--name", name, "--limit", "1"]
@@ -163,12 +161,33 @@ def running(*, without: str | None = None) -> list[int]:
 
 def _prepare(environment: Mapping[str, str]) -> None:
     """Make pool, limits and deployments; what is there already is replaced."""
-    for arguments in (
-        ["work-pool", "create", POOL, "--type", "process", "--overwrite", *_TEMPLATE],
-        ["deploy", "--name", f"*/{POOL}"],
-    ):
-        call_prefect(arguments, environment)
-    make_limits(environment)
+    prefect = [str(shutil.which("prefect")), "--no-prompt"]
+    pool = ["work-pool", "create", POOL, "--type", "process", "--overwrite", *_TEMPLATE]
+    limits = [sys.executable, "-m", "infra.serving.limits"]
+    deployments = ["deploy", "--name", f"*/{POOL}"]
+    steps = {
+        f"the pool `{POOL}`": [*prefect, *pool],
+        "its limits": limits,
+        "the deployments": [*prefect, *deployments],
+    }
+    for what, command in steps.items():
+        _say(f"making {what}")
+        _call(command, environment)
+
+
+def _call(command: Sequence[str], environment: Mapping[str, str]) -> None:
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:]
+        raise TrilightError(f"{' '.join(command)} failed: {' '.join(last)}")
 
 
 def _launch(

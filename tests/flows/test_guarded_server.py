@@ -1,4 +1,4 @@
-"""The door before Prefect's server: own names and own pages pass, everything else is turned away."""
+"""The door before Prefect's server: own names and own pages pass, all else is turned away."""
 
 import asyncio
 import stat
@@ -58,7 +58,8 @@ def test_own_names_and_addresses_are_answered(host: str) -> None:
 @pytest.mark.parametrize(
     "host",
     ["evil.example", f"evil.example:{PORT}", "localhost.evil.example", "127.0.0.1.evil.example",
-     "me@evil.example", "127.0.0.1@evil.example", "2130706433", "0x7f.1", "server.", "", "[", "a b"],
+     "me@evil.example", "127.0.0.1@evil.example", "2130706433", "0x7f.1", "server.", "",
+     "[", "a b"],
 )  # fmt: skip
 def test_other_names_are_refused(host: str) -> None:
     """A page may let its own name point to 127.0.0.1: its origin is then this very host."""

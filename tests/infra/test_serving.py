@@ -15,8 +15,8 @@ from typing import Any, cast
 
 import pytest
 
-from infra.serving import limits, local
-from infra.serving.limits import make_limits
+from infra.serving import local
+from infra.serving.limits import limits
 from infra.serving.local import running, start, stop
 from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER, wait_until_healthy
 from pipeline.flows.served.limits import DISK_LIMIT, GPU_LIMIT
@@ -142,35 +142,14 @@ def test_workers_share_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     assert local._share(11, 12) == {"TRILIGHT_CORES": "1"}
 
 
-@pytest.mark.parametrize(("there", "action"), [(True, "update"), (False, "create")])
-def test_limits_that_are_there_become_those_of_this_machine(
-    monkeypatch: pytest.MonkeyPatch, there: bool, action: str
+def test_cards_are_those_of_this_machine_or_of_all_workers(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    calls: list[list[str]] = []
-
-    def call(arguments: list[str], environment: object, *, check: bool = True) -> bool:
-        calls.append(arguments)
-        return there
-
-    monkeypatch.setattr(limits, "call_prefect", call)
-    monkeypatch.setattr(local, "call_prefect", call)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
-    local._prepare({})
-    assert ["gcl", action, GPU_LIMIT, "--limit", "3"] in calls
-    assert ["gcl", action, DISK_LIMIT, "--limit", "2"] in calls
-
-
-def test_where_cards_are_elsewhere_their_number_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[list[str]] = []
-
-    def call(arguments: list[str], environment: object, *, check: bool = True) -> bool:
-        calls.append(arguments)
-        return False
-
-    monkeypatch.setattr(limits, "call_prefect", call)
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1,2")
-    make_limits({"TRILIGHT_CARDS": "16"})
-    assert ["gcl", "create", GPU_LIMIT, "--limit", "16"] in calls
+    assert limits({}) == {DISK_LIMIT: 2, GPU_LIMIT: 3}
+    assert limits({"TRILIGHT_CARDS": "16"})[GPU_LIMIT] == 16
     for wrong in ("0", "-1", "many", "", "100001"):
         with pytest.raises(TrilightError, match=f"TRILIGHT_CARDS is '{wrong}'; expected a whole"):
-            make_limits({"TRILIGHT_CARDS": wrong})
+            limits({"TRILIGHT_CARDS": wrong})
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert limits({})[GPU_LIMIT] == 1  # a limit of 0 would let nothing begin

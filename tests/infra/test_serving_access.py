@@ -1,4 +1,4 @@
-"""Who may use what `make serve` started: one password a start, in one file, gone with the server."""
+"""Who may use what `make serve` started: a password a start, in one file, gone with the server."""
 
 import json
 import os
@@ -110,22 +110,20 @@ def test_the_password_is_no_argument_and_is_not_said(
         told.extend(command)
         environments.append(environment)
 
-    def call(arguments: list[str], environment: Any, *, check: bool = True) -> bool:
-        told.extend(arguments)
-        return True
+    def call(command: list[str], environment: Any) -> None:
+        launch("step", command, environment)
 
     monkeypatch.setattr(local, "_launch", launch)
     monkeypatch.setattr(local, "_require_free", lambda *_: None)
     monkeypatch.setattr(local, "wait_until_healthy", lambda *_: None)
-    monkeypatch.setattr(local, "call_prefect", call)
-    monkeypatch.setattr("infra.serving.limits.call_prefect", call)
+    monkeypatch.setattr(local, "_call", call)
     monkeypatch.setattr(local.shutil, "which", lambda name: name)
     monkeypatch.setenv("TRILIGHT_HOST", "my-host")
     local.main(["start"])
     password = tomllib.loads(settings_file().read_text())["api"]["auth_string"]
-    assert [environment[PASSWORDS[1]] for environment in environments] == [password] * 2
+    assert [environment[PASSWORDS[1]] for environment in environments] == [password] * 5
     assert environments[0]["TRILIGHT_HOST_NAMES"].split(",")[0] == "my-host"
     assert len(told) > 10 and not any(password in word for word in told)
     said = capsys.readouterr().out
     assert password not in said and str(settings_file()) in said
-    assert said.splitlines()[0].startswith("Prefect's server starts at http://my-host:4200")
+    assert said.splitlines()[0].startswith("starting Prefect's server at http://my-host:4200")
