@@ -31,6 +31,7 @@ from storage.errors import TrilightError
 
 NAMES = "TRILIGHT_HOST_NAMES"
 """Variable with the names, between commas, by which the server is known beside localhost."""
+_UNFRAMED = (b"content-security-policy", b"frame-ancestors 'none'")
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -67,8 +68,7 @@ class Door:
 
         async def send_unframed(message: Message) -> None:
             if message["type"] == "http.response.start":
-                unframed = (b"content-security-policy", b"frame-ancestors 'none'")
-                message["headers"] = [*message.get("headers", ()), unframed]
+                message["headers"] = [*message.get("headers", ()), _UNFRAMED]
             await send(message)
 
         return await self._inner(scope, receive, send_unframed)
@@ -98,7 +98,7 @@ async def _refuse(kind: str, refusal: str, send: Send) -> None:
     if kind == "websocket":
         await send({"type": "websocket.close", "code": 1008, "reason": refusal})
         return
-    headers = [(b"content-type", b"text/plain; charset=utf-8")]
+    headers = [(b"content-type", b"text/plain; charset=utf-8"), _UNFRAMED]
     await send({"type": "http.response.start", "status": 403, "headers": headers})
     await send({"type": "http.response.body", "body": refusal.encode()})
 

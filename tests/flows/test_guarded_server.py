@@ -66,6 +66,7 @@ def test_other_names_are_refused(host: str) -> None:
     for origin in ({}, {"origin": f"http://{host}"}):
         start, body = _answer(host=host, **origin)
         assert start["status"] == 403 and b"no name of this server" in body["body"]
+        assert (b"content-security-policy", b"frame-ancestors 'none'") in start["headers"]
         (closed,) = _answer("websocket", host=host, **origin)
         assert closed["type"] == "websocket.close"
 
