@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 PATIENCE_S = 120.0
 """A page with its scripts takes a second; on busy machines many times that."""
@@ -29,7 +30,7 @@ _LOCAL_NETWORK_CHECKS = (
 class Browser:
     """One page of a browser."""
 
-    def __init__(self, line: ClientConnection) -> None:
+    def __init__(self, line: Connection) -> None:
         self._line = line
         self._numbers = itertools.count(1)
         self._session: str | None = None

@@ -176,6 +176,18 @@ def served(
         stop_served(environment)
 
 
+def copy_of_the_project(folder: Path) -> None:
+    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (LOG.md)."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    for name in filter(None, listed.split("\0")):
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, target)
+    (folder / ".venv").symlink_to(ROOT / ".venv")
+
+
 def start_served(environment: dict[str, str]) -> None:
     """Run what `make serve` runs, and let clients know the password."""
     call(START, environment, timeout=2 * START_S)
@@ -188,10 +200,12 @@ def stop_served(environment: Mapping[str, str]) -> None:
     call(STOP, environment, timeout=120)
 
 
-def call(arguments: list[str], environment: Mapping[str, str], timeout: float) -> str:
-    """Run Python in the checkout and return what it says; a failure shows all of it."""
+def call(
+    arguments: list[str], environment: Mapping[str, str], timeout: float, folder: Path = ROOT
+) -> str:
+    """Run Python in a checkout and return what it says; a failure shows all of it."""
     done = subprocess.run(
-        [sys.executable, *arguments], cwd=ROOT, env=environment, text=True, timeout=timeout,
+        [sys.executable, *arguments], cwd=folder, env=environment, text=True, timeout=timeout,
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
