@@ -1,10 +1,41 @@
 """Where Trilight keeps what it can make again, outside of any dataset."""
 
 import os
+import stat
 from pathlib import Path
+from typing import IO, Any
+
+from storage.errors import TrilightError
 
 
 def cache_folder(name: str) -> Path:
     """Return a folder of the user's cache: below TRILIGHT_CACHE, or ~/.cache/trilight."""
     root = os.environ.get("TRILIGHT_CACHE")
     return (Path(root) if root else Path.home() / ".cache" / "trilight") / name
+
+
+def private_folder(path: Path) -> Path:
+    """Make a folder that only its user may enter, or make an existing one so, and return it.
+
+    Raises:
+        TrilightError: it cannot be made so, or is shared by all users, as /tmp is.
+    """
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        mode = path.stat().st_mode
+        if mode & stat.S_ISVTX:
+            raise TrilightError(
+                f"{path} is shared by all users; expected a folder of your own. Name one below it."
+            )
+        if stat.S_IMODE(mode) != 0o700:
+            path.chmod(0o700)
+    except OSError as error:
+        raise TrilightError(
+            f"{path} cannot be kept to yourself ({error.strerror}); expected a folder of your own."
+        ) from error
+    return path
+
+
+def open_private(path: Path, mode: str) -> IO[Any]:
+    """Open a file to write; where it is new, only its user may read it."""
+    return open(path, mode, opener=lambda name, flags: os.open(name, flags, 0o600))

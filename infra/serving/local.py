@@ -1,13 +1,25 @@
 """`make serve` and `make stop`: Prefect's server, a pool, a worker and the deployments, here.
 
-Everything binds to loopback and needs a password as soon as it does not. What is started carries a
-mark in its environment, which flow runs and their children inherit, so that `stop` ends exactly
-those, also where a worker was killed, and never a stranger. Several workers share the cores and the
-graphics cards evenly. The database is SQLite, or what PREFECT_API_DATABASE_CONNECTION_URL says.
+Everything binds to loopback, unless TRILIGHT_HOST says otherwise, and answers only who knows the
+password of this start (infra.serving.access), by its own name and for its own pages
+(pipeline.flows.guarded_server): other users of this machine, its containers and the pages in its
+user's browser can reach loopback too.
+
+Prefect knows no roles. Who has the password may do what its API can do, and with deployments and
+pools of their own that is whatever the worker's account can do: give it to nobody who may not
+have that account. What is held against accidents, stolen forms and careless automation: a run
+of our flows is given parameters and nothing else (infra/serving/pool.json and its kin let nobody
+choose a command, an image, an environment or a folder to work in), Prefect checks these by the
+flow's form, and no parameter names a program. A parameter does name places: `out` may be any folder
+that the worker may write, `objects` and `data` any that it may read.
+
+What is started carries a mark in its environment, which flow runs and their children inherit, so
+that `stop` ends exactly those, also where a worker was killed, and never a stranger. Several
+workers share the cores and the graphics cards evenly. The database is SQLite, or what
+PREFECT_API_DATABASE_CONNECTION_URL says.
 """
 
 import contextlib
-import ipaddress
 import os
 import shutil
 import signal
@@ -16,21 +28,29 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from infra.serving.limits import ROOT, call_prefect, make_limits
+from infra.serving.access import ROOT, grant, next_command, revoke, settings_file, state_folder
+from pipeline.flows.guarded_server import NAMES
 from pipeline.flows.machine import cores_owned, visible_gpus
 from pipeline.flows.prefect_server import (
+    SERVER,
     TOLD_BY_ITS_STARTER,
     quiet_prefect,
     wait_until_healthy,
 )
 from storage.atomic import write_atomically
-from storage.cache import cache_folder
+from storage.cache import open_private
 from storage.errors import TrilightError
 
 POOL = "local"
+_TEMPLATE = ("--base-job-template", "infra/serving/pool.json")
+_FLOWS = {
+    "PREFECT_LOGGING_EXTRA_LOGGERS": "trilight",
+    "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",
+}
+"""What a worker's environment says to its flows; nobody who starts one can add to it."""
 _MARK = "TRILIGHT_SERVED"
 _END_S = 20.0
 _RELEASE_S = 5.0
@@ -42,49 +62,52 @@ def start(*, host: str, port: int, workers: int) -> str:
     """Start everything and return the URL of the API.
 
     Args:
-        host: name, or address of IPv4, to bind to; anything but loopback needs
-            PREFECT_SERVER_API_AUTH_STRING.
+        host: name, or address of IPv4, to bind to.
         port: of the server.
         workers: workers of the pool; each runs one flow at a time.
 
     Raises:
-        TrilightError: it runs already, the address is open without a password, or cannot be bound
-            to, or a part does not start; then the other parts are ended again.
+        TrilightError: it runs already, the address cannot be bound to, or a part does not start;
+            then the other parts are ended again.
     """
     if running():
         raise TrilightError("make serve: it runs already; expected nothing. Try make stop first.")
-    _require_password(host)
     if shutil.which("prefect") is None:
         raise TrilightError("make serve: there is no command `prefect`; run make setup.")
     _require_free(host, port)
     shares = [_share(number, workers) for number in range(workers)]
     quiet_prefect()
     url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}/api"
-    write_atomically(_mark_file(), (mark := uuid.uuid4().hex).encode())
-    environment = {
-        **os.environ,
-        _MARK: mark,
-        "PREFECT_API_URL": url,
-        "TRILIGHT_CHECKOUT": str(ROOT),
-        "TRILIGHT_IMAGE": os.environ.get("TRILIGHT_IMAGE", "trilight:latest"),
-        "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
-        "PREFECT_LOGGING_LEVEL": "INFO",
-    }
-    if password := os.environ.get("PREFECT_SERVER_API_AUTH_STRING"):
-        environment.setdefault("PREFECT_API_AUTH_STRING", password)
+    environment = {**os.environ, **grant(url), **_surroundings(host)}
     try:
-        server = ["server", "start", "--host", host, "--port", str(port)]
+        _say(f"starting Prefect's server at {url.removesuffix('/api')}; all takes about a minute")
+        server = [*SERVER, "--host", host, "--port", str(port)]
         process = _launch("server", server, environment)
         wait_until_healthy(url, process, _log("server"))
         _prepare(environment)
+        _say(f"starting {workers} worker{'s' if workers > 1 else ''}")
         for number, share in enumerate(shares):
             name = f"worker-{number}"
             worker = ["worker", "start", "--pool", POOL, "--name", name, "--limit", "1"]
-            _launch(name, worker, environment | share)
+            _launch(name, [str(shutil.which("prefect")), *worker], environment | _FLOWS | share)
     except BaseException:
         stop()
         raise
     return url
+
+
+def _surroundings(host: str) -> dict[str, str]:
+    """Return what all parts are told of where they are, and the mark by which they are known."""
+    mark = uuid.uuid4().hex
+    write_atomically(_mark_file(), mark.encode())
+    names = [host, socket.gethostname(), *os.environ.get(NAMES, "").split(",")]
+    return {
+        _MARK: mark,
+        NAMES: ",".join(names),
+        "TRILIGHT_CHECKOUT": str(ROOT),
+        "PREFECT_LOGGING_LEVEL": "INFO",
+        "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
+    }
 
 
 def stop() -> int:
@@ -101,6 +124,7 @@ def stop() -> int:
         deadline = time.monotonic() + _END_S
         while not _all_ended() and time.monotonic() < deadline:
             time.sleep(0.1)
+    revoke()
     _mark_file().unlink(missing_ok=True)
     return len(ours)
 
@@ -137,40 +161,47 @@ def running(*, without: str | None = None) -> list[int]:
 
 def _prepare(environment: Mapping[str, str]) -> None:
     """Make pool, limits and deployments; what is there already is replaced."""
-    for arguments in (
-        ["work-pool", "create", POOL, "--type", "process", "--overwrite"],
-        ["deploy", "--name", f"*/{POOL}"],
-    ):
-        call_prefect(arguments, environment)
-    make_limits(environment)
+    prefect = [str(shutil.which("prefect")), "--no-prompt"]
+    pool = ["work-pool", "create", POOL, "--type", "process", "--overwrite", *_TEMPLATE]
+    limits = [sys.executable, "-m", "infra.serving.limits"]
+    deployments = ["deploy", "--name", f"*/{POOL}"]
+    steps = {
+        f"the pool `{POOL}`": [*prefect, *pool],
+        "its limits": limits,
+        "the deployments": [*prefect, *deployments],
+    }
+    for what, command in steps.items():
+        _say(f"making {what}")
+        _call(command, environment)
+
+
+def _call(command: Sequence[str], environment: Mapping[str, str]) -> None:
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:]
+        raise TrilightError(f"{' '.join(command)} failed: {' '.join(last)}")
 
 
 def _launch(
-    name: str, arguments: list[str], environment: Mapping[str, str]
+    name: str, command: Sequence[str], environment: Mapping[str, str]
 ) -> "subprocess.Popen[bytes]":
-    with _log(name).open("ab") as log:
+    with open_private(_log(name), "ab") as log:
         return subprocess.Popen(
-            [str(shutil.which("prefect")), *arguments],
+            command,
             cwd=ROOT,
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
             start_new_session=True,
-        )
-
-
-def _require_password(host: str) -> None:
-    loopback = host == "localhost"
-    try:
-        loopback = loopback or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        pass
-    if not loopback and not os.environ.get("PREFECT_SERVER_API_AUTH_STRING"):
-        raise TrilightError(
-            f"make serve: {host} can be reached from other machines; expected a password. Set "
-            "PREFECT_SERVER_API_AUTH_STRING to USER:PASSWORD, and PREFECT_API_AUTH_STRING to the "
-            "same where flows are started."
         )
 
 
@@ -215,12 +246,6 @@ def _share(number: int, workers: int) -> dict[str, str]:
     return share
 
 
-def state_folder() -> Path:
-    """Return where logs and the list of processes are: TRILIGHT_STATE, or in the cache."""
-    place = os.environ.get("TRILIGHT_STATE")
-    return Path(place) if place else cache_folder("serve")
-
-
 def _mark_file() -> Path:
     return state_folder() / "mark"
 
@@ -229,11 +254,8 @@ def _log(name: str) -> Path:
     return state_folder() / f"{name}.log"
 
 
-def next_command(url: str) -> str:
-    """Return what starts a flow at the API of a URL; pyproject.toml names the default one."""
-    command = "prefect deployment run generate-scenes/local --watch"
-    known = url == f"http://127.0.0.1:{_DEFAULT_PORT}/api"
-    return command if known else f"PREFECT_API_URL={url} {command}"
+def _say(text: str) -> None:
+    print(text, flush=True)  # noqa: T201
 
 
 def _number(variable: str, default: int) -> int:
@@ -249,13 +271,15 @@ def main(arguments: list[str]) -> None:
     """Start or stop, as the only argument says; TRILIGHT_HOST, _PORT and _WORKERS say how."""
     try:
         if arguments == ["stop"]:
-            print(f"ended: {stop()} processes")  # noqa: T201
+            _say(f"ended: {stop()} processes")
             return
         host = os.environ.get("TRILIGHT_HOST", "127.0.0.1")
         port, workers = _number("TRILIGHT_PORT", _DEFAULT_PORT), _number("TRILIGHT_WORKERS", 1)
         url = start(host=host, port=port, workers=workers)
-        print(f"Prefect: {url.removesuffix('/api')}; logs: {state_folder()}")  # noqa: T201
-        print(f"Next: {next_command(url)}")  # noqa: T201
+        _say(f"Prefect: {url.removesuffix('/api')}; logs: {state_folder()}")
+        # not the password itself: what is on a screen gets into recordings and logs of others
+        _say(f"The page asks for a password: it is the auth_string in {settings_file()}")
+        _say(f"Next: {next_command()}")
     except TrilightError as mistake:
         sys.exit(f"trilight: {mistake}")
 

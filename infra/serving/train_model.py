@@ -102,7 +102,7 @@ def train_order(parameters: Mapping[str, Any]) -> TrainOrder:
     return order
 
 
-@flow(name="train-model", persist_result=False)
+@flow(name="train-model", flow_run_name="{run}-{out}", persist_result=False)
 @parameters_of(TrainOrder, **TRAIN_FORMS)
 def train_model(**parameters: Any) -> None:
     """Train a model on a dataset, in processes of its own; a run that is cancelled is saved.

@@ -22,9 +22,9 @@ class DatasetOrder:
     build: str = "smoke"
     """Named settings, such as smoke or pretrain-256."""
     objects: str | None = None
-    """Source of 3D objects: a folder here or on a server, builtin:, objaverse:, or env:NAME for
-    what the environment variable NAME of the worker says. By default what the build demands, or
-    else builtin:."""
+    """Source of 3D objects: a folder here or on a server, builtin:, objaverse:, or
+    env:TRILIGHT_SOURCE_NAME for what that environment variable of the worker says. By default what
+    the build demands, or else builtin:."""
     out: str = "data/smoke"
     """Folder of the dataset, as the worker sees it, or a bucket such as s3://bucket/folder. With a
     bucket, machines that work at the same time should make different shards, or they waste work."""

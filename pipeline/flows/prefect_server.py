@@ -1,13 +1,15 @@
 """A private Prefect server for runs that nobody has started a server for.
 
 Prefect's own temporary server outlives a parent that is killed. This one asks the kernel to end
-with its parent, keeps its database in Trilight's cache, binds to loopback, and is quiet. Where
-PREFECT_API_URL is set (a served deployment, a team's server) that server is used instead.
+with its parent, keeps its database in Trilight's cache, binds to loopback, wants a password that
+only this run knows (pipeline.flows.guarded_server), and is quiet. Where PREFECT_API_URL is set (a
+served deployment, a team's server) that server is used instead.
 """
 
 import contextlib
 import fcntl
 import os
+import secrets
 import socket
 import subprocess
 import sys
@@ -17,14 +19,19 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
-from pipeline.isolation import die_with_parent
-from storage.cache import cache_folder
+from storage.cache import cache_folder, open_private, private_folder
 from storage.errors import TrilightError
 
 TOLD_BY_ITS_STARTER = "TRILIGHT_TOLD_BY_ITS_STARTER"
 """In the environment of processes that get SIGTERM from who started them, and from nobody else."""
+PASSWORD = "PREFECT_SERVER_API_AUTH_STRING"
+"""Variable of a server with USER:PASSWORD, which every request must name."""
+CLIENT_PASSWORD = "PREFECT_API_AUTH_STRING"
+"""Variable of who sends requests, with the same."""
 _START_UP_S = 120.0
 _LOG_NAME = "server.log"
+SERVER = (sys.executable, "-m", "pipeline.flows.guarded_server")
+"""Program of every server that we start; --host and --port follow."""
 
 
 def quiet_prefect() -> None:
@@ -54,13 +61,14 @@ def prefect_server() -> Iterator[str]:
     if given := os.environ.get("PREFECT_API_URL"):
         yield given
         return
-    home = Path(os.environ["PREFECT_HOME"])
-    home.mkdir(parents=True, exist_ok=True)
-    with (home / "start.lock").open("w") as lock, (home / _LOG_NAME).open("ab") as log:
+    home = private_folder(Path(os.environ["PREFECT_HOME"]))
+    password = new_password()
+    with (home / "start.lock").open("w") as lock, open_private(home / _LOG_NAME, "ab") as log:
         fcntl.flock(lock, fcntl.LOCK_EX)  # two first starts at once would both migrate the database
         port = _free_port()
         server = subprocess.Popen(
-            [sys.executable, "-m", "pipeline.flows.prefect_server", str(port)],
+            [*SERVER, "--port", str(port), "--with-parent"],
+            env={**os.environ, PASSWORD: password, "PREFECT_UI_ENABLED": "false"},
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -70,12 +78,18 @@ def prefect_server() -> Iterator[str]:
         try:
             wait_until_healthy(url, server, home / _LOG_NAME)
             fcntl.flock(lock, fcntl.LOCK_UN)
-            os.environ["PREFECT_API_URL"] = url
+            os.environ |= {"PREFECT_API_URL": url, CLIENT_PASSWORD: password}
             yield url
         finally:
-            os.environ.pop("PREFECT_API_URL", None)
+            for variable in ("PREFECT_API_URL", CLIENT_PASSWORD):
+                os.environ.pop(variable, None)
             server.kill()  # its records are a display, not the truth: nothing is waited for
             server.wait()
+
+
+def new_password() -> str:
+    """Return USER:PASSWORD that nobody can guess."""
+    return f"trilight:{secrets.token_urlsafe(24)}"
 
 
 def wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -> None:
@@ -97,15 +111,3 @@ def _free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def _serve(port: str) -> None:
-    die_with_parent()
-    from prefect.cli import app
-
-    sys.argv = ["prefect", "server", "start", "--host", "127.0.0.1", "--port", port]
-    app()
-
-
-if __name__ == "__main__":
-    _serve(sys.argv[1])

@@ -4,6 +4,7 @@ Nothing is loaded here: a record names a file, and the mesh stage finds out whet
 """
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -30,7 +31,12 @@ from storage.safe_url import printable, safe_url
 
 ENVIRONMENT = "env:"
 """Begins a source that names an environment variable: the way for URLs that hold a secret."""
+VARIABLES = "TRILIGHT_SOURCE_"
+"""Begins the names that may follow: who may start a run is not to read any other variable."""
 
+_QUOTED = re.compile(r"^objects (?:is )?(?:'[^']*'|\"[^\"]*\")")
+"""How messages about a source begin."""
+_WORD = re.compile(r"\w{3,}")
 _NOT_HAD = ("download_failed", "too_large_bytes", "too_many_buffers", "unsafe_name")
 
 
@@ -72,7 +78,8 @@ def find_objects(
         source: a folder; `http(s)://`, `s3://`, `gs://`, `hf://` or `file://` and a folder;
             `builtin:` or `builtin:N`; `objaverse:` and uids, a file of uids, or categories. Of a
             folder, `objects.jsonl` or `objects.csv` is used where it has one, and its object
-            files otherwise. `env:NAME` is what the environment variable NAME says.
+            files otherwise. `env:NAME` is what the environment variable NAME says, of which no
+            message quotes anything; NAME begins with VARIABLES.
         work_dir: where built-in objects are written; not touched for other sources.
         allowed_licences: SPDX identifiers, `LicenseRef-...`, or compound expressions as they stand.
         licence: of files that come without any statement, as the user states it.
@@ -86,7 +93,22 @@ def find_objects(
     """
     check_allowed(allowed_licences)
     stated_licence(licence)
-    source = _from_environment(source)
+    value = _value(source)
+    try:
+        return _find(value, work_dir, allowed_licences, licence, downloaded)
+    except TrilightError as mistake:
+        if value == source:
+            raise
+        raise type(mistake)(_without_value(str(mistake), source, value)) from None
+
+
+def _find(
+    source: str,
+    work_dir: Path,
+    allowed_licences: Sequence[str],
+    licence: str | None,
+    downloaded: Callable[[int, int], None],
+) -> FoundObjects:
     listing = _list(source, work_dir, licence, allowed_licences)
     shown = printable(safe_url(source))
     if not listing.records and not listing.failures:
@@ -105,16 +127,35 @@ def find_objects(
     )
 
 
-def _from_environment(source: str) -> str:
+def _value(source: str) -> str:
+    """Return the source that is meant, where an environment variable says it."""
     if not source.startswith(ENVIRONMENT):
         return source
-    name = source.removeprefix(ENVIRONMENT)
+    name, shown = source.removeprefix(ENVIRONMENT), printable(source)
+    if not name.startswith(VARIABLES):
+        raise TrilightError(
+            f"objects {shown!r} names a variable that is not for sources; expected one whose name "
+            f"begins with {VARIABLES}. Set the source under such a name."
+        )
     if not (found := os.environ.get(name)):
         raise TrilightError(
-            f"objects {printable(source)!r}: the environment variable {printable(name)!r} is not "
-            "set here; expected it to name a source of objects."
+            f"objects {shown!r}: the environment variable {printable(name)!r} is not set here; "
+            "expected it to name a source of objects."
         )
     return found
+
+
+def _without_value(message: str, source: str, value: str) -> str:
+    """Return a message about a source that a variable says, with the variable instead of it."""
+    shown = f"objects {printable(source)!r}"
+    told = _QUOTED.sub(lambda _: shown, message)
+    rest = told.removeprefix(shown)
+    if rest != told and not any(word in rest for word in _WORD.findall(value)):
+        return told
+    return (
+        f"{shown} cannot be used as what it says; expected a source of objects. Name that source "
+        "itself in a terminal of this machine to be told what is wrong: trilight assets SOURCE."
+    )
 
 
 def _list(

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -152,7 +153,10 @@ def readme_run(flow: str = "", **replaced: object) -> list[str]:
 def served(
     tmp_path: Path, database_url: str, workers: int, base: Mapping[str, str] = os.environ
 ) -> Iterator[dict[str, str]]:
-    """What `make serve` starts, with state and port of its own; gives a client's environment."""
+    """What `make serve` starts, with state and port of its own; gives a client's environment.
+
+    The password is a new one at each start, which `start_served` puts into the environment.
+    """
     port = str(free_port())
     environment = {
         **base,
@@ -172,9 +176,23 @@ def served(
         stop_served(environment)
 
 
-def start_served(environment: Mapping[str, str]) -> None:
-    """Run what `make serve` runs."""
+def copy_of_the_project(folder: Path) -> None:
+    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (LOG.md)."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    for name in filter(None, listed.split("\0")):
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, target)
+    (folder / ".venv").symlink_to(ROOT / ".venv")
+
+
+def start_served(environment: dict[str, str]) -> None:
+    """Run what `make serve` runs, and let clients know the password."""
     call(START, environment, timeout=2 * START_S)
+    settings = tomllib.loads((Path(environment["TRILIGHT_STATE"]) / "prefect.toml").read_text())
+    environment["PREFECT_API_AUTH_STRING"] = settings["api"]["auth_string"]
 
 
 def stop_served(environment: Mapping[str, str]) -> None:
@@ -182,10 +200,12 @@ def stop_served(environment: Mapping[str, str]) -> None:
     call(STOP, environment, timeout=120)
 
 
-def call(arguments: list[str], environment: Mapping[str, str], timeout: float) -> str:
-    """Run Python in the checkout and return what it says; a failure shows all of it."""
+def call(
+    arguments: list[str], environment: Mapping[str, str], timeout: float, folder: Path = ROOT
+) -> str:
+    """Run Python in a checkout and return what it says; a failure shows all of it."""
     done = subprocess.run(
-        [sys.executable, *arguments], cwd=ROOT, env=environment, text=True, timeout=timeout,
+        [sys.executable, *arguments], cwd=folder, env=environment, text=True, timeout=timeout,
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout

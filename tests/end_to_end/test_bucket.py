@@ -26,7 +26,7 @@ SECRETS = (
     "GOOGLE_API_KEY", "DATABASE_PASSWORD",
 )  # fmt: skip
 OPTIONS = (
-    "--objects", "env:TRILIGHT_TEST_OBJECTS", "--scenes", "12", "--resolution", "32",
+    "--objects", "env:TRILIGHT_SOURCE_TEST", "--scenes", "12", "--resolution", "32",
     "--noise-floor", "20",
 )  # fmt: skip
 """Three shards of four tiny scenes."""
@@ -38,7 +38,7 @@ private._START_UP_S = 600.0  # on two busy cores 120 s were not enough
 private.quiet_prefect()
 with private.prefect_server():
     from pipeline.flows.served.generate_scenes import generate_scenes
-    generate_scenes(objects="env:TRILIGHT_TEST_OBJECTS", scenes=12, resolution=32,
+    generate_scenes(objects="env:TRILIGHT_SOURCE_TEST", scenes=12, resolution=32,
                     noise_floor_db=20.0, out="s3://shards/flow")
 """
 
@@ -64,7 +64,7 @@ def environment(driver: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         yield {
             **{name: value for name, value in os.environ.items() if name != "PREFECT_API_URL"},
             **{name: f"{CANARY}-{name.lower()}" for name in SECRETS},
-            "TRILIGHT_TEST_OBJECTS": f"http://me:{CANARY}@{address}/objects/?key={CANARY}",
+            "TRILIGHT_SOURCE_TEST": f"http://me:{CANARY}@{address}/objects/?key={CANARY}",
             "PYTHONPATH": str(ROOT),
             "NO_PROXY": "127.0.0.1",
             "PREFECT_HOME": str(tmp_path / "prefect"),

@@ -28,7 +28,7 @@ WORDS = {
     "flow": "prefect.engine",
     "child": "multiprocessing.forkserver",
     "worker": "worker start",
-    "server": "server start",
+    "server": "pipeline.flows.guarded_server",
 }
 """By what a process is known among those that carry the test's mark."""
 SHARES = {"child": 0.5, "flow": 0.3, "worker": 0.1, "server": 0.1}

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from model.neural_renderer import NeuralRenderer
+from storage.cache import cache_folder
 from storage.dataset import open_dataset
 from storage.verify import verify_dataset
 from tests.conftest import ROOT
@@ -19,7 +20,9 @@ from tests.end_to_end.production_kit import (
     STOP,
     Postgres,
     call,
+    copy_of_the_project,
     dask_cluster,
+    free_port,
     postgres,
     readme_block,
     readme_run,
@@ -119,6 +122,32 @@ def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Post
     for place in (tmp_path / "state", tmp_path / "prefect"):
         for path in place.rglob("*"):
             assert not path.is_file() or CANARY.encode() not in path.read_bytes(), path
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_lines_of_the_readme_need_nothing_exported(tmp_path: Path) -> None:
+    """In a checkout: serve, a run, stop. Its cache is empty but for objects made before."""
+    checkout, cache = tmp_path / "checkout", tmp_path / "cache"
+    copy_of_the_project(checkout)
+    cache.mkdir()
+    for known in cache_folder("assets").parent.glob("*"):
+        if known.name not in ("serve", "prefect"):
+            (cache / known.name).symlink_to(known)
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    bare = {**kept, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    bare |= {"TRILIGHT_CACHE": str(cache)}
+    port = str(free_port())
+    try:
+        told = call(START, {**bare, "TRILIGHT_PORT": port}, RUN_S, checkout)
+        assert told.splitlines()[-1] == f"Next: {' '.join(readme_block()[1].split()[:5])}"
+        assert call(["-m", "prefect", "config", "view"], bare, RUN_S, checkout).count(port)
+        run = readme_run(**{**SMALL, "scenes": 4}, out=tmp_path / "mine")
+        call(run, bare, RUN_S, checkout)
+        _verified(tmp_path / "mine")
+    finally:
+        call(STOP, bare, RUN_S, checkout)
+    assert not (checkout / "prefect.toml").is_symlink()
 
 
 @pytest.mark.slow

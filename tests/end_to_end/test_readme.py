@@ -3,13 +3,13 @@
 import os
 import re
 import shlex
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import ROOT
+from tests.end_to_end.production_kit import copy_of_the_project
 
 README = (ROOT / "README.md").read_text()
 COMMANDS = [
@@ -39,18 +39,6 @@ def test_every_folder_has_its_line() -> None:
         assert f"`{name}/`" in README, name
 
 
-def _copy_of_the_project(folder: Path) -> None:
-    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (LOG.md)."""
-    listed = subprocess.run(
-        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout
-    for name in filter(None, listed.split("\0")):
-        target = folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(ROOT / name, target)
-    (folder / ".venv").symlink_to(ROOT / ".venv")
-
-
 def _run(command: str, folder: Path) -> None:
     environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKELEVEL")}
     environment["PATH"] = f"{ROOT / '.venv' / 'bin'}:{environment['PATH']}"
@@ -70,7 +58,7 @@ def _run(command: str, folder: Path) -> None:
 @pytest.mark.timeout(3600)
 def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
     """All of them, in order; only the user's own dataset and training are smaller."""
-    _copy_of_the_project(tmp_path)
+    copy_of_the_project(tmp_path)
     for command in COMMANDS:
         if command in NOT_RUN_HERE:
             continue

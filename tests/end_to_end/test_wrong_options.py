@@ -13,7 +13,7 @@ from tests.end_to_end.conftest import Trilight
         (("--address", "tcp://127.0.0.1:9"), "--runner is threads"),
         (("--shards", "7"), "shards is '7'"),
         (("--scenes", "8", "--shards", "2:4"), "expected one that begins below 2"),
-        (("--objects", "env:TRILIGHT_NOWHERE"), "'TRILIGHT_NOWHERE' is not set"),
+        (("--objects", "env:TRILIGHT_SOURCE_NONE"), "'TRILIGHT_SOURCE_NONE' is not set"),
     ],
 )
 def test_wrong_options_are_named(

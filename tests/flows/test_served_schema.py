@@ -92,7 +92,13 @@ def test_wrong_values_are_refused_by_name(parameters: dict[str, Any], message: s
 
 @pytest.mark.parametrize(
     "source",
-    [f"https://user:{CANARY}@host/folder", f"https://host/folder?token={CANARY}"],
+    [
+        f"https://user:{CANARY}@host/folder",
+        f"https://host/folder?token={CANARY}",
+        "env:PATH",
+        "env:AWS_SECRET_ACCESS_KEY",
+        "env:TRILIGHT_SOURCE_A/x",
+    ],
 )
 def test_secrets_are_refused_before_a_run_exists(source: str) -> None:
     """The server checks the same schema when a run is made, so that it never stores one."""
@@ -101,7 +107,14 @@ def test_secrets_are_refused_before_a_run_exists(source: str) -> None:
     for parameter, given in (("data", [source]), ("begin_with", source), ("lpips", source)):
         with pytest.raises(ParameterTypeError, match=parameter):
             train_model.validate_parameters({parameter: given})
-    for harmless in ("builtin:500", "https://host/folder", "s3://b/f", "env:SOURCE", "a/b c", None):
+    for harmless in (
+        "builtin:500",
+        "https://host/folder",
+        "s3://b/f",
+        "env:TRILIGHT_SOURCE_A",
+        "a/b c",
+        None,
+    ):
         generate_scenes.validate_parameters({"objects": harmless})
 
 

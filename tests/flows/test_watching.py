@@ -1,29 +1,35 @@
 """What is shown of a run: where the report is, an honest rate, and never the end of the run."""
 
+import base64
+import io
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from pipeline.flows.make_task import TaskOutcome
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.served import generate_scenes, watching
 from pipeline.flows.served.runner import PrefectRunner
-from pipeline.flows.served.watching import Watched, _report_url, usd_per_core_hour
+from pipeline.flows.served.watching import Watched, report_url, small_picture, usd_per_core_hour
 from storage.errors import TrilightError
 
 
 @pytest.mark.parametrize(
     ("base", "url"),
     [
-        ("", "data/mine/report.html"),
+        ("", None),  # a link that leads nowhere is none
         ("https://data.example/sets/", "https://data.example/sets/mine/report.html"),
     ],
 )
-def test_the_link_to_the_report(monkeypatch: pytest.MonkeyPatch, base: str, url: str) -> None:
+def test_the_link_to_the_report(
+    monkeypatch: pytest.MonkeyPatch, base: str, url: str | None
+) -> None:
     monkeypatch.setenv("TRILIGHT_PUBLIC_URL", base)
-    assert _report_url("data/mine") == url
+    assert report_url("data/mine") == url
 
 
 @pytest.fixture
@@ -70,6 +76,33 @@ def test_the_rate_begins_with_the_first_scene(
     now = 3620.0
     watched.task_done(None, _task(4, 20.0))  # type: ignore[arg-type]
     assert watched.scenes_per_s() == 4 / 20
+
+
+def test_a_page_shows_the_scenes_and_where_their_report_is(
+    tables: list[tuple[str, dict[str, str]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures: list[str] = []
+    monkeypatch.setattr(
+        watching, "create_image_artifact", lambda url, **named: pictures.append(url)
+    )
+    monkeypatch.delenv("TRILIGHT_PUBLIC_URL", raising=False)
+    out = tmp_path / "set"
+    out.mkdir()
+    Image.effect_noise((3000, 2000), 80).save(out / "contact_sheet.png")
+    statistics = SimpleNamespace(lines=lambda: [("views", "16")])
+    outcome: Any = SimpleNamespace(
+        num_shards=1, num_shards_planned=1, digest="d", statistics=statistics
+    )
+    Watched(DatasetOrder(out=str(out))).finished(outcome)
+    ((_, rows),) = tables
+    assert (rows["report"], rows["views"]) == (f"{out}/report.html", "16")
+    (url,) = pictures
+    assert url == small_picture(out / "contact_sheet.png")
+    kind, _, data = url.partition(",")
+    with Image.open(io.BytesIO(base64.b64decode(data))) as shown:
+        assert (kind, shown.format, shown.size) == (
+            "data:image/jpeg;base64", "JPEG", (1024, 683)
+        )  # fmt: skip
 
 
 def test_a_run_that_fails_says_so_in_its_summary(

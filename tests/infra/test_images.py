@@ -1,28 +1,19 @@
 """Images and manifests cannot be built or applied here: they are linted, validated and compared."""
 
-import asyncio
 import json
 import shlex
 import subprocess
 import sys
-import uuid
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
-from prefect.client.schemas.objects import FlowRun
 
 from pipeline.flows.served.orders import DatasetInRuns
 from tests.conftest import ROOT
+from tests.infra.manifests_kit import IMAGES, MANIFESTS, containers
 
-IMAGES, MANIFESTS = ROOT / "infra" / "images", ROOT / "infra" / "kubernetes"
 BIN = Path(sys.executable).parent
-
-
-def _documents() -> list[dict[str, Any]]:
-    files = sorted(MANIFESTS.glob("*.yaml"))
-    return [row for path in files for row in yaml.safe_load_all(path.read_text())]
 
 
 @pytest.mark.parametrize("path", sorted(IMAGES.glob("*.Dockerfile")), ids=lambda path: path.name)
@@ -51,33 +42,58 @@ def test_manifests_validate(path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def _containers() -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
-    """Return name, pod and container of everything that runs, the flows' jobs last."""
-    containers = [
-        (row["metadata"]["name"], pod, container)
-        for row in _documents()
-        if row["kind"] in ("Deployment", "Job")
-        for pod in [row["spec"]["template"]["spec"]]
-        for container in pod["containers"]
-    ]
-    pod = _job_template()["job_configuration"]["job_manifest"]["spec"]["template"]["spec"]
-    return [*containers, ("job template", pod, pod["containers"][0])]
-
-
-def _job_template() -> Any:
-    found = next(row for row in _documents() if row["kind"] == "ConfigMap")
-    return json.loads(found["data"]["job.json"])
-
-
 def test_every_container_has_requests_limits_and_no_rights() -> None:
-    containers = _containers()
-    assert len(containers) == 4
-    for name, pod, container in containers:
+    found = containers()
+    assert len(found) == 4
+    for name, pod, container in found:
         assert container["imagePullPolicy"] == "IfNotPresent", name  # no registry has the image
         assert set(container["resources"]["requests"]) == {"cpu", "memory"}, name
         assert set(container["resources"]["limits"]) == {"cpu", "memory"}, name
         assert pod["securityContext"]["runAsNonRoot"], name
         assert not container["securityContext"]["allowPrivilegeEscalation"], name
+        assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}, name
+        assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}, name
+        # what is written goes to volumes: /tmp is the home of everything that needs one
+        assert container["securityContext"]["readOnlyRootFilesystem"], name
+        assert "/tmp" in {mount["mountPath"] for mount in container["volumeMounts"]}, name
+        assert {"name": "HOME", "value": "/tmp"} in container["env"], name
+
+
+def test_services_of_ours_write_to_volumes_alone() -> None:
+    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())
+    ours = {name: row for name, row in compose["services"].items() if "trilight" in row["image"]}
+    assert set(ours) == {"server", "worker", "deploy"}
+    for name, service in ours.items():
+        assert service["read_only"] and service["tmpfs"] == ["/tmp"], name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["environment"]["HOME"] == "/tmp", name
+
+
+def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_commands() -> None:
+    """A worker would make a pool that is not there, and Prefect's own offers everything."""
+    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]
+    commands = {name: shlex.split(str(compose[name]["command"])) for name in ("server", "worker")}
+    for name, _, container in containers()[:-1]:
+        commands[f"kubernetes {name}"] = container["command"]
+    for name, command in commands.items():
+        if "server" in name:
+            assert command[:3] == ["python", "-m", "pipeline.flows.guarded_server"], name
+        if "worker" in name:
+            assert "--no-create-pool-if-not-found" in command and "--type" not in command, name
+    scripts = [compose["deploy"]["command"][2]]
+    scripts += [container["command"][2] for name, _, container in containers() if "deploy" in name]
+    for script in scripts:
+        created = script.replace("\\\n", " ").splitlines()[0]
+        assert " work-pool create " in created and " --overwrite " in created
+        assert "--base-job-template" in created
+
+
+def test_workers_hold_no_key_that_administers_the_store() -> None:
+    services = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]
+    root = {
+        name for name, row in services.items() if "STORE_ROOT_PASSWORD" in str(row["environment"])
+    }
+    assert root == {"store", "bucket"}
 
 
 def test_no_password_stands_in_a_file_and_every_port_is_on_loopback() -> None:
@@ -113,7 +129,7 @@ def test_images_can_write_buckets_and_locks_hold_each_other() -> None:
         if names <= set(row.get("environment", {}))
     }
     assert has == {"worker"}  # who needs no key has none
-    (source,) = _containers()[-1][2]["envFrom"]
+    (source,) = containers()[-1][2]["envFrom"]
     assert source["secretRef"]["name"] == "trilight-bucket"
 
 
@@ -125,26 +141,23 @@ def test_flows_write_to_volumes_whatever_their_form_says() -> None:
     found = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
     for row in found:
         function, given = row["entrypoint"].split(":")[1], row.get("parameters", {})
-        if row["name"] == "docker":
-            mounted = {
-                volume.partition(":")[2] for volume in row["work_pool"]["job_variables"]["volumes"]
-            }
-            assert mounted == {"/data", "/cache"}
         if function == "build_dataset":  # its ranges go to the pool that it is in
             deployment = given.get("deployment", DatasetInRuns().deployment)
             assert deployment == f"generate-scenes/{row['name']}"
         if function == "train_model" and row["name"] != "local":
             assert given["out"].startswith("/data/")
-    mounts = {mount["mountPath"] for mount in _containers()[-1][2]["volumeMounts"]}
-    assert mounts == {"/data", "/cache"}
+    docker = json.loads((IMAGES / "pool.json").read_text())["job_configuration"]
+    assert {volume.partition(":")[2] for volume in docker["volumes"]} == {"/data", "/cache"}
+    mounts = {mount["mountPath"] for mount in containers()[-1][2]["volumeMounts"]}
+    assert mounts == {"/data", "/cache", "/tmp"}
 
 
 def test_what_deploys_the_flows_makes_their_limits_first() -> None:
     """Without its limit a flow takes as many graphics cards as there are runs."""
     compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]["deploy"]
-    shell = shlex.split(compose["command"])
+    shell = compose["command"]
     assert shell[:2] == ["sh", "-ec"]
-    (job,) = (part for name, _, part in _containers() if name == "trilight-deploy")
+    (job,) = (part for name, _, part in containers() if name == "trilight-deploy")
     given = {row["name"] for row in job["env"]}
     for script, variables in ((shell[2], set(compose["environment"])), (job["command"][2], given)):
         commands = [line.strip() for line in script.replace("&&", "\n").splitlines()]
@@ -153,41 +166,19 @@ def test_what_deploys_the_flows_makes_their_limits_first() -> None:
         assert "TRILIGHT_CARDS" in variables  # where they are made, there is no card
 
 
-def test_prefect_takes_the_job_template() -> None:
-    """Its worker makes a job of it for each flow run, and refuses one that lacks anything."""
-    worker = pytest.importorskip("prefect_kubernetes.worker", reason="make setup-all")
-    values = {
-        "image": "trilight:1",
-        "env": {"DO_NOT_TRACK": "1"},
-        "command": "prefect",
-        "name": "x",
-    }
-    kind = worker.KubernetesWorkerJobConfiguration
-    made = asyncio.run(kind.from_template_and_values(_job_template(), values, client=None))
-    made.prepare_for_flow_run(FlowRun(flow_id=uuid.uuid4(), name="x"))
-    (container,) = made.job_manifest["spec"]["template"]["spec"]["containers"]
-    ours = _containers()[-1][2]
-    kept = ("imagePullPolicy", "envFrom", "workingDir", "resources", "volumeMounts")
-    assert {name: container[name] for name in kept} == {name: ours[name] for name in kept}
-    assert (container["image"], container["args"]) == ("trilight:1", ["prefect"])
-    assert {"name": "DO_NOT_TRACK", "value": "1"} in container["env"]
-
-
 def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Prefect's own settings read what the manifest says: a name that it does not know is lost."""
     kubernetes = pytest.importorskip("prefect_kubernetes.settings", reason="make setup-all")
-    containers = {name: container for name, _, container in _containers()}
-    for entry in containers["trilight-worker"]["env"]:
+    by_name = {name: container for name, _, container in containers()}
+    for entry in by_name["trilight-worker"]["env"]:
         if entry["name"].startswith("PREFECT_INTEGRATIONS_"):
             monkeypatch.setenv(entry["name"], entry["value"])
     read = kubernetes.KubernetesSettings()
     assert read.observer.namespaces == {"trilight"}
     password = next(
-        row
-        for row in containers["trilight-worker"]["env"]
-        if row["name"] == "PREFECT_API_AUTH_STRING"
+        row for row in by_name["trilight-worker"]["env"] if row["name"] == "PREFECT_API_AUTH_STRING"
     )
     assert password["valueFrom"]["secretKeyRef"] == {
         "name": read.worker.api_auth_string_secret_name,
@@ -202,7 +193,7 @@ def test_deployments_name_flows_that_are_there() -> None:
     for row in found:
         path, function = row["entrypoint"].split(":")
         assert f"def {function}(" in (ROOT / path).read_text()
-        assert row["work_pool"]["name"] == row["name"]
+        assert row["work_pool"] == {"name": row["name"]}
 
 
 def test_the_array_job_is_a_shell_script(tmp_path: Path) -> None:

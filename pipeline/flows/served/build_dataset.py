@@ -9,13 +9,13 @@ from prefect.deployments import run_deployment
 
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.served.generate_scenes import generate_scenes
-from pipeline.flows.served.orders import DATASET_FORMS, DatasetInRuns, dataset_in_runs
+from pipeline.flows.served.orders import DATASET_FORMS, DatasetInRuns, dataset_in_runs, run_name
 from pipeline.flows.served.prepare_assets import prepare_assets
 from pipeline.flows.served.schema import parameters_of
 from storage.dataset_status import read_status
 
 
-@flow(name="build-dataset", persist_result=False)
+@flow(name="build-dataset", flow_run_name=run_name, persist_result=False)
 @parameters_of(DatasetInRuns, **DATASET_FORMS)
 def build_dataset(**parameters: Any) -> None:
     """Make a dataset: its objects, its scenes, its documents; on several workers if asked for.

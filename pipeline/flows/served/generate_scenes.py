@@ -7,13 +7,13 @@ from prefect import flow
 
 from pipeline.flows.dataset_run import Outcome, make_dataset
 from pipeline.flows.order import DatasetOrder
-from pipeline.flows.served.orders import DATASET_FORMS, dataset_order
+from pipeline.flows.served.orders import DATASET_FORMS, dataset_order, run_name
 from pipeline.flows.served.runner import PrefectRunner
 from pipeline.flows.served.schema import parameters_of
 from pipeline.flows.served.watching import Watched
 
 
-@flow(name="generate-scenes", persist_result=False)
+@flow(name="generate-scenes", flow_run_name=run_name, persist_result=False)
 @parameters_of(DatasetOrder, **DATASET_FORMS)
 def generate_scenes(**parameters: Any) -> Outcome:
     """Make a dataset, or what is missing of it, or of a range of its shards."""

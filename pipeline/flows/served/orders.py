@@ -57,6 +57,15 @@ def dataset_in_runs(parameters: Mapping[str, Any]) -> DatasetInRuns:
     return DatasetInRuns(**_values(parameters, DatasetInRuns))
 
 
+def run_name() -> str:
+    """Return what the flow run that begins is called: what is made of what, and where."""
+    from prefect.runtime import flow_run
+
+    given = {"build": DatasetOrder.build, "out": DatasetOrder.out, **flow_run.parameters}
+    parts = (given["build"], given.get("scenes"), given["out"])
+    return "-".join(str(part) for part in parts if part is not None)
+
+
 def _values(parameters: Mapping[str, Any], kind: type[DatasetOrder]) -> dict[str, Any]:
     values = {name: parameters[name] for name in kind.__dataclass_fields__}
     values["allow_licences"] = tuple(values["allow_licences"])

@@ -7,11 +7,11 @@ from prefect.logging import get_run_logger
 
 from pipeline.flows.dataset_run import prepare_dataset
 from pipeline.flows.order import DatasetOrder
-from pipeline.flows.served.orders import DATASET_FORMS, dataset_order
+from pipeline.flows.served.orders import DATASET_FORMS, dataset_order, run_name
 from pipeline.flows.served.schema import parameters_of
 
 
-@flow(name="prepare-assets", persist_result=False)
+@flow(name="prepare-assets", flow_run_name=run_name, persist_result=False)
 @parameters_of(DatasetOrder, **DATASET_FORMS)
 def prepare_assets(**parameters: Any) -> None:
     """Begin a dataset: list, clean, decimate and freeze its objects, without a picture."""

@@ -147,8 +147,12 @@ def _bounds(within: Within) -> Any:
     return Field(**bounds)
 
 
-_NO_SECRET = r"^(?:(?:env|builtin|objaverse):[^@?]*|[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|[^:]*)$"
-"""URLs without a user, a password or a query: whoever may see the server would see them too."""
+_NO_SECRET = (
+    r"^(?:env:TRILIGHT_SOURCE_\w*|(?:builtin|objaverse):[^@?]*"
+    r"|[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|[^:]*)$"
+)
+"""URLs without a user, a password or a query: whoever may see the server would see them too. The
+same holds for variables that are not for sources (pipeline.objects.sources)."""
 
 PublicUrl = Annotated[str, Field(pattern=_NO_SECRET)]
 """A path or URL that may be seen by everybody who sees the server."""

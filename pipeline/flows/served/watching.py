@@ -1,9 +1,11 @@
-"""What people watch on Prefect's page: progress, a table, a link, a summary.
+"""What people watch on Prefect's page: progress, a table, a summary, a picture of the scenes.
 
 It shows what the files say (`trilight status` says the same); nothing is decided by it, and a run
 goes on where it cannot be shown.
 """
 
+import base64
+import io
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -11,7 +13,9 @@ from pathlib import Path
 from typing import cast
 from uuid import UUID
 
+from PIL import Image
 from prefect.artifacts import (
+    create_image_artifact,
     create_link_artifact,
     create_progress_artifact,
     create_table_artifact,
@@ -30,6 +34,8 @@ from storage.safe_url import safe_text
 
 _EVERY_S = 15.0
 """Between two tables; each is a row of Prefect's database."""
+_SHEET_PX = 1024
+"""Longest side of the contact sheet there: about 100 kB."""
 
 
 class Watched:
@@ -119,9 +125,15 @@ class Watched:
         self._percent(100.0 * done / planned)
         rows = [("shards", f"{done} of {planned}"), ("dataset digest", outcome.digest)]
         rows += outcome.statistics.lines() if outcome.statistics else []
-        self._table("summary", rows)
-        if outcome.statistics:
-            create_link_artifact(_report_url(self._order.out), key="report", link_text="report")
+        if outcome.statistics is None:
+            self._table("summary", rows)
+            return
+        # a page of Prefect's server cannot show files of the worker: it says where they are
+        self._table("summary", [*rows, ("report", f"{self._order.out}/report.html")])
+        if url := report_url(self._order.out):
+            create_link_artifact(url, key="report", link_text="report")
+        sheet = small_picture(self._folder.contact_sheet)
+        create_image_artifact(sheet, key="contact-sheet", description=self._order.out)
 
     def _percent(self, percent: float) -> None:
         if self._progress is not None:
@@ -157,8 +169,17 @@ def usd_per_core_hour() -> float:
     return price
 
 
-def _report_url(out: str) -> str:
-    """Return where the report page is: below TRILIGHT_PUBLIC_URL where a server shows datasets."""
+def report_url(out: str) -> str | None:
+    """Return where the report can be opened: below TRILIGHT_PUBLIC_URL, which shows datasets."""
     base = os.environ.get("TRILIGHT_PUBLIC_URL", "").rstrip("/")
-    place = f"{Path(out).name if base else out}/report.html"
-    return f"{base}/{place}" if base else place
+    return f"{base}/{Path(out).name}/report.html" if base else None
+
+
+def small_picture(path: Path) -> str:
+    """Return a picture as a URL that holds it, at most _SHEET_PX wide and high."""
+    stream = io.BytesIO()
+    with Image.open(path) as picture:
+        small = picture.convert("RGB")
+    small.thumbnail((_SHEET_PX, _SHEET_PX))
+    small.save(stream, "JPEG", quality=85)
+    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"

@@ -1,0 +1,161 @@
+"""Prefect's server behind a door: a password, one host name, one origin, files of one's own.
+
+A page that somebody opens in a browser can send requests to this machine's ports, also to those of
+loopback, and Prefect answers any page. So nothing is answered here without the password (but for
+the page that asks for it, and whether the server is healthy), and nothing at all that
+
+- asks for a name that is not this server's: a page of evil.example may let its own name point to
+  127.0.0.1 and is then, for the browser, of the same origin (DNS rebinding). An address cannot be
+  pointed elsewhere, so that addresses are admitted;
+- comes from a page of another origin, whatever it sends: fetch, form or websocket;
+- puts our pages into a frame of its own, to have somebody click in them.
+
+Tokens against forged requests (PREFECT_SERVER_CSRF_PROTECTION_ENABLED) would add nothing: no
+browser sends this password of its own accord, as it is no cookie.
+"""
+
+import argparse
+import contextlib
+import ipaddress
+import os
+import sys
+from collections.abc import Awaitable, Callable, Collection, MutableMapping
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import urlsplit
+
+from pipeline.flows.prefect_server import PASSWORD, quiet_prefect
+from pipeline.isolation import die_with_parent
+from storage.cache import private_folder
+from storage.errors import TrilightError
+
+NAMES = "TRILIGHT_HOST_NAMES"
+"""Variable with the names, between commas, by which the server is known beside localhost."""
+_UNFRAMED = (b"content-security-policy", b"frame-ancestors 'none'")
+
+Scope = MutableMapping[str, Any]
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+
+
+class Application(Protocol):
+    """An application as ASGI has it."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+
+
+class Door:
+    """An application that passes on what may come in, and refuses everything else."""
+
+    def __init__(self, inner: Application, names: Collection[str]) -> None:
+        """Stand before an application.
+
+        Args:
+            inner: what is guarded.
+            names: by which this server is known, beside localhost and addresses.
+        """
+        self._inner = inner
+        self._names = {"localhost", *(name.lower() for name in names)}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection, or refuse it."""
+        if scope["type"] == "lifespan":
+            return await self._inner(scope, receive, send)
+        if refusal := self._refusal(scope["headers"]):
+            return await _refuse(scope["type"], refusal, send)
+
+        async def send_unframed(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message.get("headers", ()), _UNFRAMED]
+            await send(message)
+
+        return await self._inner(scope, receive, send_unframed)
+
+    def _refusal(self, headers: Collection[tuple[bytes, bytes]]) -> str | None:
+        """Return why a request is refused, or None."""
+        hosts, origins = (
+            [value.decode("latin-1").lower() for name, value in headers if name == wanted]
+            for wanted in (b"host", b"origin")
+        )
+        if len(hosts) != 1 or not self._is_ours(hosts[0]):
+            return f"this is no name of this server; set {NAMES} where it has others"
+        if any(origin.partition("://")[2] != hosts[0] for origin in origins):
+            return "pages of other origins are not answered"
+        return None
+
+    def _is_ours(self, host: str) -> bool:
+        with contextlib.suppress(ValueError):
+            name = urlsplit(f"//{host}").hostname or ""
+            if name in self._names:
+                return True
+            return bool(ipaddress.ip_address(name))
+        return False
+
+
+async def _refuse(kind: str, refusal: str, send: Send) -> None:
+    if kind == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": refusal})
+        return
+    headers = [(b"content-type", b"text/plain; charset=utf-8"), _UNFRAMED]
+    await send({"type": "http.response.start", "status": 403, "headers": headers})
+    await send({"type": "http.response.body", "body": refusal.encode()})
+
+
+def serve(host: str, port: int) -> None:
+    """Serve Prefect at an address until this process is told to end.
+
+    What this process writes is for its user only, the database of SQLite too.
+
+    Raises:
+        TrilightError: there is no password.
+    """
+    if not os.environ.get(PASSWORD):
+        raise TrilightError(f"{PASSWORD} is not set; expected USER:PASSWORD.")
+    os.umask(0o077)
+    names = [name for name in os.environ.get(NAMES, "").split(",") if name]
+    quiet_prefect()
+    home = private_folder(Path(os.environ["PREFECT_HOME"]))
+    for database in home.glob("prefect.db*"):
+        database.chmod(0o600)  # of a version that was more generous
+    here = {
+        "PREFECT_UI_API_URL": "/api",  # the page asks where it came from, by whatever name
+        "PREFECT_UI_STATIC_DIRECTORY": str(home / "ui"),  # not in the packages, which others use
+        "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://{host}:{port}",
+    }
+    for variable, value in here.items():
+        os.environ.setdefault(variable, value)
+    import uvicorn
+    from prefect.server.api.server import create_app
+    from prefect.settings import get_current_settings
+
+    settings = get_current_settings()
+    uvicorn.run(
+        Door(create_app(final=True), names),
+        host=host,
+        port=port,
+        log_level=settings.server.logging_level.lower(),
+        timeout_keep_alive=settings.server.api.keepalive_timeout,
+        ws_ping_interval=settings.server.api.websocket_ping_interval,
+        ws_ping_timeout=settings.server.api.websocket_ping_timeout,
+    )
+
+
+def main(arguments: list[str]) -> None:
+    """Serve as the arguments say."""
+    parser = argparse.ArgumentParser(description="Prefect's server, behind a password.")
+    parser.add_argument("--host", default="127.0.0.1", help="address to bind to")
+    parser.add_argument("--port", type=int, default=4200, help="port to listen at")
+    parser.add_argument("--with-parent", action="store_true", help="end when the parent does")
+    given = parser.parse_args(arguments)
+    if given.with_parent:
+        die_with_parent()
+    try:
+        serve(given.host, given.port)
+    except TrilightError as mistake:
+        sys.exit(f"trilight: {mistake}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
