@@ -1,8 +1,9 @@
 """Which of Mitsuba's variants this machine can run, found out by really rendering with it.
 
 LLVM is loaded at run time, and a library that loads may still abort the whole process while it
-compiles (LLVM 15 does, "Cannot select: fminimum"). So each candidate renders a tiny picture in a
-process of its own, without any kernel that another library compiled. The answer is remembered.
+compiles (LLVM 15 does, "Cannot select: fminimum"). So each candidate renders a small picture in a
+process of its own, without any kernel that another library compiled, and must meet the stored one
+within its noise. The answer is remembered.
 
 A graphics card is used only where the user asks for it (TRILIGHT_VARIANT=cuda_ad_rgb), and only
 after the same probe: no figure of this project was measured on one.
@@ -21,6 +22,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, get_args
 
+from pipeline.renders import probe_picture
 from pipeline.renders.llvm_libraries import llvm_libraries
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
@@ -30,6 +32,9 @@ from storage.errors import TrilightError
 _ROOT = Path(__file__).parents[2]
 _PROBE_S = 180
 _REMEMBERED_TRIES = 32
+
+_RAYS_LEFT_OUT = "Disabling this ray tracing operation"
+"""What Dr.Jit says, and no more, where a kernel on a graphics card is too much for OptiX."""
 
 
 VariantName = Literal["llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"]
@@ -73,10 +78,11 @@ def choose_variant() -> Variant:
 
 def _on_graphics_card() -> Variant:
     chosen = Variant(name="cuda_ad_rgb", libllvm="", note="")
-    if not _probe(chosen):
+    problem = _probe(chosen)
+    if problem:
         raise TrilightError(
-            f"{_ASK} is {chosen.name!r}, but no picture could be rendered with it here; "
-            "unset it to render on the processor."
+            f"{_ASK} is {chosen.name!r}, but no right picture could be rendered with it here "
+            f"({problem}); unset it to render on the processor."
         )
     return chosen
 
@@ -120,11 +126,11 @@ def _works(library: Path) -> bool:
     somebody has installed since.
     """
     memory = cache_folder("llvm_probes.json")
-    identity = _identity(library)
+    identity = sha256_hex(canonical_json([_identity(library), probe_picture.TABLE]))
     known = _remembered(memory)
     if identity in known:
         return True
-    if not _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note="")):
+    if _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note="")):
         return False
     with contextlib.suppress(TrilightError):  # remembered next time, or probed again
         recent = [*known, identity][-_REMEMBERED_TRIES:]
@@ -147,8 +153,8 @@ def _identity(library: Path) -> str:
     return sha256_hex(canonical_json([str(library), status.st_mtime_ns, status.st_size, *versions]))
 
 
-def _probe(variant: Variant) -> bool:
-    """Render a tiny picture in a child; an abort, a hang or a wrong picture is a no."""
+def _probe(variant: Variant) -> str:
+    """Render a small picture in a child; return what went wrong, or nothing."""
     with tempfile.TemporaryDirectory() as kernels:
         environment = {**os.environ, "DRJIT_CACHE_DIR": kernels}
         if variant.libllvm:
@@ -159,9 +165,16 @@ def _probe(variant: Variant) -> bool:
                 cwd=_ROOT,
                 env=environment,
                 capture_output=True,
+                text=True,
+                errors="replace",
                 timeout=_PROBE_S,
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            return False
-    return result.returncode == 0
+            return f"no answer within {_PROBE_S} s"
+    if _RAYS_LEFT_OUT in result.stderr:
+        return "Dr.Jit left out some of the rays"
+    if result.returncode == 0:
+        return ""
+    lines = result.stderr.strip().splitlines()
+    return lines[-1] if lines else f"the probe ended with status {result.returncode}"

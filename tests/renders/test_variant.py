@@ -55,12 +55,12 @@ def test_success_is_remembered_and_believed(
     assert choose_variant() == chosen
 
 
-def _must_not_be_asked(variant: Variant) -> bool:
+def _must_not_be_asked(variant: Variant) -> str:
     raise AssertionError(f"{variant} was probed again")
 
 
 def test_where_no_library_works_the_fallback_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(variant_module, "_probe", lambda variant: False)
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: "an abort")
     monkeypatch.setattr(variant_module, "_remembered", lambda memory: [])
     fallback = choose_variant()
     assert (fallback.name, fallback.libllvm) == ("scalar_rgb", "")
@@ -81,13 +81,29 @@ def test_the_user_may_name_the_variant(monkeypatch: pytest.MonkeyPatch, variant:
 
 def test_a_graphics_card_is_used_only_after_a_probe(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
-    monkeypatch.setattr(variant_module, "_probe", lambda variant: variant.name == "cuda_ad_rgb")
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: "")
     assert choose_variant().name == "cuda_ad_rgb"
     monkeypatch.undo()
     monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # hides the cards of a machine that has some
-    with pytest.raises(TrilightError, match="no picture could be rendered"):
+    with pytest.raises(
+        TrilightError, match=r"no right picture could be rendered with it here \(.+\)"
+    ):
         choose_variant()
+
+
+def test_a_picture_without_some_of_its_rays_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dr.Jit warns of it once, while it compiles, and goes on."""
+    warning = "jit_eval(): more than one OptiX shader binding table. Disabling this ray tracing op"
+    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
+    for said, refused in ((warning + "eration to avoid", True), ("another warning", False)):
+        ended = subprocess.CompletedProcess([], 0, stdout="", stderr=said)
+        monkeypatch.setattr(variant_module.subprocess, "run", lambda *_, ended=ended, **__: ended)
+        if refused:
+            with pytest.raises(TrilightError, match="Dr.Jit left out some of the rays"):
+                choose_variant()
+        else:
+            assert choose_variant().name == "cuda_ad_rgb"
 
 
 def test_where_llvm_is_asked_for_and_missing_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
