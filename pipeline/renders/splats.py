@@ -63,5 +63,6 @@ class Splats:
         They stay where the kernels run.
         """
         dr.eval(self._sums, self._broken)
-        sums = mi.Color3d(*self._sums) * dr.opaque(mi.Float64, self._unit)
+        sums: Any = mi.Color3d(*self._sums)
+        sums *= dr.opaque(mi.Float64, self._unit)
         return dr.select(self._broken > 0, dr.nan, sums)

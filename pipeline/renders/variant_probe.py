@@ -4,25 +4,35 @@ LLVM's library is the one of the environment. Ends with status 0 only when the p
 one (pipeline.renders.probe_picture) within its noise. What the scene has, the picture needs: a lamp
 beside the view, a glossy wall that light is reflected by, and a screen that hides and shades what
 is behind it. Where a kernel misses one of its rays to surfaces or emitters, some part is wrong.
+
+On a graphics card it then says on standard output why pictures cannot be denoised there, if so.
 """
 
 import resource
 import sys
+from typing import Literal
 
 import drjit
 import mitsuba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.renders.denoiser import DenoiserDevice, card_is_supported, set_denoiser_device
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from storage.conventions import look_at_c2w
-from storage.scene import Scene, SceneObject
+from storage.scene import ObjectKind, Scene, SceneObject
 
 BLOCK = 4
 """Pixels each way whose mean is compared: of single ones, a few bright samples decide."""
 
 _MOST_DEVIATIONS = 6
 """A right picture is off by so much in one block and channel once in ten million probes."""
+
+_DENOISER_TOLERANCE = 0.02
+"""Of a block's mean: cards compute in half floats, which are exact to 0.0005, through many layers;
+a picture that a card gets wrong is off by far more."""
+
+_DEVICES: tuple[DenoiserDevice, ...] = ("CPU", "CUDA")
 
 
 def main() -> None:
@@ -32,6 +42,8 @@ def main() -> None:
     wrong = wrong_picture()
     if wrong:
         raise SystemExit(wrong)
+    if sys.argv[1] == "cuda_ad_rgb":
+        sys.stdout.write(denoiser_problem())
 
 
 def wrong_picture() -> str:
@@ -50,7 +62,26 @@ def wrong_picture() -> str:
     )
 
 
-def probe_blocks(seed: int) -> tuple[NDArray[np.float64], bool]:
+def denoiser_problem() -> str:
+    """Return why pictures cannot be denoised on the graphics card, or nothing."""
+    if not card_is_supported():
+        return "Open Image Denoise does not support the graphics card"
+    blocks = []
+    for device in _DEVICES:
+        set_denoiser_device(device)
+        try:
+            blocks.append(probe_blocks(seed=0, denoiser="high")[0])
+        except RuntimeError as error:
+            return f"{error} (on {device})"
+    right, found = blocks
+    if (np.abs(found - right) < _DENOISER_TOLERANCE * right).all():
+        return ""
+    return "Open Image Denoise gives another picture on the graphics card"
+
+
+def probe_blocks(
+    seed: int, denoiser: Literal["high", "off"] = "off"
+) -> tuple[NDArray[np.float64], bool]:
     """Return the means [4, 4, 3] of the picture's blocks, and whether all pixels see the scene."""
     from pipeline.renders.renderer import SceneRenderer
     from pipeline.renders.settings import RenderSettings
@@ -60,7 +91,7 @@ def probe_blocks(seed: int) -> tuple[NDArray[np.float64], bool]:
         noise_floor_db=90,
         min_spp=512,
         max_spp=512,
-        denoiser="off",
+        denoiser=denoiser,
         min_mean_radiance=0,
     )
     scene = probe_scene()
@@ -77,7 +108,7 @@ def probe_scene() -> Scene:
         _quad([-0.2, -0.6, 0], [0.9, -0.6, 0], [0.9, -0.6, 0.8], [-0.2, -0.6, 0.8]),
         np.array([[[-0.6, -1.2, 1.9], [0.2, -1.2, 1.9], [-0.2, -0.8, 2.2]]]),
     ]
-    kinds = ("shell", "shell", "object", "emitter")
+    kinds: tuple[ObjectKind, ...] = ("shell", "shell", "object", "emitter")
     rows = np.repeat(np.arange(4), [len(part) for part in parts]).astype(np.uint16)
     corners = np.concatenate(parts)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -118,8 +118,8 @@ class _DeviceSum:
         self._total = dr.opaque(mi.Color3d, 0, camera.resolution**2)
 
     def add(self, *, seed: int, spp: int) -> None:
-        mean = self._tracer._one_pass(self._camera, seed=seed, spp=spp)
-        self._total += mi.Color3d(mean) * dr.opaque(mi.Float64, spp)
+        samples: Any = mi.Color3d(self._tracer._one_pass(self._camera, seed=seed, spp=spp))
+        self._total += samples * dr.opaque(mi.Float64, spp)
         dr.eval(self._total)
 
     def read(self) -> NDArray[np.float64]:
