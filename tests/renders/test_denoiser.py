@@ -84,7 +84,7 @@ class _Card:
         self.opened = list[int]()
         card = self
 
-        class Device(self._oidn.Device):  # type: ignore[misc, name-defined]
+        class Device(self._oidn.Device):  # type: ignore[name-defined]
             def __init__(self, kind: int) -> None:
                 card.opened.append(kind)
                 self.is_card = kind == card._oidn.OIDN_DEVICE_TYPE_CUDA
@@ -105,12 +105,12 @@ class _Card:
             def is_cuda_available(device_id: int = 0) -> bool:
                 return supported
 
-        class Filter(self._oidn.Filter):  # type: ignore[misc, name-defined]
+        class Filter(self._oidn.Filter):  # type: ignore[name-defined]
             def set_image(self, name: str, data: object, *rest: object, **named: object) -> None:
                 assert isinstance(data, card._oidn.Buffer), "a card does not see numpy's memory"
                 super().set_image(name, data, *rest, **named)
 
-        class Buffer(self._oidn.Buffer):  # type: ignore[misc, name-defined]
+        class Buffer(self._oidn.Buffer):  # type: ignore[name-defined]
             def read(self, offset: int, size: int, picture: NDArray[np.float32]) -> None:
                 super().read(offset, size, picture)
                 picture *= brightens if self._device.is_card else 1
