@@ -80,30 +80,39 @@ def _renderer() -> Finding:
     if finding.state == "missing":
         return finding
     variant = choose_variant()
-    if variant.libllvm:
-        found = f"{found}, {variant.name}, {variant.libllvm}"
+    found = ", ".join(part for part in (found, variant.name, variant.libllvm) if part)
+    if variant.name != "scalar_rgb":
         return Finding(name="renderer", state="ok", found=found)
     return Finding(
         name="renderer",
         state="slower",
-        found=f"{found}, {variant.name}",
+        found=found,
         consequence=variant.note,
         mend=f"{_APT} libllvm19",
     )
 
 
 def _denoiser() -> Finding:
-    facts = render_facts(choose_variant())
-    if "denoiser" in facts:
-        found = f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads"
-        return Finding(name="denoiser", state="ok", found=found)
-    return Finding(
-        name="denoiser",
-        state="missing",
-        found=f"pyoidn {facts['pyoidn']} does not answer",
-        consequence="pictures cannot be denoised",
-        mend="make setup",
-    )
+    variant = choose_variant()
+    facts = render_facts(variant)
+    if "denoiser" not in facts:
+        return Finding(
+            name="denoiser",
+            state="missing",
+            found=f"pyoidn {facts['pyoidn']} does not answer",
+            consequence="pictures cannot be denoised",
+            mend="make setup",
+        )
+    found = f"OIDN {facts['denoiser']}, {facts['denoiser_device']}, {facts['threads']} threads"
+    if variant.name == "cuda_ad_rgb" and variant.note:
+        return Finding(
+            name="denoiser",
+            state="slower",
+            found=found,
+            consequence=variant.note,
+            mend="a newer driver, or a card from compute capability 7.5 on",
+        )
+    return Finding(name="denoiser", state="ok", found=found)
 
 
 def _mesh_decimation() -> Finding:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from storage.conventions import EMISSION, MATERIAL_WIDTH, log10_radiance
 from storage.errors import TrilightError
-from storage.scene import Scene
+from storage.scene import MAX_POSITION_M, Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,11 +82,6 @@ class SceneBatch:
         return Cameras(c2w_BV44=self.c2w_BV44, fov_deg_BV=self.fov_deg_BV)
 
 
-MAX_POSITION_M = 1000.0
-"""Farthest coordinate that is read. At 11 radians per metre, float32 knows the rotary angles of
-positions so far out to half a thousandth of a radian, and beyond them no better."""
-
-
 def scene_tensors(scene: Scene) -> SceneTensors:
     """Return the tensors of a scene that passes `Scene.check`; its arrays stay unchanged.
 
@@ -94,7 +89,7 @@ def scene_tensors(scene: Scene) -> SceneTensors:
         TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis.
     """
     farthest = np.abs(scene.vertex_positions).max()
-    if farthest > MAX_POSITION_M:
+    if not farthest <= MAX_POSITION_M:  # not a number is no place either
         raise TrilightError(
             f"scene: a vertex stands {farthest:g} m from the origin; the network reads up to "
             f"{MAX_POSITION_M:g} m. Move the scene, with its cameras, towards the origin."

@@ -5,7 +5,8 @@ The file itself says how it is packed, so a reader need not be told. Which codec
 """
 
 import io
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,10 @@ from storage.ranges import FLOAT32_MAX, Within
 
 MAX_RESOLUTION = 8192
 """A larger window in a file from outside is refused before any memory is taken."""
+
+_MAX_BYTES = 3 << 30
+"""And so are more bytes of pixels: 64 lights of 2048 x 2048, the most that is ever written, take
+this much at the 4 bytes which a value has at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +47,9 @@ ZIP = ExrCodec(compression="ZIP")
 _LOSSY = frozenset(
     getattr(OpenEXR, f"{name}_COMPRESSION") for name in ("B44", "B44A", "DWAA", "DWAB", "LJ2K")
 )
+
+_MOST_LISTED = 6
+"""Names of channels in a message."""
 
 _HALF = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
 _NOT_NEGATIVE = np.where(_HALF < 0, np.float32(0), _HALF)
@@ -129,18 +137,12 @@ def decode_exr(data: bytes) -> NDArray[np.float32]:
     Where the file is packed with losses, what they took below 0 is 0 again.
 
     Raises:
-        TrilightError: not an EXR file, truncated, larger than MAX_RESOLUTION, or without RGB.
+        TrilightError: not an EXR file, truncated, larger than MAX_RESOLUTION, or with other
+            channels than R, G and B.
     """
     header: dict[str, Any] = {}
-
-    def check(found: Header) -> None:
-        _check_window(found)
-        header.update(found)
-
-    channels = decode_channels(data, check)
-    if "RGB" not in channels:
-        raise TrilightError(f"picture: channels are {sorted(channels)}; expected R, G and B.")
-    pixels, lossy = channels["RGB"], header["compression"] in _LOSSY
+    pixels = decode_channels(data, "RGB", header.update)["RGB"]
+    lossy = header["compression"] in _LOSSY
     if pixels.dtype != np.float16:  # other tools write float32
         return np.asarray(np.maximum(pixels, 0) if lossy else pixels, np.float32)
     table = _NOT_NEGATIVE if lossy else _HALF
@@ -149,20 +151,33 @@ def decode_exr(data: bytes) -> NDArray[np.float32]:
 
 
 def decode_channels(
-    data: bytes, check: Callable[[Header], None], *, separate: bool = False
+    data: bytes,
+    names: Collection[str],
+    check: Callable[[Header], None],
+    *,
+    separate: bool = False,
 ) -> dict[str, NDArray]:
     """Return the channels of an OpenEXR file by name, R, G and B as one unless `separate`.
 
+    The library takes memory for all that a file's headers speak of, and small files can speak of
+    much: no pixel is read before the headers are what is expected.
+
     Args:
         data: the file.
+        names: of the channels that it must have.
         check: called with the header before any pixel is read; raises TrilightError.
         separate: keep R, G and B apart.
 
     Raises:
-        TrilightError: not an EXR file, truncated, or refused by `check`.
+        TrilightError: not an EXR file, truncated, of several parts, with other channels, larger
+            than MAX_RESOLUTION, of more than 3 GiB, or refused by `check`.
     """
     try:
-        check(OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header())
+        parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
+        if len(parts) != 1:
+            raise TrilightError(f"picture: the file has {len(parts)} parts; expected one.")
+        check(parts[0].header)
+        _check_pixels(parts[0].header, names)
         file = OpenEXR.File(io.BytesIO(data), num_threads=0, separate_channels=separate)
         return {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, KeyError) as error:
@@ -177,10 +192,28 @@ def window_size(header: Header) -> tuple[int, int]:
     return bottom - top + 1, right - left + 1
 
 
-def _check_window(header: Header) -> None:
+def _check_pixels(header: Header, names: Collection[str]) -> None:
+    """Refuse pixels that are not expected, or that take too much memory."""
+    found, wanted = sorted(channel.name for channel in header["channels"]), sorted(names)
+    if found != wanted:
+        raise TrilightError(f"picture: channels are {_listed(found)}; expected {_listed(wanted)}.")
+    if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
+        raise TrilightError(f"picture: its storage is {header['type']}; expected lines or tiles.")
     size = window_size(header)
     if max(size) > MAX_RESOLUTION:
         raise TrilightError(
             f"picture: the data window spans {list(size)} pixels; expected at most "
             f"{MAX_RESOLUTION} each way."
         )
+    most_bytes = 4 * len(found) * math.prod(size)
+    if most_bytes > _MAX_BYTES:
+        raise TrilightError(
+            f"picture: {len(found)} channels of {list(size)} pixels may take {most_bytes} bytes; "
+            f"expected at most {_MAX_BYTES}."
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    if len(names) <= _MOST_LISTED:
+        return ", ".join(names) or "none"
+    return f"{', '.join(names[:_MOST_LISTED])} and {len(names) - _MOST_LISTED} more"

@@ -72,20 +72,17 @@ def decode_lights_exr(data: bytes, shape: tuple[int, int, int]) -> NDArray[np.fl
         TrilightError: not an EXR file, truncated, or with other channels or another size.
     """
     num, height, width = shape
+    if num > MAX_LIGHTS:
+        raise TrilightError(f"lights: {num} emitters; expected at most {MAX_LIGHTS}.")
     names = [f"light{i}.{name}" for i in range(num) for name in "RGB"]
 
     def check(header: Header) -> None:
-        if num > MAX_LIGHTS or {channel.name for channel in header["channels"]} != set(names):
-            raise TrilightError(
-                f"lights: {len(header['channels'])} channels; expected light<i>.R, .G and .B of "
-                f"{num} emitters, at most {MAX_LIGHTS}."
-            )
         if window_size(header) != (height, width):
             raise TrilightError(
                 f"lights: {list(window_size(header))} pixels; expected {[height, width]}."
             )
 
-    channels = decode_channels(data, check, separate=True)
+    channels = decode_channels(data, names, check, separate=True)
     if any(channel.shape != (height, width) for channel in channels.values()):
         raise TrilightError(f"lights: a channel is no {[height, width]} pixels; expected all.")
     planes = np.stack([np.asarray(channels[name], np.float32) for name in names])

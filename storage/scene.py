@@ -31,6 +31,14 @@ POSE_TOLERANCE = 1e-4
 FINITE = Within(-FLOAT32_MAX, FLOAT32_MAX)
 """Any float32 but NaN and infinity."""
 
+MAX_POSITION_M = 1000.0
+"""Farthest coordinate of a vertex. At 11 radians per metre, float32 knows the rotary angles of the
+network for positions so far out to half a thousandth of a radian, and path tracers know such points
+to 0.06 mm. Far beyond, both make wrong pictures without a word."""
+
+POSITION = Within(-MAX_POSITION_M, MAX_POSITION_M, unit="m")
+"""Of a vertex along an axis."""
+
 COMPONENT = Within(-1 - UNIT_NORMAL_TOLERANCE, 1 + UNIT_NORMAL_TOLERANCE)
 """Of a unit vector."""
 
@@ -57,8 +65,8 @@ class SceneObject:
 class Scene:
     """A triangle scene with palette materials, emitters and cameras, in world space."""
 
-    vertex_positions: Annotated[NDArray[np.float32], FINITE]
-    """[V, 3] world units."""
+    vertex_positions: Annotated[NDArray[np.float32], POSITION]
+    """[V, 3] world units, metres."""
     vertex_normals: Annotated[NDArray[np.float32], COMPONENT]
     """[V, 3] unit shading normals; a flat face has three vertices of its own."""
     faces: Annotated[NDArray[np.uint32], Within(0, 2**32 - 1)]

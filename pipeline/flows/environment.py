@@ -25,7 +25,10 @@ _VECTOR_EXTENSIONS = ("avx512f", "avx2", "sse4_2", "asimd")
 
 def environment(variant: Variant) -> dict[str, Any]:
     """Return what a dataset must agree on to keep its digest, as JSON values."""
+    # Only where it is not the processor: what was made before this could be said stays the same.
+    on_card = {} if variant.denoiser == "CPU" else {"denoiser_device": variant.denoiser}
     return {
+        **on_card,
         "mitsuba_variant": variant.name,
         "llvm": Path(variant.libllvm).name,
         "processor": f"{platform.machine()} {vector_extension()}".strip(),

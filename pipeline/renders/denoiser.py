@@ -6,6 +6,7 @@ same here: with clean auxiliary pictures `high` is 1.6 dB better on sampled scen
 
 import functools
 import importlib
+import math
 import sys
 from typing import Any, Literal
 
@@ -19,14 +20,26 @@ Quality = Literal["high", "fast"]
 _QUALITIES = {"high": "OIDN_QUALITY_HIGH", "fast": "OIDN_QUALITY_FAST"}
 _INPUTS = ("color", "albedo", "normal")
 
+DenoiserDevice = Literal["CPU", "CUDA"]
+"""What Open Image Denoise runs on. It knows other makers' cards, but Mitsuba renders on none."""
+
 _threads = 0
 """Threads of filters made from now on; 0 is all cores."""
+
+_device: DenoiserDevice = "CPU"
+"""What filters run on that are made from now on."""
 
 
 def set_denoiser_threads(count: int) -> None:
     """Use `count` threads for every picture from now on."""
     global _threads
     _threads = count
+
+
+def set_denoiser_device(device: DenoiserDevice) -> None:
+    """Denoise every picture from now on there."""
+    global _device
+    _device = device
 
 
 def denoise(
@@ -44,7 +57,7 @@ def denoise(
     """
     if not radiance_rgb.any():
         return np.zeros_like(radiance_rgb)  # the filter would paint the albedo, up to 0.003 bright
-    filtered = _filter(radiance_rgb.shape[0], quality, _threads)
+    filtered = _filter(radiance_rgb.shape[0], quality, _device, _threads)
     inputs = (radiance_rgb, features.albedo, features.normal)
     picture = filtered.run(dict(zip(_INPUTS, inputs, strict=True)))
     met = np.any(features.normal != 0, axis=-1) | np.any(radiance_rgb != 0, axis=-1)
@@ -52,43 +65,71 @@ def denoise(
 
 
 class _Filter:
-    """One committed filter with the memory that it reads and writes."""
+    """One committed filter with the memory that it reads and writes, which is the device's own."""
 
-    def __init__(self, resolution: int, quality: Quality, threads: int) -> None:
+    def __init__(
+        self, resolution: int, quality: Quality, device: DenoiserDevice, threads: int
+    ) -> None:
         oidn = load_oidn()
-        self._device = oidn.Device(oidn.OIDN_DEVICE_TYPE_CPU)
-        if threads:
-            self._device.set_int("numThreads", threads)
-        # Pinned threads of two workers would share the same cores.
-        self._device.set_bool("setAffinity", False)
-        self._device.commit()
+        self._device = open_device(device, threads)
         self._filter = oidn.Filter(self._device, oidn.OIDN_FILTER_TYPE_RT)
-        shape = (resolution, resolution, 3)
-        self._memory = {name: np.zeros(shape, np.float32) for name in (*_INPUTS, "output")}
+        self._shape = (resolution, resolution, 3)
+        self._bytes = 4 * math.prod(self._shape)
+        self._memory = {
+            name: oidn.Buffer(self._device, self._bytes) for name in (*_INPUTS, "output")
+        }
         for name, memory in self._memory.items():
-            self._filter.set_image(name, memory, oidn.OIDN_FORMAT_FLOAT3)
+            size = {"width": resolution, "height": resolution}
+            self._filter.set_image(name, memory, oidn.OIDN_FORMAT_FLOAT3, **size)
         self._filter.set_bool("hdr", True)
         self._filter.set_bool("cleanAux", True)
         self._filter.set_quality(getattr(oidn, _QUALITIES[quality]))
         self._filter.commit()
-        self._check()
+        _check(self._device)
 
     def run(self, inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
         for name, values in inputs.items():
-            self._memory[name][...] = values
+            self._memory[name].write(0, self._bytes, np.ascontiguousarray(values, np.float32))
         self._filter.execute()
-        self._check()
-        return self._memory["output"].copy()
+        picture = np.zeros(self._shape, np.float32)
+        self._memory["output"].read(0, self._bytes, picture)
+        _check(self._device)
+        return picture
 
-    def _check(self) -> None:
-        message = self._device.get_error()
-        if message is not None:
-            raise RuntimeError(f"Open Image Denoise: {message}")
+
+def open_device(device: DenoiserDevice, threads: int = 0) -> Any:
+    """Return a device of Open Image Denoise; raises RuntimeError where there is none.
+
+    Args:
+        device: what it runs on. A card is the first one, on which Mitsuba renders too.
+        threads: of the processor; 0 is all cores.
+    """
+    oidn = load_oidn()
+    opened = oidn.Device(getattr(oidn, f"OIDN_DEVICE_TYPE_{device}"))
+    if device == "CPU":
+        if threads:
+            opened.set_int("numThreads", threads)
+        # Pinned threads of two workers would share the same cores.
+        opened.set_bool("setAffinity", False)
+    opened.commit()
+    _check(opened)
+    return opened
+
+
+def card_is_supported() -> bool:
+    """Return whether Open Image Denoise can run on the first graphics card (CUDA)."""
+    return bool(load_oidn().Device.is_cuda_available())
+
+
+def _check(device: Any) -> None:
+    message = device.get_error()
+    if message is not None:
+        raise RuntimeError(f"Open Image Denoise: {message}")
 
 
 @functools.cache
-def _filter(resolution: int, quality: Quality, threads: int) -> _Filter:
-    return _Filter(resolution, quality, threads)
+def _filter(resolution: int, quality: Quality, device: DenoiserDevice, threads: int) -> _Filter:
+    return _Filter(resolution, quality, device, threads)
 
 
 def load_oidn() -> Any:

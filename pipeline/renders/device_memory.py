@@ -1,4 +1,4 @@
-"""Arrays that kernels gather from, in memory that Dr.Jit allocated itself."""
+"""Between numpy's memory and Dr.Jit's: arrays that kernels gather from, and what comes back."""
 
 from typing import Any
 
@@ -18,3 +18,12 @@ def own_floats(values: NDArray) -> Any:
     copy = mi.Float(flat) * dr.opaque(mi.Float, 1)  # exact, and not simplified away
     dr.eval(copy)
     return copy
+
+
+def read_back(values: Any) -> NDArray:
+    """Return an array of Dr.Jit, or the components of a vector of arrays side by side, flat.
+
+    This waits for all kernels that were launched before, so it is done where a number is needed,
+    and never in between.
+    """
+    return np.array(dr.ravel(values))

@@ -14,18 +14,16 @@ _ASK_S = 120
 
 _QUESTION = """
 import json, sys
-from pipeline.renders.denoiser import load_oidn
+from pipeline.renders.denoiser import open_device
 from pipeline.renders.variant import Variant, activate
 variant = Variant(**json.loads(sys.argv[1]))
 activate(variant)
 import drjit
-device = (oidn := load_oidn()).Device(oidn.OIDN_DEVICE_TYPE_CPU)
-device.commit()
-version = device.get_int("version")
+version = open_device(variant.denoiser).get_int("version")
 print(json.dumps({
     "threads": str(drjit.thread_count()),
     "denoiser": f"{version // 10000}.{version // 100 % 100}.{version % 100}",
-    "denoiser_device": "CPU" if device.get_error() is None else "none",
+    "denoiser_device": variant.denoiser,
 }))
 """
 

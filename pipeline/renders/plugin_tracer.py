@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.plugin_scene import plugin_feature_scene, plugin_scene
-from pipeline.renders.tracer import Features
+from pipeline.renders.tracer import Features, HostSum
 from storage.scene import Scene
 
 _BLOCK_SIZE = 8
@@ -47,6 +47,9 @@ class PluginTracer:
 
     def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
         return _render(self._scene, self._path, camera, seed=seed, spp=spp)
+
+    def pass_sum(self, camera: Camera) -> HostSum:
+        return HostSum(self, camera)
 
     def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
         channels = _render(self._feature_scene, self._features, camera, seed=seed, spp=spp)

@@ -31,10 +31,10 @@ class HalfSamples:
             first_spp: samples per pixel of the first measurement, both halves together.
             max_spp: the most that will be asked for.
         """
-        self._parts, self._camera, self._seed = parts, camera, seed
+        self._seed = seed
         self._first, self._most = first_spp // 2, max_spp // 2
-        shape = (len(parts), camera.resolution, camera.resolution, 3)
-        self._sums = [np.zeros(shape), np.zeros(shape)]
+        self._sums = [[part.pass_sum(camera) for part in parts] for _ in range(2)]
+        self._read: list[NDArray[np.float64]] = []
         self._half_spp = [0, 0]
         self._passes = 0
 
@@ -57,31 +57,39 @@ class HalfSamples:
     def passes_to(self, spp: int) -> Iterator[None]:
         """Add passes to both halves until there are `spp` samples at least, yielding after each.
 
-        Raises:
-            Rejected: "nonfinite_radiance" where a raw sample is not finite.
+        Nothing waits for a pass to be finished before a mean is asked for.
         """
         while self.spp < spp:
             size = self.pass_spp
-            for half, total in enumerate(self._sums):
+            for half, parts in enumerate(self._sums):
                 seed = seed_for(self._seed, "pass", self._passes, half)
-                for part, tracer in enumerate(self._parts):
-                    total[part] += size * self._one_pass(tracer, seed, size)
+                for part in parts:
+                    part.add(seed=seed, spp=size)
                 self._half_spp[half] += size
+                self._read = []
                 yield
             self._passes += 1
 
     def half_means(self) -> list[NDArray[np.float32]]:
-        """Return the mean of each half, [P, R, R, 3]."""
-        pairs = zip(self._sums, self._half_spp, strict=True)
+        """Return the mean of each half, [P, R, R, 3]; raises as `mean`."""
+        pairs = zip(self._totals(), self._half_spp, strict=True)
         return [(total / spp).astype(np.float32) for total, spp in pairs]
 
     def mean(self) -> NDArray[np.float32]:
-        """Return the mean of all samples, [P, R, R, 3]."""
-        return ((self._sums[0] + self._sums[1]) / self.spp).astype(np.float32)
+        """Return the mean of all samples, [P, R, R, 3].
 
-    def _one_pass(self, tracer: Tracer, seed: int, spp: int) -> NDArray[np.float32]:
-        radiance_rgb = tracer.radiance(self._camera, seed=seed, spp=spp)
-        if not np.isfinite(radiance_rgb).all():
-            count = int((~np.isfinite(radiance_rgb)).any(axis=-1).sum())
-            raise Rejected("nonfinite_radiance", f"{count} pixels of raw samples")
-        return radiance_rgb
+        Raises:
+            Rejected: "nonfinite_radiance" where a raw sample is not finite.
+        """
+        first, second = self._totals()
+        return ((first + second) / self.spp).astype(np.float32)
+
+    def _totals(self) -> list[NDArray[np.float64]]:
+        """Return the sums of both halves, [P, R, R, 3], read back once after each pass."""
+        if not self._read:
+            totals = [np.stack([part.read() for part in parts]) for parts in self._sums]
+            broken = ~np.isfinite(totals).all(axis=(0, 1, -1))
+            if broken.any():
+                raise Rejected("nonfinite_radiance", f"{broken.sum()} pixels of raw samples")
+            self._read = totals
+        return self._read

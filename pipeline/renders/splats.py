@@ -10,8 +10,6 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-from numpy.typing import NDArray
 
 from storage.conventions import EMISSION
 from storage.scene import Scene
@@ -42,7 +40,7 @@ class Splats:
             resolution: width and height in pixels.
             unit: from `splat_unit`.
         """
-        self._resolution, self._unit = resolution, unit
+        self._unit = unit
         self._per_unit = dr.opaque(mi.Float, 1 / unit)
         self._sums = [dr.zeros(mi.UInt64, resolution**2) for _ in range(3)]
         self._broken = dr.zeros(mi.UInt32, resolution**2)
@@ -59,9 +57,12 @@ class Splats:
             dr.scatter_reduce(add, total, rounded, pixel, active & fits, mode=direct)
         dr.scatter_reduce(add, self._broken, mi.UInt32(1), pixel, active & ~fits, mode=direct)
 
-    def picture(self) -> NDArray[np.float64]:
-        """Return the sums, [R, R, 3]; NaN where a splat was not finite or far too large."""
+    def picture(self) -> Any:
+        """Return the sums (Color3d), pixel by pixel; NaN where a splat was not finite or too large.
+
+        They stay where the kernels run.
+        """
         dr.eval(self._sums, self._broken)
-        sums = np.stack([np.array(total) for total in self._sums], axis=-1) * self._unit
-        sums[np.array(self._broken) > 0] = np.nan
-        return sums.reshape(self._resolution, self._resolution, 3)
+        sums: Any = mi.Color3d(*self._sums)
+        sums *= dr.opaque(mi.Float64, self._unit)
+        return dr.select(self._broken > 0, dr.nan, sums)

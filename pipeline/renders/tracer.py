@@ -25,6 +25,21 @@ class Features:
     """[R, R, 3] its shading normal in world space, 0 where there is none."""
 
 
+class PassSum(Protocol):
+    """The growing sum of the passes of one view, in the memory where they are traced."""
+
+    def add(self, *, seed: int, spp: int) -> None:
+        """Add all samples of one pass: `Tracer.radiance` times `spp`. It may return before."""
+        ...
+
+    def read(self) -> NDArray[np.float64]:
+        """Return the sum over all samples, [R, R, 3]; not finite where any sample was not.
+
+        It waits until they are traced, and equals the sum in float64 of the passes, one by one.
+        """
+        ...
+
+
 class Tracer(Protocol):
     """One loaded scene. Emitters are hidden from camera rays in everything that it returns."""
 
@@ -50,6 +65,10 @@ class Tracer(Protocol):
         """
         ...
 
+    def pass_sum(self, camera: Camera) -> PassSum:
+        """Return an empty sum of passes of a view."""
+        ...
+
     def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
         """Return the albedo and normal pictures."""
         ...
@@ -57,6 +76,20 @@ class Tracer(Protocol):
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
         """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
         ...
+
+
+class HostSum:
+    """A `PassSum` in numpy's memory, of a tracer whose passes come there anyway."""
+
+    def __init__(self, tracer: Tracer, camera: Camera) -> None:
+        self._tracer, self._camera = tracer, camera
+        self._total = np.zeros((camera.resolution, camera.resolution, 3))
+
+    def add(self, *, seed: int, spp: int) -> None:
+        self._total += spp * self._tracer.radiance(self._camera, seed=seed, spp=spp)
+
+    def read(self) -> NDArray[np.float64]:
+        return self._total.copy()
 
 
 def split_triangles(scene: Scene) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -1,16 +1,19 @@
 """Which of Mitsuba's variants this machine can run, found out by really rendering with it.
 
 LLVM is loaded at run time, and a library that loads may still abort the whole process while it
-compiles (LLVM 15 does, "Cannot select: fminimum"). So each candidate renders a tiny picture in a
-process of its own, without any kernel that another library compiled. The answer is remembered.
+compiles (LLVM 15 does, "Cannot select: fminimum"). So each candidate renders a small picture in a
+process of its own, without any kernel that another library compiled, and must meet the stored one
+within its noise. The answer is remembered.
 
 A graphics card is used only where the user asks for it (TRILIGHT_VARIANT=cuda_ad_rgb), and only
-after the same probe: no figure of this project was measured on one.
+after the same probe: no figure of this project was measured on one. It denoises too, where Open
+Image Denoise gives the picture there that it gives on the processor.
 
 Nothing here imports mitsuba, except `activate`.
 """
 
 import contextlib
+import dataclasses
 import json
 import os
 import subprocess
@@ -21,6 +24,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, get_args
 
+from pipeline.renders import probe_picture
+from pipeline.renders.denoiser import DenoiserDevice, set_denoiser_device
 from pipeline.renders.llvm_libraries import llvm_libraries
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
@@ -30,6 +35,9 @@ from storage.errors import TrilightError
 _ROOT = Path(__file__).parents[2]
 _PROBE_S = 180
 _REMEMBERED_TRIES = 32
+
+_RAYS_LEFT_OUT = "Disabling this ray tracing operation"
+"""What Dr.Jit says, and no more, where a kernel on a graphics card is too much for OptiX."""
 
 
 VariantName = Literal["llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"]
@@ -46,7 +54,9 @@ class Variant:
     libllvm: str
     """The LLVM library that it compiles with; empty for the others."""
     note: str
-    """One sentence for the user where this is the slow fallback, else empty."""
+    """What is slower than it could be, for the user, else empty."""
+    denoiser: DenoiserDevice = "CPU"
+    """What Open Image Denoise runs on."""
 
 
 def choose_variant() -> Variant:
@@ -72,13 +82,17 @@ def choose_variant() -> Variant:
 
 
 def _on_graphics_card() -> Variant:
-    chosen = Variant(name="cuda_ad_rgb", libllvm="", note="")
-    if not _probe(chosen):
+    card = Variant(name="cuda_ad_rgb", libllvm="", note="", denoiser="CUDA")
+    found = _probe(card)
+    if found.problem:
         raise TrilightError(
-            f"{_ASK} is {chosen.name!r}, but no picture could be rendered with it here; "
-            "unset it to render on the processor."
+            f"{_ASK} is {card.name!r}, but no right picture could be rendered with it here "
+            f"({found.problem}); unset it to render on the processor."
         )
-    return chosen
+    if not found.denoiser_problem:
+        return card
+    note = f"{found.denoiser_problem}, so pictures are denoised on the processor"
+    return dataclasses.replace(card, denoiser="CPU", note=note)
 
 
 def _on_processor() -> Variant:
@@ -111,6 +125,7 @@ def activate(variant: Variant) -> None:
 
     mitsuba.set_variant(variant.name)
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
+    set_denoiser_device(variant.denoiser)
 
 
 def _works(library: Path) -> bool:
@@ -120,11 +135,11 @@ def _works(library: Path) -> bool:
     somebody has installed since.
     """
     memory = cache_folder("llvm_probes.json")
-    identity = _identity(library)
+    identity = sha256_hex(canonical_json([_identity(library), probe_picture.TABLE]))
     known = _remembered(memory)
     if identity in known:
         return True
-    if not _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note="")):
+    if _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note="")).problem:
         return False
     with contextlib.suppress(TrilightError):  # remembered next time, or probed again
         recent = [*known, identity][-_REMEMBERED_TRIES:]
@@ -147,8 +162,18 @@ def _identity(library: Path) -> str:
     return sha256_hex(canonical_json([str(library), status.st_mtime_ns, status.st_size, *versions]))
 
 
-def _probe(variant: Variant) -> bool:
-    """Render a tiny picture in a child; an abort, a hang or a wrong picture is a no."""
+@dataclass(frozen=True, kw_only=True)
+class _Probed:
+    """What a probe found."""
+
+    problem: str = ""
+    """Why the variant cannot be used; empty where it can."""
+    denoiser_problem: str = ""
+    """Why its card cannot denoise; empty where it can, or where there is no card."""
+
+
+def _probe(variant: Variant) -> _Probed:
+    """Render a small picture in a child; an abort, a hang or a wrong picture is a problem."""
     with tempfile.TemporaryDirectory() as kernels:
         environment = {**os.environ, "DRJIT_CACHE_DIR": kernels}
         if variant.libllvm:
@@ -159,9 +184,16 @@ def _probe(variant: Variant) -> bool:
                 cwd=_ROOT,
                 env=environment,
                 capture_output=True,
+                text=True,
+                errors="replace",
                 timeout=_PROBE_S,
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            return False
-    return result.returncode == 0
+            return _Probed(problem=f"no answer within {_PROBE_S} s")
+    if _RAYS_LEFT_OUT in result.stderr:
+        return _Probed(problem="Dr.Jit left out some of the rays")
+    if result.returncode == 0:
+        return _Probed(denoiser_problem=result.stdout.strip())
+    lines = result.stderr.strip().splitlines()
+    return _Probed(problem=lines[-1] if lines else f"it ended with status {result.returncode}")

@@ -1,54 +1,144 @@
-"""Run as a process of its own: renders a tiny picture with the variant that its argument names.
+"""Run as a process of its own: renders a small picture with the variant that its argument names.
 
-LLVM's library is the one of the environment. Ends with status 0 only when the picture is as bright
-as it must be: a white light above the middle of a grey floor, seen from the side.
+LLVM's library is the one of the environment. Ends with status 0 only when the picture is the right
+one (pipeline.renders.probe_picture) within its noise. What the scene has, the picture needs: a lamp
+beside the view, a glossy wall that light is reflected by, and a screen that hides and shades what
+is behind it. Where a kernel misses one of its rays to surfaces or emitters, some part is wrong.
+
+On a graphics card it then says on standard output why pictures cannot be denoised there, if so.
 """
 
 import resource
 import sys
+from typing import Literal
 
+import drjit
 import mitsuba
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from pipeline.renders.denoiser import DenoiserDevice, card_is_supported, set_denoiser_device
+from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from storage.conventions import look_at_c2w
-from storage.scene import Scene, SceneObject
+from storage.scene import ObjectKind, Scene, SceneObject
+
+BLOCK = 4
+"""Pixels each way whose mean is compared: of single ones, a few bright samples decide."""
+
+_MOST_DEVIATIONS = 6
+"""A right picture is off by so much in one block and channel once in ten million probes."""
+
+_DENOISER_TOLERANCE = 0.02
+"""Of a block's mean: cards compute in half floats, which are exact to 0.0005, through many layers;
+a picture that a card gets wrong is off by far more."""
+
+_DEVICES: tuple[DenoiserDevice, ...] = ("CPU", "CUDA")
 
 
 def main() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # an abort is an answer, not an accident
     mitsuba.set_variant(sys.argv[1])
+    drjit.set_log_level(drjit.LogLevel.Warn)  # of rays that it leaves out, Dr.Jit says no more
+    wrong = wrong_picture()
+    if wrong:
+        raise SystemExit(wrong)
+    if sys.argv[1] == "cuda_ad_rgb":
+        sys.stdout.write(denoiser_problem())
+
+
+def wrong_picture() -> str:
+    """Return what is wrong with the picture that is rendered here, or nothing."""
+    blocks, all_hit = probe_blocks(seed=0)
+    if not all_hit:
+        return "rays of the camera miss the scene"
+    deviations = np.abs(blocks - MEAN_RGB) / DEVIATION_RGB
+    if (deviations < _MOST_DEVIATIONS).all():  # a comparison that no NaN passes
+        return ""
+    row, column, channel = np.unravel_index(np.argmax(deviations), deviations.shape)
+    return (
+        f"a wrong picture: block {row}, {column} has a {'RGB'[channel]} of "
+        f"{blocks[row, column, channel]:.4g}; expected {MEAN_RGB[row, column, channel]:.4g} with a "
+        f"standard deviation of {DEVIATION_RGB[row, column, channel]:.2g}"
+    )
+
+
+def denoiser_problem() -> str:
+    """Return why pictures cannot be denoised on the graphics card, or nothing."""
+    if not card_is_supported():
+        return "Open Image Denoise does not support the graphics card"
+    blocks = []
+    for device in _DEVICES:
+        set_denoiser_device(device)
+        try:
+            blocks.append(probe_blocks(seed=0, denoiser="high")[0])
+        except RuntimeError as error:
+            return f"{error} (on {device})"
+    right, found = blocks
+    if (np.abs(found - right) < _DENOISER_TOLERANCE * right).all():
+        return ""
+    return "Open Image Denoise gives another picture on the graphics card"
+
+
+def probe_blocks(
+    seed: int, denoiser: Literal["high", "off"] = "off"
+) -> tuple[NDArray[np.float64], bool]:
+    """Return the means [4, 4, 3] of the picture's blocks, and whether all pixels see the scene."""
     from pipeline.renders.renderer import SceneRenderer
     from pipeline.renders.settings import RenderSettings
 
     settings = RenderSettings(
-        resolution=8, noise_floor_db=20, min_spp=32, max_spp=32, aux_spp=16, denoiser="off"
+        resolution=4 * BLOCK,
+        noise_floor_db=90,
+        min_spp=512,
+        max_spp=512,
+        denoiser=denoiser,
+        min_mean_radiance=0,
     )
-    scene = _scene()
-    view = SceneRenderer(scene, settings).render_view(scene.c2w[0], 40.0, seed=0)
-    if not (view.hits.all() and 0.01 < float(view.radiance_rgb.mean()) < 1):
-        raise SystemExit(f"wrong picture: mean {view.radiance_rgb.mean()}")
+    scene = probe_scene()
+    view = SceneRenderer(scene, settings).render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
+    cells = view.radiance_rgb.astype(np.float64).reshape(4, BLOCK, 4, BLOCK, 3)
+    return cells.mean(axis=(1, 3)), bool(view.hits.all())
 
 
-def _scene() -> Scene:
-    positions = [[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0], [0, 0, 3], [1, 0, 3], [0, 1, 3]]
-    materials = np.zeros((2, 10), np.float32)
-    materials[0] = [0.4, 0.4, 0.4, 0.4, 0.4, 0.4, 0.5, 0, 0, 0]
-    materials[1, 7:] = 10
+def probe_scene() -> Scene:
+    """Return a floor, a glossy wall behind it, a screen in front of both, and a lamp above."""
+    parts = [
+        _quad([-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]),
+        _quad([-3, 1, 0], [3, 1, 0], [3, 1, 5], [-3, 1, 5]),
+        _quad([-0.2, -0.6, 0], [0.9, -0.6, 0], [0.9, -0.6, 0.8], [-0.2, -0.6, 0.8]),
+        np.array([[[-0.6, -1.2, 1.9], [0.2, -1.2, 1.9], [-0.2, -0.8, 2.2]]]),
+    ]
+    kinds: tuple[ObjectKind, ...] = ("shell", "shell", "object", "emitter")
+    rows = np.repeat(np.arange(4), [len(part) for part in parts]).astype(np.uint16)
+    corners = np.concatenate(parts)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    materials = [
+        [0.7, 0.6, 0.5, 0, 0, 0, 1, 0, 0, 0],
+        [0.05, 0.05, 0.05, 0.8, 0.7, 0.5, 0.3, 0, 0, 0],
+        [0.1, 0.3, 0.1, 0, 0, 0, 1, 0, 0, 0],
+        [0, 0, 0, 0, 0, 0, 1, 12, 10, 8],
+    ]
     return Scene(
-        vertex_positions=np.array(positions, np.float32),
-        vertex_normals=np.tile(np.array([0, 0, 1], np.float32), (7, 1)),
-        faces=np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]], np.uint32),
-        material_index=np.array([0, 0, 1], np.uint16),
-        materials=materials,
-        object_index=np.array([0, 0, 1], np.uint16),
-        c2w=look_at_c2w(eye=[0, -3, 2], target=[0, 0, 0], up=[0, 0, 1])[None].astype(np.float32),
+        vertex_positions=corners.reshape(-1, 3).astype(np.float32),
+        vertex_normals=np.repeat(normals, 3, axis=0).astype(np.float32),
+        faces=np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3),
+        material_index=rows,
+        materials=np.array(materials, np.float32),
+        object_index=rows,
+        c2w=look_at_c2w(eye=[0, -3, 1.6], target=[0.1, 0, 0.4], up=[0, 0, 1])[None].astype(
+            np.float32
+        ),
         fov_deg=np.array([40], np.float32),
-        objects=(
-            SceneObject(name="floor", kind="shell"),
-            SceneObject(name="light", kind="emitter"),
+        objects=tuple(
+            SceneObject(name=f"{kind} {row}", kind=kind) for row, kind in enumerate(kinds)
         ),
         provenance={},
     )
+
+
+def _quad(*ring: ArrayLike) -> NDArray[np.float64]:
+    return np.asarray(ring, np.float64)[np.array([[0, 1, 2], [0, 2, 3]])]
 
 
 if __name__ == "__main__":

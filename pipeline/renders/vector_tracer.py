@@ -1,4 +1,4 @@
-"""`VectorTracer`: a pass is two compiled kernels (Mitsuba's LLVM variant): camera and light paths.
+"""`VectorTracer`: a pass is two compiled kernels (LLVM or CUDA): camera paths and light paths.
 
 The sum over a pixel's samples is a reduction of our own, in a fixed order, and that of the light
 paths is one of whole numbers: pictures do not depend on the number of threads. A pass is explicit,
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
-from pipeline.renders.device_memory import own_floats
+from pipeline.renders.device_memory import own_floats, read_back
 from pipeline.renders.emission_cone import EmissionCone
 from pipeline.renders.emitter_table import EmitterTable
 from pipeline.renders.film import Film
@@ -40,9 +40,10 @@ class VectorTracer:
         surfaces, emitters = split_triangles(scene)
         order = np.concatenate([surfaces, emitters])
         self._record, self._emitters = scene, emitters
+        seen = _load(scene, surfaces)
         self._scene = KernelScene(
-            surfaces=_load(scene, surfaces),
-            everything=_load(scene, order),
+            surfaces=seen,
+            everything=_load(scene, order, beside=seen),
             table=SurfaceTable(scene, order),
             emitters=EmitterTable(scene, emitters),
             cone=EmissionCone(scene),
@@ -61,22 +62,25 @@ class VectorTracer:
         return tracer
 
     def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        return _picture(camera, self._one_pass(camera, seed=seed, spp=spp))
+
+    def pass_sum(self, camera: Camera) -> "_DeviceSum":
+        return _DeviceSum(self, camera)
+
+    def _one_pass(self, camera: Camera, *, seed: int, spp: int) -> Any:
+        """Return what `radiance` does, as Color3f."""
         light_paths = LIGHT_PATHS * camera.resolution**2
         traced = self._traced(camera, light_paths, seed=seed, spp=spp)
         return traced + self._landed(camera, light_paths, seed=seed, count=int(light_paths * spp))
 
-    def _traced(
-        self, camera: Camera, light_paths: float, *, seed: int, spp: int
-    ) -> NDArray[np.float32]:
+    def _traced(self, camera: Camera, light_paths: float, *, seed: int, spp: int) -> Any:
         """Return what camera paths leave to themselves beside so many light paths per sample."""
         sampler = _sampler(camera, seed, spp)
         film, beside = Film(camera), dr.opaque(mi.Float, light_paths)
         ray = film.rays(*_jittered(camera, sampler, spp))
-        return _pixel_means(camera, spp, trace(self._scene, film, beside, sampler, ray))
+        return _pixel_means(spp, trace(self._scene, film, beside, sampler, ray))
 
-    def _landed(
-        self, camera: Camera, light_paths: float, *, seed: int, count: int
-    ) -> NDArray[np.float32]:
+    def _landed(self, camera: Camera, light_paths: float, *, seed: int, count: int) -> Any:
         """Return the rest, from `count` light paths."""
         splats, beside = Splats(camera.resolution, self._unit), dr.opaque(mi.Float, light_paths)
         u = even_numbers(count, seed)
@@ -85,7 +89,7 @@ class VectorTracer:
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(seed_for(seed, "light paths"), count)
         trace_light(self._scene, Film(camera), beside, emitter, to, sampler, splats)
-        return (splats.picture() * (light_paths / count)).astype(np.float32)
+        return mi.Color3f(splats.picture() * dr.opaque(mi.Float64, light_paths / count))
 
     def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
         sampler = _sampler(camera, seed, spp)
@@ -95,25 +99,47 @@ class VectorTracer:
         normal, lobes = self._scene.table.shading(hit.prim_index, hit.prim_uv, active)
         albedo = dr.select(active, lobes.diffuse + lobes.specular, 0)
         return Features(
-            albedo=_pixel_means(camera, spp, albedo),
-            normal=_pixel_means(camera, spp, dr.select(active, normal, 0)),
+            albedo=_picture(camera, _pixel_means(spp, albedo)),
+            normal=_picture(camera, _pixel_means(spp, dr.select(active, normal, 0))),
         )
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
         column, row = _pixel_corners(camera, 1)
         ray = Film(camera).rays(column + 0.5, row + 0.5)
         found = self._scene.surfaces.ray_intersect_preliminary(ray, coherent=True).is_valid()
-        return np.array(found).reshape(camera.resolution, camera.resolution)
+        return read_back(found).reshape(camera.resolution, camera.resolution)
 
 
-def _load(scene: Scene, triangles: NDArray[np.intp]) -> Any:
-    """Return a mi.Scene of one mesh, whose triangle numbers are places in `triangles`."""
+class _DeviceSum:
+    """A `PassSum` in the memory of the device, in double precision: passes do not wait for us."""
+
+    def __init__(self, tracer: VectorTracer, camera: Camera) -> None:
+        self._tracer, self._camera = tracer, camera
+        self._total = dr.opaque(mi.Color3d, 0, camera.resolution**2)
+
+    def add(self, *, seed: int, spp: int) -> None:
+        samples: Any = mi.Color3d(self._tracer._one_pass(self._camera, seed=seed, spp=spp))
+        self._total += samples * dr.opaque(mi.Float64, spp)
+        dr.eval(self._total)
+
+    def read(self) -> NDArray[np.float64]:
+        return _picture(self._camera, self._total)
+
+
+def _load(scene: Scene, triangles: NDArray[np.intp], beside: Any = None) -> Any:
+    """Return a mi.Scene of one mesh, whose triangle numbers are places in `triangles`.
+
+    Rays of one kernel may meet it and the mi.Scene `beside`: on a graphics card Dr.Jit lets rays of
+    a kernel meet one OptiX shader binding table, and what has another one is empty space for them.
+    A scene that is given another one as a child shares its table.
+    """
     mesh = mi.Mesh("triangles", len(scene.vertex_positions), len(triangles))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = own_floats(scene.vertex_positions)
     parameters["faces"] = scene.faces[triangles].ravel()
     parameters.update()
-    return mi.load_dict({"type": "scene", "mesh": mesh})
+    children = {"mesh": mesh} if beside is None else {"mesh": mesh, "beside": beside}
+    return mi.load_dict({"type": "scene", **children})
 
 
 def _sampler(camera: Camera, seed: int, spp: int) -> Any:
@@ -138,9 +164,13 @@ def _jittered(camera: Camera, sampler: Any, spp: int) -> tuple[Any, Any]:
     return column + jitter.x, row + jitter.y
 
 
-def _pixel_means(camera: Camera, spp: int, samples: Any) -> NDArray[np.float32]:
-    """Return the mean over the samples of each pixel, [R, R, 3]."""
+def _pixel_means(spp: int, samples: Any) -> Any:
+    """Return the mean over the samples of each pixel, Color3f."""
     dr.eval(samples)  # else each channel's reduction would run the whole kernel again
-    sums = np.stack([np.array(dr.block_sum(channel, spp)) for channel in samples], axis=-1)
-    means = (sums / spp).astype(np.float32)  # spp is a power of two: exact
-    return means.reshape(camera.resolution, camera.resolution, 3)
+    sums = mi.Color3f(*(dr.block_sum(channel, spp) for channel in samples))
+    return sums / spp  # spp is a power of two: exact
+
+
+def _picture(camera: Camera, pixels: Any) -> NDArray:
+    """Return [R, R, 3] of the pixels of a camera, in numpy's memory."""
+    return read_back(pixels).reshape(camera.resolution, camera.resolution, 3)

@@ -12,7 +12,7 @@ from infra.bench.renders.cost_scene import cost_scene
 from pipeline.scenes.renderformer_json_write import described_files
 from storage.conventions import EMISSION
 from storage.errors import TrilightError
-from storage.scene import Scene, SceneObject
+from storage.scene import MAX_POSITION_M, Scene, SceneObject
 from tests.renders.scene_kit import join, light, quad
 from tests.scenes.exchange_kit import (
     assert_h5_keeps_light,
@@ -24,6 +24,7 @@ from tests.scenes.exchange_kit import (
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 
 ENDS = np.finfo(np.float32)
+FARTHER = np.nextafter(np.float32(MAX_POSITION_M), np.float32(np.inf))
 
 
 def surface(**columns: ArrayLike) -> Scene:
@@ -85,7 +86,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "64 lights": many_lights,
     "sliver 1e-7": lambda: shrunk([0, 0, 0], [1, 0, 0], [0.5, 1e-7, 0]),
     "a micrometre": lambda: scaled(1e-3),
-    "a kilometre": lambda: scaled(1e3),
+    "to the farthest position": lambda: scaled(500),
 }
 
 
@@ -148,8 +149,8 @@ def test_a_scene_whose_light_has_no_area_is_no_json() -> None:
 
 def at_the_ends_of_floats() -> Scene:
     scene = tiny_scene()
-    scene.vertex_positions[0] = np.array([ENDS.max, -ENDS.tiny, -0.0], np.float32)
-    scene.vertex_positions[1] = np.array([ENDS.smallest_subnormal, 0, -ENDS.max], np.float32)
+    scene.vertex_positions[0] = np.array([MAX_POSITION_M, -ENDS.tiny, -0.0], np.float32)
+    scene.vertex_positions[1] = np.array([ENDS.smallest_subnormal, 0, -MAX_POSITION_M], np.float32)
     scene.materials[LIGHT, EMISSION] = np.array([1e38, ENDS.smallest_subnormal, 0], np.float32)
     return scene
 
@@ -179,6 +180,7 @@ def test_json_that_readers_would_refuse_is_not_written(
 
 UNLAWFUL: dict[str, dict[str, object]] = {
     "NaN": {"vertex_positions": np.full((7, 3), np.nan, np.float32)},
+    "too far": {"vertex_positions": np.full((7, 3), FARTHER, np.float32)},
     "infinite": {"vertex_positions": np.full((7, 3), np.inf, np.float32)},
     "fov 0": {"fov_deg": np.array([0, 40], np.float32)},
     "fov 180": {"fov_deg": np.array([40, 180], np.float32)},

@@ -19,8 +19,9 @@ from model.layer_errors import layer_errors, probe_batch, random_network
 from model.layers import LAYER_NORM_EPS, Norm
 from model.positions import TriangleRotary
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import MAX_POSITION_M, SceneBatch, batch_scenes, scene_tensors
+from model.scene_tensors import SceneBatch, batch_scenes, scene_tensors
 from storage.errors import TrilightError
+from storage.scene import MAX_POSITION_M
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 from tests.train.toy import toy_sample, toy_scene
 from train.data.buckets import make_batch
@@ -220,6 +221,9 @@ def test_a_vertex_beyond_is_refused_with_its_distance() -> None:
     at_the_end[0, 0] = -MAX_POSITION_M
     scene_tensors(dataclasses.replace(scene, vertex_positions=at_the_end))
     with pytest.raises(TrilightError, match="a vertex stands 1000 m from the origin"):
+        scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
+    positions[0, 0] = np.nan
+    with pytest.raises(TrilightError, match="a vertex stands nan m from the origin"):
         scene_tensors(dataclasses.replace(scene, vertex_positions=positions))
 
 

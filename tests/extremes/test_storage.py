@@ -20,7 +20,7 @@ from storage.profiles import PROFILES, Profile, keeps_law, pack_picture
 from storage.renderformer_h5 import write_renderformer_h5
 from storage.renderformer_h5_read import read_renderformer_h5
 from storage.sample import decode_sample, encode_sample
-from storage.scene import Scene, SceneObject
+from storage.scene import MAX_POSITION_M, Scene, SceneObject
 from tests.scenes.exchange_kit import assert_usd_keeps_all
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
 
@@ -99,7 +99,7 @@ def test_rounding_to_half_floats_is_the_only_loss() -> None:
 def test_a_scene_of_extreme_numbers_is_packed_exactly(profile: Profile) -> None:
     scene = tiny_scene()
     ends = np.finfo(np.float32)
-    scene.vertex_positions[0] = np.array([ends.max, ends.tiny, -0.0], np.float32)
+    scene.vertex_positions[0] = np.array([MAX_POSITION_M, ends.tiny, -0.0], np.float32)
     scene.materials[LIGHT, EMISSION] = [1e38, 1e-45, 0]
     sample = dataclasses.replace(tiny_sample(), scene=scene)
     back = decode_sample("0", encode_sample(sample, profile)).scene

@@ -17,7 +17,7 @@ from infra.bench.renders.kept import Kept
 from infra.bench.renders.remembering_tracer import RememberingTracer
 from infra.cli.app import app
 from pipeline.renders.camera import Camera
-from pipeline.renders.tracer import Features
+from pipeline.renders.tracer import Features, HostSum
 from storage.errors import TrilightError
 
 OPTIONS = Options(quick=True, objects=("builtin:",), allowed_licences=())
@@ -73,6 +73,9 @@ class _Counting:
         self.calls.append(("radiance", seed))
         sum(range(2_000_000))
         return np.full((camera.resolution, camera.resolution, 3), float(seed), np.float32)
+
+    def pass_sum(self, camera: Camera) -> HostSum:
+        raise NotImplementedError
 
     def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
         self.calls.append(("features", seed))

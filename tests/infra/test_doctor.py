@@ -44,3 +44,19 @@ def test_no_llvm_is_slower_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     finding = doctor._renderer()
     assert (finding.state, finding.consequence) == ("slower", "rendering is slower")
     assert "libllvm19" in finding.mend
+
+
+@pytest.mark.parametrize("note", ["", "the card is too old, so pictures are denoised elsewhere"])
+def test_a_graphics_card_is_well_or_says_what_it_lacks(
+    note: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pipeline.renders.variant import Variant
+
+    card = Variant(name="cuda_ad_rgb", libllvm="", note=note, denoiser="CPU" if note else "CUDA")
+    facts = {"denoiser": "2.5.1", "denoiser_device": card.denoiser, "threads": "2"}
+    monkeypatch.setattr(doctor, "choose_variant", lambda: card)
+    monkeypatch.setattr(doctor, "render_facts", lambda variant: facts)
+    assert doctor._renderer().state == "ok"
+    finding = doctor._denoiser()
+    assert (finding.state, finding.consequence) == ("slower" if note else "ok", note)
+    assert card.denoiser in finding.found

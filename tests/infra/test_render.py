@@ -215,6 +215,23 @@ def test_a_scene_in_a_shard_obeys_the_laws(tmp_path: Path) -> None:
         load_source(scene_source(f"{shard}::000000012"))
 
 
+@pytest.mark.parametrize("engine", ["mitsuba", "neural"])
+def test_no_engine_takes_a_vertex_beyond_the_farthest_position(
+    engine: str, described: Path, tmp_path: Path
+) -> None:
+    """Triangles that reach so far vanish from traced pictures, and rotary angles lose digits."""
+    far = json.loads(described.read_text())
+    far["objects"]["floor"]["transform"]["scale"] = [1e6, 1, 1]
+    described.write_text(json.dumps(far))
+    positions = tiny_scene().vertex_positions.copy()
+    positions[0, 0] = 1e38
+    shard = _shard(tmp_path / "train-000000.tar", tiny_scene(vertex_positions=positions))
+    for source in (described, f"{shard}::000000012"):
+        told = mistake(source, "--engine", engine, "--out", tmp_path / "x.exr", *SMALL)
+        assert "vertex_positions[0, 0] is " in told and "expected from -1000 to 1000 m" in told
+    assert not (tmp_path / "x.exr").exists()
+
+
 def test_a_mesh_outside_of_the_folder_is_refused(described: Path) -> None:
     described.write_text(described.read_text().replace("floor.obj", "../floor.obj"))
     with pytest.raises(TrilightError, match="leads out of the folder"):

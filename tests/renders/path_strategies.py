@@ -1,7 +1,6 @@
 """The camera paths and the light paths of `VectorTracer` apart, as tracers of their own."""
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.vector_tracer import VectorTracer
@@ -14,14 +13,14 @@ _ALMOST_ALL = 2.0**40
 class CameraPathsOnly(VectorTracer):
     """The path tracer as it is without light paths."""
 
-    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+    def _one_pass(self, camera: Camera, *, seed: int, spp: int) -> Any:
         return self._traced(camera, 0.0, seed=seed, spp=spp)
 
 
 class CameraPathsLeft(VectorTracer):
     """What weights leave to camera paths beside light paths without number."""
 
-    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+    def _one_pass(self, camera: Camera, *, seed: int, spp: int) -> Any:
         return self._traced(camera, _ALMOST_ALL, seed=seed, spp=spp)
 
 
@@ -32,6 +31,6 @@ class LightPathsOnly(VectorTracer):
         super().__init__(scene, max_depth=max_depth, rr_depth=rr_depth)
         self._unit /= 2.0**32  # each of so many paths counts for so much less
 
-    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+    def _one_pass(self, camera: Camera, *, seed: int, spp: int) -> Any:
         count = camera.resolution**2 * spp
         return self._landed(camera, _ALMOST_ALL, seed=seed, count=count)

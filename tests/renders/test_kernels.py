@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -108,14 +108,10 @@ def test_the_count_of_kernels_can_tell() -> None:
 def test_all_views_and_lights_share_one_load(
     llvm: None, monkeypatch: pytest.MonkeyPatch, per_light: bool
 ) -> None:
-    loads = []
+    loads = list[str]()
     load = vector_tracer._load
 
-    def counted(*arguments: object) -> object:
-        loads.append(arguments)
-        return load(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(vector_tracer, "_load", counted)
+    monkeypatch.setattr(vector_tracer, "_load", _counted("load", load, loads))
     scene = sampled_like_scene(np.random.default_rng(3))
     scene = scene.with_provenance({"camera_attempts": [0] * 4})
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": per_light}
@@ -123,6 +119,29 @@ def test_all_views_and_lights_share_one_load(
     sample = _render_sample("000000000", scene, settings, [])
     assert len(sample.views) == 4
     assert len(loads) == 2  # what camera rays meet, and what all other rays meet
+
+
+@pytest.mark.parametrize("spp", [256, 1024])
+def test_pictures_come_back_only_where_something_is_decided(
+    llvm: None, monkeypatch: pytest.MonkeyPatch, spp: int
+) -> None:
+    """A pass that is read back makes a graphics card wait for us, and us for it."""
+    import drjit as dr
+
+    reads = list[str]()
+    for way in ("__array__", "__dlpack__", "numpy"):
+        monkeypatch.setattr(dr.ArrayBase, way, _counted(way, getattr(dr.ArrayBase, way), reads))
+    _render(_smallest(), dataclasses.replace(SETTINGS, min_spp=spp, max_spp=spp))
+    # Both halves at the first look for black and at the floor; albedo, normals and hits once.
+    assert reads == ["__array__"] * (2 + 2 + 3)
+
+
+def _counted(way: str, read: Callable[..., object], reads: list[str]) -> Callable[..., object]:
+    def counted(*arguments: object, **named: object) -> object:
+        reads.append(way)
+        return read(*arguments, **named)
+
+    return counted
 
 
 @pytest.mark.slow

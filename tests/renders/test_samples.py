@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.samples import HalfSamples
+from pipeline.renders.tracer import HostSum
 
 CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
 
@@ -15,6 +16,9 @@ class Recorder:
 
     def __init__(self) -> None:
         self.asked: list[tuple[int, int]] = []
+
+    def pass_sum(self, camera: Camera) -> HostSum:
+        return HostSum(self, camera)  # type: ignore[arg-type]
 
     def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
         self.asked.append((spp, seed))

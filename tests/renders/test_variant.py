@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.flows.environment import environment
 from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts
 from pipeline.renders.llvm_libraries import llvm_libraries
-from pipeline.renders.variant import Variant, choose_variant
+from pipeline.renders.variant import Variant, _Probed, choose_variant
 from storage.errors import TrilightError
 from tests.conftest import ROOT
 
@@ -55,12 +56,12 @@ def test_success_is_remembered_and_believed(
     assert choose_variant() == chosen
 
 
-def _must_not_be_asked(variant: Variant) -> bool:
+def _must_not_be_asked(variant: Variant) -> _Probed:
     raise AssertionError(f"{variant} was probed again")
 
 
 def test_where_no_library_works_the_fallback_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(variant_module, "_probe", lambda variant: False)
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: _Probed(problem="abort"))
     monkeypatch.setattr(variant_module, "_remembered", lambda memory: [])
     fallback = choose_variant()
     assert (fallback.name, fallback.libllvm) == ("scalar_rgb", "")
@@ -81,13 +82,42 @@ def test_the_user_may_name_the_variant(monkeypatch: pytest.MonkeyPatch, variant:
 
 def test_a_graphics_card_is_used_only_after_a_probe(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
-    monkeypatch.setattr(variant_module, "_probe", lambda variant: variant.name == "cuda_ad_rgb")
+    monkeypatch.setattr(variant_module, "_probe", lambda variant: _Probed())
     assert choose_variant().name == "cuda_ad_rgb"
     monkeypatch.undo()
     monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # hides the cards of a machine that has some
-    with pytest.raises(TrilightError, match="no picture could be rendered"):
+    with pytest.raises(
+        TrilightError, match=r"no right picture could be rendered with it here \(.+\)"
+    ):
         choose_variant()
+
+
+def test_a_picture_without_some_of_its_rays_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dr.Jit warns of it once, while it compiles, and goes on."""
+    warning = "jit_eval(): more than one OptiX shader binding table. Disabling this ray tracing op"
+    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
+    for said, refused in ((warning + "eration to avoid", True), ("another warning", False)):
+        ended = subprocess.CompletedProcess([], 0, stdout="", stderr=said)
+        monkeypatch.setattr(variant_module.subprocess, "run", lambda *_, ended=ended, **__: ended)
+        if refused:
+            with pytest.raises(TrilightError, match="Dr.Jit left out some of the rays"):
+                choose_variant()
+        else:
+            assert choose_variant().name == "cuda_ad_rgb"
+
+
+@pytest.mark.parametrize("problem", ["", "Open Image Denoise: out of memory (on CUDA)"])
+def test_pictures_are_denoised_on_the_card_or_it_is_said(
+    problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = subprocess.CompletedProcess([], 0, stdout=problem + "\n", stderr="")
+    monkeypatch.setenv("TRILIGHT_VARIANT", "cuda_ad_rgb")
+    monkeypatch.setattr(variant_module.subprocess, "run", lambda *_, **__: ended)
+    chosen = choose_variant()
+    assert chosen.denoiser == ("CPU" if problem else "CUDA")
+    assert bool(chosen.note) == bool(problem) and chosen.note.startswith(problem)
+    assert ("denoiser_device" in environment(chosen)) == (not problem)
 
 
 def test_where_llvm_is_asked_for_and_missing_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
-from pipeline.renders.tracer import Features, Tracer
+from pipeline.renders.tracer import Features, HostSum, Tracer
 
 Answer = TypeVar("Answer")
 
@@ -35,6 +35,9 @@ class RememberingTracer:
         return self._remembered(
             ("radiance", seed, spp), lambda: self._tracer.radiance(camera, seed=seed, spp=spp)
         )
+
+    def pass_sum(self, camera: Camera) -> HostSum:
+        return HostSum(self, camera)
 
     def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
         return self._remembered(
