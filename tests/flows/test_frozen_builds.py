@@ -110,8 +110,9 @@ def _numbers(settings: SceneSettings, seed: int, index: int) -> np.ndarray:
     found: list[Any] = [part.positions for part in layout.shell]
     for placed in layout.objects:
         found += [placed.pose.centre, placed.pose.radius, placed.pose.rotation]
-    found += [placed.surface.diffuse_rgb for placed in (*layout.shell, *layout.objects)]
-    found += [placed.surface.roughness for placed in (*layout.shell, *layout.objects)]
+    surfaces = [part.surface for part in layout.shell] + [one.surface for one in layout.objects]
+    found += [surface.diffuse_rgb for surface in surfaces]
+    found += [surface.roughness for surface in surfaces]
     found += [value for lamp in layout.emitters for value in (lamp.triangle, lamp.radiance_rgb)]
     return np.concatenate([np.ravel(value) for value in (*found, camera.c2w, camera.fov_deg)])
 

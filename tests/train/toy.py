@@ -48,7 +48,7 @@ def toy_scene(index: int, *, views: int = VIEWS, boxes: int | None = None) -> Sc
     materials[:, ROUGHNESS] = shine.uniform(0.3, 0.8, num_objects)
     materials[-1, EMITTED] = EMISSION
     kinds = ["shell", *["object"] * (num_objects - 2), "emitter"]
-    ups = np.column_stack([shine.uniform(-0.3, 0.3, (views, 2)), np.ones(views)])
+    ups = np.column_stack([shine.uniform(-0.1, 0.1, (views, 2)), np.ones(views)])
     poses = [
         look_at_c2w(eye=eye, target=[0, 0, 0.1], up=up)
         for eye, up in zip(_eyes(rng, views), ups, strict=True)
