@@ -11,15 +11,26 @@ class Progress(Protocol):
         """There is something about the data that the user should know."""
 
     def begin(
-        self, *, step: int, num_steps: int, num_parameters: int, median_scores: Mapping[str, float]
+        self,
+        *,
+        step: int,
+        num_steps: int,
+        num_parameters: int,
+        median_scores: Mapping[str, float] | None,
     ) -> None:
-        """The run starts at `step`, above 0 when it resumes; the median picture is its rival."""
+        """The run starts at `step`, above 0 when it resumes; the median picture is its rival.
+
+        None where there is no validation split.
+        """
 
     def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
         """`step` steps are done; `loss` is the mean over the views of the last one."""
 
     def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
         """The validation split was judged after `step` steps (evaluation.scores)."""
+
+    def interrupted(self, times: int) -> None:
+        """A signal asks to stop, for the `times`-th time; comes from a thread of its own."""
 
 
 class Silent:
@@ -29,7 +40,12 @@ class Silent:
         """Ignore it."""
 
     def begin(
-        self, *, step: int, num_steps: int, num_parameters: int, median_scores: Mapping[str, float]
+        self,
+        *,
+        step: int,
+        num_steps: int,
+        num_parameters: int,
+        median_scores: Mapping[str, float] | None,
     ) -> None:
         """Ignore it."""
 
@@ -37,4 +53,7 @@ class Silent:
         """Ignore it."""
 
     def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
+        """Ignore it."""
+
+    def interrupted(self, times: int) -> None:
         """Ignore it."""

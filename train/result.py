@@ -10,6 +10,7 @@ from model.weights import encode_weights
 from storage.atomic import write_atomically
 from storage.training_data import TrainingData
 from train.evaluation.judge import Judge
+from train.evaluation.scores import Lead
 from train.evaluation.sheet import write_picture
 from train.evaluation.validation_sheet import drawn_validation_sheet
 from train.folder import RunFolder
@@ -37,19 +38,21 @@ class TrainResult:
     """Mean training loss over the first twentieth of the run."""
     loss_at_end: float
     """The same over the last twentieth."""
-    scores: dict[str, float]
-    """The network on the validation split (evaluation.judge)."""
-    median_scores: dict[str, float]
+    scores: dict[str, float] | None
+    """The network on the validation split (evaluation.judge); None where the data has none."""
+    median_scores: dict[str, float] | None
     """The median picture of the training views on the same split."""
+    lead: Lead | None
+    """Of the network over the median picture."""
     unusable: tuple[str, ...]
     """What was wrong with data that was left out in this call."""
     seconds: float
     """Wall time of this call, from opening the data to writing the sheet."""
 
     @property
-    def beats_median(self) -> bool:
-        """Whether the network's log_l1 is below that of the median picture."""
-        return self.scores["log_l1"] < self.median_scores["log_l1"]
+    def beats_median(self) -> bool | None:
+        """Whether the network is better than the median picture by more than chance explains."""
+        return None if self.lead is None else self.lead.is_sure
 
 
 def finished(
@@ -57,15 +60,17 @@ def finished(
     settings: TrainSettings,
     folder: RunFolder,
     data: TrainingData,
-    judge: Judge,
+    judge: Judge | None,
     seconds_before: float,
 ) -> TrainResult:
     """Judge the finished network, write weights, sheet and summary, and return the result."""
     trained = TrainedRange(max_triangles=data.max_triangles, resolution=settings.resolution)
     write_atomically(folder.weights, encode_weights(state.shown, trained))
-    judgement = judge.judge(state.shown)
     loss_at_start, loss_at_end = _losses(folder)
-    write_picture(folder.sheet, drawn_validation_sheet(settings, judge, judgement, state.step))
+    judgement = None
+    if judge is not None:
+        judgement = judge.judge(state.shown)
+        write_picture(folder.sheet, drawn_validation_sheet(settings, judge, judgement, state.step))
     result = TrainResult(
         folder=folder,
         num_parameters=count_parameters(state.model),
@@ -73,8 +78,9 @@ def finished(
         skipped_steps=state.skipped_steps,
         loss_at_start=loss_at_start,
         loss_at_end=loss_at_end,
-        scores=judgement.scores,
-        median_scores=judge.median_scores,
+        scores=judgement.scores if judgement else None,
+        median_scores=judge.median_scores if judge else None,
+        lead=judgement.lead if judgement else None,
         unusable=tuple(state.unusable.messages),
         seconds=seconds_before,
     )

@@ -38,6 +38,14 @@ from train.start import Start
 MEDIAN_SCENES = 256
 """Training scenes of which the median picture is taken; more would not move it."""
 
+VALIDATION = "validation"
+"""Split of the scenes that a run is judged on and never shown."""
+
+UNJUDGED = (
+    "the data has no validation split, so the network is not judged on scenes that it has never "
+    "seen, and there is no sheet; a dataset of more scenes has one"
+)
+
 
 def train_run(
     settings: TrainSettings,
@@ -53,8 +61,8 @@ def train_run(
 
     Args:
         settings: the run; `train.runs.named_run` returns those that have a name.
-        data: root of a dataset with a train and a validation split, or a list of shards
-            (storage.training_data).
+        data: root of a dataset, or a list of shards (storage.training_data), with a train split;
+            without a validation split nothing is judged.
         out: folder of the run (train.folder), new unless it resumes.
         start: how it begins; anew unless said.
         crew: the processes that train together (loop.crew.join_crew); this one unless said.
@@ -74,13 +82,13 @@ def train_run(
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
     progress = progress if progress is not None and crew.is_first else Silent()
     opened, folder = open_training_data(data), RunFolder(out)
-    for note in opened.notes:
+    for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         progress.noted(note)
     objective = Objective(settings.loss, load_lpips(start.lpips))
     _check_data(opened, settings)
     settings, state = _begin(settings, folder, opened, start, crew, progress)
     judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
-    recorder = _recorder(state, settings, folder, judge, progress)
+    recorder = _recorder(state, settings, folder, judge, progress) if crew.is_first else None
     trainer = Trainer(
         state=state,
         settings=settings,
@@ -100,7 +108,7 @@ def train_run(
     )
     with closing(batches):
         trainer.run(batches)
-    if recorder is None or judge is None:
+    if recorder is None:
         return None
     recorder.close()
     return finished(state, settings, folder, opened, judge, time.monotonic() - began)
@@ -121,8 +129,7 @@ def stream_settings(settings: TrainSettings) -> StreamSettings:
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:
     """Find out before any work what the data cannot give; damage is counted when it is used."""
-    for split in ("train", "validation"):
-        data.split(split)
+    data.split("train")
     num_views = data.num_views
     lights_apart = settings.augmentation.light_mix > 1
     if num_views is None or lights_apart:
@@ -183,13 +190,15 @@ def _note_other_crew(checkpoint: Checkpoint, crew: Crew, progress: Progress) -> 
         )
 
 
-def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable) -> Judge:
+def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable) -> Judge | None:
+    if VALIDATION not in data.splits:
+        return None
     training = [
         training_scene(sample, settings.resolution)
         for sample in first_samples(data.split("train"), MEDIAN_SCENES, unusable)
     ]
     # what is judged by must be whole: a score over fewer scenes would be another score
-    samples = list(first_samples(data.split("validation"), settings.validation_scenes, Unusable(0)))
+    samples = list(first_samples(data.split(VALIDATION), settings.validation_scenes, Unusable(0)))
     return Judge(samples, settings.resolution, median_picture(training))
 
 
@@ -199,13 +208,11 @@ def _recorder(
     folder: RunFolder,
     judge: Judge | None,
     progress: Progress,
-) -> Recorder | None:
-    if judge is None:
-        return None
+) -> Recorder:
     progress.begin(
         step=state.step,
         num_steps=settings.num_steps,
         num_parameters=count_parameters(state.model),
-        median_scores=judge.median_scores,
+        median_scores=judge.median_scores if judge else None,
     )
     return Recorder(folder, settings, judge, progress, first_step=state.step)

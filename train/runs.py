@@ -7,6 +7,7 @@ replacement, and the loss behind the ELU. `pretrain` and `finetune` are ours.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -146,6 +147,9 @@ RUNS: dict[str, Callable[[], TrainSettings]] = {
 }
 """Every named run."""
 
+_INTERVALS = ("log_every", "validate_every", "checkpoint_every", "keep_every")
+"""Settings that say after how many steps something happens again."""
+
 
 def named_run(name: str) -> TrainSettings:
     """Return the settings of a run; raises TrilightError for an unknown name."""
@@ -168,14 +172,49 @@ def changed_run(
     Args:
         name: of the run.
         changes: values by dotted name, as `storage.changes` takes them.
-        steps: replaces the number of steps, after the changes.
-        most_unusable: replaces that setting, likewise.
+        steps: replaces the number of steps; where it is smaller, the warm-up and the intervals
+            that `changes` do not name become shorter in proportion.
+        most_unusable: replaces that setting, after the changes.
 
     Raises:
         TrilightError: no such run or setting, or a value that is refused; the message names it.
     """
-    settings = changed(named_run(name), changes)
-    last: dict[str, Any] = {"num_steps": steps, "most_unusable": most_unusable}
-    return dataclasses.replace(
-        settings, **{field: value for field, value in last.items() if value is not None}
-    )
+    run = named_run(name)
+    every = dict(changes)
+    if steps is not None:
+        every |= {**in_proportion(run, steps, changes), "num_steps": steps}
+    if most_unusable is not None:
+        every["most_unusable"] = most_unusable
+    return changed(run, every)
+
+
+def in_proportion(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -> dict[str, int]:
+    """Return the warm-up and the intervals of a run of fewer steps; none where it has more.
+
+    An interval is a multiple of the one that it must fit: validations and checkpoints fall on rows
+    of the log, checkpoints that stay on checkpoints.
+
+    Args:
+        run: as it is named.
+        steps: how many are wanted.
+        stated: the values by name that a person gave; these are kept.
+    """
+    if not 0 < steps < run.num_steps:
+        return {}
+    kept = {name: stated[name] for name in _INTERVALS if isinstance(stated.get(name), int)}
+
+    def shorter(name: str, unit: int) -> int:
+        exact = getattr(run, name) * steps / run.num_steps
+        return int(kept.get(name, max(round(exact / unit), 1) * unit))
+
+    on_rows = [kept[name] for name in ("validate_every", "checkpoint_every") if name in kept]
+    row = math.gcd(shorter("log_every", 1), *on_rows)
+    found = {
+        "warmup_steps": round(run.warmup_steps * steps / run.num_steps),
+        "log_every": row,
+        "validate_every": shorter("validate_every", row),
+        "checkpoint_every": shorter("checkpoint_every", row),
+    }
+    if run.keep_every:
+        found["keep_every"] = shorter("keep_every", found["checkpoint_every"])
+    return {name: value for name, value in found.items() if name not in stated}

@@ -5,30 +5,25 @@ Their pictures are kept without loss: there are few, and all figures are measure
 
 import dataclasses
 
+from pipeline.flows.frozen_v1 import BUILD_V1, JUDGING_SPLITS
 from pipeline.flows.settings import BuildSettings, NamedBuild
-from pipeline.flows.training_builds import finetune_512, pretrain_256
 from pipeline.objects.generated import BENCHMARK
-from scene_templates.families.default_families import ONE_FAMILY_EACH
 from scene_templates.families.out_of_range import out_of_range_settings
 from storage.profiles import StorageSettings
-from storage.splits import SplitSettings
 
 _EXACT = StorageSettings(profile="lossless")
 
 
 def out_of_range() -> BuildSettings:
     """One axis at a time beyond the trained range: 37 values of nine axes in four layouts."""
-    build = finetune_512()
-    scenes = out_of_range_settings(max_triangles=4096)
     return dataclasses.replace(
-        build,
+        BUILD_V1,
         build="out-of-range",
-        scenes=dataclasses.replace(scenes, num_views=1),
+        assets=dataclasses.replace(BUILD_V1.assets, budgets=(3900, 2600, 1700, 1100, 700, 400)),
+        scenes=out_of_range_settings(max_triangles=4096),
         # Lights of a hundredth of the area: a view is black where it is a thousand times darker.
-        renders=dataclasses.replace(
-            build.renders, resolution=256, max_spp=2048, min_mean_radiance=1e-5
-        ),
-        splits=SplitSettings(scenes_per_shard=37, one_split=True),
+        renders=dataclasses.replace(BUILD_V1.renders, max_spp=2048, min_mean_radiance=1e-5),
+        splits=dataclasses.replace(JUDGING_SPLITS, scenes_per_shard=37),
         storage=_EXACT,
     )
 
@@ -39,17 +34,13 @@ def benchmark_v1() -> BuildSettings:
     The settings, the seed and the built-in objects are frozen: whoever runs it gets the same
     scenes (their digest is in `README.md`). For the second resolution use `--resolution 512`.
     """
-    build = pretrain_256()
     return dataclasses.replace(
-        build,
+        BUILD_V1,
         build="benchmark-v1",
         seed=20261121,
         source=BENCHMARK,
-        scenes=dataclasses.replace(
-            build.scenes, families=ONE_FAMILY_EACH, families_in_turn=True, num_views=1
-        ),
-        renders=dataclasses.replace(build.renders, noise_floor_db=48.0, max_spp=2048),
-        splits=SplitSettings(scenes_per_shard=20, one_split=True),
+        renders=dataclasses.replace(BUILD_V1.renders, noise_floor_db=48.0, max_spp=2048),
+        splits=JUDGING_SPLITS,
         storage=_EXACT,
     )
 

@@ -27,52 +27,57 @@ turn in their plane, so that the diagonals of floor and walls run one way.
 import dataclasses
 import functools
 
-from pipeline.assets.settings import AssetSettings
+from pipeline.flows.frozen_v1 import BUILD_V1
 from pipeline.flows.settings import BuildSettings, NamedBuild
-from pipeline.flows.training_builds import finetune_512, pretrain_256
-from scene_templates.contents.lights import LightSettings
-from scene_templates.contents.materials import MaterialSettings
-from scene_templates.contents.placement import PlacementSettings
 from scene_templates.families.family import Family
+from scene_templates.families.frozen_v1 import SCENES_V1
 from scene_templates.families.renderformer_v1 import Policy, stage_1_families, stage_2_families
-from scene_templates.settings import SceneSettings, ViewLaws
+from scene_templates.settings import SceneSettings
 
 
 def renderformer_v1_256(policy: Policy = "de-biased") -> BuildSettings:
     """The published first stage: 21 families, 256 pixels, at most 1572 triangles."""
-    build = pretrain_256()
     return dataclasses.replace(
-        build,
+        BUILD_V1,
         build="renderformer-v1-256" + _suffix(policy),
-        assets=AssetSettings(budgets=(1188, 840, 594, 396, 297, 198)),
+        assets=dataclasses.replace(BUILD_V1.assets, budgets=(1188, 840, 594, 396, 297, 198)),
         scenes=_published(stage_1_families(policy), max_triangles=1572),
     )
 
 
 def renderformer_v1_512(policy: Policy = "de-biased") -> BuildSettings:
     """The published second stage: 14 families, 512 pixels, at most 4192 triangles."""
-    build = finetune_512()
     return dataclasses.replace(
-        build,
+        BUILD_V1,
         build="renderformer-v1-512" + _suffix(policy),
-        assets=AssetSettings(budgets=(3968, 2380, 1188, 840, 594, 396)),
+        assets=dataclasses.replace(BUILD_V1.assets, budgets=(3968, 2380, 1188, 840, 594, 396)),
         scenes=_published(stage_2_families(policy), max_triangles=4192),
+        renders=dataclasses.replace(BUILD_V1.renders, resolution=512),
+        splits=dataclasses.replace(BUILD_V1.splits, scenes_per_shard=64),
     )
 
 
 def _published(families: tuple[Family, ...], *, max_triangles: int) -> SceneSettings:
-    return SceneSettings(
+    return dataclasses.replace(
+        SCENES_V1,
         families=families,
+        families_in_turn=False,
         max_triangles=max_triangles,
         enough_error=0.0,
         centring="vertex_mean",
         num_views=4,
-        placement=PlacementSettings(
-            orientation="euler", resting_share=0.0, overlap_share=1.0, inside=False
+        placement=dataclasses.replace(
+            SCENES_V1.placement,
+            orientation="euler",
+            resting_share=0.0,
+            overlap_share=1.0,
+            inside=False,
         ),
-        materials=MaterialSettings(triangle_colours_share=0.0),
-        lights=LightSettings(orientation="euler", reflectance=1.0),
-        views=ViewLaws(min_coverage=0.0, min_lit=0.0, max_shell_back=1.0),
+        materials=dataclasses.replace(SCENES_V1.materials, triangle_colours_share=0.0),
+        lights=dataclasses.replace(SCENES_V1.lights, orientation="euler", reflectance=1.0),
+        views=dataclasses.replace(
+            SCENES_V1.views, min_coverage=0.0, min_lit=0.0, max_shell_back=1.0
+        ),
     )
 
 

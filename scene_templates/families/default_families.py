@@ -2,11 +2,13 @@
 
 from scene_templates.families.family import Family
 from scene_templates.shell.rooms import SharedRoom
-from scene_templates.templates.registry import TEMPLATES
+
+LAYOUTS = ("plane", "wall", "corner", "open_box")
+"""A template that is registered later joins a build when its name is written here."""
 
 DEFAULT_FAMILIES = tuple(
     family
-    for name in TEMPLATES
+    for name in LAYOUTS
     for family in (
         Family(
             name=f"{name}-single",
@@ -27,15 +29,3 @@ DEFAULT_FAMILIES = tuple(
     )
 )
 """The sizes are the published ones of most families."""
-
-ONE_FAMILY_EACH = tuple(
-    Family(
-        name=name,
-        template=name,
-        shell=SharedRoom(),
-        num_objects=(1, 3),
-        object_scale=(0.8, 1.8),
-    )
-    for name in TEMPLATES
-)
-"""One family for each layout, for sets in which the layouts take turns."""

@@ -10,13 +10,9 @@ import math
 from typing import Any
 
 from scene_templates.checks import Range
-from scene_templates.contents.cameras import CameraSettings
-from scene_templates.contents.lights import LightSettings
-from scene_templates.contents.materials import MaterialSettings
-from scene_templates.contents.placement import PlacementSettings
-from scene_templates.families.default_families import ONE_FAMILY_EACH
 from scene_templates.families.excursions import Excursion
 from scene_templates.families.family import Family
+from scene_templates.families.frozen_v1 import ONE_FAMILY_EACH, SCENES_V1
 from scene_templates.settings import SceneSettings
 from scene_templates.shell.rooms import SharedRoom
 
@@ -25,25 +21,27 @@ _MEDIAN_EMISSION, _MEDIAN_SIZE = 3750.0, 2.25
 
 def median_settings(max_triangles: int) -> SceneSettings:
     """Return scenes of two objects under four lights, every range at its middle."""
-    rough = MaterialSettings()
+    rough = SCENES_V1.materials
     median_roughness = math.sqrt(math.prod(rough.roughness_log)) - rough.roughness_bias
-    return SceneSettings(
+    return dataclasses.replace(
+        SCENES_V1,
         families=tuple(_median_family(family) for family in ONE_FAMILY_EACH),
-        families_in_turn=True,
         max_triangles=max_triangles,
-        placement=PlacementSettings(overlap_share=0.0),
-        materials=MaterialSettings(
+        placement=dataclasses.replace(SCENES_V1.placement, overlap_share=0.0),
+        materials=dataclasses.replace(
+            rough,
             albedo_sum=_point(0.95),
             specular_ratio=_point(0.5),
             roughness_clip=_point(round(median_roughness, 4)),
         ),
-        lights=LightSettings(
+        lights=dataclasses.replace(
+            SCENES_V1.lights,
             count=(4, 4),
             total_emission=_point(_MEDIAN_EMISSION),
             scale=_point(_MEDIAN_SIZE),
             distance=_point(2.4),
         ),
-        cameras=CameraSettings(distance=_point(1.75), fov_deg=_point(45.0)),
+        cameras=dataclasses.replace(SCENES_V1.cameras, distance=_point(1.75), fov_deg=_point(45.0)),
     )
 
 

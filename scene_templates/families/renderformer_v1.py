@@ -30,6 +30,15 @@ _NEAR: Range = (-0.05, 0.05)
 _FAR: Range = (-0.25, 0.25)
 _RAISED: Range = (0.15, 0.25)
 _FREE: Range = (-0.05, 0.25)
+_EXACT: Range = (0.0, 0.0)
+_STILL = SideRanges(
+    spin_deg=0.0,
+    tilt_deg=0.0,
+    scale=(1.0, 1.0),
+    shift_x=_EXACT,
+    shift_y=_EXACT,
+    shift_z=_EXACT,
+)
 
 
 def stage_1_families(policy: Policy) -> tuple[Family, ...]:
@@ -112,13 +121,20 @@ def _family(
 def _open_shell(policy: Policy, *, floor_z: Range, wall: bool) -> SeparateSides:
     return SeparateSides(
         floor=_side(policy, z=floor_z),
-        wall1=_side(policy, y=_FAR) if wall else SideRanges(),
+        wall0=_STILL,
+        wall1=_side(policy, y=_FAR) if wall else _STILL,
+        wall2=_STILL,
+        wall2_faces_out=False,
     )
 
 
 def _corner_shell(policy: Policy) -> SeparateSides:
     return SeparateSides(
-        floor=_side(policy), wall0=_side(policy, y=_FAR), wall1=_side(policy, x=_FAR)
+        floor=_side(policy),
+        wall0=_side(policy, y=_FAR),
+        wall1=_side(policy, x=_FAR),
+        wall2=_STILL,
+        wall2_faces_out=False,
     )
 
 
@@ -138,7 +154,13 @@ def _box_shell(policy: Policy) -> SeparateSides:
 
 def _exact_shell(policy: Policy) -> SeparateSides:
     """Return the unturned Cornell-like box; a spin of exactly 0 stays 0 in both policies."""
-    return SeparateSides(floor=SideRanges(), wall2_faces_out=policy == "original")
+    return SeparateSides(
+        floor=_STILL,
+        wall0=_STILL,
+        wall1=_STILL,
+        wall2=_STILL,
+        wall2_faces_out=policy == "original",
+    )
 
 
 def _side(policy: Policy, *, x: Range = _NEAR, y: Range = _NEAR, z: Range = _NEAR) -> SideRanges:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.families.default_families import DEFAULT_FAMILIES, ONE_FAMILY_EACH
+from scene_templates.families.default_families import DEFAULT_FAMILIES
+from scene_templates.families.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.layout import Layout, Pose
 from scene_templates.layout_rand import layout_rand
 from scene_templates.plans import ScenePlan, scene_plan

@@ -11,9 +11,9 @@ from scene_templates.contents.cameras import CameraSettings
 from scene_templates.contents.lights import LightSettings
 from scene_templates.contents.materials import MaterialSettings
 from scene_templates.contents.placement import PlacementSettings
-from scene_templates.families.default_families import ONE_FAMILY_EACH
 from scene_templates.families.excursions import Excursion
 from scene_templates.families.family import Family
+from scene_templates.families.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.shell.rooms import SharedRoom
 from scene_templates.shell.separate_sides import SideRanges

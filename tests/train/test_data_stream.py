@@ -81,7 +81,13 @@ def same_batches(a: list[list[TrainingScene]], b: list[list[TrainingScene]]) -> 
 
 
 def by_key(batch: list[TrainingScene]) -> list[TrainingScene]:
-    return sorted(batch, key=lambda scene: (scene.key, float(scene.target_VRR3.sum())))
+    return sorted(batch, key=identity)
+
+
+def identity(scene: TrainingScene) -> tuple[str | bytes, ...]:
+    """Key and bytes: two visits of a scene may differ in nothing that a sum would tell."""
+    tensors = [scene.target_VRR3, *(value for _, value in sorted(vars(scene.tensors).items()))]
+    return (scene.key, *(tensor.contiguous().numpy().tobytes() for tensor in tensors))
 
 
 WHOLE = 8

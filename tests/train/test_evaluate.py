@@ -15,6 +15,7 @@ from infra.excursion_plots import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
 from pipeline.flows.judging_builds import JUDGING_BUILDS
+from storage.conventions import ROUGHNESS
 from storage.dataset import Dataset
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
@@ -274,7 +275,8 @@ def test_facts_come_from_the_scene() -> None:
     scene = sample.scene.with_provenance(provenance)
     facts = facts_of(dataclasses.replace(sample, scene=scene))
     assert facts["excursion"] == ("lights", 16.0) and facts["template"] == "toy"
-    assert (facts["num_lights"], facts["roughness"]) == (1, 0.5)
+    *surfaces, _lamp = scene.materials[:, ROUGHNESS].tolist()
+    assert (facts["num_lights"], facts["roughness"]) == (1, min(surfaces))
 
 
 def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from tests.train.toy import toy_sample, toy_scene
 from train.data.scenes import training_scene
 from train.evaluation.hits import CHUNK, hit_masks
 from train.evaluation.judge import median_picture
-from train.evaluation.scores import ViewScore, score_view, share_better, summarise
+from train.evaluation.scores import ViewScore, lead, score_view, share_better, summarise
 from train.evaluation.sheet import (
     ERROR_WHITE,
     NOISE_WHITE,
@@ -72,6 +72,26 @@ def test_many_triangles_go_through_in_chunks() -> None:
     assert (~scene.triangle_emits).sum() > CHUNK
     masks = hit_masks(scene, 8)
     assert np.array_equal(masks[0], hits_one_by_one(scene, 0, 8))
+
+
+def view_score(log_l1: float) -> ViewScore:
+    return ViewScore(log_l1=log_l1, psnr_log_db=0, psnr_linear_db=0, object_psnr_log_db=0)
+
+
+def test_a_lead_is_sure_where_scenes_agree_on_it() -> None:
+    """Views of one scene are one draw: many of them make no lead surer."""
+    rival = [view_score(0.06)] * 12
+    agreed = lead([view_score(x) for x in (0.05, 0.052, 0.051) * 4], rival, [3] * 4)
+    assert agreed.log_l1 == pytest.approx(0.009) and agreed.is_sure
+    one_scene_alone, rival = [view_score(0.02)] * 6 + [view_score(0.0599)] * 18, rival * 2
+    doubtful = lead(one_scene_alone, rival, [6] * 4)
+    # by hand: 0.04 of one scene and 0.0001 of three; its spread is 0.01995, over two for four
+    assert doubtful.log_l1 == pytest.approx(0.010075)
+    assert doubtful.error == pytest.approx(0.009975) and not doubtful.is_sure
+    assert lead(one_scene_alone, rival, [1] * 24).is_sure, "as so many scenes it would be"
+    single = lead([view_score(0.01)] * 2, rival[:2], [2])
+    assert single.error is None and not single.is_sure
+    assert not lead([view_score(0.07)] * 24, rival, [6] * 4).is_sure
 
 
 def test_scores_are_those_of_storage() -> None:

@@ -84,10 +84,14 @@ def alone(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def same_to_rounding(ours: Path, theirs: Path) -> None:
     a, b = weights(ours), weights(theirs)
     assert a.keys() == b.keys()
-    for name in a:
-        # float32 sums in another order, over 8 steps of AdamW, which divides by their own size: a
-        # weight moves by up to 1.5e-3 a step, so this is far below a wrong mean (measured: 4e-7)
-        np.testing.assert_allclose(a[name], b[name], rtol=1e-4, atol=5e-6, err_msg=name)
+    one = np.concatenate([a[name].ravel() for name in sorted(a)])
+    other = np.concatenate([b[name].ravel() for name in sorted(a)])
+    # float32 sums in another order, over 8 steps of AdamW, which divides a gradient by its own
+    # size. So a weight whose gradient is nothing but rounding may go either way, by up to a whole
+    # step of 1.5e-3; what is summed wrongly moves most (measured: 6 of 181,632)
+    far = ~np.isclose(one, other, rtol=1e-4, atol=5e-6)
+    assert far.mean() < 1e-3
+    assert abs(one - other).max() < 8 * 1.5e-3
     first, second = (
         [row["loss"] for row in read_rows(out / "metrics.jsonl") if "loss" in row]
         for out in (ours, theirs)

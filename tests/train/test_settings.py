@@ -1,5 +1,6 @@
 """Named runs exist, and contradictions are refused by field."""
 
+import dataclasses
 import json
 
 import pytest
@@ -7,7 +8,7 @@ import pytest
 from storage.changes import changed
 from storage.errors import TrilightError
 from tests.train.kit import tiny_run
-from train.runs import RUNS, named_run
+from train.runs import RUNS, changed_run, in_proportion, named_run
 from train.settings import settings_record
 
 
@@ -23,6 +24,38 @@ def test_named_runs_carry_their_name_and_survive_json(name: str) -> None:
 def test_an_unknown_run_is_refused_with_the_known_ones() -> None:
     with pytest.raises(TrilightError, match="'smoek': no such run; expected one of builtin, fine"):
         named_run("smoek")
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+def test_fewer_steps_bring_their_warm_up_and_intervals_along(name: str) -> None:
+    """So that any number of steps is a run that is logged, judged and saved as the whole one is."""
+    run = named_run(name)
+    for steps in (1, 2, 7, 24, 331, run.num_steps // 2):
+        shorter = changed_run(name, {}, steps=steps)
+        assert shorter.num_steps == steps
+        share = steps / run.num_steps
+        # rounded to a whole number of rows, and never to none
+        assert abs(shorter.warmup_steps - run.warmup_steps * share) <= 0.5
+        assert abs(shorter.log_every - run.log_every * share) < 1
+        for field in ("validate_every", "checkpoint_every"):
+            assert abs(getattr(shorter, field) - getattr(run, field) * share) <= shorter.log_every
+        assert shorter.keep_every % shorter.checkpoint_every == 0
+        assert (shorter.keep_every > 0) == (run.keep_every > 0)
+    assert changed_run(name, {}, steps=run.num_steps) == run
+    longer = changed_run(name, {}, steps=3 * run.num_steps)
+    assert dataclasses.replace(longer, num_steps=run.num_steps) == run
+
+
+def test_what_is_stated_is_not_brought_along() -> None:
+    stated = {"warmup_steps": 5, "validate_every": 12, "checkpoint_every": 24}
+    found = changed_run("smoke", stated, steps=24)
+    assert {name: getattr(found, name) for name in stated} == stated
+    assert changed_run("smoke", {"checkpoint_every": 9}, steps=80).log_every in (1, 3)
+    assert not in_proportion(named_run("smoke"), 24, stated).keys() & stated.keys()
+    with pytest.raises(TrilightError, match="warmup_steps is 50; expected 0 to 23"):
+        changed_run("smoke", {"warmup_steps": 50}, steps=24)
+    with pytest.raises(TrilightError, match="num_steps is 0; expected a whole number from 1"):
+        changed_run("smoke", {}, steps=0)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from storage.sample import Sample
 from train.data.buckets import make_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.hits import hit_masks
-from train.evaluation.scores import ViewScore, score_view, share_better, summarise
+from train.evaluation.scores import Lead, ViewScore, lead, score_view, share_better, summarise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,6 +38,8 @@ class Judgement:
     """Scene by scene, view by view."""
     scores: dict[str, float]
     """evaluation.scores.summarise, and `better_than_median`: the share of views won."""
+    lead: Lead
+    """Of the network over the median picture."""
 
 
 class Judge:
@@ -55,7 +57,9 @@ class Judge:
         views = score_pictures(pictures, self.scenes)
         scores = summarise(views)
         scores["better_than_median"] = share_better(views, self.median_views)
-        return Judgement(pictures=pictures, views=tuple(views), scores=scores)
+        sizes = [len(scene.target_VRR3) for scene in self.scenes]
+        ahead = lead(views, self.median_views, sizes)
+        return Judgement(pictures=pictures, views=tuple(views), scores=scores, lead=ahead)
 
 
 def judged_scene(sample: Sample, resolution: int) -> JudgedScene:

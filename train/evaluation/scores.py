@@ -52,3 +52,31 @@ def share_better(views: Sequence[ViewScore], others: Sequence[ViewScore]) -> flo
     """Return the share of views whose log_l1 is below that of the same view in `others`."""
     pairs = zip(views, others, strict=True)
     return float(np.mean([view.log_l1 < other.log_l1 for view, other in pairs]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lead:
+    """By how much some pictures are better than others, and how much of that chance may be."""
+
+    log_l1: float
+    """By how much log_l1 is less; a mean over scenes."""
+    error: float | None
+    """Standard error of that mean, as scenes are drawn by chance; None of a single scene."""
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it is more than two standard errors."""
+        return self.error is not None and self.log_l1 > 2 * self.error
+
+
+def lead(
+    views: Sequence[ViewScore], others: Sequence[ViewScore], views_of_scene: Sequence[int]
+) -> Lead:
+    """Return the lead over `others` on the same views; those of one scene are counted as one."""
+    pairs = zip(views, others, strict=True)
+    of_view = np.array([other.log_l1 - view.log_l1 for view, other in pairs])
+    of_scene = [part.mean() for part in np.split(of_view, np.cumsum(views_of_scene)[:-1])]
+    error = None
+    if len(of_scene) > 1:
+        error = float(np.std(of_scene, ddof=1) / np.sqrt(len(of_scene)))
+    return Lead(log_l1=float(np.mean(of_scene)), error=error)

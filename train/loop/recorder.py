@@ -20,7 +20,7 @@ class Recorder:
         self,
         folder: RunFolder,
         settings: TrainSettings,
-        judge: Judge,
+        judge: Judge | None,
         progress: Progress,
         *,
         first_step: int,
@@ -37,7 +37,9 @@ class Recorder:
         self._board.scalars(row)
 
     def validate(self, state: TrainState) -> None:
-        """Judge the network on the validation split, and write down how it did."""
+        """Judge the network on the validation split, if there is one, and write down how it did."""
+        if self._judge is None:
+            return
         judgement = self._judge.judge(state.shown)
         self.row({"step": state.step, "validation": judgement.scores})
         sheet = drawn_validation_sheet(self._settings, self._judge, judgement, state.step)

@@ -14,13 +14,14 @@ from train.loop.checkpoints import keep_checkpoint
 from train.loop.crew import Crew
 from train.loop.dead_start import StartWatch
 from train.loop.flops import device_peak, scene_flops
-from train.loop.interrupts import deferred_interrupts
+from train.loop.interrupts import Stopped, deferred_interrupts
 from train.loop.optim import learning_rate
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
 from train.loop.step import Stepper, StepReport
 from train.loop.window import Window
 from train.loss.objective import Objective
+from train.progress import Silent
 from train.settings import TrainSettings
 
 PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -63,19 +64,15 @@ class Trainer:
             TrilightError: a signal asked to stop or the start went dead (the state is saved), or
                 the steps keep failing.
         """
-        with deferred_interrupts() as asked_to_stop:
+        progress = Silent() if self.recorder is None else self.recorder.progress
+        with deferred_interrupts(progress.interrupted) as asked_to_stop:
             while self.state.step < self.settings.num_steps:
                 self._after_step(self._step(batches))
                 if self.state.step == self.settings.num_steps:
                     return
                 # one process may be signalled before another; all stop at the same step
                 if self.crew.any(asked_to_stop()):
-                    self._leave(
-                        TrilightError(
-                            f"training: stopped at step {self.state.step} by a signal, nothing is "
-                            "lost. Run the same command with --resume to go on."
-                        )
-                    )
+                    self._leave(Stopped(self.state.step))
                 if verdict := self.start_watch.verdict(self.state.step):
                     self._leave(verdict)
 

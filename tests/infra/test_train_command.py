@@ -1,0 +1,146 @@
+"""What a person who types `trilight train` reads, and what Ctrl-C does, in real processes."""
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tests.conftest import ROOT
+from tests.train.toy import write_toy_dataset
+from train.loop.checkpoints import saved_steps
+from train.loop.metrics_log import read_rows
+
+TRILIGHT = [sys.executable, "-m", "infra.cli.app"]
+TINY = {
+    "resolution": 16,
+    "model.width": 36,
+    "model.hidden_width": 48,
+    "model.rope_num_freqs": 1,
+    "model.encoder_layers": 1,
+    "model.decoder_layers": 1,
+    "views_per_scene": 2,
+    "log_every": 1,
+}
+
+
+def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
+    """Torch takes seconds to import; here it cannot be."""
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from infra.cli.app import main\n"
+        "sys.argv = ['trilight', 'train', *sys.argv[1:]]\n"
+        "main()"
+    )
+
+    def said(*arguments: str) -> tuple[str, str]:
+        done = subprocess.run(
+            [sys.executable, "-c", code, *arguments, "--data", str(tmp_path)],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=False,
+            env=os.environ | {"COLUMNS": "200"},
+        )
+        assert done.returncode == 1
+        return done.stdout, done.stderr
+
+    assert "run 'smok': no such run; expected one of" in said("smok")[1]
+    assert "setting 'widht' does not exist" in said("smoke", "--set", "widht=3")[1]
+    assert "name one with --from" in said("finetune")[1]
+    words, mistake = said("smoke", "--steps", "24")
+    assert "warmup_steps=3, log_every=1, validate_every=4, checkpoint_every=4" in words
+    assert "Run smoke: 24 steps of 4 scenes at 64 pixels. Loading torch" in words
+    assert "torch is not installed" in mistake
+
+
+def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(tmp_path: Path) -> None:
+    """As printed, in a folder with a blank in its name; threads wait without burning a core."""
+    data = write_toy_dataset(tmp_path / "the data", train=4, validation=0, resolution=16)
+    out = tmp_path / "my runs" / "first"
+    command = ["train", "smoke", "--data", str(data.folder.root), "--out", str(out)]
+    command += ["--device", "cpu", "--set", "checkpoint_every=50000", "--steps", "100000"]
+    command += [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
+    words, mistake = _stopped_after(command, out, 1)
+    assert "Stopping after this step" in words
+    assert "the data has no validation split" in words
+    assert "OMP_WAIT_POLICY = 'PASSIVE'" in mistake, "libgomp itself says so, as torch loads it"
+    found = re.search(r"training: stopped at step (\d+), nothing is lost\. To go on: (.*)", mistake)
+    assert found, mistake
+    (saved,) = saved_steps(out / "checkpoints")
+    assert int(found[1]) == saved
+    name, *again = shlex.split(found[2])
+    assert (name, again) == ("trilight", [*command, "--resume"])
+    _, mistake = _stopped_after(again, out, saved + 1)
+    assert found[2] in mistake, "once more the same, with one --resume"
+    assert saved_steps(out / "checkpoints")[-1] > saved
+
+
+def _stopped_after(arguments: list[str], out: Path, step: int) -> tuple[str, str]:
+    """Return what a run says, and what on stderr, that gets Ctrl-C when its log has a step."""
+    unset = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    started = subprocess.Popen(
+        [*TRILIGHT, *arguments],
+        cwd=ROOT,
+        env=unset | {"OMP_DISPLAY_ENV": "true", "OMP_NUM_THREADS": "1", "COLUMNS": "200"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while started.poll() is None and not any(
+        row["step"] >= step for row in read_rows(out / "metrics.jsonl")
+    ):
+        time.sleep(0.05)
+    started.send_signal(signal.SIGINT)
+    words, mistake = started.communicate()
+    assert started.returncode == 1, mistake
+    return words, mistake
+
+
+def test_a_second_ctrl_c_ends_a_step_that_does_not(tmp_path: Path) -> None:
+    """The step is a call into C that hears no signal, as a backward pass."""
+    code = (
+        "import ctypes, time\n"
+        "from infra.cli.console import progress_bars\n"
+        "from infra.cli.train import _BarProgress\n"
+        "from train.loop.interrupts import deferred_interrupts\n"
+        "c, mutex = ctypes.CDLL(None), (ctypes.c_byte * 64)()\n"
+        "c.pthread_mutex_lock(mutex)\n"
+        "until = (ctypes.c_long * 2)(int(time.time()) + 300, 0)\n"
+        "with progress_bars() as bars, deferred_interrupts(_BarProgress(bars).interrupted):\n"
+        "    print('in the step', flush=True)\n"
+        "    c.pthread_mutex_timedlock(mutex, until)\n"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-u", "-c", code],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert started.stdout is not None
+    assert started.stdout.readline() == "in the step\n"
+    started.send_signal(signal.SIGINT)
+    assert "Stopping after this step" in started.stdout.readline()
+    time.sleep(1.1)  # closer together they are one asking
+    started.send_signal(signal.SIGINT)
+    _, mistake = started.communicate(timeout=120)
+    assert started.returncode == 130, mistake
+    assert "ended at once; --resume goes on from the last checkpoint" in mistake
+
+
+def test_a_wait_policy_of_the_users_own_stays() -> None:
+    code = (
+        "import os, sys; sys.argv = ['trilight', '--help']\n"
+        "from infra.cli.app import main\n"
+        "try:\n    main()\nfinally:\n    print(os.environ['OMP_WAIT_POLICY'])"
+    )
+    for own, expected in (({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")):
+        unset = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=ROOT, env=unset | own, capture_output=True, text=True
+        )
+        assert done.stdout.splitlines()[-1] == expected
