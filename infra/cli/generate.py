@@ -11,6 +11,7 @@ import typer
 from rich.progress import Progress as Bars
 
 from infra.cli.changes import parse_changes
+from infra.cli.completion import builds
 from infra.cli.console import console, progress_bars
 from infra.cli.generate_report import report
 from pipeline.flows.order import DatasetOrder
@@ -28,7 +29,9 @@ _POLL_S = 0.5
 
 
 def generate(
-    build: Annotated[str, typer.Argument(help="named settings, such as smoke")],
+    build: Annotated[
+        str, typer.Argument(help="named settings, such as smoke", autocompletion=builds)
+    ],
     objects: Annotated[
         str | None,
         typer.Option(help="folder of 3D objects, its URL, builtin: or objaverse: [builtin:]"),

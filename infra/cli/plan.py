@@ -6,13 +6,16 @@ from typing import Annotated
 import typer
 
 from infra.cli.changes import parse_changes
+from infra.cli.completion import builds
 from infra.cli.console import console, print_json, print_rows, progress_bars
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
 
 
 def plan(
-    build: Annotated[str, typer.Argument(help="named settings, such as pretrain-256")],
+    build: Annotated[
+        str, typer.Argument(help="named settings, such as pretrain-256", autocompletion=builds)
+    ],
     scenes: Annotated[int | None, typer.Option(help="scenes of the dataset [the build's]")] = None,
     objects: Annotated[str | None, typer.Option(help="as for generate [builtin:]")] = None,
     samples: Annotated[int, typer.Option(min=4, help="scenes to measure")] = 12,

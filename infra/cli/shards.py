@@ -10,7 +10,9 @@ from pipeline.shards.derive import Derive
 from pipeline.shards.plans import Selection
 from storage.errors import TrilightError
 
-app = typer.Typer(no_args_is_help=True, help="Make new datasets of finished ones.")
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, help="Make new datasets of finished ones."
+)
 
 Source = Annotated[Path, typer.Argument(help="folder of a finished dataset")]
 Out = Annotated[Path, typer.Option(help="folder of the new dataset; must not exist")]
