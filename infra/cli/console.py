@@ -18,7 +18,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 console = Console(stderr=False, highlight=False)
@@ -113,9 +113,9 @@ def progress_bars() -> Bars:
     """Return progress bars with count, rate, elapsed time and ETA; silent without a terminal."""
     return Bars(
         TextColumn("{task.description:<8}"),
-        BarColumn(bar_width=30),
+        BarColumn(bar_width=20),
         MofNCompleteColumn(),
-        RateColumn(),
+        RateColumn(table_column=Column(no_wrap=True)),
         TimeElapsedColumn(),
         TextColumn("left"),
         # a shard's scenes end together, so that the speed of the last seconds says little

@@ -20,12 +20,15 @@ from pipeline.flows.machine import cores_owned, visible_gpus
 from pipeline.flows.make_shard import is_free
 from pipeline.flows.make_task import ShardJob, TaskOutcome, close_children
 from pipeline.flows.order import DatasetOrder
+from pipeline.flows.order_words import generate_words
 from pipeline.flows.pieces import TaskSizes, TasksLeft
 from pipeline.flows.publication import Publication
 from pipeline.flows.runners import Runner
 from pipeline.flows.scene_files import SceneFolder, find_scene_files
 from pipeline.flows.settings import BuildSettings
+from pipeline.objects.sources import look_at_source
 from pipeline.renders.variant import choose_variant
+from storage.asked import write_asked
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
 from storage.output import dataset_folder
@@ -124,8 +127,10 @@ def _settings(order: DatasetOrder) -> tuple[BuildSettings, SceneFolder | None]:
         allow_licences=order.allow_licences,
         changes=order.changes,
     )
-    object_source(settings, order.objects)  # refuse before anything is written
+    source = object_source(settings, order.objects)  # refuse before anything is written
     listed = None if order.scenes_from is None else find_scene_files(order.scenes_from)
+    if listed is None and not _folder(order).manifest.exists():
+        look_at_source(source, allowed_licences=settings.allowed_licences, licence=order.licence)
     return settings_for_files(settings, listed, order.views), listed
 
 
@@ -147,6 +152,7 @@ def _begin(
         else:
             source = object_source(settings, order.objects)
             accepted = accept_objects(source, order.licence, settings, publication, cores_owned())
+        write_asked(folder, generate_words(order))
     return Run(
         order=order, settings=settings, listed=listed, publication=publication, accepted=accepted
     )

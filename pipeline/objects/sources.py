@@ -10,7 +10,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from pipeline.objects.generated import PREFIX as BUILTIN
-from pipeline.objects.generated import generate_objects
+from pipeline.objects.generated import generate_objects, num_builtin
 from pipeline.objects.licences import (
     check_allowed,
     refuse_licences,
@@ -84,17 +84,9 @@ def find_objects(
             licence has no form of one, or is stated where the source states its own; a package is
             missing; a server does not answer, or nothing could be downloaded.
     """
-    check_allowed(allowed_licences)
-    stated_licence(licence)
     source = _from_environment(source)
-    listing = _list(source, work_dir, licence, allowed_licences)
+    listing = _listed(source, work_dir, licence, allowed_licences)
     shown = printable(safe_url(source))
-    if not listing.records and not listing.failures:
-        raise TrilightError(
-            f"objects {shown!r} holds no object; expected {' '.join(SUFFIXES)} files, or a "
-            f"catalogue (objects.jsonl or objects.csv) that lists some. Name {BUILTIN} for "
-            "built-in objects."
-        )
     allowed, refused = refuse_licences(listing.records, allowed_licences)
     here, lost = listing.fetch(allowed, downloaded)
     failures = [*listing.failures, *refused, *lost]
@@ -103,6 +95,22 @@ def find_objects(
         records=tuple(sorted(here, key=attrgetter("uid"))),
         failures=tuple(sorted(failures, key=attrgetter("item"))),
     )
+
+
+def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
+    """Find out whether a source is there and holds anything, before a dataset of it is begun.
+
+    Nothing is written beside what a server's listing leaves in the cache.
+
+    Raises:
+        TrilightError: as `find_objects`, as far as listing the source tells.
+    """
+    source = _from_environment(source)
+    if source.startswith(BUILTIN):
+        require_unstated(licence, BUILTIN)
+        num_builtin(source)
+    else:
+        _listed(source, Path(), licence, allowed_licences)
 
 
 def _from_environment(source: str) -> str:
@@ -115,6 +123,22 @@ def _from_environment(source: str) -> str:
             "set here; expected it to name a source of objects."
         )
     return found
+
+
+def _listed(
+    source: str, work_dir: Path, licence: str | None, allowed_licences: Sequence[str]
+) -> Listing:
+    """Return what a source says that it holds; raises TrilightError where that is nothing."""
+    check_allowed(allowed_licences)
+    stated_licence(licence)
+    listing = _list(source, work_dir, licence, allowed_licences)
+    if not listing.records and not listing.failures:
+        raise TrilightError(
+            f"objects {printable(safe_url(source))!r} holds no object; expected "
+            f"{' '.join(SUFFIXES)} files, or a catalogue (objects.jsonl or objects.csv) that lists "
+            f"some. Name {BUILTIN} for built-in objects."
+        )
+    return listing
 
 
 def _list(
