@@ -85,7 +85,7 @@ def test_wrong_bytes_are_one_sentence_with_what_mends_it(suffix: str, tmp_path: 
     dataset = five_scenes(tmp_path)
     shard = dataset.manifest.shards[0]
     path = dataset.folder.shard(shard.name)
-    name, offset, num_bytes = next(
+    _, offset, num_bytes = next(
         row for row in shard.members if row[0].partition(".")[2].startswith(suffix)
     )
     data = bytearray(path.read_bytes())
