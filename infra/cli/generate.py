@@ -15,6 +15,7 @@ from infra.cli.generate_report import report
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.renders.variant import choose_variant
+from pipeline.scenes.described_albedos import require_choice
 from storage.errors import TrilightError
 from storage.output import dataset_folder
 
@@ -82,6 +83,9 @@ def generate(
         int | None,
         typer.Option(help="with --scenes-from: first cameras of each file [all that every has]"),
     ] = None,
+    albedo_over_one: Annotated[
+        str, typer.Option(help="RenderFormer scenes with diffuse + specular above 1: scale, refuse")
+    ] = "scale",
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -108,6 +112,7 @@ def generate(
         accept_environment=accept_environment,
         scenes_from=None if scenes_from is None else str(scenes_from),
         views=views,
+        albedo_over_one=require_choice(albedo_over_one),
         shards=shards,
         changes=parse_changes(set_ or ()),
     )

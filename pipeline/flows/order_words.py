@@ -17,6 +17,7 @@ _OPTIONS = {
     "failure_budget": "--failure-budget",
     "scenes_from": "--scenes-from",
     "views": "--views",
+    "albedo_over_one": "--albedo-over-one",
 }
 """Options of one value by the field that they fill."""
 
