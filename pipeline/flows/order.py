@@ -12,6 +12,7 @@ from storage.errors import TrilightError
 from storage.output import dataset_folder
 from storage.ranges import Seed, Share, Within, check_ranges
 from storage.splits import MOST_SCENES
+from storage.suggestion import expected_one_of
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
@@ -63,8 +64,8 @@ class DatasetOrder:
 
     def __post_init__(self) -> None:
         if self.build not in BUILDS:
-            names = ", ".join(BUILDS)
-            raise TrilightError(f"build {self.build!r} is unknown; expected one of {names}.")
+            expected = expected_one_of(self.build, BUILDS)
+            raise TrilightError(f"build {self.build!r} is unknown; {expected}.")
         check_ranges(self)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(

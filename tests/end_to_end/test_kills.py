@@ -1,6 +1,7 @@
 """A run that is killed at any moment ends, when run again, in the digest of one that was not."""
 
 import os
+import shlex
 import signal
 import subprocess
 import time
@@ -86,8 +87,7 @@ def test_ctrl_c_says_what_to_do_and_leaves_nobody(tmp_path: Path) -> None:
     run.send_signal(signal.SIGINT)
     _, errors = run.communicate(timeout=30)
     assert run.returncode == 130
-    assert (
-        errors.strip()
-        == "trilight: interrupted. What was finished is safe; the same command goes on."
-    )
+    again = shlex.join(["trilight", *ARGUMENTS, "--out", str(tmp_path / "set")])
+    told = "trilight: interrupted. What was finished is safe; to go on, run:"
+    assert errors.strip() == f"{told} {again}"
     _wait_until_nobody_is_left(mark)
