@@ -21,7 +21,6 @@ from pipeline.flows.prepare_isolated import asset_child
 from pipeline.flows.publication import begin
 from pipeline.flows.scene_files import SceneFiles, build_scene
 from pipeline.flows.scene_folder import find_scene_files
-from pipeline.flows.scene_source import load_source, scene_source
 from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import IsolatedChild
 from storage.errors import Rejected, TrilightError
@@ -287,21 +286,3 @@ def test_only_bad_files_are_refused_with_the_reason_of_the_first(tmp_path: Path)
     (tmp_path / "a.json").write_text("{")
     with pytest.raises(TrilightError, match="none of the 1 scene files is usable; the first: a.js"):
         find_scene_files(str(tmp_path))
-
-
-def test_albedos_beyond_one_are_scaled_with_a_note_or_refused(folder: Path) -> None:
-    """1.1 as the background of one published scene has it: one factor for both and all channels."""
-    example = json.loads((folder / "a.json").read_text())["objects"]["green"]["material"]
-    plain = {"rand_tri_diffuse_seed": None, "diffuse": [0.6, 0.3, 0.0], "specular": [0.5] * 3}
-    _change(folder, "a.json", material={**example, **plain})
-    scene = _build(folder)
-    row = scene.materials[scene.material_index[scene.object_index == 0][0]]
-    expected = [0.6 / 1.1, 0.3 / 1.1, 0.0, 0.5 / 1.1, 0.5 / 1.1, 0.5 / 1.1]
-    assert row[:6] == pytest.approx(expected, rel=1e-6)  # the rounding of float32
-    assert scene.provenance["albedo_scale"] == {"green": round(1 / 1.1, 6)}
-    assert "albedo_scale" not in _build(folder, "b.json").provenance
-    loaded = load_source(scene_source(str(folder / "a.json")))
-    assert any("diffuse + specular is 1.1000" in note for note in loaded.notes)
-    refusing = scene_source(str(folder / "a.json"), albedo_over_one="refuse")
-    with pytest.raises(TrilightError, match="diffuse \\+ specular is 1.1000; expected at most 1"):
-        load_source(refusing)
