@@ -7,7 +7,7 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -40,9 +40,15 @@ class Finding:
     """The one command that mends it."""
 
 
-def examine() -> list[Finding]:
-    """Look at everything; probes that may crash run in processes of their own."""
-    return [check() for check in CHECKS]
+def examine(looking_at: Callable[[str], None] = lambda name: None) -> Iterator[Finding]:
+    """Look at one thing after another; probes that may crash run in processes of their own.
+
+    Args:
+        looking_at: called with the name of what is looked at next, which may take seconds.
+    """
+    for name, check in CHECKS.items():
+        looking_at(name)
+        yield check()
 
 
 def _machine() -> Finding:
@@ -228,16 +234,16 @@ def _last_line(text: str, status: int) -> str:
     return text.strip().splitlines()[-1] if text.strip() else f"ended with status {status}"
 
 
-CHECKS: Sequence[Callable[[], Finding]] = (
-    _machine,
-    _disk,
-    _cache,
-    _renderer,
-    _denoiser,
-    _mesh_filters,
-    _mesh_decimation,
-    _orchestrator,
-    _learning,
-    _accelerator,
-)
-"""What `examine` looks at, in the order of the report."""
+CHECKS: Mapping[str, Callable[[], Finding]] = {
+    "machine": _machine,
+    "disk": _disk,
+    "cache": _cache,
+    "renderer": _renderer,
+    "denoiser": _denoiser,
+    "mesh filters": _mesh_filters,
+    "mesh decimation": _mesh_decimation,
+    "orchestrator": _orchestrator,
+    "learning": _learning,
+    "GPU": _accelerator,
+}
+"""What `examine` looks at by the name of its finding, in the order of the report."""

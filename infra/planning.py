@@ -7,9 +7,9 @@ The scenes are the first ones of the dataset itself, in its own shards and split
 
 import dataclasses
 import math
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,39 +99,41 @@ class Prediction:
 
 
 def measure_scenes(
-    order: DatasetOrder, count: int, scene_done: Callable[[], None]
+    order: DatasetOrder, count: int, place: Path, scene_done: Callable[[], None]
 ) -> MeasuredScenes:
-    """Make the first scenes of a dataset in a folder that is then deleted.
+    """Make the first scenes of a dataset in another folder.
 
     Args:
         order: the dataset; its folder is not touched.
         count: scenes to make.
+        place: an empty folder, which may be deleted then.
         scene_done: called after each.
 
     Raises:
         TrilightError: as `prepare_dataset`.
     """
-    with tempfile.TemporaryDirectory(prefix="trilight-plan-") as place:
-        run = prepare_dataset(dataclasses.replace(order, out=place, scenes=count))
-        job = ShardJob(
-            folder=run.publication.folder,
-            settings=run.settings,
-            environment={},
-            accepted=run.accepted,
-            lock_sha256=run.publication.manifest.objects_lock_sha256,
-            num_at_once=1,
-        )
-        splits = run.settings.splits
-        core_s, sizes = [], []
-        try:
-            for scene in range(count):
-                shard = scene // splits.scenes_per_shard
-                made = make_task(job, (Piece(shard_index=shard, first=scene, last=scene + 1),))
-                core_s.append(made.core_s)
-                sizes.append(_scene_bytes(job.folder, shard_name(shard, splits), scene))
-                scene_done()
-        finally:
-            close_children()
+    # begun as large as it will be, so that a lack of objects is told now and not by `generate`
+    scenes = max(count, _num_scenes(order))
+    run = prepare_dataset(dataclasses.replace(order, out=str(place), scenes=scenes))
+    job = ShardJob(
+        folder=run.publication.folder,
+        settings=run.settings,
+        environment={},
+        accepted=run.accepted,
+        lock_sha256=run.publication.manifest.objects_lock_sha256,
+        num_at_once=1,
+    )
+    splits = run.settings.splits
+    core_s, sizes = [], []
+    try:
+        for scene in range(count):
+            shard = scene // splits.scenes_per_shard
+            made = make_task(job, (Piece(shard_index=shard, first=scene, last=scene + 1),))
+            core_s.append(made.core_s)
+            sizes.append(_scene_bytes(job.folder, shard_name(shard, splits), scene))
+            scene_done()
+    finally:
+        close_children()
     return MeasuredScenes(
         core_s=tuple(core_s), num_bytes=tuple(sizes), num_views=run.settings.scenes.num_views
     )
@@ -147,8 +149,7 @@ def predict(
     is too narrow for very few scenes and cannot know what none of them shows.
     """
     splits = _settings(order).splits
-    wanted = BUILDS[order.build].num_scenes if order.scenes is None else order.scenes
-    num_scenes = planned_scenes(wanted, splits)
+    num_scenes = planned_scenes(_num_scenes(order), splits)
     num_shards = shards_for(num_scenes, splits)
     core_hours = _total(measured.core_s[1:] or measured.core_s, num_scenes / 3600)
     scene_s = core_hours.value * 3600 / num_scenes / cores_owned()
@@ -184,6 +185,10 @@ def _notes(found: Prediction) -> Iterator[str]:
             f"one flow run would have tasks of {found.task_minutes:.0f} minutes: let build-dataset "
             f"make it in at least {parts} flow runs, on as many workers"
         )
+
+
+def _num_scenes(order: DatasetOrder) -> int:
+    return BUILDS[order.build].num_scenes if order.scenes is None else order.scenes
 
 
 def _settings(order: DatasetOrder) -> BuildSettings:

@@ -9,6 +9,8 @@ from pipeline.flows.order import DatasetOrder
 from pipeline.flows.runners import ThreadRunner
 from pipeline.flows.settings import differences
 from pipeline.objects.licences import BY_USER
+from pipeline.scenes.described_albedos import require_choice
+from storage.asked import read_asked, value_of
 from storage.dataset import Dataset, open_dataset
 from storage.derived import derivation_of
 from storage.errors import TrilightError
@@ -52,6 +54,7 @@ def repair(
     manifest = opened.manifest
     _require_generated(manifest, scenes_from)
     changes, licence = _changes(manifest), _stated_licence(opened)
+    asked = read_asked(opened) or ()
     for name in bad_shards:
         if (root / name).exists():
             (root / name).replace(root / f"{name}{ASIDE}")
@@ -63,6 +66,7 @@ def repair(
         licence=licence,
         scenes_from=scenes_from,
         views=manifest.num_views if scenes_from else None,
+        albedo_over_one=require_choice(value_of(asked, "--albedo-over-one") or "scale"),
         changes=changes,
     )
     outcome = make_dataset(order, ThreadRunner())

@@ -31,6 +31,9 @@ BUILTIN = "builtin:"
 MAX_CONFIG_BYTES = 1 << 16
 """A published config.json has about 1 KiB."""
 
+_ANSWER_S = 5.0
+"""Within which the hub says that it is there; what was fetched before is used without it."""
+
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 _PICKLES = (".pt", ".pth", ".bin", ".ckpt", ".pkl")
 
@@ -117,18 +120,29 @@ def _read_config(path: Path) -> PublishedConfig:
 def _download(name: str) -> Path:
     """Return the local folder of a repository on the hub, fetched if it is not there yet."""
     try:
-        from huggingface_hub import hf_hub_download
+        from huggingface_hub import hf_hub_download, model_info
     except ModuleNotFoundError as error:
         raise TrilightError(
             f"checkpoint {name}: no such file or folder, and huggingface_hub, which would fetch "
             "it, is not installed. Run `make setup-all`, or name a local folder."
         ) from error
+    reason = ""
+    try:  # one short question: the downloads would ask again and again, for half a minute
+        model_info(name, timeout=_ANSWER_S)
+    except Exception as error:  # of whatever library asks
+        reason = _first_line(error)
     try:
-        hf_hub_download(name, CONFIG_NAME)
-        return Path(hf_hub_download(name, WEIGHTS_NAME)).parent
+        hf_hub_download(name, CONFIG_NAME, local_files_only=bool(reason))
+        path = hf_hub_download(name, WEIGHTS_NAME, local_files_only=bool(reason))
+        return Path(path).parent
     except (OSError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise TrilightError(
-            f"checkpoint {name}: not on this machine, and the hub did not give it ({reason}). "
-            "Check the name and the network, or name a local folder."
+            f"checkpoint {name}: not on this machine, and the hub did not give it "
+            f"({reason or _first_line(error)}). Check the name and the network, or name a local "
+            "folder."
         ) from error
+
+
+def _first_line(error: Exception) -> str:
+    text = str(error).strip()
+    return text.splitlines()[0] if text else type(error).__name__

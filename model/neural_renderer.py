@@ -200,7 +200,8 @@ class NeuralRenderer:
         if most is not None and scene.num_triangles > most:
             notes.append(
                 f"{scene.num_triangles} triangles, and the network was trained on at most {most}: "
-                "expect less detail (trilight convert --budget)"
+                "expect less detail, or bring the scene to that number first (trilight convert SRC "
+                f"DST --budget {most})"
             )
         return tuple(notes)
 
@@ -247,7 +248,7 @@ def _trained_range(source: str) -> TrainedRange | None:
     if not path.is_file():
         return PUBLISHED  # a name on the hub
     with path.open("rb") as file:
-        header = safetensors_header(file.read(8 + MAX_HEADER_BYTES))
+        header = safetensors_header(file.read(8 + MAX_HEADER_BYTES), name=str(path))
     metadata = header.get("__metadata__", {})
     return trained_range(metadata) if CONFIG_KEY in metadata else PUBLISHED
 

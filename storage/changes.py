@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 from storage.errors import TrilightError
+from storage.suggestion import expected_one_of
 
 Settings = TypeVar("Settings")
 
@@ -60,8 +61,8 @@ def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Ch
     for path, value, name in changes:
         if path[0] not in fields:
             raise TrilightError(
-                f"setting {name!r} does not exist; expected one of {', '.join(fields)} in place of "
-                f"{path[0]!r}."
+                f"setting {name!r} does not exist: {path[0]!r} is unknown there; "
+                f"{expected_one_of(path[0], fields)}."
             )
         is_group = _is_group(getattr(group, path[0]))
         if is_group != (len(path) > 1):
@@ -82,7 +83,8 @@ def _like(old: Any, value: Any, name: str) -> Any:
         value = tuple(value)
     if not _same_kind(old, value):
         shown = list(old) if isinstance(old, tuple) else old
-        raise TrilightError(f"setting {name!r} is {value!r}; expected something like {shown!r}.")
+        expected = "true or false" if isinstance(old, bool) else f"something like {shown!r}"
+        raise TrilightError(f"setting {name!r} is {value!r}; expected {expected}.")
     if isinstance(old, tuple) and all(isinstance(part, float) for part in old):
         return tuple(float(part) for part in value)
     return float(value) if isinstance(old, float) else value

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import BinaryIO
 
+from storage.damage import reading
 from storage.dataset_files import DatasetFiles, RemoteFiles, dataset_files
 from storage.errors import TrilightError
 from storage.failures import decode_failures
@@ -65,8 +66,9 @@ class Dataset:
         with self.files.open(shard, checked=False) as stream:
             for key, members in shard.index.items():
                 scene_members = [suffix for suffix in members if not suffix.endswith("exr")]
-                record = decode_scene(key, _read(stream, shard, members, scene_members))
-                _require_lawful(record)
+                with reading(self.shown, shard.name):
+                    record = decode_scene(key, _read(stream, members, scene_members))
+                    _require_lawful(record)
                 yield record
 
     def read_samples(self, shard: ShardEntry, keys: Iterable[str]) -> Iterator[Sample]:
@@ -74,8 +76,9 @@ class Dataset:
         index = shard.index
         with self.files.open(shard, checked=False) as stream:
             for key in keys:
-                sample = decode_sample(key, _read(stream, shard, index[key], index[key]))
-                _require_lawful(sample)
+                with reading(self.shown, shard.name):
+                    sample = decode_sample(key, _read(stream, index[key], index[key]))
+                    _require_lawful(sample)
                 yield sample
 
     def objects_lock(self) -> list[LockedObject]:
@@ -90,7 +93,6 @@ class Dataset:
 
 def _read(
     stream: BinaryIO,
-    shard: ShardEntry,
     index: Mapping[str, tuple[int, int]],
     suffixes: Iterable[str],
 ) -> dict[str, bytes]:
@@ -100,9 +102,7 @@ def _read(
         stream.seek(offset)
         members[suffix] = stream.read(num_bytes)
         if len(members[suffix]) != num_bytes:
-            raise TrilightError(
-                f"{shard.name}: shorter than the manifest says; run `trilight verify`."
-            )
+            raise TrilightError("shorter than the manifest says")
     return members
 
 
@@ -110,11 +110,11 @@ def _require_lawful(record: SceneRecord | Sample) -> None:
     try:
         record.scene.check()
     except TrilightError as error:
-        raise TrilightError(f"sample {record.key}: {error} Run `trilight verify`.") from error
+        raise TrilightError(f"sample {record.key}: {error}") from error
     if record.scene.num_views != len(record.views):
         raise TrilightError(
             f"sample {record.key}: {len(record.views)} view records; expected "
-            f"{record.scene.num_views}, one for each camera. Run `trilight verify`."
+            f"{record.scene.num_views}, one for each camera."
         )
 
 

@@ -1,9 +1,9 @@
 """How far a dataset is and when it will be done, from its files alone: here, or on a server."""
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from storage.asked import read_asked
 from storage.dataset import Dataset, open_dataset
 from storage.dataset_files import LocalFiles
 from storage.failures import count_by_reason, decode_failures
@@ -53,16 +53,15 @@ class DatasetStatus:
     digest: str
     """The dataset digest, of the listed shards."""
 
+    asked: Sequence[str] | None
+    """Words of the command that makes it, without its place; None where nobody wrote them down."""
+
     @property
-    def next_command(self) -> str:
-        """What to do next."""
-        place = shlex.quote(self.shown)
+    def next_words(self) -> Sequence[str] | None:
+        """The words of the command to run next, if it is known."""
         if self.finished:
-            return f"trilight verify {place}"
-        return (
-            f"trilight generate {self.build} --out {place} --scenes {self.scenes_planned}, with "
-            "the same other options as before, goes on"
-        )
+            return ("verify", self.shown)
+        return None if self.asked is None else (*self.asked, "--out", self.shown)
 
 
 def read_status(url: str) -> DatasetStatus:
@@ -96,6 +95,7 @@ def read_status(url: str) -> DatasetStatus:
         last_scene_unix_s=max((row.finished_unix_s for row in logs), default=None),
         failures=count_by_reason(decode_failures(dataset.files.read("failures.jsonl") or b"")),
         digest=dataset.digest,
+        asked=read_asked(dataset),
     )
 
 

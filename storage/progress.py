@@ -1,7 +1,9 @@
 """How far a dataset is, from its files alone: anybody may look, from any process."""
 
+import contextlib
 import functools
 import json
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +11,12 @@ from pathlib import Path
 from storage.atomic import write_atomically, write_error
 from storage.derived import derivation_of
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
+from storage.layout import DatasetFolder, numbered
 from storage.manifest import Manifest, read_manifest
 from storage.splits import SplitSettings, scenes_of_shard, shard_name, shards_for
+
+_AT_WORK_S = 600.0
+"""What is told of a scene is not older than a pass of samples takes; else a kill has left it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +35,10 @@ class Progress:
     """Scenes in shards or waiting for their shard."""
     scenes_planned: int
     """Scenes to make."""
+    num_views: int
+    """Views of a scene."""
+    views_done: float
+    """Views of the finished scenes, and how far those of the scenes at work are."""
 
 
 def announce_downloads(folder: DatasetFolder, done: int, total: int) -> None:
@@ -53,14 +62,33 @@ def count_object(folder: DatasetFolder) -> None:
         raise write_error(path, error) from error
 
 
+def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
+    """Write down how many views of a scene at work are finished, the one at hand in part.
+
+    It is for people alone, so that where it cannot be written nothing is said.
+    """
+    with contextlib.suppress(OSError):
+        path = _at_work(folder) / numbered(scene_index, f"{scene_index:09d}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{views:.3f}")
+
+
+def forget_views(folder: DatasetFolder, scene_index: int) -> None:
+    """Take back what `tell_views` wrote: the scene is finished, or begun anew."""
+    with contextlib.suppress(OSError):
+        (_at_work(folder) / numbered(scene_index, f"{scene_index:09d}")).unlink()
+
+
 def read_progress(folder: DatasetFolder) -> Progress:
     """Count files; cheap enough to be called twice a second: a manifest is read when it changes."""
     try:
         facts = folder.manifest.stat()
-        scenes_planned, planned = _plan_of(folder.manifest, facts.st_mtime_ns, facts.st_size)
+        scenes_planned, num_views, planned = _plan_of(
+            folder.manifest, facts.st_mtime_ns, facts.st_size
+        )
         scenes_done = num_scenes_done(folder, planned)
     except (TrilightError, OSError):
-        scenes_planned = scenes_done = 0
+        scenes_planned = num_views = scenes_done = 0
     plan = json.loads(_plan(folder).read_bytes()) if _plan(folder).exists() else {"objects": 0}
     done, total = (
         json.loads(_downloads(folder).read_bytes()) if _downloads(folder).exists() else (0, 0)
@@ -72,14 +100,27 @@ def read_progress(folder: DatasetFolder) -> Progress:
         objects_planned=plan["objects"],
         scenes_done=scenes_done,
         scenes_planned=scenes_planned,
+        num_views=num_views,
+        views_done=scenes_done * num_views + _views_at_work(folder),
     )
 
 
+def _views_at_work(folder: DatasetFolder) -> float:
+    """Return how many views are told of that a kill has not left long ago."""
+    since = time.time() - _AT_WORK_S
+    told = 0.0
+    for path in _at_work(folder).rglob("[0-9]*"):
+        with contextlib.suppress(OSError, ValueError):  # it is gone, or half written
+            if path.is_file() and path.stat().st_mtime > since:
+                told += float(path.read_text())
+    return told
+
+
 @functools.lru_cache(maxsize=4)
-def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, Mapping[str, int]]:
-    """Return the scenes and the shards of a manifest file, which is known by its time and size."""
+def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, int, Mapping[str, int]]:
+    """Return scenes, views of each, and shards of a manifest, known by the time and size of it."""
     found = read_manifest(manifest)
-    return found.num_scenes, planned_shards(found)
+    return found.num_scenes, found.num_views, planned_shards(found)
 
 
 def planned_shards(manifest: Manifest) -> dict[str, int]:
@@ -112,6 +153,10 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
     there = shards_there(folder) & planned.keys()
     unpacked = sum(path.is_file() for path in folder.staged_samples.rglob("*.tar"))
     return sum(planned[name] for name in there) + unpacked
+
+
+def _at_work(folder: DatasetFolder) -> Path:
+    return folder.staging / "at_work"
 
 
 def _plan(folder: DatasetFolder) -> Path:

@@ -15,7 +15,7 @@ MAX_HEADER_BYTES = 1 << 20
 
 
 def read_safetensors(
-    data: bytes, max_header_bytes: int = MAX_HEADER_BYTES
+    data: bytes, max_header_bytes: int = MAX_HEADER_BYTES, *, name: str = "safetensors"
 ) -> tuple[dict[str, NDArray], dict[str, str]]:
     """Return arrays and metadata of a safetensors file held in memory.
 
@@ -23,17 +23,24 @@ def read_safetensors(
         TrilightError: as `safetensors_header`, or the library refuses the bytes (it checks every
             offset against the length of `data`).
     """
-    header = safetensors_header(data, max_header_bytes)
+    header = safetensors_header(data, max_header_bytes, name=name)
     try:
         arrays = load(data)
     except (SafetensorError, ValueError) as error:
-        raise TrilightError(f"safetensors: unreadable ({error}).") from error
+        raise TrilightError(f"{name}: unreadable ({error}).") from error
     metadata = header.get("__metadata__", {})
     return {name: np.asarray(array) for name, array in arrays.items()}, metadata
 
 
-def safetensors_header(data: bytes, max_header_bytes: int = MAX_HEADER_BYTES) -> dict[str, Any]:
+def safetensors_header(
+    data: bytes, max_header_bytes: int = MAX_HEADER_BYTES, *, name: str = "safetensors"
+) -> dict[str, Any]:
     """Return the header of a safetensors file held in memory, as it stands there.
+
+    Args:
+        data: the file, or as much of it as the header may take.
+        max_header_bytes: a longer header is refused.
+        name: of the file, for messages.
 
     Raises:
         TrilightError: the bytes are truncated, the header is larger than `max_header_bytes`, or it
@@ -42,13 +49,13 @@ def safetensors_header(data: bytes, max_header_bytes: int = MAX_HEADER_BYTES) ->
     length = int.from_bytes(data[:8], "little")
     if len(data) < 8 or length > min(max_header_bytes, len(data) - 8):
         raise TrilightError(
-            f"safetensors: the header claims {length} bytes of a file of {len(data)}; expected at "
-            f"most {max_header_bytes}. The file is damaged."
+            f"{name}: the header claims {length} bytes of a file of {len(data)}; expected at most "
+            f"{max_header_bytes}. The file is damaged, or no safetensors file."
         )
     try:
         header = json.loads(data[8 : 8 + length])
     except (ValueError, RecursionError) as error:
-        raise TrilightError(f"safetensors: unreadable ({error}).") from error
+        raise TrilightError(f"{name}: unreadable ({error}).") from error
     if not isinstance(header, dict):
-        raise TrilightError("safetensors: the header is no JSON object.")
+        raise TrilightError(f"{name}: the header is no JSON object.")
     return header

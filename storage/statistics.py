@@ -3,14 +3,17 @@
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.damage import reading
 from storage.dataset import Dataset
 from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.manifest import ShardEntry
 from storage.profiles import PACKED, PLAIN, unpack_arrays
 
 
@@ -70,42 +73,59 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     """Read every sample but its pictures through the manifest's index.
 
     Raises:
-        TrilightError, OSError: a shard is missing or shorter than its index.
+        TrilightError: a shard is missing or damaged.
     """
-    splits: Counter[str] = Counter()
-    templates: Counter[str] = Counter()
-    excursions: Counter[str] = Counter()
-    views: list[Any] = []
-    scene_members: dict[str, str] = {}
+    tally = _Tally()
     for shard in dataset.manifest.shards:
-        with dataset.files.open(shard, checked=False) as stream:
-            for name, offset, num_bytes in shard.members:
-                key, _, suffix = name.partition(".")
-                if suffix not in ("json", PLAIN, PACKED):
-                    continue
-                stream.seek(offset)
-                member = stream.read(num_bytes)
-                if suffix != "json":
-                    arrays = unpack_arrays({suffix: member})
-                    scene_members[f"{key}.{PLAIN}"] = sha256_hex(arrays)
-                    continue
-                record = json.loads(member)
-                splits[shard.split] += 1
-                templates[record["provenance"]["template"]] += 1
-                if excursion := record["provenance"].get("excursion"):
-                    excursions[excursion["axis"]] += 1
-                views.extend(record["views"])
+        with dataset.files.open(shard, checked=False) as stream, reading(dataset.shown, shard.name):
+            _require_whole(dataset, shard)
+            _count_shard(stream, shard, tally)
     return Statistics(
         num_scenes=dataset.manifest.num_samples,
-        scenes_by_split=splits,
-        scenes_by_template=templates,
-        scenes_by_excursion=excursions,
-        scene_digest=digest_of_scenes(scene_members),
+        scenes_by_split=tally.splits,
+        scenes_by_template=tally.templates,
+        scenes_by_excursion=tally.excursions,
+        scene_digest=digest_of_scenes(tally.scene_members),
         num_bytes=dataset.manifest.num_bytes,
-        spp=np.array([view["spp"] for view in views], np.int64),
-        noise_floor_db=np.array([view["noise_floor_db"] for view in views], np.float64),
-        at_cap=np.array([view["at_cap"] for view in views], np.bool_),
+        spp=np.array([view["spp"] for view in tally.views], np.int64),
+        noise_floor_db=np.array([view["noise_floor_db"] for view in tally.views], np.float64),
+        at_cap=np.array([view["at_cap"] for view in tally.views], np.bool_),
     )
+
+
+@dataclass(kw_only=True, eq=False)
+class _Tally:
+    """Counts in the making."""
+
+    splits: Counter[str] = field(default_factory=Counter)
+    templates: Counter[str] = field(default_factory=Counter)
+    excursions: Counter[str] = field(default_factory=Counter)
+    views: list[Any] = field(default_factory=list)
+    scene_members: dict[str, str] = field(default_factory=dict)
+
+
+def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
+    for name, offset, num_bytes in shard.members:
+        key, _, suffix = name.partition(".")
+        if suffix not in ("json", PLAIN, PACKED):
+            continue
+        stream.seek(offset)
+        member = stream.read(num_bytes)
+        if suffix != "json":
+            tally.scene_members[f"{key}.{PLAIN}"] = sha256_hex(unpack_arrays({suffix: member}))
+            continue
+        record = json.loads(member)
+        tally.splits[shard.split] += 1
+        tally.templates[record["provenance"]["template"]] += 1
+        if excursion := record["provenance"].get("excursion"):
+            tally.excursions[excursion["axis"]] += 1
+        tally.views.extend(record["views"])
+
+
+def _require_whole(dataset: Dataset, shard: ShardEntry) -> None:
+    num_bytes = dataset.files.num_bytes(shard)
+    if num_bytes is not None and num_bytes != shard.num_bytes:
+        raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
 
 
 def digest_of_scenes(members: Mapping[str, str]) -> str:

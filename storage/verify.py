@@ -17,6 +17,7 @@ from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry, index_stream
 from storage.member_table import MemberTable
 from storage.objects_lock import decode_objects_lock
+from storage.progress import planned_shards
 from storage.records import LockedObject
 from storage.remote.fetch import download
 from storage.remote.tries import TransferFailed
@@ -39,6 +40,13 @@ class Verification:
     """Samples that were looked at."""
     bad_shards: Sequence[str]
     """Names of the shards that are missing or not what they should be."""
+    num_shards_planned: int
+    """Shards of the finished dataset."""
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether every shard is listed."""
+        return len(self.manifest.shards) >= self.num_shards_planned
 
 
 @dataclass(kw_only=True)
@@ -50,7 +58,10 @@ class _Found:
 
 
 def verify_dataset(
-    root: str | Path, *, fast: bool = False, shard_done: Callable[[str], None] = lambda name: None
+    root: str | Path | Dataset,
+    *,
+    fast: bool = False,
+    shard_done: Callable[[str], None] = lambda name: None,
 ) -> Verification:
     """Check a dataset, in a folder or on a server, against its manifest.
 
@@ -58,7 +69,7 @@ def verify_dataset(
     Shards of a server are fetched anew, past the cache, and not kept.
 
     Args:
-        root: the dataset, a path or a URL.
+        root: the dataset, opened, or its path or URL.
         fast: compare only sizes, and in a folder also the members' names and places; reads no
             picture. A changed byte is not seen.
         shard_done: called with the name of each shard that was looked at.
@@ -67,7 +78,7 @@ def verify_dataset(
         TrilightError: there is no readable manifest, so there is nothing to check against, or the
             disk is full.
     """
-    dataset = open_dataset(str(root))
+    dataset = root if isinstance(root, Dataset) else open_dataset(str(root))
     manifest = dataset.manifest
     lock = dataset.files.read("objects.lock.jsonl")
     problems = list(_check_lock(lock, manifest))
@@ -94,8 +105,20 @@ def verify_dataset(
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return Verification(
-        manifest=manifest, problems=problems, num_samples=manifest.num_samples, bad_shards=bad
+        manifest=manifest,
+        problems=problems,
+        num_samples=manifest.num_samples,
+        bad_shards=bad,
+        num_shards_planned=_num_planned(manifest),
     )
+
+
+def _num_planned(manifest: Manifest) -> int:
+    """Return how many shards there will be; of settings that do not say, those that are there."""
+    try:
+        return len(planned_shards(manifest))
+    except (KeyError, TypeError, TrilightError):
+        return len(manifest.shards)
 
 
 def _strangers(dataset: Dataset) -> list[str]:

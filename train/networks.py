@@ -25,7 +25,7 @@ def open_network(place: str | Path) -> RenderFormer:
     """
     path = _run_file(Path(place))
     if path.suffix == ".safetensors" and path.is_file():
-        _, metadata = read_safetensors(path.read_bytes())
+        _, metadata = read_safetensors(path.read_bytes(), name=str(path))
         if is_checkpoint(metadata):
             return read_checkpoint(path).network()
     return open_checkpoint(str(path))
@@ -39,7 +39,7 @@ def trained_resolution(place: str | Path) -> int | None:
         return int(record["settings"]["resolution"])
     path = checkpoint_path(str(place))
     if path.is_file():
-        _, metadata = read_safetensors(path.read_bytes())
+        _, metadata = read_safetensors(path.read_bytes(), name=str(path))
         if is_checkpoint(metadata):
             return int(read_checkpoint(path).header["settings"]["resolution"])
         known = trained_range(metadata)

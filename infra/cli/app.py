@@ -1,53 +1,14 @@
-"""The command `trilight`: one file per subcommand, one way to report a mistake."""
+"""The command `trilight`: what it does with a mistake, and with Ctrl-C."""
 
 import os
+import shlex
 import signal
 import sys
 from types import FrameType
-from typing import NoReturn
 
-import typer
-
-from infra.cli import (
-    assets,
-    bench,
-    convert,
-    doctor,
-    evaluate,
-    generate,
-    inspect,
-    model,
-    plan,
-    render,
-    shards,
-    status,
-    train,
-    verify,
-)
-from infra.cli.console import console
+from infra.cli.commands import app
+from infra.cli.leaving import leave
 from storage.errors import TrilightError
-
-app = typer.Typer(
-    name="trilight",
-    help="Triangles in, light out: make data for, train and judge RenderFormer-style renderers.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-app.command("doctor")(doctor.doctor)
-app.command("assets")(assets.assets)
-app.command("generate")(generate.generate)
-app.command("plan")(plan.plan)
-app.command("render")(render.render)
-app.command("convert")(convert.convert)
-app.command("verify")(verify.verify)
-app.command("inspect")(inspect.inspect)
-app.command("model")(model.model)
-app.command("status")(status.status)
-app.command("train")(train.train)
-app.command("evaluate")(evaluate.evaluate)
-app.command("bench")(bench.bench)
-app.add_typer(shards.app, name="shards")
 
 
 def main() -> None:
@@ -57,23 +18,14 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     signal.signal(signal.SIGINT, _interrupted)
     try:
-        app()
+        app(prog_name="trilight")  # in usage lines and in completion, also under `python -m`
     except TrilightError as mistake:
-        _leave(f"trilight: {mistake}", 1)
+        leave(f"trilight: {mistake}", 1)
 
 
 def _interrupted(signal_number: int, frame: FrameType | None) -> None:
-    console.show_cursor()  # progress bars hide it, and nothing is unwound
-    _leave("trilight: interrupted. What was finished is safe; the same command goes on.", 130)
-
-
-def _leave(message: str, status: int) -> NoReturn:
-    """End at once: every child ends with its parent, and every file is whole or absent."""
-    sys.stdout.flush()
-    errors = sys.__stderr__ or sys.stderr  # progress bars would draw themselves again below it
-    errors.write(f"\n{message}\n")
-    errors.flush()
-    os._exit(status)
+    again = shlex.join(["trilight", *sys.argv[1:]])
+    leave(f"trilight: interrupted. What was finished is safe; to go on, run: {again}", 130)
 
 
 if __name__ == "__main__":

@@ -8,11 +8,21 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from infra.cli.console import console, print_json, print_rows, progress_bars
+from infra.cli.assets_next import generate_from_meshes
+from infra.cli.console import (
+    console,
+    first_words,
+    look_at,
+    next_step,
+    print_json,
+    print_rows,
+    progress_bars,
+)
 from pipeline.assets.settings import AssetSettings, Profile
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
 from storage.failures import count_by_reason
+from storage.safe_url import safe_url
 
 if TYPE_CHECKING:
     from pipeline.flows.make_assets import AssetReport
@@ -45,12 +55,13 @@ def assets(
     json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
 ) -> None:
     """Turn objects into clean meshes within a budget or an error; writes quality.html."""
+    settings = _settings(budget, epsilon, profile)
+    first_words(f"Meshes of {safe_url(source)} to {out}", silent=json)
     from pipeline.flows.make_assets import AssetFolder, make_assets
 
-    settings = _settings(budget, epsilon, profile)
     folder = AssetFolder(out)
     with progress_bars() as bars:
-        fetched = bars.add_task("download", total=None, note="", visible=False)
+        fetched = bars.add_task("download", total=None, note="", visible=not json)
         task = bars.add_task("objects", total=None, note="", visible=not json)
         report = make_assets(
             source,
@@ -59,9 +70,7 @@ def assets(
             allowed_licences=(*DEFAULT_ALLOWED, *(allow_licence or ())),
             licence=licence,
             workers=os.cpu_count() or 1 if workers is None else workers,
-            downloaded=lambda done, total: bars.update(
-                fetched, completed=done, total=total, visible=not json
-            ),
+            downloaded=lambda done, total: bars.update(fetched, completed=done, total=total),
             planned=lambda total: bars.update(task, total=total),
             done=lambda: bars.advance(task),
         )
@@ -79,8 +88,10 @@ def assets(
         ("meshes, catalogue", f"{folder.meshes}, {folder.catalogue}"),
     ]
     print_rows("Assets finished", rows)
-    console.print(f"\nLook at {folder.page}", style="bold")
-    console.print(f"Next: trilight generate smoke --objects {out}", style="bold")
+    look_at(f"Look at {folder.page}")
+    if report.rows:
+        allowed = allow_licence or ()
+        next_step(generate_from_meshes(report.geometry_sha256, out, allowed))
 
 
 def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:

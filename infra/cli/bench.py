@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 
 import typer
 
-from infra.cli.console import console, print_rows, progress_bars
+from infra.cli.console import console, first_words, print_rows, progress_bars
 from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
+from storage.suggestion import expected_one_of
 
 if TYPE_CHECKING:
     from infra.bench.harness import Options, Result
@@ -82,6 +83,8 @@ def bench(
     if write_docs:
         _write_docs(name)
         return
+    if name in _NAMES:
+        first_words(f"Measuring {name}")
     benchmarks = _chosen(name, part or [])
     from infra.bench.harness import Options
 
@@ -143,7 +146,7 @@ def _chosen(name: str, parts: list[str]) -> list[_Benchmark[Any]]:
     known = [benchmark.part for benchmark in benchmarks if benchmark.part]
     for part in parts:
         if part not in known:
-            expected = f"expected one of {', '.join(known)}" if known else "it has no parts"
+            expected = expected_one_of(part, known) if known else "it has no parts"
             raise TrilightError(f"--part {part!r}: unknown in benchmark {name!r}; {expected}.")
     return [benchmark for benchmark in benchmarks if not parts or benchmark.part in parts]
 
@@ -187,7 +190,7 @@ def _named(name: str) -> list[_Benchmark[Any]]:
         from infra.bench.trade import run as trade
 
         return [_whole(trade, trade)]
-    raise TrilightError(f"benchmark {name!r} is unknown; expected one of {', '.join(_NAMES)}.")
+    raise TrilightError(f"benchmark {name!r} is unknown; {expected_one_of(name, _NAMES)}.")
 
 
 def _whole(module: Any, report: Any, part: str = "") -> _Benchmark[Any]:

@@ -1,7 +1,9 @@
-"""What people see: tables, progress bars with rate and ETA, and nothing else on stdout."""
+"""What people see: first words, tables, progress bars with rate and ETA, and what to do next."""
 
 import json
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterable, Sequence
+from types import TracebackType
 from typing import Any
 
 from rich.console import Console
@@ -11,14 +13,52 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 console = Console(stderr=False, highlight=False)
+
+_LEAST_RATED_S = 1.0
+"""What was over sooner has no rate worth printing."""
+
+
+def first_words(text: str, *, silent: bool = False) -> None:
+    """Say what begins now; call before anything slow is imported or read.
+
+    Args:
+        text: a sentence without its full stop.
+        silent: whether the outcome is printed as JSON, beside which nothing is printed.
+    """
+    if not silent:
+        console.print(Text(f"{text} ...", style="dim"), soft_wrap=True)
+
+
+def next_step(*commands: Sequence[str]) -> None:
+    """Print commands that go on from here, one a line; each has to run as it is printed.
+
+    Args:
+        commands: the words of each without `trilight`; paths as they are, since they are quoted
+            here.
+    """
+    for row, words in enumerate(commands):
+        lead = "     " if row else "\nNext:"
+        line = f"{lead} {shlex.join(['trilight', *words])}"
+        console.print(Text(line, style="bold"), soft_wrap=True)
+
+
+def look_at(text: str) -> None:
+    """Print where to look, or what else there is to do that is no command."""
+    console.print(Text(f"\n{text}", style="bold"), soft_wrap=True)
+
+
+def note(text: str) -> None:
+    """Print what a person should know of an outcome; a sentence without its full stop."""
+    console.print(Text(f"Note: {text}.", style="yellow"))
 
 
 class RateColumn(ProgressColumn):
@@ -26,18 +66,56 @@ class RateColumn(ProgressColumn):
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
-        if not speed:
+        if not speed or (task.elapsed or 0) < _LEAST_RATED_S:
             return Text("")
-        return Text(f"{speed:.1f}/s" if speed >= 1 else f"{60 * speed:.1f}/min", style="cyan")
+        what = task.description
+        rate = f"{speed:.1f} {what}/s" if speed >= 1 else f"{60 * speed:.1f} {what}/min"
+        return Text(rate, style="cyan")
 
 
-def progress_bars() -> Progress:
+class Bars(Progress):
+    """Progress bars, each drawn as soon as it is known how long it is; before, nothing is."""
+
+    def add_task(self, *args: Any, **fields: Any) -> TaskID:
+        task = super().add_task(*args, **fields)
+        self._begin()
+        return task
+
+    def update(self, *args: Any, **fields: Any) -> None:
+        super().update(*args, **fields)
+        self._begin()
+
+    def make_tasks_table(self, tasks: Iterable[Task]) -> Table:
+        return super().make_tasks_table(list(filter(_is_drawn, tasks)))
+
+    def __enter__(self) -> "Bars":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self.live.is_started:
+            self.stop()
+
+    def _begin(self) -> None:
+        if not self.live.is_started and any(map(_is_drawn, self.tasks)):
+            self.start()
+
+
+def _is_drawn(task: Task) -> bool:
+    return task.visible and task.total is not None
+
+
+def progress_bars() -> Bars:
     """Return progress bars with count, rate, elapsed time and ETA; silent without a terminal."""
-    return Progress(
+    return Bars(
         TextColumn("{task.description:<8}"),
-        BarColumn(bar_width=30),
+        BarColumn(bar_width=20),
         MofNCompleteColumn(),
-        RateColumn(),
+        RateColumn(table_column=Column(no_wrap=True)),
         TimeElapsedColumn(),
         TextColumn("left"),
         # a shard's scenes end together, so that the speed of the last seconds says little
@@ -50,9 +128,8 @@ def progress_bars() -> Progress:
 
 def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
     """Print (name, value) rows as a table without lines."""
-    table = Table(
-        title=title, title_justify="left", title_style="bold", box=None, show_header=False
-    )
+    table = Table(title=Text(title), title_justify="left", title_style="bold", box=None)
+    table.show_header = False
     table.add_column(style="dim")
     table.add_column(overflow="fold")
     for name, value in rows:

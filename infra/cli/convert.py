@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.text import Text
 
-from infra.cli.console import console, print_json, print_rows, progress_bars
+from infra.cli.console import first_words, note, print_json, print_rows, progress_bars
 from storage.errors import TrilightError
 
 
@@ -28,15 +27,25 @@ def convert(
     usd_folder: Annotated[
         Path | None, typer.Option(help="a USD stage may read files below it [its own folder]")
     ] = None,
+    albedo_over_one: Annotated[
+        str, typer.Option(help="RenderFormer scenes with diffuse + specular above 1: scale, refuse")
+    ] = "scale",
     json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
 ) -> None:
     """Convert by extension, and say what could not be carried over."""
-    from pipeline.flows.convert_scene import convert_scene
-    from pipeline.flows.scene_source import scene_source
-
     if budget is not None and budget < 1:
         raise TrilightError(f"--budget is {budget}; expected at least 1.")
-    wanted = scene_source(source, many=True, usd_folder=usd_folder)
+    first_words(f"Converting {source} to {target}", silent=json)
+    from pipeline.flows.convert_scene import convert_scene
+    from pipeline.flows.scene_source import scene_source
+    from pipeline.scenes.described_albedos import require_choice
+
+    wanted = scene_source(
+        source,
+        many=True,
+        usd_folder=usd_folder,
+        albedo_over_one=require_choice(albedo_over_one),
+    )
     with progress_bars() as bars:
         task = bars.add_task("files", total=None, note="", visible=not json)
         found = convert_scene(
@@ -54,7 +63,7 @@ def convert(
             }
         )
         return
-    for note in found.notes:
-        console.print(Text(f"Note: {note}.", style="yellow"))
+    for text in found.notes:
+        note(text)
     shown = str(found.files[0]) if len(found.files) == 1 else f"{len(found.files)} files"
     print_rows("Converted", [("written", shown), ("triangles", f"{found.triangles}")])

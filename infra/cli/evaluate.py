@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
+from rich.text import Text
 
-from infra.cli.console import console, print_json, print_rows, progress_bars
+from infra.cli.console import console, first_words, look_at, print_json, progress_bars
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 
@@ -42,6 +44,7 @@ def evaluate(
     json: Annotated[bool, typer.Option(help="print the summary as JSON")] = False,
 ) -> None:
     """Judge a network; writes evaluation.json, evaluation.md and sheets of pictures."""
+    first_words(f"Judging {checkpoint} on the split {split}", silent=json)
     try:
         from storage.training_data import open_training_data
         from train.evaluation.evaluate import judged_views
@@ -63,8 +66,10 @@ def evaluate(
         device=device,
     )
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="")
+        total = _num_scenes(contest)
+        task = bars.add_task("scenes", total=total, note="", visible=not json)
         views = judged_views(contest, lambda: bars.advance(task))
+    first_words(f"Drawing the sheets of {out}", silent=json)
     found = record(views, _about(checkpoint, opened, contest, split, views))
     write_atomically(out / "evaluation.json", _encoded(found))
     write_atomically(out / "evaluation.md", markdown(found).encode())
@@ -150,16 +155,31 @@ def _encoded(found: dict[str, Any]) -> bytes:
     return pretty_json(found)
 
 
+def _num_scenes(contest: "Contest") -> int:
+    """Return how many scenes will be judged; opens no shard that is not judged anyway."""
+    count = 0
+    for number in range(len(contest.shards.names)):
+        if count < contest.most_scenes:
+            count += contest.shards.num_samples(number)
+    return min(count, contest.most_scenes)
+
+
 def _report(found: dict[str, Any], out: Path) -> None:
     from train.evaluation.picture_scores import DECIMALS
 
-    names = list(found["contestants"])
-    rows = [("median over views", ", ".join(names))]
+    contestants = found["contestants"]
+    table = Table(box=None, title_justify="left", header_style="dim")
+    table.title = Text(f"Evaluation, medians over {len(found['views'])} views", style="bold")
+    table.add_column("", style="dim", no_wrap=True)
+    for name in contestants:
+        table.add_column(Text(name), justify="right")
     for metric, places in DECIMALS.items():
-        medians = [found["contestants"][name][metric]["median"] for name in names]
+        medians = [scores[metric]["median"] for scores in contestants.values()]
         shown = ["n/a" if value is None else f"{value:.{places}f}" for value in medians]
-        rows.append((metric, ", ".join(shown)))
-    near = found["contestants"][names[0]]["near_floor"]
-    rows.append(("within 3 dB of the noise", f"{near:.1%} of {len(found['views'])} views"))
-    print_rows("Evaluation", rows)
-    console.print(f"\nRead {out / 'evaluation.md'}, look at {out / 'worst.png'}", style="bold")
+        table.add_row(metric, *shown)
+    near = [scores.get("near_floor") for scores in contestants.values()]
+    table.add_row(
+        "within 3 dB of the noise", *("" if share is None else f"{share:.1%}" for share in near)
+    )
+    console.print(table)
+    look_at(f"Read {out / 'evaluation.md'}, look at {out / 'worst.png'}")

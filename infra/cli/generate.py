@@ -1,41 +1,42 @@
 """`trilight generate`: objects, or scenes in files, to shards."""
 
-import contextlib
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import Progress as Bars
 
 from infra.cli.changes import parse_changes
-from infra.cli.console import console, progress_bars
+from infra.cli.completion import builds
+from infra.cli.console import first_words, note
+from infra.cli.generate_progress import watched
 from infra.cli.generate_report import report
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.renders.variant import choose_variant
+from pipeline.scenes.described_albedos import require_choice
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
 from storage.output import dataset_folder
-from storage.progress import read_progress
 
 if TYPE_CHECKING:
     from pipeline.flows.dataset_run import Outcome
 
-_POLL_S = 0.5
-
 
 def generate(
-    build: Annotated[str, typer.Argument(help="named settings, such as smoke")],
+    build: Annotated[
+        str, typer.Argument(help="named settings, such as smoke", autocompletion=builds)
+    ],
     objects: Annotated[
         str | None,
         typer.Option(help="folder of 3D objects, its URL, builtin: or objaverse: [builtin:]"),
     ] = None,
     out: Annotated[
-        str, typer.Option(help="folder of the dataset, or a bucket such as s3://bucket/folder")
-    ] = "data/smoke",
+        str | None,
+        typer.Option(
+            help="folder of the dataset, or a bucket such as s3://bucket/folder [data/BUILD]"
+        ),
+    ] = None,
     scenes: Annotated[
         int | None, typer.Option(help="scenes, rounded up to whole shards [as the build says]")
     ] = None,
@@ -82,6 +83,9 @@ def generate(
         int | None,
         typer.Option(help="with --scenes-from: first cameras of each file [all that every has]"),
     ] = None,
+    albedo_over_one: Annotated[
+        str, typer.Option(help="RenderFormer scenes with diffuse + specular above 1: scale, refuse")
+    ] = "scale",
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -96,7 +100,7 @@ def generate(
     order = DatasetOrder(
         build=build,
         objects=objects,
-        out=out,
+        out=out or f"data/{build}",
         scenes=scenes,
         seed=seed,
         resolution=resolution,
@@ -108,14 +112,16 @@ def generate(
         accept_environment=accept_environment,
         scenes_from=None if scenes_from is None else str(scenes_from),
         views=views,
+        albedo_over_one=require_choice(albedo_over_one),
         shards=shards,
         changes=parse_changes(set_ or ()),
     )
+    folder, started = dataset_folder(order.out), time.monotonic()
+    first_words(f"Making {folder.shown} with the build {build}", silent=json)
     make = _runner(runner, address, workers)
-    folder, started = dataset_folder(out), time.monotonic()
-    if note := choose_variant().note:
-        console.print(f"Note: {note}; see trilight doctor.", style="yellow")
-    with _progress(folder):
+    if (text := choose_variant().note) and not json:
+        note(f"{text}; see trilight doctor")
+    with watched(folder, silent=json):
         outcome = make(order)
     report(folder, outcome, time.monotonic() - started, as_json=json)
 
@@ -150,49 +156,3 @@ def _runner(
             return make_on_dask(order, address)
 
     return on_cluster
-
-
-@contextlib.contextmanager
-def _progress(folder: DatasetFolder) -> Iterator[None]:
-    """Draw progress bars from the files of the dataset while the block runs."""
-    ended = threading.Event()
-    with progress_bars() as bars:
-        watcher = threading.Thread(target=_watch, args=(folder, bars, ended), daemon=True)
-        watcher.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            watcher.join()
-
-
-def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event) -> None:
-    downloads = bars.add_task("download", total=None, note="", visible=False)
-    objects = bars.add_task("objects", total=None, note="")
-    scenes = bars.add_task("scenes", total=None, start=False, note="")
-    already: int | None = None
-    last = False
-    while not last:
-        last = ended.wait(_POLL_S)
-        with contextlib.suppress(OSError, ValueError):  # a file may vanish between two looks
-            now = read_progress(folder)
-            bars.update(
-                downloads,
-                completed=now.downloads_done,
-                total=now.downloads_planned,
-                visible=now.downloads_planned > 0,
-            )
-            bars.update(objects, completed=now.objects_done, total=now.objects_planned or None)
-            if not now.scenes_planned:
-                continue
-            if already is None:
-                already = now.scenes_done
-            # rate and ETA count what this run makes, not what it found
-            bars.update(
-                scenes,
-                completed=now.scenes_done - already,
-                total=now.scenes_planned - already,
-                note=f"({already} were there)" if already else "",
-            )
-            if now.objects_done >= now.objects_planned > 0 or last:
-                bars.start_task(scenes) if not bars.tasks[scenes].started else None

@@ -1,23 +1,26 @@
 """What `trilight generate` says when it is done."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.text import Text
-
-from infra.cli.console import console, print_json, print_rows
+from infra.cli.console import next_step, note, print_json, print_rows
 from pipeline.objects.licences import USER_PROVIDED
 from storage.failures import count_by_reason, read_failures
 from storage.layout import DatasetFolder
+from storage.manifest import Manifest, read_manifest
 from storage.objects_lock import read_objects_lock
+from storage.statistics import Statistics
 
 if TYPE_CHECKING:
     from pipeline.flows.dataset_run import Outcome
 
 _MAX_NOTES = 20
 """Most notes that are printed."""
+_RUN = "smoke"
+"""The run that is named as the next step."""
 
 
 def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json: bool) -> None:
@@ -46,12 +49,28 @@ def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json
     if statistics is None:
         there = f"{outcome.num_shards} of {outcome.num_shards_planned} shards are there"
         print_rows(f"Range finished; {there}", rows)
-        console.print(f"\nNext: trilight status {folder.shown}", style="bold")
+        next_step(["status", folder.shown])
         return
     print_rows("Dataset finished", rows)
-    console.print(f"\nNext: trilight verify {folder.shown}", style="bold")
-    if statistics.scenes_by_split.get("train"):
-        console.print(f"      trilight train smoke --data {folder.shown}", style="bold")
+    next_step(*_next_steps(folder, statistics))
+
+
+def _next_steps(folder: DatasetFolder, statistics: Statistics) -> Iterator[Sequence[str]]:
+    """Yield what can be done with a finished dataset; training only where it is for training."""
+    yield ("verify", folder.shown)
+    yield ("inspect", folder.shown)
+    if statistics.scenes_by_split.get("train") and _fits_training(read_manifest(folder.manifest)):
+        yield ("train", _RUN, "--data", folder.shown)
+
+
+def _fits_training(manifest: Manifest) -> bool:
+    """Return whether the smallest run can learn from such pictures, and is installed at all."""
+    from train.runs import named_run  # not before the end: the first words come sooner
+
+    run = named_run(_RUN)
+    pictures = manifest.settings["renders"]["resolution"]
+    enough = manifest.num_views >= run.views_per_scene
+    return enough and pictures % run.resolution == 0 and find_spec("torch") is not None
 
 
 def _print_json(
@@ -86,10 +105,10 @@ def _place(folder: DatasetFolder, path: Path) -> str:
 
 
 def _print_notes(notes: Sequence[str]) -> None:
-    for note in notes[:_MAX_NOTES]:
-        console.print(Text(f"Note: {note}.", style="yellow"))
+    for text in notes[:_MAX_NOTES]:
+        note(text)
     if len(notes) > _MAX_NOTES:
-        console.print(f"Note: {len(notes) - _MAX_NOTES} more; --json has all.", style="yellow")
+        note(f"{len(notes) - _MAX_NOTES} more; --json has all")
 
 
 def _licences(folder: DatasetFolder) -> str:

@@ -1,19 +1,27 @@
 """`trilight inspect`: what is in a dataset or in one scene, for a person."""
 
 import os
+import shlex
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.text import Text
 
-from infra.cli.console import console, print_json, print_rows, progress_bars
+from infra.cli.console import (
+    first_words,
+    look_at,
+    note,
+    print_json,
+    print_rows,
+    progress_bars,
+)
 from storage.dataset import Dataset, open_dataset
 from storage.dataset_files import RemoteFiles
 from storage.errors import TrilightError
 from storage.failures import count_by_reason
 from storage.layout import DatasetFolder
+from storage.safe_url import safe_url
 from storage.statistics import Statistics, dataset_statistics
 
 if TYPE_CHECKING:
@@ -53,9 +61,11 @@ def inspect(
         return
     if turntable is not None:
         raise TrilightError(f"--turntable: {source} is a dataset; expected one scene.")
+    first_words(f"Reading {safe_url(source)}", silent=json)
+    opened = open_dataset(source)
+    _require_shards(opened)
     from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
 
-    opened = open_dataset(source)
     with progress_bars() as bars:
         total = len(opened.manifest.shards)
         task = bars.add_task("shards", total=total, note="", visible=not json)
@@ -70,8 +80,15 @@ def inspect(
         print_json(_as_json(opened, statistics, found))
         return
     _print_summary(opened.shown, opened, statistics, found)
-    look = f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY
-    console.print(f"\n{look}", style="bold")
+    look_at(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
+
+
+def _require_shards(opened: Dataset) -> None:
+    if not opened.manifest.shards:
+        raise TrilightError(
+            f"{opened.shown}: the dataset is empty, since none of its shards is finished; expected "
+            f"at least one. See how it goes on: `trilight status {shlex.quote(opened.shown)}`."
+        )
 
 
 def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | None:
@@ -86,6 +103,7 @@ def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | N
 
 
 def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
+    first_words(f"Reading {source}", silent=json)
     from pipeline.flows.inspect_scene import inspect_scene
     from pipeline.flows.scene_source import scene_source
 
@@ -93,13 +111,13 @@ def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
     if json:
         print_json({**found.facts, "notes": list(found.notes)})
         return
-    for note in found.notes:
-        console.print(Text(f"Note: {note}.", style="yellow"))
+    for text in found.notes:
+        note(text)
     print_rows(
         source, [(name.replace("_", " "), str(value)) for name, value in found.facts.items()]
     )
     if turntable is not None:
-        console.print(f"\nLook at {turntable}", style="bold")
+        look_at(f"Look at {turntable}")
 
 
 def _write(

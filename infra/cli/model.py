@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from infra.cli.console import console, print_json, print_rows
+from infra.cli.console import console, first_words, print_json, print_rows
 from infra.cli.layer_plot import plot_layer_errors
 from storage.errors import TrilightError
+from storage.suggestion import expected_one_of
 
 if TYPE_CHECKING:
     from model.config import ModelConfig
@@ -37,6 +38,7 @@ def model(
     json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
 ) -> None:
     """Print parameters, FLOPs and memory by precision of a named size or of a checkpoint."""
+    first_words(f"Looking at {name}", silent=json)
     try:
         from model.config import SIZES
         from model.costs import Workload, costs
@@ -75,7 +77,7 @@ def _open(name: str) -> "RenderFormer":
         if Path(name).exists() or "/" in name:
             raise
         raise TrilightError(
-            f"model {name!r}: neither a size ({', '.join(SIZES)}) nor a checkpoint here."
+            f"model {name!r}: neither a size nor a checkpoint here; {expected_one_of(name, SIZES)}."
         ) from error
 
 

@@ -6,13 +6,25 @@ from typing import Annotated
 import typer
 
 from infra.cli.changes import parse_changes
-from infra.cli.console import console, print_json, print_rows, progress_bars
+from infra.cli.completion import builds
+from infra.cli.console import (
+    first_words,
+    next_step,
+    note,
+    print_json,
+    print_rows,
+    progress_bars,
+)
+from infra.cli.leaving import temporary_folder
 from pipeline.flows.order import DatasetOrder
+from pipeline.flows.order_words import generate_words
 from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
 
 
 def plan(
-    build: Annotated[str, typer.Argument(help="named settings, such as pretrain-256")],
+    build: Annotated[
+        str, typer.Argument(help="named settings, such as pretrain-256", autocompletion=builds)
+    ],
     scenes: Annotated[int | None, typer.Option(help="scenes of the dataset [the build's]")] = None,
     objects: Annotated[str | None, typer.Option(help="as for generate [builtin:]")] = None,
     samples: Annotated[int, typer.Option(min=4, help="scenes to measure")] = 12,
@@ -22,26 +34,37 @@ def plan(
     noise_floor: Annotated[
         float | None, typer.Option("--noise-floor", help="target in dB (psnr_log_db)")
     ] = None,
+    seed: Annotated[int | None, typer.Option(help="seed of every draw")] = None,
+    allow_licence: Annotated[
+        list[str] | None, typer.Option(help="allow this licence too; may be repeated")
+    ] = None,
+    licence: Annotated[
+        str | None, typer.Option(help="licence of files that state none [yours to use]")
+    ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="any other setting, as for generate")
     ] = None,
     json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
 ) -> None:
     """Measure a few scenes and predict time, cores, bytes and cost, each with an interval."""
-    from infra.planning import measure_scenes, predict  # slow: every stage
-
     core_price = CorePrice(price=price)
     order = DatasetOrder(
         build=build,
         objects=objects,
         scenes=scenes,
+        seed=seed,
         resolution=resolution,
         noise_floor_db=noise_floor,
+        allow_licences=tuple(allow_licence or ()),
+        licence=licence,
         changes=parse_changes(set_ or ()),
     )
-    with progress_bars() as bars:
+    first_words(f"Measuring {samples} scenes of {build}", silent=json)
+    from infra.planning import measure_scenes, predict  # slow: every stage
+
+    with progress_bars() as bars, temporary_folder("trilight-plan-") as place:
         task = bars.add_task("scenes", total=samples, note="", visible=not json)
-        measured = measure_scenes(order, samples, lambda: bars.advance(task))
+        measured = measure_scenes(order, samples, place, lambda: bars.advance(task))
     found = predict(measured, order, cores=cores, usd_per_core_hour=core_price.price)
     if json:
         print_json(dataclasses.asdict(found))
@@ -60,7 +83,6 @@ def plan(
             ("manifest.json", f"{found.manifest_mb:.1f} MB"),
         ],
     )
-    for note in found.notes:
-        console.print(f"Note: {note}.", style="yellow")
-    shown = f" --scenes {scenes}" if scenes else ""
-    console.print(f"\nNext: trilight generate {build}{shown} --out data/{build}", style="bold")
+    for text in found.notes:
+        note(text)
+    next_step((*generate_words(order), "--out", f"data/{build}"))

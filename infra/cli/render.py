@@ -66,6 +66,9 @@ def render(
     skip_empty_bundles: Annotated[
         bool, typer.Option(help="neural: leave black what no triangle reaches; faster, less exact")
     ] = False,
+    albedo_over_one: Annotated[
+        str, typer.Option(help="RenderFormer scenes with diffuse + specular above 1: scale, refuse")
+    ] = "scale",
     seed: Annotated[int, typer.Option(help="mitsuba: seed of the samples")] = 0,
     threads: Annotated[
         int | None, typer.Option(help="processor threads, all cores by default")
@@ -75,6 +78,7 @@ def render(
     """Render scenes: path traced to a measured noise floor, or by a trained network."""
     from infra.cli.rendered import print_outcome
     from infra.rendering.session import Asked, render_asked
+    from pipeline.scenes.described_albedos import require_choice
 
     asked = Asked(
         source=source,
@@ -93,6 +97,7 @@ def render(
         precision=precision,
         lights_per_pass=lights_per_pass,
         skip_empty_bundles=skip_empty_bundles,
+        albedo_over_one=require_choice(albedo_over_one),
         seed=seed,
         threads=threads,
     )

@@ -5,12 +5,14 @@ from typing import Annotated
 
 import typer
 
-from infra.cli.console import console, print_json, print_rows, progress_bars
+from infra.cli.console import first_words, next_step, print_json, print_rows, progress_bars
 from pipeline.shards.derive import Derive
 from pipeline.shards.plans import Selection
 from storage.errors import TrilightError
 
-app = typer.Typer(no_args_is_help=True, help="Make new datasets of finished ones.")
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, help="Make new datasets of finished ones."
+)
 
 Source = Annotated[Path, typer.Argument(help="folder of a finished dataset")]
 Out = Annotated[Path, typer.Option(help="folder of the new dataset; must not exist")]
@@ -60,6 +62,7 @@ def reshard(
 
 
 def _run(datasets: list[Path], derive: Derive, out: Path, *, as_json: bool) -> None:
+    first_words(f"Making {out}", silent=as_json)
     from pipeline.flows.derive_dataset import derive_dataset  # slow: matplotlib
 
     places = [str(path) for path in datasets]
@@ -84,4 +87,4 @@ def _run(datasets: list[Path], derive: Derive, out: Path, *, as_json: bool) -> N
         )
         return
     print_rows("Dataset finished", [*statistics.lines(), ("dataset digest", digest)])
-    console.print(f"\nNext: trilight verify {out}", style="bold")
+    next_step(["verify", str(out)])

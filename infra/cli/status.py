@@ -1,12 +1,13 @@
 """`trilight status`: how far a dataset is, from its files alone."""
 
 import dataclasses
+import shlex
 import time
 from typing import Annotated
 
 import typer
 
-from infra.cli.console import console, print_json, print_rows
+from infra.cli.console import look_at, next_step, print_json, print_rows
 from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
 from storage.dataset_status import DatasetStatus, read_status
 
@@ -21,7 +22,7 @@ def status(
     found = read_status(dataset)
     cost = None if found.core_hours is None else found.core_hours * core_price.price
     if json:
-        row = {**dataclasses.asdict(found), "next": found.next_command, "cost_usd": cost}
+        row = {**dataclasses.asdict(found), "next": _next(found), "cost_usd": cost}
         print_json(row)
         return
     rows = [
@@ -36,7 +37,19 @@ def status(
         rows.append(("cost so far", f"{found.core_hours:.2f} core-hours, {cost:.2f} USD"))
     title = "finished" if found.finished else "in the making"
     print_rows(f"{found.shown}: {found.build}, {title}", rows)
-    console.print(f"\nNext: {found.next_command}", style="bold", soft_wrap=True)
+    if found.next_words:
+        next_step(found.next_words)
+    else:
+        look_at(_next(found))
+
+
+def _next(found: DatasetStatus) -> str:
+    if found.next_words:
+        return shlex.join(["trilight", *found.next_words])
+    return (
+        f"It goes on with trilight generate {found.build} --scenes {found.scenes_planned} and the "
+        "same other options as before."
+    )
 
 
 def _speed(found: DatasetStatus) -> list[tuple[str, str]]:

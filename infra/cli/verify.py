@@ -4,10 +4,19 @@ from typing import Annotated
 
 import typer
 
-from infra.cli.console import console, print_json, print_rows, progress_bars
+from infra.cli.console import (
+    first_words,
+    look_at,
+    next_step,
+    print_json,
+    print_rows,
+    progress_bars,
+)
+from storage.asked import read_asked, value_of
 from storage.dataset import open_dataset
 from storage.derived import derivation_of
 from storage.remote.url import RemoteUrl, parse_url
+from storage.safe_url import safe_url
 from storage.verify import Verification, verify_dataset
 
 
@@ -25,55 +34,73 @@ def verify(
     ] = None,
     json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
 ) -> None:
-    """Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."""
+    """Check every hash, member and law of a dataset; exit 1 with a list of what is wrong.
+
+    A dataset that is not finished is checked as far as it is, and the exit status is 1 too.
+    """
+    first_words(f"Verifying {safe_url(dataset)}", silent=json)
     found = _verified(dataset, fast=fast, silent=json)
-    if repair and found.bad_shards:
+    if repair and found.bad_shards and found.is_finished:
         from infra.repair import repair as make_anew  # slow: the whole pipeline
 
         if not json:
             _report(found, fast=fast)
+            first_words("Making the named shards anew")
         make_anew(dataset, found.bad_shards, objects=objects, scenes_from=scenes_from)
         found = _verified(dataset, fast=fast, silent=json)
     if json:
         print_json(_as_json(found))
     else:
         _report(found, fast=fast)
-        if found.bad_shards:
-            console.print(f"\nNext: {_next_step(found, dataset)}", style="bold")
-    if found.problems:
+        _say_what_mends(found, dataset)
+    if found.problems or not found.is_finished:
         raise typer.Exit(1)
 
 
 def _verified(dataset: str, *, fast: bool, silent: bool) -> Verification:
-    num_shards = len(open_dataset(dataset).manifest.shards)
+    opened = open_dataset(dataset)
     with progress_bars() as bars:
-        task = bars.add_task("shards", total=num_shards, note="", visible=not silent)
-        return verify_dataset(dataset, fast=fast, shard_done=lambda _: bars.advance(task))
+        total = len(opened.manifest.shards) or None
+        task = bars.add_task("shards", total=total, note="", visible=not silent)
+        return verify_dataset(opened, fast=fast, shard_done=lambda _: bars.advance(task))
 
 
-def _next_step(found: Verification, dataset: str) -> str:
-    """Return what makes bad shards whole, which depends on where the dataset is from."""
-    settings = found.manifest.settings
-    if isinstance(parse_url(dataset, what="dataset"), RemoteUrl):
-        return (
-            "delete the named shards there and run trilight generate again, or copy them again "
+def _say_what_mends(found: Verification, dataset: str) -> None:
+    """Print what makes a dataset whole, which depends on where it is from."""
+    asked = read_asked(open_dataset(dataset))
+    is_remote = isinstance(parse_url(dataset, what="dataset"), RemoteUrl)
+    derivation = derivation_of(found.manifest.settings)
+    if not found.is_finished:
+        if asked is not None:
+            next_step((*asked, "--out", dataset))
+        else:
+            look_at("It goes on with the same trilight generate that began it.")
+    elif not found.bad_shards:
+        return
+    elif is_remote:
+        look_at(
+            "Delete the named shards there and run trilight generate again, or copy them again "
             "from the folder that the dataset was copied from."
         )
-    if (derivation := derivation_of(settings)) is not None:
-        return f"make it again of its sources: trilight shards {derivation.operation}."
-    if settings.get("splits", {}).get("listed_scenes") is not None:
-        return "trilight verify --repair --scenes-from FOLDER makes the named shards anew."
-    return "trilight verify --repair makes the named shards anew."
+    elif derivation is not None:
+        look_at(f"Make it again of its sources: trilight shards {derivation.operation}.")
+    else:
+        sources = ("--objects", "--scenes-from")
+        given = [(option, value_of(asked or (), option)) for option in sources]
+        named = [word for option, value in given if value for word in (option, value)]
+        next_step(("verify", dataset, "--repair", *named))
 
 
 def _as_json(found: Verification) -> dict[str, object]:
     return {
         "bad_shards": list(found.bad_shards),
         "dataset_digest": found.manifest.dataset_digest,
+        "finished": found.is_finished,
         "problems": list(found.problems),
         "samples": found.num_samples,
         "scenes_planned": found.manifest.num_scenes,
         "shards": len(found.manifest.shards),
+        "shards_planned": found.num_shards_planned,
     }
 
 
@@ -81,9 +108,20 @@ def _report(found: Verification, *, fast: bool) -> None:
     manifest = found.manifest
     rows = [
         ("dataset digest", manifest.dataset_digest),
-        ("shards", f"{len(manifest.shards)}, {manifest.num_bytes / 1e6:.1f} MB"),
+        ("shards", f"{_shards(found)}, {manifest.num_bytes / 1e6:.1f} MB"),
         ("scenes", f"{found.num_samples} of {manifest.num_scenes} planned"),
         ("checked", "sizes and counts" if fast else "hashes, members, laws, pictures, splits"),
         *(("wrong", problem) for problem in found.problems),
     ]
-    print_rows("Verified" if not found.problems else "Not what the manifest says", rows)
+    print_rows(_verdict(found), rows)
+
+
+def _shards(found: Verification) -> str:
+    there = len(found.manifest.shards)
+    return f"{there}" if found.is_finished else f"{there} of {found.num_shards_planned}"
+
+
+def _verdict(found: Verification) -> str:
+    if found.problems:
+        return "Not what the manifest says"
+    return "Verified" if found.is_finished else "Unfinished; what is there is as it should be"

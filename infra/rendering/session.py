@@ -19,6 +19,7 @@ from pipeline.flows.read_scenes import SceneReader
 from pipeline.flows.scene_source import SceneSource, scene_source
 from pipeline.renders.settings import PASS_SPP, NoiseFloor, RenderSettings, Resolution, Samples
 from pipeline.renders.variant import choose_variant
+from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.errors import TrilightError
 from storage.ranges import Seed, Within, check_ranges
 
@@ -74,6 +75,8 @@ class Asked:
     """Of samples."""
     threads: Annotated[int | None, Within(1, 1024, unit="threads")]
     """Of the processor; None for all cores."""
+    albedo_over_one: AlbedoOverOne = "scale"
+    """Of RenderFormer's JSON, where diffuse and specular albedos add up to more than 1."""
 
     def __post_init__(self) -> None:
         check_ranges(self, named=_option)
@@ -119,7 +122,7 @@ def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
         scene_source(asked.source)  # a wrong name is said before any library is loaded
     where = place(asked.out)
     with ExitStack() as stack:
-        reader = stack.enter_context(SceneReader())
+        reader = stack.enter_context(SceneReader(asked.albedo_over_one))
         wanted = _shots(asked, where, reader)
         engines = [_engine(name, asked, settings, watcher, stack) for name in ENGINES[asked.engine]]
         run = ShotRun(engines, where, view=asked.view, tone_map=tone_map)

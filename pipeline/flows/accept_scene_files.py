@@ -2,16 +2,20 @@
 
 import dataclasses
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.flows.accept_objects import AcceptedObjects, frozen_objects
 from pipeline.flows.prepare_isolated import asset_child
 from pipeline.flows.publication import Publication
-from pipeline.flows.scene_files import SceneFiles, SceneFolder, build_scene
+from pipeline.flows.scene_files import SceneFiles, build_scene
+from pipeline.flows.scene_folder import SceneFolder, require_usable
 from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.objects.licences import StatedLicence, stated_licence
+from pipeline.scenes.described_albedos import AlbedoOverOne
+from pipeline.scenes.from_description import scaled_albedo_notes
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.progress import announce_objects, count_object
 from storage.records import LockedObject
@@ -34,7 +38,7 @@ def settings_for_files(
         settings,
         scenes=dataclasses.replace(settings.scenes, num_views=folder.views(views)),
         splits=dataclasses.replace(
-            settings.splits, one_split=True, listed_scenes=len(folder.descriptions)
+            settings.splits, one_split=True, listed_scenes=len(folder.names)
         ),
     )
 
@@ -47,22 +51,15 @@ def accept_scene_files(
 ) -> AcceptedObjects:
     """Build every scene once, without a picture, and freeze their files at the first time.
 
+    A file of which no scene can be made is noted, and none of what it names is frozen for it.
+
     Raises:
-        TrilightError: a scene cannot be built, the licence is not allowed, or the files are not
-            those that the dataset was begun with.
+        TrilightError: no scene at all can be built, the licence is not allowed, or the files are
+            not those that the dataset was begun with.
     """
     stated = _allowed(stated_licence(licence), settings)
-    names = tuple(description.file for description in folder.descriptions)
-    announce_objects(publication.folder, len(names))
-    sha256: dict[str, str] = {}
-    child = asset_child()
-    try:
-        for name in names:
-            sha256 |= _digests(child, folder.root, name, settings)
-            count_object(publication.folder)
-    finally:
-        child.close()
-    locked = [_locked(uid, digest, stated) for uid, digest in sorted(sha256.items())]
+    files = _built_once(folder, stated, settings, publication)
+    locked = [_locked(uid, digest, stated) for uid, digest in sorted(files.sha256.items())]
     frozen = frozen_objects(publication)
     if frozen is None:
         publication.lock_objects(locked)
@@ -71,26 +68,87 @@ def accept_scene_files(
     return AcceptedObjects(
         objects=tuple((entry, folder.root / entry.uid) for entry in locked),
         num_found=len(locked),
-        files=SceneFiles(root=folder.root, names=names, sha256=sha256, licence=stated.licence),
+        files=files,
     )
 
 
-def digests_of_scene(
-    root: Path, name: str, settings: AssetSettings, num_views: int
-) -> Mapping[str, str]:
-    """Build a scene and return the digests of its files; raises TrilightError as `build_scene`."""
-    _, digests = build_scene(
-        root, name, settings, licence="", num_views=num_views, scene_index=0, seed=0
+def _built_once(
+    folder: SceneFolder, stated: StatedLicence, settings: BuildSettings, publication: Publication
+) -> SceneFiles:
+    """Return the digests of all files that scenes can be made of, and what is wrong with others."""
+    announce_objects(publication.folder, len(folder.names))
+    sha256: dict[str, str] = {}
+    notes: list[str] = []
+    unusable = dict(folder.unusable)
+    child = asset_child()
+    try:
+        for name in folder.names:
+            if name not in unusable:
+                try:
+                    built = _built(child, folder, name, settings)
+                    sha256 |= built.sha256
+                    notes += built.notes
+                except EnvironmentFailure:
+                    raise
+                except TrilightError as mistake:
+                    unusable[name] = str(mistake)
+            count_object(publication.folder)
+    finally:
+        child.close()
+    require_usable(folder.names, unusable)
+    return SceneFiles(
+        root=folder.root,
+        names=folder.names,
+        sha256=sha256,
+        unusable=unusable,
+        licence=stated.licence,
+        albedo_over_one=folder.albedo_over_one,
+        notes=(*notes, *(f"{name} is left out: {unusable[name].rstrip('.')}" for name in unusable)),
     )
-    return digests
 
 
-def _digests(
-    child: IsolatedChild, root: Path, name: str, settings: BuildSettings
-) -> Mapping[str, str]:
+@dataclass(frozen=True, kw_only=True)
+class BuiltScene:
+    """What is kept of a scene that was built once, to see whether it can be."""
+
+    sha256: Mapping[str, str]
+    """Digest of every file that it is made of by path below the folder."""
+    notes: tuple[str, ...]
+    """What a person should know of it."""
+
+
+def build_once(
+    root: Path, name: str, settings: AssetSettings, num_views: int, over_one: AlbedoOverOne
+) -> BuiltScene:
+    """Build a scene; only children come here. Raises TrilightError as `build_scene`."""
+    scene, sha256 = build_scene(
+        root,
+        name,
+        settings,
+        licence="",
+        num_views=num_views,
+        scene_index=0,
+        seed=0,
+        albedo_over_one=over_one,
+    )
+    notes = tuple(f"{name}: {text}" for text in scaled_albedo_notes(scene))
+    return BuiltScene(sha256=sha256, notes=notes)
+
+
+def _built(
+    child: IsolatedChild, folder: SceneFolder, name: str, settings: BuildSettings
+) -> BuiltScene:
+    """Build a scene in a child; raises TrilightError, of the environment where that is at fault."""
+    num_views = settings.scenes.num_views
     try:
         return call_with_retries(
-            child, digests_of_scene, root, name, settings.assets, settings.scenes.num_views
+            child,
+            build_once,
+            folder.root,
+            name,
+            settings.assets,
+            num_views,
+            folder.albedo_over_one,
         )
     except ChildFailed as failure:
         if failure.is_verdict:

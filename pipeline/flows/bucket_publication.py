@@ -2,14 +2,16 @@
 
 import contextlib
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from pipeline.flows.publication import Publication, begin, require_free
 from pipeline.flows.settings import BuildSettings
 from pipeline.shards.mirror import Mirror
 from storage.dataset import Dataset
+from storage.errors import TrilightError
 from storage.layout import DatasetFolder
-from storage.manifest import Manifest, ShardEntry
+from storage.manifest import Manifest, ShardEntry, read_manifest
 from storage.objects_lock import encode_objects_lock
 from storage.records import LockedObject
 from storage.remote.bucket import Bucket
@@ -126,7 +128,22 @@ def begin_dataset(
 def joined(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
     """Take part in the making of a dataset; of one in a bucket, its folder here says the same then.
 
+    A dataset that was begun and of which nothing was made is begun anew.
+
     Raises:
         TrilightError: the folder cannot be written, or the bucket not be read.
     """
-    return folder.joined(Mirror(folder).adopt) if folder.bucket else folder.joined()
+    return folder.joined(Mirror(folder).adopt if folder.bucket else partial(forget_empty, folder))
+
+
+def forget_empty(folder: DatasetFolder) -> None:
+    """Delete a manifest of which nothing was made: no object is frozen, no scene or shard there.
+
+    A run that ended that early, over its objects, must not bind the next one to its settings. Call
+    while alone in the folder; whoever was at it all the same finds out (`Publication.refresh`).
+    """
+    with contextlib.suppress(TrilightError):  # an unreadable one is told of by whoever needs it
+        manifest = read_manifest(folder.manifest)
+        made = manifest.objects_lock_sha256 or manifest.shards or folder.shard_files()
+        if not made and not any(folder.staged_samples.rglob("*.tar")):
+            folder.manifest.unlink()

@@ -14,6 +14,7 @@ from storage.changes import changed
 from storage.errors import TrilightError
 from storage.safe_url import safe_url
 from storage.statistics import Statistics
+from storage.suggestion import expected_one_of
 
 BUILDS: Mapping[str, NamedBuild] = {**TRAINING_BUILDS, **RENDERFORMER_BUILDS, **JUDGING_BUILDS}
 """By the name that the command line takes."""
@@ -40,7 +41,7 @@ def named_build(
         TrilightError: an unknown name, or values that contradict each other.
     """
     if name not in BUILDS:
-        raise TrilightError(f"build {name!r} is unknown; expected one of {', '.join(BUILDS)}.")
+        raise TrilightError(f"build {name!r} is unknown; {expected_one_of(name, BUILDS)}.")
     build = BUILDS[name].settings()
     named = {
         "seed": seed,

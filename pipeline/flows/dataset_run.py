@@ -20,12 +20,15 @@ from pipeline.flows.machine import cores_owned, visible_gpus
 from pipeline.flows.make_shard import is_free
 from pipeline.flows.make_task import ShardJob, TaskOutcome, close_children
 from pipeline.flows.order import DatasetOrder
+from pipeline.flows.order_words import generate_words
 from pipeline.flows.pieces import TaskSizes, TasksLeft
 from pipeline.flows.publication import Publication
 from pipeline.flows.runners import Runner
-from pipeline.flows.scene_files import SceneFolder, find_scene_files
+from pipeline.flows.scene_folder import SceneFolder, find_scene_files
 from pipeline.flows.settings import BuildSettings
+from pipeline.objects.sources import look_at_source
 from pipeline.renders.variant import choose_variant
+from storage.asked import write_asked
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
 from storage.output import dataset_folder
@@ -96,7 +99,7 @@ def make_dataset(
         finally:
             close_children()
         finished = not run.publication.missing_shards()
-        _require_within_budget(run.publication, order.failure_budget)  # of earlier runs too
+        _require_within_budget(run)  # of earlier runs too
         run.publication.publish()
         statistics = runner.finish(lambda: _documents(run.publication)) if finished else None
     return _outcome(run, statistics)
@@ -124,8 +127,11 @@ def _settings(order: DatasetOrder) -> tuple[BuildSettings, SceneFolder | None]:
         allow_licences=order.allow_licences,
         changes=order.changes,
     )
-    object_source(settings, order.objects)  # refuse before anything is written
-    listed = None if order.scenes_from is None else find_scene_files(order.scenes_from)
+    source = object_source(settings, order.objects)  # refuse before anything is written
+    files = order.scenes_from
+    listed = None if files is None else find_scene_files(files, order.albedo_over_one)
+    if listed is None and not _folder(order).manifest.exists():
+        look_at_source(source, allowed_licences=settings.allowed_licences, licence=order.licence)
     return settings_for_files(settings, listed, order.views), listed
 
 
@@ -147,6 +153,7 @@ def _begin(
         else:
             source = object_source(settings, order.objects)
             accepted = accept_objects(source, order.licence, settings, publication, cores_owned())
+        write_asked(folder, generate_words(order))
     return Run(
         order=order, settings=settings, listed=listed, publication=publication, accepted=accepted
     )
@@ -191,7 +198,7 @@ def _make_missing(run: Run, runner: Runner, watch: Watcher) -> None:
             for shard in outcome.shards:
                 publication.add_shard(shard)
             watch(run, outcome)
-            _require_within_budget(publication, order.failure_budget)
+            _require_within_budget(run)
         if made == 0 and wanted is not None:
             return
         pause_s = _FIRST_PAUSE_S if made else _wait_for_others(run, pause_s)
@@ -227,8 +234,8 @@ def _documents(publication: Publication) -> Statistics:
 def _outcome(run: Run, statistics: Statistics | None) -> Outcome:
     publication, listed = run.publication, run.listed
     notes: tuple[str, ...] = ()
-    if listed:
-        notes = listed.notes(run.settings.scenes.num_views)
+    if listed and run.accepted.files:
+        notes = (*run.accepted.files.notes, *listed.notes(run.settings.scenes.num_views))
     elif statistics:
         notes = frozen_note(run.order.build, statistics)
     return Outcome(
@@ -243,11 +250,14 @@ def _outcome(run: Run, statistics: Statistics | None) -> Outcome:
     )
 
 
-def _require_within_budget(publication: Publication, failure_budget: float) -> None:
+def _require_within_budget(run: Run) -> None:
+    """Raise TrilightError where too many scenes failed; files that nothing is made of are none."""
+    publication, files = run.publication, run.accepted.files
+    num_scenes, budget = publication.manifest.num_scenes, run.order.failure_budget
     given_up = publication.num_given_up()
-    if given_up > failure_budget * publication.manifest.num_scenes:
+    if given_up > budget * num_scenes + (len(files.unusable) if files else 0):
         raise TrilightError(
-            f"{publication.folder.shown}: {given_up} of {publication.manifest.num_scenes} scenes "
-            f"could not be made, more than the failure budget of {failure_budget:.0%}. The reasons "
-            f"are in {publication.folder.failures.name}; mend them, or raise --failure-budget."
+            f"{publication.folder.shown}: {given_up} of {num_scenes} scenes could not be made, "
+            f"more than the failure budget of {budget:.0%}. The reasons are in "
+            f"{publication.folder.failures.name}; mend them, or raise --failure-budget."
         )

@@ -10,6 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
+from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
@@ -73,6 +77,8 @@ class AssetReport:
     """The accepted ones, in the order of their uids."""
     failures: tuple[Failure, ...]
     """The rejected ones."""
+    geometry_sha256: tuple[str, ...]
+    """Digest of the geometry of each written mesh, by which `generate` deals it to a split."""
 
     @property
     def num_repaired(self) -> int:
@@ -137,6 +143,7 @@ def make_assets(
     report = AssetReport(
         rows=tuple(rows),
         failures=tuple(sorted([*found.failures, *rejected], key=lambda row: row.item)),
+        geometry_sha256=tuple(map(_geometry_sha256, levels)),
     )
     _write(folder, settings, report, levels)
     pairs = _pairs(prepared, rows, levels, settings)
@@ -165,6 +172,12 @@ def _target(settings: AssetSettings) -> str:
 def _only_level(asset: PreparedAsset) -> Level:
     (level,) = decode_asset(asset.path.read_bytes()).levels
     return level
+
+
+def _geometry_sha256(level: Level) -> str:
+    """Return the digest that the mesh stage finds in the file of a level."""
+    positions, faces = level.positions.astype(np.float64), level.faces.astype(np.int64)
+    return geometry_sha256(clean(normalise(TriangleMesh(positions=positions, faces=faces))))
 
 
 def _row(prepared: PreparedAsset, level: Level) -> AssetRow:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.flows.scene_files import SceneFiles
 from pipeline.flows.settings import BuildSettings
+from pipeline.flows.view_progress import ViewProgress
 from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.renders.variant import Variant, activate
 from pipeline.scenes.compose import compose_scene
@@ -18,6 +19,7 @@ from pipeline.scenes.sight import Sight, ViewFacts
 from pipeline.scenes.views import next_camera
 from storage.asset import decode_asset
 from storage.errors import Rejected
+from storage.layout import DatasetFolder
 from storage.records import Failure, LockedObject
 from storage.sample import Sample, ViewRecord, sample_key
 from storage.scene import Scene
@@ -43,6 +45,8 @@ class SceneSource:
     """Every locked object with its asset file."""
     files: SceneFiles | None = None
     """Where scenes are read from files; otherwise they are composed of the objects."""
+    folder: DatasetFolder | None = None
+    """Where it is told how far a scene is; None where nobody looks."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,6 +92,8 @@ def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
     except Rejected as rejection:
         failures.append(_failure(stage, key, rejection, attempt))
         return SceneAttempt(sample=None, failures=failures)
+    finally:
+        ViewProgress(_state.source.folder, scene_index).end()
     return SceneAttempt(sample=sample, failures=failures)
 
 
@@ -127,6 +133,7 @@ def _render_sample(
     The cameras of a scene that was read from a file are what they are: a rejected one is fatal.
     """
     renderer, sight = SceneRenderer(scene, settings.renders), Sight(scene)
+    told = ViewProgress(_state.source.folder, int(key))
     pictures, records = [], []
     lights: list[NDArray[np.float32]] = []
     for view in range(scene.num_views):
@@ -134,7 +141,8 @@ def _render_sample(
             camera_attempt = int(scene.provenance["camera_attempts"][view])
             seed = seed_for(settings.seed, "samples", int(key), view, camera_attempt)
             try:
-                rendered = renderer.render_view(scene.c2w[view], float(scene.fov_deg[view]), seed)
+                steps = renderer.view_steps(scene.c2w[view], float(scene.fov_deg[view]), seed)
+                rendered = told.view(view, steps)
                 break
             except Rejected as rejection:
                 if _state.source.files is not None:

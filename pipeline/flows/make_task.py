@@ -146,6 +146,7 @@ def _new_pool(job: ShardJob) -> ChildPool:
             gpu=cards[number % len(cards)] if cards else None,
             objects=job.accepted.objects,
             files=job.accepted.files,
+            folder=job.folder,
         )
         limits = _CARD_LIMITS if on_card else _RENDER_LIMITS
         return IsolatedChild(limits=limits, setup=set_up_child, setup_args=(source,))

@@ -7,10 +7,12 @@ from typing import Annotated, Any
 
 from pipeline.flows.builds import BUILDS
 from pipeline.renders.settings import NoiseFloor, Resolution
+from pipeline.scenes.described_albedos import AlbedoOverOne, require_choice
 from storage.errors import TrilightError
 from storage.output import dataset_folder
 from storage.ranges import Seed, Share, Within, check_ranges
 from storage.splits import MOST_SCENES
+from storage.suggestion import expected_one_of
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
@@ -51,6 +53,9 @@ class DatasetOrder:
     k-th *.json, all are of the split test, and the build's limits on scenes do not apply."""
     views: Annotated[int | None, Within(1, 1000, unit="cameras")] = None
     """First cameras of each scene file; by default as many as every file has."""
+    albedo_over_one: AlbedoOverOne = "scale"
+    """What to do with a material of a scene file whose diffuse and specular albedos add up to more
+    than 1: scale multiplies both by one number, refuse leaves the file out."""
     shards: str | None = None
     """A range of shards A:B, from A up to but not B: make these only. Whoever makes the last
     missing shard of a dataset finishes it."""
@@ -59,8 +64,8 @@ class DatasetOrder:
 
     def __post_init__(self) -> None:
         if self.build not in BUILDS:
-            names = ", ".join(BUILDS)
-            raise TrilightError(f"build {self.build!r} is unknown; expected one of {names}.")
+            expected = expected_one_of(self.build, BUILDS)
+            raise TrilightError(f"build {self.build!r} is unknown; {expected}.")
         check_ranges(self)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(
@@ -69,6 +74,7 @@ class DatasetOrder:
             )
         if self.scenes_from is None and self.views is not None:
             raise TrilightError(f"--views is {self.views}; expected it only with --scenes-from.")
+        require_choice(self.albedo_over_one)
         dataset_folder(self.out)
         self.shard_range()
 

@@ -151,8 +151,18 @@ class Publication:
         return list(({entry.name: entry for entry in self.manifest.shards} | self._noted).values())
 
     def refresh(self) -> None:
-        """Read what other makers have written."""
-        self.manifest = read_manifest(self.folder.manifest)
+        """Read what other makers have written.
+
+        Raises:
+            TrilightError: another dataset has been begun in the folder since.
+        """
+        found = read_manifest(self.folder.manifest)
+        if found.settings != self.manifest.settings:
+            raise TrilightError(
+                f"{self.folder.shown}: another dataset has been begun here in the meantime; choose "
+                "another --out."
+            )
+        self.manifest = found
 
     @contextlib.contextmanager
     def _turn(self) -> Iterator[None]:

@@ -16,14 +16,21 @@ from pipeline.flows.scene_source import (
     source_keys,
 )
 from pipeline.isolation import ChildFailed, Result, call_with_retries
+from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.errors import TrilightError
 
 
 class SceneReader:
     """One child for any number of sources; close it, or use it in a `with` block."""
 
-    def __init__(self) -> None:
+    def __init__(self, albedo_over_one: AlbedoOverOne = "scale") -> None:
+        """Start nothing yet.
+
+        Args:
+            albedo_over_one: of RenderFormer's JSON, where albedos add up to more than 1.
+        """
         self._child = file_child()
+        self._over_one = albedo_over_one
 
     def scenes_of(self, source: SceneSource) -> list[SceneSource]:
         """Return each scene that a file holds as a source of its own, in the order of the file.
@@ -38,6 +45,7 @@ class SceneReader:
 
     def load(self, source: SceneSource) -> LoadedScene:
         """Read one scene; raises TrilightError as `scene_source.load_source`."""
+        source = dataclasses.replace(source, albedo_over_one=self._over_one)
         return self._call(load_source, source)
 
     def cameras(self, source: SceneSource) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

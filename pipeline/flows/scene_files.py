@@ -1,8 +1,8 @@
-"""A folder of scene files: what is in it, and each of its scenes, built in a child process.
+"""Scenes of files, each built in a child process from one folder and nothing outside of it.
 
-Scene k is the k-th `*.json` of the folder by name. Everything that a scene is made of lies in that
-folder: a path that leads out of it, by dots or by a link, is refused. What a scene is made of is
-known by its digests, so that none is ever built from other bytes than the ones that were locked.
+Everything that a scene is made of lies in that folder: a path that leads out of it, by dots or by a
+link, is refused. What a scene is made of is known by its digests, so that none is ever built from
+other bytes than the ones that were locked.
 """
 
 import stat
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.flows.settings import BuildSettings
+from pipeline.scenes.described_albedos import AlbedoOverOne
 from pipeline.scenes.description import DescribedObject, SceneDescription
 from pipeline.scenes.from_description import (
     LoadedMesh,
@@ -26,53 +27,8 @@ from storage.digests import sha256_hex
 from storage.errors import Rejected, TrilightError
 from storage.scene import Scene
 
-MAX_SCENES = 100_000
-"""Most scene files of one folder."""
-
 TEMPLATE = "renderformer-json"
 """What stands as the template of such scenes in their provenance."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneFolder:
-    """The scene files of one folder."""
-
-    root: Path
-    """The folder, without links; nothing outside of it is read."""
-    descriptions: tuple[SceneDescription, ...]
-    """What each file describes, sorted by name."""
-
-    def views(self, wanted: int | None) -> int:
-        """Return how many views every scene gets: `wanted`, or as many as every file has.
-
-        No camera is ever invented: the pictures show what the files say.
-
-        Raises:
-            TrilightError: a file has fewer cameras than wanted.
-        """
-        fewest = min(self.descriptions, key=lambda description: len(description.cameras))
-        if wanted is None:
-            return len(fewest.cameras)
-        if not 1 <= wanted <= len(fewest.cameras):
-            raise TrilightError(
-                f"--views is {wanted}; expected 1 to {len(fewest.cameras)}, the number of cameras "
-                f"in {fewest.file}: choose fewer views, or add cameras to the file."
-            )
-        return wanted
-
-    def notes(self, num_views: int) -> tuple[str, ...]:
-        """Return what a person should know: fields without meaning, and cameras not used."""
-        found = []
-        for description in self.descriptions:
-            found += [
-                f"{description.file}: unknown field {name}" for name in description.unknown_fields
-            ]
-            if (unused := len(description.cameras) - num_views) > 0:
-                found.append(
-                    f"{description.file}: {unused} of {len(description.cameras)} cameras not used, "
-                    f"from cameras[{num_views}] on"
-                )
-        return tuple(found)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,23 +41,34 @@ class SceneFiles:
     """The scene files; the position is the index of the scene."""
     sha256: Mapping[str, str]
     """Digest of every locked file by its path below `root`."""
+    unusable: Mapping[str, str]
+    """What is wrong with each file of which no scene can be made, by its name."""
     licence: str
     """Of every object."""
+    albedo_over_one: AlbedoOverOne = "scale"
+    """What to do where albedos add up to more than 1."""
+    notes: tuple[str, ...] = ()
+    """What a person should know of the scenes that were built."""
 
     def scene(self, scene_index: int, settings: BuildSettings) -> Scene:
         """Build a scene; only children come here.
 
         Raises:
+            Rejected: "unusable_scene_file", for a file of which none can be made.
             TrilightError: a file is not the one that was locked.
         """
+        name = self.names[scene_index]
+        if (why := self.unusable.get(name)) is not None:
+            raise Rejected("unusable_scene_file", why)
         scene, digests = build_scene(
             self.root,
-            self.names[scene_index],
+            name,
             settings.assets,
             licence=self.licence,
             num_views=settings.scenes.num_views,
             scene_index=scene_index,
             seed=settings.seed,
+            albedo_over_one=self.albedo_over_one,
         )
         for uid, digest in digests.items():
             if self.sha256.get(uid) != digest:
@@ -110,30 +77,6 @@ class SceneFiles:
                     "same command again."
                 )
         return scene
-
-
-def find_scene_files(folder: str) -> SceneFolder:
-    """Read every `*.json` of a local folder, not of those below it.
-
-    Raises:
-        TrilightError: no such folder, no scene file in it or too many, or a file that is not
-            usable, named with its field.
-    """
-    root = Path(folder)
-    if not root.is_dir():
-        raise TrilightError(f"--scenes-from {folder}: no such folder; expected one of *.json.")
-    root = root.resolve()
-    names = sorted(path.name for path in root.glob("*.json"))
-    if not 1 <= len(names) <= MAX_SCENES:
-        raise TrilightError(
-            f"--scenes-from {folder}: {len(names)} files *.json; expected 1 to {MAX_SCENES}."
-        )
-    for name in names:
-        if not name.isprintable():
-            raise TrilightError(
-                f"--scenes-from {folder}: rename {name!r}; expected printable text."
-            )
-    return SceneFolder(root=root, descriptions=tuple(described_by(root, name) for name in names))
 
 
 def described_by(root: Path, name: str) -> SceneDescription:
@@ -163,6 +106,7 @@ def build_scene(
     num_views: int | None,
     scene_index: int,
     seed: int,
+    albedo_over_one: AlbedoOverOne = "scale",
 ) -> tuple[Scene, Mapping[str, str]]:
     """Build the scene of one file; only children come here, since it reads meshes.
 
@@ -174,6 +118,7 @@ def build_scene(
         num_views: cameras to take from the file, or None for all.
         scene_index: which scene of the dataset this is; stands in its provenance.
         seed: of the dataset; stands in the provenance, and decides nothing here.
+        albedo_over_one: what to do where albedos add up to more than 1.
 
     Returns:
         The scene, and the sha256 of every file that it was made of by path below `root`.
@@ -195,6 +140,7 @@ def build_scene(
         description,
         [meshes[described.mesh_path, described.remesh_faces] for described in description.objects],
         num_views=num_views,
+        albedo_over_one=albedo_over_one,
         provenance={
             "template": TEMPLATE,
             "scene_index": scene_index,

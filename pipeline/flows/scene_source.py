@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from pipeline.assets.settings import AssetSettings
 from pipeline.flows.scene_files import build_scene, cameras_by, described_by
 from pipeline.objects.licences import USER_PROVIDED
+from pipeline.scenes.described_albedos import AlbedoOverOne
+from pipeline.scenes.from_description import scaled_albedo_notes
 from pipeline.scenes.usd.read import read_usd, usd_keys
 from storage.errors import TrilightError
 from storage.profiles import PACKED, PLAIN
@@ -52,6 +54,8 @@ class SceneSource:
     """Which scene of it, where it holds many."""
     usd_folder: Path | None = None
     """A USD file may name files below it; below its own folder by default."""
+    albedo_over_one: AlbedoOverOne = "scale"
+    """Of RenderFormer's JSON: what to do where albedos add up to more than 1."""
 
     @property
     def name(self) -> str:
@@ -71,13 +75,19 @@ class LoadedScene:
     """[V, R, R, 3] pictures of all views, where they were asked for and the source has them."""
 
 
-def scene_source(text: str, *, many: bool = False, usd_folder: Path | None = None) -> SceneSource:
+def scene_source(
+    text: str,
+    *,
+    many: bool = False,
+    usd_folder: Path | None = None,
+    albedo_over_one: AlbedoOverOne = "scale",
+) -> SceneSource:
     """Return what the user's `SRC` names; the file is not opened yet.
 
     Args:
         text: what the user typed.
         many: whether a shard without a key will do.
-        usd_folder: see `SceneSource`.
+        usd_folder, albedo_over_one: see `SceneSource`.
 
     Raises:
         TrilightError: a URL, no such file, or a name that is none of the forms.
@@ -97,7 +107,12 @@ def scene_source(text: str, *, many: bool = False, usd_folder: Path | None = Non
         raise TrilightError(f"{text}: a shard holds many scenes; expected {text}{SEPARATOR}KEY.")
     if not separator and suffix not in (".tar", *SUFFIXES):
         raise TrilightError(f"{text}: cannot be read as a scene; {_EXPECTED}.")
-    return SceneSource(path=path, key=key if separator else None, usd_folder=usd_folder)
+    return SceneSource(
+        path=path,
+        key=key if separator else None,
+        usd_folder=usd_folder,
+        albedo_over_one=albedo_over_one,
+    )
 
 
 def source_keys(source: SceneSource) -> list[str | None]:
@@ -166,8 +181,10 @@ def load_source(source: SceneSource, *, pictures: bool = False) -> LoadedScene:
         num_views=None,
         scene_index=0,
         seed=0,
+        albedo_over_one=source.albedo_over_one,
     )
-    return LoadedScene(scene=scene, notes=tuple(f"{name}: unknown field {f}" for f in unknown))
+    texts = (*(f"unknown field {field}" for field in unknown), *scaled_albedo_notes(scene))
+    return LoadedScene(scene=scene, notes=tuple(f"{name}: {text}" for text in texts))
 
 
 def _load_sample(path: Path, key: str, *, pictures: bool) -> LoadedScene:

@@ -37,7 +37,7 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
     names = list(FAMILIES)
     group = "builtin" if source != BENCHMARK else "builtin-benchmark-v1"
     records = []
-    for index in range(_count(source)):
+    for index in range(num_builtin(source)):
         family, number = names[index % len(names)], index // len(names)
         path = work_dir / group / numbered(index, f"{family}-{number:05d}.ply")
         data = encode_ply(*FAMILIES[family](rng_for(0, f"{group}/{family}", number)))
@@ -57,7 +57,8 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
     return records
 
 
-def _count(source: str) -> int:
+def num_builtin(source: str) -> int:
+    """Return how many objects a source of built-in ones has; raises as `generate_objects`."""
     if source == BENCHMARK:
         return BENCHMARK_COUNT
     text = source.removeprefix(PREFIX)

@@ -3,15 +3,16 @@
 Nothing is loaded here: a record names a file, and the mesh stage finds out whether it is any good.
 """
 
+import contextlib
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
 from pipeline.objects.generated import PREFIX as BUILTIN
-from pipeline.objects.generated import generate_objects
+from pipeline.objects.generated import generate_objects, num_builtin
 from pipeline.objects.licences import (
     check_allowed,
     refuse_licences,
@@ -91,15 +92,24 @@ def find_objects(
             licence has no form of one, or is stated where the source states its own; a package is
             missing; a server does not answer, or nothing could be downloaded.
     """
-    check_allowed(allowed_licences)
-    stated_licence(licence)
-    value = _value(source)
-    try:
+    with _said_by(source) as value:
         return _find(value, work_dir, allowed_licences, licence, downloaded)
-    except TrilightError as mistake:
-        if value == source:
-            raise
-        raise type(mistake)(_without_value(str(mistake), source, value)) from None
+
+
+def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
+    """Find out whether a source is there and holds anything, before a dataset of it is begun.
+
+    Nothing is written beside what a server's listing leaves in the cache.
+
+    Raises:
+        TrilightError: as `find_objects`, as far as listing the source tells.
+    """
+    with _said_by(source) as value:
+        if value.startswith(BUILTIN):
+            require_unstated(licence, BUILTIN)
+            num_builtin(value)
+        else:
+            _listed(value, Path(), licence, allowed_licences)
 
 
 def _find(
@@ -109,22 +119,27 @@ def _find(
     licence: str | None,
     downloaded: Callable[[int, int], None],
 ) -> FoundObjects:
-    listing = _list(source, work_dir, licence, allowed_licences)
-    shown = printable(safe_url(source))
-    if not listing.records and not listing.failures:
-        raise TrilightError(
-            f"objects {shown!r} holds no object; expected {' '.join(SUFFIXES)} files, or a "
-            f"catalogue (objects.jsonl or objects.csv) that lists some. Name {BUILTIN} for "
-            "built-in objects."
-        )
+    listing = _listed(source, work_dir, licence, allowed_licences)
     allowed, refused = refuse_licences(listing.records, allowed_licences)
     here, lost = listing.fetch(allowed, downloaded)
     failures = [*listing.failures, *refused, *lost]
-    _require_some(shown, here, failures)
+    _require_some(printable(safe_url(source)), here, failures)
     return FoundObjects(
         records=tuple(sorted(here, key=attrgetter("uid"))),
         failures=tuple(sorted(failures, key=attrgetter("item"))),
     )
+
+
+@contextlib.contextmanager
+def _said_by(source: str) -> Iterator[str]:
+    """Lend the source that is meant; where a variable says it, no message shows what it says."""
+    value = _value(source)
+    try:
+        yield value
+    except TrilightError as mistake:
+        if value == source:
+            raise
+        raise type(mistake)(_without_value(str(mistake), source, value)) from None
 
 
 def _value(source: str) -> str:
@@ -156,6 +171,22 @@ def _without_value(message: str, source: str, value: str) -> str:
         f"{shown} cannot be used as what it says; expected a source of objects. Name that source "
         "itself in a terminal of this machine to be told what is wrong: trilight assets SOURCE."
     )
+
+
+def _listed(
+    source: str, work_dir: Path, licence: str | None, allowed_licences: Sequence[str]
+) -> Listing:
+    """Return what a source says that it holds; raises TrilightError where that is nothing."""
+    check_allowed(allowed_licences)
+    stated_licence(licence)
+    listing = _list(source, work_dir, licence, allowed_licences)
+    if not listing.records and not listing.failures:
+        raise TrilightError(
+            f"objects {printable(safe_url(source))!r} holds no object; expected "
+            f"{' '.join(SUFFIXES)} files, or a catalogue (objects.jsonl or objects.csv) that lists "
+            f"some. Name {BUILTIN} for built-in objects."
+        )
+    return listing
 
 
 def _list(

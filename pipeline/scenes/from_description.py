@@ -7,9 +7,9 @@ converter. Vertices are not joined first, so that smooth shading stops where the
 its vertices. Template files, whose scales and translations are meant to be halved, are not known.
 
 An emitter's triangles become emitters each. They reflect by the albedos that the file gives them,
-since the published renderer's emitters have a white surface, as its files say. What has albedos
-that add up to more than 1 is refused and not made darker: it would give off more light than it
-gets, and a picture of some other material would be no help.
+since the published renderer's emitters have a white surface, as its files say. Materials whose
+albedos add up to more than 1 are scaled or refused (pipeline.scenes.described_albedos); what was
+scaled stands in the provenance, by object.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.scenes.described_albedos import AlbedoOverOne, lawful_albedos
 from pipeline.scenes.described_colours import colour_groups, random_diffuse
 from pipeline.scenes.description import (
     DescribedCamera,
@@ -39,7 +40,7 @@ from storage.conventions import (
     look_at_c2w,
 )
 from storage.errors import TrilightError
-from storage.scene import ALBEDO_SUM_TOLERANCE, ObjectKind, Scene, SceneObject
+from storage.scene import ObjectKind, Scene, SceneObject
 
 SHELL_FOLDER = "templates/backgrounds/"
 """Meshes below it are floors and walls; the published scene files keep them there."""
@@ -77,6 +78,7 @@ def scene_from_description(
     *,
     num_views: int,
     provenance: Mapping[str, Any],
+    albedo_over_one: AlbedoOverOne = "scale",
 ) -> Scene:
     """Return the scene that a file describes.
 
@@ -84,7 +86,8 @@ def scene_from_description(
         description: the file.
         meshes: one per object, in its order.
         num_views: how many of the file's cameras to take, from the first.
-        provenance: of the scene.
+        provenance: of the scene; `albedo_scale` is added where materials were scaled.
+        albedo_over_one: what to do where albedos add up to more than 1.
 
     Returns:
         A checked scene; objects in the order of the file, an emitting object as one object per
@@ -94,9 +97,13 @@ def scene_from_description(
         TrilightError: an object or a camera that means nothing, named; or too much of something.
     """
     pieces: list[Piece] = []
+    scales: dict[str, float] = {}
     for described, mesh in zip(description.objects, meshes, strict=True):
         try:
-            pieces += _pieces(described, mesh)
+            found, scale = _pieces(described, mesh, albedo_over_one)
+            pieces += found
+            if scale < 1:
+                scales[described.name] = round(scale, 6)
         except TrilightError as error:
             raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
     try:
@@ -107,7 +114,7 @@ def scene_from_description(
             c2w=c2w,
             fov_deg=fov_deg,
             objects=tuple(piece.entry for piece in pieces),
-            provenance=provenance,
+            provenance={**provenance, "albedo_scale": scales} if scales else provenance,
         )
         scene.check()
     except TrilightError as error:
@@ -126,7 +133,19 @@ def placed(mesh: LoadedMesh, described: DescribedObject) -> NDArray[np.float32]:
     return world.astype(np.float32)
 
 
-def _pieces(described: DescribedObject, mesh: LoadedMesh) -> list[Piece]:
+def scaled_albedo_notes(scene: Scene) -> tuple[str, ...]:
+    """Return, for people, which objects of a described scene are darker than their file says."""
+    return tuple(
+        f"objects.{name}: diffuse + specular is {1 / scale:.4f}, which is more than 1; both were "
+        f"multiplied by {scale:.4f}"
+        for name, scale in scene.provenance.get("albedo_scale", {}).items()
+    )
+
+
+def _pieces(
+    described: DescribedObject, mesh: LoadedMesh, over_one: AlbedoOverOne
+) -> tuple[list[Piece], float]:
+    """Return the pieces of an object, and by what the darkest of its materials was multiplied."""
     positions = placed(mesh, described)
     mirrored = np.prod(described.transform.scale) < 0
     faces = (mesh.faces[:, ::-1] if mirrored else mesh.faces).astype(np.uint32)
@@ -136,17 +155,20 @@ def _pieces(described: DescribedObject, mesh: LoadedMesh) -> list[Piece]:
             f"no triangle of {mesh.uid} has an area after its transform; expected at least one."
         )
     if described.material.emits:
-        return _emitters(described, mesh, positions, faces)
+        return _emitters(described, mesh, positions, faces, over_one)
     smooth = described.material.smooth_shading
     shaded = (
         smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
         if smooth
         else flat_shaded(positions, faces)
     )
-    return [_surface(described, mesh, shaded)]
+    piece, scale = _surface(described, mesh, shaded, over_one)
+    return [piece], scale
 
 
-def _surface(described: DescribedObject, mesh: LoadedMesh, shaded: ShadedMesh) -> Piece:
+def _surface(
+    described: DescribedObject, mesh: LoadedMesh, shaded: ShadedMesh, over_one: AlbedoOverOne
+) -> tuple[Piece, float]:
     material = described.material
     rows = np.zeros(len(shaded.faces), np.int64)
     diffuse = np.array([material.diffuse])
@@ -154,24 +176,22 @@ def _surface(described: DescribedObject, mesh: LoadedMesh, shaded: ShadedMesh) -
         rows = colour_groups(shaded, material)
         count = int(rows.max()) + 1
         diffuse = random_diffuse(material.rand_tri_diffuse_seed, material.random_diffuse_max, count)
-    materials = _reflecting(diffuse, material)
+    materials, scale = _reflecting(diffuse, material, over_one)
     kind: ObjectKind = "shell" if mesh.uid.startswith(SHELL_FOLDER) else "object"
     entry = _entry(described.name, kind, mesh)
-    return Piece(entry=entry, mesh=shaded, materials=materials, material_index=rows)
+    return Piece(entry=entry, mesh=shaded, materials=materials, material_index=rows), scale
 
 
-def _reflecting(diffuse: NDArray[np.float64], material: DescribedMaterial) -> NDArray[np.float32]:
-    """Return material rows [M, 10] that do not emit, for diffuse albedos [M, 3]."""
-    largest = float((diffuse + np.array(material.specular)).max())
-    if largest > 1 + ALBEDO_SUM_TOLERANCE:
-        raise TrilightError(
-            f"diffuse + specular is {largest:.4f}; expected at most 1 in every channel: lower one."
-        )
+def _reflecting(
+    diffuse: NDArray[np.float64], material: DescribedMaterial, over_one: AlbedoOverOne
+) -> tuple[NDArray[np.float32], float]:
+    """Return rows [M, 10] that do not emit, for diffuse albedos [M, 3], and the least factor."""
+    diffuse, specular, scale = lawful_albedos(diffuse, np.array(material.specular), over_one)
     materials = np.zeros((len(diffuse), MATERIAL_WIDTH), np.float32)
     materials[:, DIFFUSE] = diffuse
-    materials[:, SPECULAR] = material.specular
+    materials[:, SPECULAR] = specular
     materials[:, ROUGHNESS] = material.roughness
-    return materials
+    return materials, scale
 
 
 def _emitters(
@@ -179,13 +199,15 @@ def _emitters(
     mesh: LoadedMesh,
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
-) -> list[Piece]:
+    over_one: AlbedoOverOne,
+) -> tuple[list[Piece], float]:
     if len(faces) > MAX_EMITTERS:
         _too_many("emitting triangles", len(faces), MAX_EMITTERS)
-    materials = _reflecting(np.array([described.material.diffuse]), described.material)
+    diffuse = np.array([described.material.diffuse])
+    materials, scale = _reflecting(diffuse, described.material, over_one)
     materials[:, EMISSION] = described.material.emissive
     single = len(faces) == 1
-    return [
+    pieces = [
         Piece(
             entry=_entry(described.name if single else f"{described.name}.{row}", "emitter", mesh),
             mesh=flat_shaded(positions, faces[row : row + 1]),
@@ -194,6 +216,7 @@ def _emitters(
         )
         for row in range(len(faces))
     ]
+    return pieces, scale
 
 
 def _entry(name: str, kind: ObjectKind, mesh: LoadedMesh) -> SceneObject:

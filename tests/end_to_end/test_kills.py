@@ -3,6 +3,7 @@
 import contextlib
 import os
 import pty
+import shlex
 import signal
 import subprocess
 import threading
@@ -155,8 +156,9 @@ def test_ctrl_c_says_what_to_do_and_leaves_nobody(tmp_path: Path, moment: str) -
     run.send_signal(signal.SIGINT)
     assert run.wait(timeout=30) == 130
     reader.join()
-    words = b"trilight: interrupted. What was finished is safe; the same command goes on."
-    assert bytes(shown).rstrip().endswith(words)
+    again = shlex.join(["trilight", *ARGUMENTS, "--out", str(tmp_path / "set")])
+    told = f"trilight: interrupted. What was finished is safe; to go on, run: {again}"
+    assert bytes(shown).rstrip().endswith(told.encode())
     assert shown.rfind(b"\x1b[?25h") > shown.rfind(b"\x1b[?25l") > 0
     _wait_until_nobody_is_left(mark)
 

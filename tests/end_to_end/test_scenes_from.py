@@ -82,9 +82,11 @@ def test_existing_scenes_become_a_dataset(trilight: Trilight, scenes: Path, tmp_
 
 
 def test_bad_scenes_are_one_clear_line(trilight: Trilight, scenes: Path, tmp_path: Path) -> None:
-    (scenes / "bad.json").write_text('{"scene_name": "x", "version": "1.0", "objects": {}}')
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "bad.json").write_text('{"scene_name": "x", "version": "1.0"}')
     for arguments, message in (
-        (("--scenes-from", "scenes"), "bad.json: cameras is missing"),
+        (("--scenes-from", "bad"), "none of the 1 scene files is usable; the first: bad.json: "),
+        (("--scenes-from", "scenes", "--albedo-over-one", "no"), "expected scale or refuse"),
         (("--scenes-from", "nowhere"), "no such folder"),
         (("--views", "2"), "--views is 2"),
     ):
@@ -95,15 +97,32 @@ def test_bad_scenes_are_one_clear_line(trilight: Trilight, scenes: Path, tmp_pat
         assert message in line
 
 
-def test_a_dark_scene_is_given_up_at_once(trilight: Trilight, scenes: Path, tmp_path: Path) -> None:
+def test_a_bad_file_and_a_dark_scene_cost_themselves(
+    trilight: Trilight, scenes: Path, tmp_path: Path
+) -> None:
+    """The first of three is no scene, the second dark; the third has albedos that add up to 1.1."""
+    (scenes / "bad.json").write_text('{"scene_name": "x", "version": "1.0", "objects": {}}')
     dark = json.loads((scenes / "cbox.json").read_text())
     dark["objects"]["light_0"]["material"]["emissive"] = [0.1, 0.1, 0.1]
     (scenes / "cbox.json").write_text(json.dumps(dark))
-    arguments = ("--scenes-from", "scenes", "--out", "set", "--failure-budget", "0.5")
+    bright = json.loads((scenes / "crystals.json").read_text())
+    bright["objects"]["background_0"]["material"] |= {"diffuse": [0.6] * 3, "specular": [0.5] * 3}
+    (scenes / "crystals.json").write_text(json.dumps(bright))
+    arguments = ("--scenes-from", "scenes", "--out", "set", "--failure-budget", "0.4")
     made = trilight("generate", "smoke", *arguments, *SMALL)
     assert made.returncode == 0, made.stderr
-    (failure,) = read_failures(DatasetFolder(tmp_path / "set").failures)
-    assert (failure.item, failure.reason, failure.attempt) == ("000000000", "black_view", 0)
     outcome = json.loads(made.stdout[made.stdout.index("{") :])
-    assert (outcome["scenes"], outcome["scenes_given_up"]) == (1, 1)
+    assert (outcome["scenes"], outcome["scenes_given_up"]) == (1, 2)
+    assert any("background_0: diffuse + specular is 1.1000" in note for note in outcome["notes"])
+    failures = read_failures(DatasetFolder(tmp_path / "set").failures)
+    rows = sorted(failures, key=lambda row: row.item)
+    assert [(row.item, row.reason, row.attempt) for row in rows] == [
+        ("000000000", "unusable_scene_file", 0),
+        ("000000001", "black_view", 0),
+    ]
+    assert "bad.json: cameras is missing" in rows[0].message
     assert trilight("verify", "set").returncode == 0
+    again = trilight("generate", "smoke", *arguments, *SMALL, "--workers", "2")
+    assert json.loads(again.stdout)["dataset_digest"] == outcome["dataset_digest"]
+    refused = trilight("generate", "smoke", *arguments, *SMALL, "--albedo-over-one", "refuse")
+    assert "scene file crystals.json: is missing" in refused.stderr  # it would be another set

@@ -12,17 +12,18 @@ import pytest
 
 from pipeline.flows.accept_scene_files import (
     accept_scene_files,
-    digests_of_scene,
+    build_once,
     settings_for_files,
 )
 from pipeline.flows.builds import named_build
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.prepare_isolated import asset_child
 from pipeline.flows.publication import begin
-from pipeline.flows.scene_files import SceneFiles, build_scene, find_scene_files
+from pipeline.flows.scene_files import SceneFiles, build_scene
+from pipeline.flows.scene_folder import find_scene_files
 from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import IsolatedChild
-from storage.errors import TrilightError
+from storage.errors import Rejected, TrilightError
 from storage.layout import DatasetFolder
 from storage.manifest import read_manifest
 from storage.objects_lock import read_objects_lock
@@ -80,7 +81,7 @@ def _build(folder: Path, name: str = "a.json") -> Scene:
 
 def _digests(folder: Path, name: str) -> dict[str, str]:
     assets = named_build("smoke").assets
-    return dict(digests_of_scene(folder.resolve(), name, assets, num_views=1))
+    return dict(build_once(folder.resolve(), name, assets, 1, "scale").sha256)
 
 
 def _settings(folder: Path, views: int | None = None) -> BuildSettings:
@@ -133,8 +134,7 @@ def test_links_in_a_circle_are_refused(folder: Path) -> None:
 def test_a_scene_file_that_links_out_is_refused(folder: Path) -> None:
     shutil.move(folder / "a.json", folder.parent / "a.json")
     (folder / "a.json").symlink_to(folder.parent / "a.json")
-    with pytest.raises(TrilightError, match="a.json is a.json, which leads out"):
-        find_scene_files(str(folder))
+    assert "a.json is a.json, which leads out" in find_scene_files(str(folder)).unusable["a.json"]
 
 
 def test_a_pipe_is_no_scene_file_and_no_mesh(folder: Path) -> None:
@@ -143,8 +143,9 @@ def test_a_pipe_is_no_scene_file_and_no_mesh(folder: Path) -> None:
     with pytest.raises(TrilightError, match="not a regular file"):
         _build(folder)
     os.mkfifo(folder / "c.json")
-    with pytest.raises(TrilightError, match="c.json: expected a regular file"):
-        find_scene_files(str(folder))
+    unusable = find_scene_files(str(folder)).unusable
+    assert list(unusable) == ["c.json"]
+    assert "c.json: expected a regular file" in unusable["c.json"]
 
 
 @pytest.mark.parametrize(
@@ -231,6 +232,7 @@ def test_a_file_that_changes_during_a_run_stops_it(folder: Path) -> None:
         root=folder.resolve(),
         names=("a.json", "b.json"),
         sha256=_digests(folder, "a.json") | _digests(folder, "b.json"),
+        unusable={},
         licence="MIT",
     )
     settings = _settings(folder)
@@ -253,4 +255,34 @@ def test_a_folder_without_scenes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="no such folder"):
         find_scene_files(str(tmp_path / "nowhere"))
     with pytest.raises(TrilightError, match=r"0 files \*.json"):
+        find_scene_files(str(tmp_path))
+
+
+def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Path) -> None:
+    """One that is no scene, and one whose mesh is broken; scene k stays the k-th file."""
+    (folder / "aa.json").write_text("{")
+    shutil.copy(folder / "a.json", folder / "c.json")
+    (folder / "broken.obj").write_bytes(b"")
+    _change(folder, "c.json", mesh_path="broken.obj")
+    found, settings = find_scene_files(str(folder)), _settings(folder)
+    assert found.names == ("a.json", "aa.json", "b.json", "c.json")
+    assert settings.splits.listed_scenes == 4
+    publication = begin(DatasetFolder(tmp_path / "set"), settings, {}, 1, accept_environment=False)
+    files = accept_scene_files(found, None, settings, publication).files
+    assert files is not None
+    assert sorted(files.unusable) == ["aa.json", "c.json"]
+    for scene_index in (1, 3):
+        with pytest.raises(Rejected, match="unusable_scene_file") as rejection:
+            files.scene(scene_index, settings)
+        assert found.names[scene_index] in rejection.value.message
+    assert files.scene(2, settings).provenance["scene_file"]["name"] == "b.json"
+    assert {"aa.json", "c.json"} & set(files.sha256) == set()
+    assert any("c.json is left out: c.json: objects.green" in note for note in files.notes), (
+        files.notes
+    )
+
+
+def test_only_bad_files_are_refused_with_the_reason_of_the_first(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("{")
+    with pytest.raises(TrilightError, match="none of the 1 scene files is usable; the first: a.js"):
         find_scene_files(str(tmp_path))

@@ -7,12 +7,26 @@ from infra import doctor
 
 @pytest.fixture(scope="module")
 def findings() -> list[doctor.Finding]:
-    return doctor.examine()
+    return list(doctor.examine())
 
 
 def test_a_machine_that_passes_tests_lacks_nothing(findings: list[doctor.Finding]) -> None:
     assert {finding.name for finding in findings} >= {"renderer", "mesh filters", "orchestrator"}
     assert [finding for finding in findings if finding.state == "missing"] == []
+
+
+def test_each_finding_comes_before_the_next_look() -> None:
+    """The probes take seconds each; who waits sees the first at once, and what is looked at."""
+    told: list[str] = []
+    found = doctor.examine(told.append)
+    assert next(found).name == "machine"
+    assert told == ["machine"]
+    assert next(found).name == "disk"
+    assert told == ["machine", "disk"]
+
+
+def test_what_is_looked_at_is_called_as_what_is_found(findings: list[doctor.Finding]) -> None:
+    assert [finding.name for finding in findings] == list(doctor.CHECKS)
 
 
 def test_whatever_is_not_well_names_its_consequence_and_cure(

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from infra.cli.app import app
+from storage.errors import TrilightError
 from tests.documents.dataset_by_hand import five_scenes, write_dataset
 
 
@@ -55,7 +56,40 @@ def test_json_holds_the_distributions(tmp_path: Path) -> None:
     assert (tmp_path / "report.html").exists()
 
 
-def test_a_dataset_without_scenes(tmp_path: Path) -> None:
+def _refused(dataset: Path) -> str:
+    """Return the one line that `inspect` ends with."""
+    result = CliRunner().invoke(app, ["inspect", str(dataset)])
+    assert isinstance(result.exception, TrilightError), result.exception
+    return str(result.exception)
+
+
+def test_a_dataset_without_scenes_is_said_to_be_empty(tmp_path: Path) -> None:
     write_dataset(tmp_path, {})
-    assert "scenes" in inspect(tmp_path)
-    assert (tmp_path / "report.html").exists()
+    assert "the dataset is empty" in _refused(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_a_cut_shard_is_one_sentence_with_what_mends_it(tmp_path: Path) -> None:
+    dataset = five_scenes(tmp_path / "my set")
+    name = dataset.manifest.shards[0].name
+    path = dataset.folder.shard(name)
+    path.write_bytes(path.read_bytes()[:2000])
+    said = _refused(tmp_path / "my set")
+    assert said.startswith(f"{name}: 2000 bytes; expected ")
+    assert said.endswith(f"run `trilight verify '{tmp_path}/my set' --repair`.")
+
+
+@pytest.mark.parametrize("suffix", ["json", "scene", "0.exr"])
+def test_wrong_bytes_are_one_sentence_with_what_mends_it(suffix: str, tmp_path: Path) -> None:
+    """Of the same length, in the middle of each kind of member."""
+    dataset = five_scenes(tmp_path)
+    shard = dataset.manifest.shards[0]
+    path = dataset.folder.shard(shard.name)
+    _, offset, num_bytes = next(
+        row for row in shard.members if row[0].partition(".")[2].startswith(suffix)
+    )
+    data = bytearray(path.read_bytes())
+    data[offset : offset + num_bytes] = bytes(255 - byte for byte in data[offset:][:num_bytes])
+    path.write_bytes(data)
+    assert f"{shard.name}: " in _refused(tmp_path)
+    assert "--repair`." in _refused(tmp_path)

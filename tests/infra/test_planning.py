@@ -82,7 +82,7 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
 
     scenes = without_rendering(monkeypatch, work)
     order = tiny_order(out=str(tmp_path / "set"), scenes=24)
-    measured = measure_scenes(order, 10, lambda: None)
+    measured = measure_scenes(order, 10, tmp_path / "measured", lambda: None)
     assert not (tmp_path / "set").exists()
     cores = cores_owned()
     assert measured.core_s == tuple(cores * seconds for seconds in (1000, *range(1, 10)))

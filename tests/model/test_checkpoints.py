@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -55,27 +56,46 @@ def test_a_published_name_is_fetched_from_the_hub(
 ) -> None:
     asked = []
 
-    def download(repo_id: str, filename: str) -> str:
+    def download(repo_id: str, filename: str, local_files_only: bool) -> str:
+        assert not local_files_only
         asked.append((repo_id, filename))
         return str(published / filename)
 
-    hub = ModuleType("huggingface_hub")
-    hub.hf_hub_download = download  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    _stand_in_hub(monkeypatch, download, lambda name, timeout: None)
     assert same(open_checkpoint(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
     assert asked == [(PUBLISHED[1], CONFIG_NAME), (PUBLISHED[1], WEIGHTS_NAME)]
 
 
-def test_a_hub_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def download(repo_id: str, filename: str) -> str:
-        raise OSError("no route to host\nand a page of advice")
-
+def _stand_in_hub(monkeypatch: pytest.MonkeyPatch, download: Any, model_info: Any) -> None:
     hub = ModuleType("huggingface_hub")
-    hub.hf_hub_download = download  # type: ignore[attr-defined]
+    hub.hf_hub_download, hub.model_info = download, model_info  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+
+
+def _no_route(*words: Any, **named: Any) -> None:
+    raise ConnectionError("no route to host\nand a page of advice")
+
+
+def test_a_hub_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def download(repo_id: str, filename: str, local_files_only: bool) -> str:
+        assert local_files_only  # else the library tries for half a minute, line by line
+        raise OSError("not in the cache")
+
+    _stand_in_hub(monkeypatch, download, _no_route)
     with pytest.raises(TrilightError, match=r"the hub did not give it \(no route to host\)") as got:
         open_checkpoint(PUBLISHED[0])
     assert "\n" not in str(got.value)
+
+
+def test_what_was_fetched_before_is_opened_without_the_hub(
+    published: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def download(repo_id: str, filename: str, local_files_only: bool) -> str:
+        assert local_files_only
+        return str(published / filename)
+
+    _stand_in_hub(monkeypatch, download, _no_route)
+    assert same(open_checkpoint(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
 
 
 def test_without_the_hub_library_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

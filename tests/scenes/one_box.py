@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from pipeline.scenes.described_albedos import AlbedoOverOne
 from pipeline.scenes.description import SceneDescription
 from pipeline.scenes.from_description import LoadedMesh, scene_from_description
 from pipeline.scenes.renderformer_json import read_description
@@ -84,10 +85,19 @@ def loaded(mesh: trimesh.Trimesh, uid: str = "box.obj") -> LoadedMesh:
 
 
 def built(
-    description: SceneDescription, mesh: LoadedMesh | None = None, light: LoadedMesh | None = None
+    description: SceneDescription,
+    mesh: LoadedMesh | None = None,
+    light: LoadedMesh | None = None,
+    albedo_over_one: AlbedoOverOne = "scale",
 ) -> Scene:
     mesh = mesh or loaded(trimesh.creation.box())
     light = light or loaded(
         trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False), "light.obj"
     )
-    return scene_from_description(description, [mesh, light], num_views=1, provenance={})
+    return scene_from_description(
+        description,
+        [mesh, light],
+        num_views=1,
+        provenance={},
+        albedo_over_one=albedo_over_one,
+    )

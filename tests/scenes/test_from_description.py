@@ -215,9 +215,33 @@ def test_what_means_nothing_is_refused_by_name(
     path: tuple[str | int, ...], change: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(TrilightError) as caught:
-        built(described(*path, **change))
+        built(described(*path, **change), albedo_over_one="refuse")
     assert str(caught.value).startswith("a.json: ")
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("emissive", [[0.0] * 3, [1.0] * 3])
+def test_of_random_colours_only_those_beyond_one_are_scaled(emissive: list[float]) -> None:
+    """Each by its own factor, so that hue and gloss beside colour stay; the others are untouched.
+
+    An emitter has one colour, that of its file."""
+    lit = any(emissive)
+    colours = {"diffuse": [0.9, 0.6, 0.3]} if lit else {"rand_tri_diffuse_seed": 1}
+    change = {"specular": [0.25, 0.2, 0.15], "random_diffuse_max": 1.0, "emissive": emissive}
+    lawful = built(described(*MATERIAL, **{**change, **colours}))
+    plain = built(described(*MATERIAL, **{**change, **colours, "specular": [0.0] * 3}))
+    specular = np.array([0.25, 0.2, 0.15])
+    box = lawful.material_index[:12]
+    factors = set()
+    for row, before in zip(lawful.materials[box], plain.materials[box], strict=True):
+        diffuse = before[:3].astype(np.float64)
+        factor = min(1.0, 1 / float((diffuse + specular).max()))
+        expected = np.concatenate([factor * diffuse, factor * specular])
+        assert row[:6] == pytest.approx(expected, rel=1e-6)  # the rounding of float32
+        factors.add(factor)
+    assert min(factors) < 1
+    assert lit or max(factors) == 1
+    assert lawful.provenance["albedo_scale"] == {"box": round(min(factors), 6)}
 
 
 def test_a_scene_without_light_is_refused() -> None:

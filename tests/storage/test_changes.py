@@ -131,7 +131,8 @@ def test_values_come_as_json_has_them() -> None:
 
 WRONG: list[tuple[str, Any, str]] = [
     ("", 1, "does not exist"),
-    ("ages", 1, "does not exist; expected one of branch, branches, age"),
+    ("ages", 1, "'ages' is unknown there; did you mean age? Expected one of branch, branches, age"),
+    ("branch.leaf.flag", "tru", "is 'tru'; expected true or false"),
     ("branch.leaf.colour", 1, "'colour'"),
     ("branches.leaves.colour", 1, "'colour'"),
     ("branch.", 1, "does not exist"),
@@ -149,8 +150,8 @@ WRONG: list[tuple[str, Any, str]] = [
     ("age", [1], "something like 100"),
     ("branch.height", "2", "something like 2.0"),
     ("branch.height", True, "something like 2.0"),
-    ("branch.leaf.flag", 1, "something like False"),
-    ("branch.leaf.flag", "true", "something like False"),
+    ("branch.leaf.flag", 1, "expected true or false"),
+    ("branch.leaf.flag", "true", "expected true or false"),
     ("branch.leaf.name", 5, "something like 'leaf'"),
     ("branch.leaf.pair", 0.5, "something like"),
     ("branch.leaf.pair", "ab", "something like"),

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+from storage.asked import write_asked
 from storage.dataset_status import read_status
 from storage.layout import DatasetFolder
 from storage.manifest import read_manifest, write_manifest
@@ -18,8 +19,10 @@ def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:
     assert (found.shards_done, found.shards_planned) == (1, 3)
     assert (found.scenes_done, found.scenes_planned) == (4, 12)
     assert not found.finished
-    assert "trilight generate smoke" in found.next_command
-    assert "--scenes 12" in found.next_command
+    assert found.next_words is None  # nobody wrote down how it was begun
+    write_asked(publication.folder, ["generate", "smoke", "--scenes", "12"])
+    begun = ("generate", "smoke", "--scenes", "12", "--out", str(tmp_path))
+    assert read_status(str(tmp_path)).next_words == begun
     assert found.failures == [("scenes", "no_camera", 4)]
     # a shard that the manifest does not list yet, as a range of another process leaves it
     manifest = read_manifest(publication.folder.manifest)

@@ -1,5 +1,6 @@
 """How far a dataset is, from its files alone."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,9 @@ from storage.progress import (
     announce_downloads,
     announce_objects,
     count_object,
+    forget_views,
     read_progress,
+    tell_views,
 )
 from tests.flows.test_publication import begin_tiny, make_tiny_shard
 
@@ -58,3 +61,29 @@ def test_a_manifest_is_read_when_it_changes_and_not_twice_a_second(
     make_tiny_shard(publication, 0)
     now = read_progress(publication.folder)
     assert (now.scenes_done, now.scenes_planned, len(read)) == (4, 8, 2)
+
+
+def test_scenes_at_work_count_in_part(tmp_path: Path) -> None:
+    """The bar moves within a scene; what a kill left long ago is not counted."""
+    publication = begin_tiny(tmp_path, 8)
+    folder = publication.folder
+    assert read_progress(folder).views_done == 0
+    tell_views(folder, 3, 0.25)
+    tell_views(folder, 4, 1.5)
+    now = read_progress(folder)
+    assert (now.views_done, now.num_views) == (1.75, 2)
+    make_tiny_shard(publication, 0)
+    assert read_progress(folder).views_done == 4 * 2 + 1.75
+    forget_views(folder, 3)
+    forget_views(folder, 3)  # whoever comes second
+    assert read_progress(folder).views_done == 4 * 2 + 1.5
+    (left,) = (folder.staging / "at_work").iterdir()
+    os.utime(left, (0, 0))
+    assert read_progress(folder).views_done == 4 * 2
+
+
+def test_where_nothing_can_be_written_nothing_is_told(tmp_path: Path) -> None:
+    folder = DatasetFolder(tmp_path)
+    (tmp_path / ".staging").write_text("in the way")
+    tell_views(folder, 0, 0.5)
+    forget_views(folder, 0)

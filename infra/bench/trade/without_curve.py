@@ -53,6 +53,7 @@ _BY_REASON: tuple[tuple[str, tuple[str, ...]], ...] = (
             "build.scenes.views.min_depth",
             "build.renders.min_mean_radiance",
             "order.failure_budget",
+            *("order.albedo_over_one", "render.albedo_over_one"),
         ),
     ),
     (

@@ -1,0 +1,69 @@
+"""The bars of `trilight generate`, from the files of the dataset alone, whoever works on it."""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+
+from rich.progress import Progress as Bars
+
+from infra.cli.console import progress_bars
+from storage.layout import DatasetFolder
+from storage.progress import Progress, read_progress
+
+_POLL_S = 0.5
+
+
+@contextlib.contextmanager
+def watched(folder: DatasetFolder, *, silent: bool) -> Iterator[None]:
+    """Draw progress bars while the block runs."""
+    ended = threading.Event()
+    with progress_bars() as bars:
+        watcher = threading.Thread(target=_watch, args=(folder, bars, ended, silent), daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            watcher.join()
+
+
+def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event, silent: bool) -> None:
+    drawn = _Drawn(bars, silent=silent)
+    last = False
+    while not last:
+        last = ended.wait(_POLL_S)
+        with contextlib.suppress(OSError, ValueError):  # a file may vanish between two looks
+            drawn.show(read_progress(folder))
+
+
+class _Drawn:
+    """Three bars: what is fetched, objects, and views, of which those at work count in part."""
+
+    def __init__(self, bars: Bars, *, silent: bool) -> None:
+        self._bars = bars
+        self._downloads, self._objects, self._views = (
+            bars.add_task(name, total=None, note="", visible=not silent)
+            for name in ("download", "objects", "views")
+        )
+        self._already: float | None = None
+        self._most = 0.0
+
+    def show(self, now: Progress) -> None:
+        """Bring the bars up to date."""
+        downloads, objects = now.downloads_planned or None, now.objects_planned or None
+        self._bars.update(self._downloads, completed=now.downloads_done, total=downloads)
+        self._bars.update(self._objects, completed=now.objects_done, total=objects)
+        if not now.scenes_planned or now.objects_done < now.objects_planned:
+            return
+        if self._already is None:  # rate and ETA count what this run makes, not what it found
+            self._already = now.views_done
+            self._bars.reset(self._views)
+        # a scene that is given up counts as made, and one that is begun again does not go back
+        self._most = max(self._most, now.views_done - self._already)
+        there = f", {self._already:.0f} views were there" if self._already else ""
+        self._bars.update(
+            self._views,
+            completed=self._most,
+            total=now.scenes_planned * now.num_views - self._already,
+            note=f"scenes {now.scenes_done} of {now.scenes_planned}{there}",
+        )

@@ -1,0 +1,76 @@
+"""Each long command speaks before it works; Ctrl-C ends it with one line that says how to go on."""
+
+import os
+import shlex
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from infra.cli.leaving import temporary_folder
+from tests.end_to_end.conftest import command
+
+SCENE = "{}"
+LONG = {
+    "generate": ("generate", "smoke", "--out", "set"),
+    "assets": ("assets", "builtin:", "--out", "my meshes"),
+    "plan": ("plan", "smoke"),
+    "convert": ("convert", "scene.json", "scene.usda"),
+    "inspect": ("inspect", "scene.json"),
+    "verify": ("verify", "pipe"),
+    "evaluate": ("evaluate", "builtin:", "--data", "nowhere"),
+    "doctor": ("doctor",),
+}
+
+
+def _started(words: tuple[str, ...], folder: Path) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        command(*words),
+        cwd=folder,
+        env={**os.environ, "TMPDIR": str(folder)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_words_come_first_and_ctrl_c_is_answered(name: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.json").write_text(SCENE)
+    (tmp_path / "pipe").mkdir()
+    os.mkfifo(tmp_path / "pipe" / "manifest.json")  # whoever reads it waits
+    run = _started(LONG[name], tmp_path)
+    assert run.stdout is not None
+    assert run.stdout.readline().rstrip().endswith(" ...")
+    run.send_signal(signal.SIGINT)
+    _, errors = run.communicate(timeout=60)
+    assert run.returncode == 130, errors
+    told = "trilight: interrupted. What was finished is safe; to go on, run: "
+    assert errors == f"{told}{shlex.join(['trilight', *LONG[name]])}\n"
+
+
+def test_plan_leaves_no_scenes_behind_at_ctrl_c(tmp_path: Path) -> None:
+    run = _started(LONG["plan"], tmp_path)
+    while not list(tmp_path.glob("trilight-plan-*")):
+        assert run.poll() is None
+        time.sleep(0.05)
+    run.send_signal(signal.SIGINT)
+    run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert not list(tmp_path.glob("trilight-plan-*"))
+
+
+def test_a_temporary_folder_is_gone_after_its_block() -> None:
+    with temporary_folder("trilight-test-") as folder:
+        (folder / "file").touch()
+    assert not folder.exists()
+
+
+def test_an_error_is_one_line_without_a_bar_before_it(tmp_path: Path) -> None:
+    run = _started(("verify", "nowhere"), tmp_path)
+    output, errors = run.communicate(timeout=60)
+    assert run.returncode == 1
+    assert len(errors.splitlines()) == 1
+    assert output == "Verifying nowhere ...\n"
