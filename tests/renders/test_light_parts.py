@@ -43,6 +43,22 @@ def test_splats_add_up_in_any_order() -> None:
     np.testing.assert_allclose(pictures[0].reshape(16, 3), expected, rtol=1e-6, atol=1e-5)
 
 
+def test_a_splat_counts_to_the_nearest_unit() -> None:
+    """Cut off instead, dim light would be lost: 0.75 of a unit would be none, a thousand times."""
+    import mitsuba as mi
+
+    from pipeline.renders.device_memory import read_back
+    from pipeline.renders.splats import Splats, splat_unit
+
+    unit = splat_unit(_scene())
+    splats = Splats(1, unit)
+    for units in (0.25, 0.75):
+        colour = mi.Color3f(*(np.full(1000, units * unit, np.float32) for _ in range(3)))
+        splats.add(colour, mi.UInt32(np.zeros(1000, np.uint32)), mi.Bool(True))
+    counted = read_back(splats.picture()).ravel() / unit
+    np.testing.assert_array_equal(counted, [1000.0] * 3)
+
+
 @pytest.mark.parametrize("value", [np.inf, np.nan, 1e9])
 def test_a_splat_that_no_sum_can_hold_shows(value: float) -> None:
     import mitsuba as mi

@@ -14,8 +14,8 @@ PUBLISHED = {"psnr_linear_db": 29.77, "ssim": 0.9526, "lpips": 0.0551, "hdr_flip
 
 PUBLISHED_WHERE = (
     "The paper's figures (Zeng et al. 2025, Table 1) are of 400 scenes of its own with four views "
-    "each at 256 x 256, which were never released, and it does not say how it tone-mapped: same kind "
-    "of set, not the same set."
+    "each at 256 x 256, which were never released, and it does not say how it tone-mapped: same "
+    "kind of set, not the same set."
 )
 
 
