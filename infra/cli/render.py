@@ -26,8 +26,9 @@ def render(
     out: Annotated[
         Path,
         typer.Option(
-            help="X.exr for one picture (X.png is written beside it); a folder, X.mp4 or X.webp "
-            "for many: numbered, and kept where they are there already"
+            help="X.exr for one picture (X.png is written beside it for looking, enlarged below "
+            "256 pixels); a folder, X.mp4 or X.webp for many: numbered, and kept where they are "
+            "there already"
         ),
     ],
     engine: Annotated[str, typer.Option(help="mitsuba, neural, or both side by side")] = "mitsuba",
@@ -57,6 +58,14 @@ def render(
     tone_map: Annotated[
         str, typer.Option(help="of PNG and video: plain, or filmic (ACES 2.0)")
     ] = "plain",
+    exposure: Annotated[
+        float,
+        typer.Option(
+            metavar="EV",
+            help="stops by which PNG and video are brightened, or darkened below 0: each doubles "
+            "the light; EXR keeps radiance as it is",
+        ),
+    ] = 0.0,
     precision: Annotated[
         str, typer.Option(help="neural: float32, bfloat16; on CUDA also tf32, float16")
     ] = "float32",
@@ -94,6 +103,7 @@ def render(
         cameras=cameras,
         fps=fps,
         tone_map=tone_map,
+        exposure_ev=exposure,
         precision=precision,
         lights_per_pass=lights_per_pass,
         skip_empty_bundles=skip_empty_bundles,

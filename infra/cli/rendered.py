@@ -9,6 +9,7 @@ import numpy as np
 from rich.text import Text
 
 from infra.cli.console import console, print_json, print_rows
+from infra.rendering.look import enlargement
 from infra.rendering.picture_file import PictureFile
 from infra.rendering.run import FinishedShot, Flicker
 from infra.rendering.session import Asked, Outcome
@@ -77,7 +78,7 @@ def _print_one(asked: Asked, outcome: Outcome, seconds: float) -> None:
             f"{asked.source}, view {asked.view}; triangles: {scene.num_triangles}, "
             f"lights: {scene.num_lights}",
         ),
-        ("picture", f"{asked.resolution} x {asked.resolution}, linear radiance"),
+        ("picture", f"{asked.resolution} x {asked.resolution}, linear radiance{_enlarged(asked)}"),
     ]
     for name, picture in shot.pictures.items():
         rows += _traced(picture, outcome) if name == "mitsuba" else _neural(asked, picture)
@@ -87,6 +88,12 @@ def _print_one(asked: Asked, outcome: Outcome, seconds: float) -> None:
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in shot.pictures.values())
     console.print(f"\nLook at {shot.png}; measure with {measure}", style="bold")
+
+
+def _enlarged(asked: Asked) -> str:
+    assert asked.resolution is not None
+    factor = enlargement(asked.resolution)
+    return "" if factor == 1 else f"; in the PNG a pixel is {factor} x {factor}"
 
 
 def _traced(picture: PictureFile, outcome: Outcome) -> Rows:

@@ -10,6 +10,7 @@ from infra.rendering.cameras import Shot, own_camera
 from infra.rendering.comparison import comparison_sheet
 from infra.rendering.engines import Engine
 from infra.rendering.flicker import flicker_db, log_error, noise_flicker_db
+from infra.rendering.look import Look, shown
 from infra.rendering.picture_file import (
     PictureFile,
     Radiance,
@@ -18,7 +19,6 @@ from infra.rendering.picture_file import (
     write_picture,
 )
 from infra.rendering.places import Place
-from infra.rendering.tone_maps import ToneMap, tone_mapped
 from pipeline.documents.png import encode_png
 from pipeline.flows.read_scenes import SceneReader
 from pipeline.flows.scene_source import LoadedScene, SceneSource
@@ -96,19 +96,17 @@ def _is_next_frame(source: SceneSource, before: SceneSource) -> bool:
 class ShotRun:
     """Renders shots one after the other; scenes are read once for shots in a row."""
 
-    def __init__(
-        self, engines: Sequence[Engine], place: Place, *, view: int, tone_map: ToneMap
-    ) -> None:
+    def __init__(self, engines: Sequence[Engine], place: Place, *, view: int, look: Look) -> None:
         """Remember how.
 
         Args:
             engines: one or both.
             place: where files go.
             view: which of a scene's own cameras is meant.
-            tone_map: of the PNG.
+            look: of the PNG.
         """
         self._engines, self._place = engines, place
-        self._view, self._tone_map = view, tone_map
+        self._view, self._look = view, look
         self._before: _Frame | None = None
         self.notes: dict[str, None] = {}
         """What a person should know, each once, in order."""
@@ -147,15 +145,15 @@ class ShotRun:
         agreement, flicker = None, None
         if len(self._engines) == 1:
             (radiance_rgb,) = radiances.values()
-            shown = tone_mapped(radiance_rgb, self._tone_map)
+            pixels = shown(radiance_rgb, self._look)
         else:
             traced, neural = radiances["mitsuba"], radiances["neural"]
             agreement = psnr_log_db(neural, traced)
             floor_db = float(files["mitsuba"].facts["noise_floor_db"])
             flicker = self._flicker(log_error(neural, traced), floor_db)
-            shown = comparison_sheet(traced, neural, self._tone_map)
+            pixels = comparison_sheet(traced, neural, self._look)
         png = Path(f"{stem}.png")
-        write_atomically(png, encode_png(shown))
+        write_atomically(png, encode_png(pixels))
         return FinishedShot(
             scene=scene.facts, pictures=files, png=png, psnr_log_db=agreement, flicker=flicker
         )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 
 from infra.rendering.cameras import Camera, Shot, camera_path, orbit, own_camera, shots
 from infra.rendering.engines import Engine, MitsubaEngine, NeuralEngine
+from infra.rendering.look import Look
 from infra.rendering.places import Place, place
 from infra.rendering.run import FinishedShot, ShotRun
 from infra.rendering.sources import scene_sources
@@ -65,6 +67,8 @@ class Asked:
     """Pictures a second of a video."""
     tone_map: str
     """A name of infra.rendering.tone_maps."""
+    exposure_ev: Annotated[float, Within(-32, 32, unit="stops")]
+    """Brightness of PNG and video."""
     precision: str
     """A name of model.precision."""
     lights_per_pass: Annotated[int, Within(1, 65_535, unit="triangles")]
@@ -117,7 +121,8 @@ def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
     """
     _check(asked)
     asked = _completed(asked)
-    settings, tone_map = _settings(asked), require_tone_map(asked.tone_map)
+    settings = _settings(asked)
+    look = Look(tone_map=require_tone_map(asked.tone_map), exposure_ev=asked.exposure_ev)
     if asked.out.suffix.lower() == ".exr":
         scene_source(asked.source)  # a wrong name is said before any library is loaded
     where = place(asked.out)
@@ -125,7 +130,7 @@ def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
         reader = stack.enter_context(SceneReader(asked.albedo_over_one))
         wanted = _shots(asked, where, reader)
         engines = [_engine(name, asked, settings, watcher, stack) for name in ENGINES[asked.engine]]
-        run = ShotRun(engines, where, view=asked.view, tone_map=tone_map)
+        run = ShotRun(engines, where, view=asked.view, look=look)
         watcher.pictures(0, len(wanted))
         finished = run.run(wanted, reader, lambda now: watcher.pictures(now, len(wanted)))
     if where.video is not None:
@@ -187,7 +192,7 @@ def _require_torch() -> None:
 
 def _option(name: str) -> str:
     """Return the option that a field stands for."""
-    return "--" + name.removesuffix("_db").removesuffix("_deg").replace("_", "-")
+    return "--" + re.sub("_(db|deg|ev)$", "", name).replace("_", "-")
 
 
 def _settings(asked: Asked) -> RenderSettings:

@@ -41,8 +41,8 @@ End = Literal["low", "high"]
 ASKED = Asked(
     source="a.json", out=Path("a.exr"), engine="mitsuba", checkpoint=None, resolution=64,
     noise_floor_db=40.0, max_spp=64, view=0, orbit=None, arc_deg=360.0, cameras=None, fps=24,
-    tone_map="plain", precision="float32", lights_per_pass=8, skip_empty_bundles=False,
-    seed=0, threads=None,
+    tone_map="plain", exposure_ev=0.0, precision="float32", lights_per_pass=8,
+    skip_empty_bundles=False, seed=0, threads=None,
 )  # fmt: skip
 CONTEST: Any = Contest(
     network=None, shards=None, resolution=64, rivals=None, lpips=None, most_scenes=1  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import math
+import re
 import typing
 from collections.abc import Iterator
 from typing import Annotated, Any, get_args, get_origin
@@ -58,7 +59,7 @@ def test_an_end_is_accepted(settings: type, field: Declared, end: End) -> None:
 @every_field
 def test_one_step_outside_is_refused_by_name(settings: type, field: Declared, end: End) -> None:
     number = first_outside(field, end)
-    option = field.name.removesuffix("_db").removesuffix("_deg").replace("_", "-")
+    option = re.sub("_(db|deg|ev)$", "", field.name).replace("_", "-")
     with pytest.raises(TrilightError) as caught:
         at_end(settings, field, end, number)
     message = str(caught.value)

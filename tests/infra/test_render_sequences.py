@@ -36,7 +36,7 @@ def test_a_turn_is_path_traced_to_a_video_and_kept(scene: Path, tmp_path: Path) 
     assert min(picture.mean() for picture in pictures) > 0.01
     assert (pictures[0] != pictures[1]).any()
     with Image.open(out) as video:
-        assert (getattr(video, "n_frames", 1), video.size) == (3, (16, 16))
+        assert (getattr(video, "n_frames", 1), video.size) == (3, (256, 256))
     exrs[1].unlink()
     again = render(*words)
     assert [picture["kept"] for picture in again["pictures"]] == [True, False, True]

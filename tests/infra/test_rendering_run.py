@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from infra.rendering.cameras import Shot, orbit, own_camera, shots
+from infra.rendering.comparison import comparison_sheet
 from infra.rendering.engines import Engine, Rendered
+from infra.rendering.look import Look, enlarged, enlargement
 from infra.rendering.places import Place, place
 from infra.rendering.run import FinishedShot, ShotRun
-from infra.rendering.tone_maps import ToneMap, require_tone_map, tone_mapped
+from infra.rendering.tone_maps import require_tone_map, tone_mapped
 from infra.rendering.video import write_video
 from pipeline.flows.scene_source import SceneSource
 from storage.conventions import preview_srgb8
@@ -56,9 +58,12 @@ def turn(tmp_path: Path) -> list[Shot]:
 
 
 def run(
-    engines: list[Engine], out: Path, wanted: list[Shot], tone_map: ToneMap = "plain"
+    engines: list[Engine],
+    out: Path,
+    wanted: list[Shot],
+    look: Look = Look(),  # noqa: B008
 ) -> tuple[list[FinishedShot], list[str]]:
-    drawn = ShotRun(engines, place(out), view=0, tone_map=tone_map)
+    drawn = ShotRun(engines, place(out), view=0, look=look)
     return drawn.run(wanted, HereReader(), lambda now: None), list(drawn.notes)
 
 
@@ -125,9 +130,47 @@ def test_another_tone_map_needs_no_other_picture(turn: list[Shot], tmp_path: Pat
     out, again = tmp_path / "turn", FlatEngine()
     run([FlatEngine()], out, turn)
     plain = (out / "000000.png").read_bytes()
-    run([again], out, turn, "filmic")
+    run([again], out, turn, Look(tone_map="filmic"))
     assert again.rendered == 0
     assert (out / "000000.png").read_bytes() != plain
+
+
+def test_another_exposure_needs_no_other_picture(turn: list[Shot], tmp_path: Path) -> None:
+    """Stops multiply the light by powers of two; the EXR that is measured knows nothing of it."""
+    out, again = tmp_path / "turn", FlatEngine()
+    run([FlatEngine()], out, turn)
+    measured = (out / "000000.exr").read_bytes()
+    run([again], out, turn, Look(exposure_ev=-3.0))
+    assert again.rendered == 0
+    assert (out / "000000.exr").read_bytes() == measured
+    darker = np.asarray(Image.open(out / "000000.png"))
+    np.testing.assert_array_equal(darker[::16, ::16], preview_srgb8(decode_exr(measured) / 8))
+    assert 0 < darker.min() < 255
+
+
+@pytest.mark.parametrize(("width", "factor"), [(8, 32), (64, 4), (96, 3), (248, 2), (256, 1)])
+def test_small_pictures_are_enlarged_by_whole_numbers(width: int, factor: int) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (width, width, 3)).astype(np.uint8)
+    found = enlarged(pixels)
+    assert enlargement(width) == factor
+    assert found.shape == (factor * width, factor * width, 3)
+    for row in range(factor):
+        for column in range(factor):
+            np.testing.assert_array_equal(found[row::factor, column::factor], pixels)
+
+
+@pytest.mark.parametrize("exposure_ev", [0.0, -1.5])
+def test_the_captions_of_a_small_comparison_are_whole(exposure_ev: float) -> None:
+    dark, bright = (np.full((64, 64, 3), value, np.float32) for value in (0.1, 9.0))
+    sheet = comparison_sheet(dark, bright, Look(exposure_ev=exposure_ev)).astype(int)
+    assert sheet.shape == (24 + 256, 3 * 256 + 2 * 8, 3)
+    for column in range(3):
+        left = column * (256 + 8)
+        strip = sheet[:24, left : left + 256 + 8]
+        text = (strip.sum(axis=-1) < 3 * 128).any(axis=0)
+        # as tall letters as in the sheets of evaluate, and none under the next caption or cut off
+        assert (strip.sum(axis=-1) < 3 * 128).any(axis=1).sum() >= 10
+        assert text.any() and not text[256:].any() and not text[-20:].any()
 
 
 def test_the_film_like_curve_keeps_what_the_plain_one_clips() -> None:

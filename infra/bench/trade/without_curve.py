@@ -83,7 +83,7 @@ _BY_REASON: tuple[tuple[str, tuple[str, ...]], ...] = (
     ),
     (
         "Of how pictures are shown, not of how they are made.",
-        _named("render.", "fps tone_map"),
+        _named("render.", "fps tone_map exposure"),
     ),
     (
         "One of the changes of the table of small trainings (infra.bench.training_table), which "
