@@ -65,6 +65,7 @@ def _wait_until(run: "subprocess.Popen[bytes]", reached: Callable[[], bool]) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path) -> None:
     started = time.monotonic()
     expected = _undisturbed(tmp_path)
@@ -102,6 +103,7 @@ def test_killed_anywhere_ends_in_the_same_digest(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_kills_of_children_end_in_the_same_digest(tmp_path: Path) -> None:
     """While meshes are made, with an empty store, and while pictures are; fork servers too."""
     expected = _undisturbed(tmp_path)
@@ -159,7 +161,7 @@ def test_ctrl_c_says_what_to_do_and_leaves_nobody(tmp_path: Path, moment: str) -
     again = shlex.join(["trilight", *ARGUMENTS, "--out", str(tmp_path / "set")])
     told = f"trilight: interrupted. What was finished is safe; to go on, run: {again}"
     assert bytes(shown).rstrip().endswith(told.encode())
-    assert shown.rfind(b"\x1b[?25h") > shown.rfind(b"\x1b[?25l") > 0
+    assert shown.rfind(b"\x1b[?25h") > shown.rfind(b"\x1b[?25l") >= 0
     _wait_until_nobody_is_left(mark)
 
 
