@@ -91,7 +91,7 @@ def test_without_a_password_there_is_no_server() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "pipeline.flows.guarded_server", "--port", "1"],
         env={"PATH": "/usr/bin:/bin"}, cwd=Path(__file__).parents[2],
-        capture_output=True, text=True, check=False,
+        capture_output=True, text=True, check=False, timeout=60,
     )  # fmt: skip
     assert done.returncode == 1
     assert "PREFECT_SERVER_API_AUTH_STRING is not set; expected USER:PASSWORD" in done.stderr
