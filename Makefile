@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: setup setup-all dataset test test-slow train serve stop lint lock third-party ranges clean
+.PHONY: setup setup-all dataset test test-slow test-elsewhere train serve stop lint lock third-party ranges clean
 
 setup: $(VENV)/.dataset-ready  ## what making data needs
 
@@ -23,6 +23,9 @@ test: setup-all  ## the tests that take minutes
 
 test-slow: setup-all  ## the others
 	python -m pytest -m slow -n 2
+
+test-elsewhere: setup-all  ## the most telling ones, as other processors would run them
+	python -m tests.elsewhere
 
 train: setup-all  ## the smoke model on what `make dataset` made
 	trilight train smoke --data data/smoke --out runs/smoke $(if $(wildcard runs/smoke/checkpoints/*),--resume)
