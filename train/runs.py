@@ -201,7 +201,9 @@ def in_proportion(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -> 
     """
     if not 0 < steps < run.num_steps:
         return {}
-    kept = {name: stated[name] for name in _INTERVALS if isinstance(stated.get(name), int)}
+    given = {name: stated[name] for name in _INTERVALS if name in stated}
+    # what is no number of steps is refused, by name, when the settings are made
+    kept = {name: value for name, value in given.items() if isinstance(value, int) and value > 0}
 
     def shorter(name: str, unit: int) -> int:
         exact = getattr(run, name) * steps / run.num_steps

@@ -56,6 +56,11 @@ def test_what_is_stated_is_not_brought_along() -> None:
         changed_run("smoke", {"warmup_steps": 50}, steps=24)
     with pytest.raises(TrilightError, match="num_steps is 0; expected a whole number from 1"):
         changed_run("smoke", {}, steps=0)
+    for name in ("log_every", "validate_every", "checkpoint_every"):
+        with pytest.raises(TrilightError, match=f"{name} is 0; expected a whole number from 1"):
+            changed_run("pretrain", {name: 0}, steps=24)
+    with pytest.raises(TrilightError, match="'log_every' is 'often'"):
+        changed_run("pretrain", {"log_every": "often"}, steps=24)
 
 
 @pytest.mark.parametrize(
