@@ -76,7 +76,7 @@ def train_run(
     opened, folder = open_training_data(data), RunFolder(out)
     for note in opened.notes:
         progress.noted(note)
-    objective = Objective(settings.loss, load_lpips(start.lpips))
+    objective = Objective(settings.loss, load_lpips(start.lpips)).to(crew.device)
     _check_data(opened, settings)
     settings, state = _begin(settings, folder, opened, start, crew, progress)
     judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
