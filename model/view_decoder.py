@@ -100,7 +100,7 @@ class ViewDecoder(nn.Module):
         return stack_taps(outputs, self.head.taps)
 
     def bundle_tokens(self, fov_deg_BV: Tensor, resolution: int) -> Tensor:
-        """Return the tokens [B, V, Q, W] of all bundles of square pictures, float32 under autocast."""
+        """Return the tokens [B, V, Q, W] of square pictures, float32 under autocast too."""
         rays_BVQC = bundle_rays(ray_directions(fov_deg_BV, resolution), self.patch_px)
         with as_given(rays_BVQC.device):
             return self.token_W + self.rays_norm(self.rays(rays_BVQC))

@@ -21,8 +21,8 @@ from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable
 from train.evaluation.judge import Judge, median_picture
 from train.folder import RunFolder
-from train.loop.checkpoint import Checkpoint, read_checkpoint, resumed_state
-from train.loop.checkpoints import newest_checkpoint, saved_steps
+from train.loop.checkpoint import Checkpoint, resumed_state
+from train.loop.checkpoints import resumed_checkpoint, saved_steps
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState, new_state
@@ -146,7 +146,7 @@ def _begin(
 ) -> tuple[TrainSettings, TrainState]:
     """Return the state that the run begins or goes on with, and the settings with its network."""
     if start.resume:
-        checkpoint = read_checkpoint(newest_checkpoint(folder.checkpoints))
+        checkpoint = resumed_checkpoint(folder.checkpoints, crew, progress.noted)
         if settings.from_weights:
             config = decode_config(checkpoint.header["model"])
             settings = dataclasses.replace(settings, model=config)
