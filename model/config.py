@@ -6,7 +6,7 @@ size cannot change: two stages, QK-norm over the full width, SwiGLU, RMSNorm bef
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from storage.errors import TrilightError
 from storage.ranges import Within, check_ranges
@@ -27,6 +27,8 @@ LAYERS = 256
 class ModelConfig:
     """All numbers of one network."""
 
+    PRESETS: ClassVar[dict[str, Callable[[], "ModelConfig"]]] = {}
+    """The named sizes, by which a setting of this kind may be given (storage.changes)."""
     width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)]
     """Width of every token."""
     num_heads: Annotated[int, Within(1, 512)]
@@ -185,14 +187,10 @@ def large() -> ModelConfig:
     )
 
 
-SIZES: dict[str, Callable[[], ModelConfig]] = {
-    "smoke": smoke,
-    "tiny": tiny,
-    "small": small,
-    "base": base,
-    "large": large,
-}
+SIZES = ModelConfig.PRESETS
 """Every named size, smallest first."""
+
+SIZES.update(smoke=smoke, tiny=tiny, small=small, base=base, large=large)
 
 
 def _wrong(got: str, expected: str) -> None:

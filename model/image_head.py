@@ -12,6 +12,7 @@ from torch.nn.functional import interpolate, silu
 
 from model.config import NUM_TAPS, ModelConfig
 from model.layers import LAYER_NORM_EPS, Norm
+from model.precision import as_given
 from model.rays import unbundle
 
 LAST_CHANNELS = 32
@@ -31,7 +32,8 @@ class LinearHead(nn.Module):
     def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
         """Return pictures [M, 3, R, R]."""
         tokens_MQW = taps_MQW[0].to(self.last.weight.dtype)
-        return unbundle(self.last(self.norm(tokens_MQW)), self.patch_px)
+        with as_given(tokens_MQW.device):
+            return unbundle(self.last(self.norm(tokens_MQW)), self.patch_px)
 
     def rounded_parts(self) -> list[nn.Module]:
         """Return no part: what the last layer rounds is seen as it is."""
@@ -110,7 +112,8 @@ class DptHead(nn.Module):
                 height, width = 2 * grids[0].shape[-2], 2 * grids[0].shape[-1]
             fused = self.fuse[level](fused, grids[level], (height, width))
         halved = self.halve(fused).to(self.last.weight.dtype)
-        return self.last(silu(self.widen(halved)))
+        with as_given(halved.device):
+            return self.last(silu(self.widen(halved)))
 
     def rounded_parts(self) -> list[nn.Module]:
         """Return all but the last two layers: what those round is seen as it is."""

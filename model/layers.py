@@ -11,6 +11,7 @@ from torch.utils.checkpoint import checkpoint
 from model.attention import attend
 from model.encoded_scene import KeysValues
 from model.positions import Rotation, rotate
+from model.precision import as_given
 from model.windows import Windows, attend_in_windows
 
 LAYER_NORM_EPS = 1e-6
@@ -23,14 +24,16 @@ TOKEN_NORM_EPS = 1.1920929e-07
 class Norm(nn.RMSNorm):
     """RMSNorm whose result has the type of its input, whatever the type of its weight.
 
-    Under autocast the two differ, and torch then leaves its fused kernel.
+    Under autocast the two differ, and torch then leaves its fused kernel. On CUDA, autocast would
+    also have it return float32, and all that follows compute in it.
     """
 
     def forward(self, x: Tensor) -> Tensor:
         """[..., W] -> [..., W]."""
         assert self.weight is not None
         weight = self.weight.to(x.dtype)
-        return nn.functional.rms_norm(x, self.normalized_shape, weight, self.eps)
+        with as_given(x.device):
+            return nn.functional.rms_norm(x, self.normalized_shape, weight, self.eps)
 
 
 def dtype_of(layers: nn.ModuleList) -> torch.dtype:

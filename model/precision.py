@@ -8,11 +8,12 @@ trained network (docs/tradeoffs.md has every part alone). `trilight model NAME -
 what is left, layer by layer.
 
 Weights are rounded once, when the network is made ready, and not at every use (autocast): equally
-fast, half the memory. Training in few bits is another matter and needs float32 weights.
+fast, half the memory. Training in few bits is another matter and needs float32 weights, so that it
+asks autocast; what is always float32 stands in `as_given` and does not hear of that.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -73,6 +74,14 @@ def set_precision(model: "RenderFormer", name: str) -> "RenderFormer":
         part.to(precision.dtype)
     model.tf32 = precision.tf32
     return model
+
+
+def as_given(device: torch.device) -> AbstractContextManager[None]:
+    """Return a context whose operations keep the types they are given, whatever autocast says."""
+    if not torch.amp.is_autocast_available(device.type):
+        return nullcontext()  # the meta device, on which operations are only counted
+    context: AbstractContextManager[None] = torch.autocast(device.type, enabled=False)
+    return context
 
 
 @contextmanager

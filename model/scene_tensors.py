@@ -111,16 +111,16 @@ def scene_tensors(scene: Scene) -> SceneTensors:
 
 def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
     """Stack scenes of equal view count; the picture of a scene does not depend on its company."""
-    lengths = torch.tensor([scene.num_triangles for scene in scenes])
-    longest = int(lengths.max())
-    padded = bool((lengths < longest).any())
+    lengths = [scene.num_triangles for scene in scenes]
+    longest = max(lengths)
+    padded = min(lengths) < longest
     return SceneBatch(
         triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
         normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
         material_BT10=_stack_padded([scene.material_T10 for scene in scenes], longest),
         c2w_BV44=torch.stack([scene.c2w_V44 for scene in scenes]),
         fov_deg_BV=torch.stack([scene.fov_deg_V for scene in scenes]),
-        is_triangle_BT=torch.arange(longest) < lengths[:, None] if padded else None,
+        is_triangle_BT=torch.arange(longest) < torch.tensor(lengths)[:, None] if padded else None,
     )
 
 

@@ -17,6 +17,7 @@ from model.positions import (
     token_places,
     world_rotation,
 )
+from model.precision import as_given
 from model.scene_tensors import SceneBatch
 from storage.conventions import MATERIAL_WIDTH
 
@@ -38,10 +39,11 @@ class TriangleTokens(nn.Module):
         self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
 
     def forward(self, material_BT10: Tensor, normals_BT33: Tensor) -> Tensor:
-        """Return tokens [B, T, W]."""
-        material_BTW = self.material_norm(self.material(material_BT10))
-        normal_BTW = self.normal_norm(self.normal(encode_normals(normals_BT33, self.octaves)))
-        return self.token_W + material_BTW + normal_BTW
+        """Return tokens [B, T, W], float32 under autocast too."""
+        with as_given(material_BT10.device):
+            material_BTW = self.material_norm(self.material(material_BT10))
+            normal_BTW = self.normal_norm(self.normal(encode_normals(normals_BT33, self.octaves)))
+            return self.token_W + material_BTW + normal_BTW
 
 
 class TriangleEncoder(nn.Module):

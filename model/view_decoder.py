@@ -16,6 +16,7 @@ from model.encoded_scene import EncodedScene, KeysValues
 from model.image_head import build_head, stack_taps
 from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
 from model.positions import Rotation, TriangleRotary, camera_rotation
+from model.precision import as_given
 from model.rays import bundle_rays, ray_directions
 from model.scene_tensors import Cameras
 from model.windows import Windows, cut_windows
@@ -99,9 +100,10 @@ class ViewDecoder(nn.Module):
         return stack_taps(outputs, self.head.taps)
 
     def bundle_tokens(self, fov_deg_BV: Tensor, resolution: int) -> Tensor:
-        """Return the tokens [B, V, Q, W] of all bundles of square pictures."""
+        """Return the tokens [B, V, Q, W] of square pictures, float32 under autocast too."""
         rays_BVQC = bundle_rays(ray_directions(fov_deg_BV, resolution), self.patch_px)
-        return self.token_W + self.rays_norm(self.rays(rays_BVQC))
+        with as_given(rays_BVQC.device):
+            return self.token_W + self.rays_norm(self.rays(rays_BVQC))
 
     def _cuts(self, per_side: int, device: torch.device) -> Cuts:
         if not self.window_bundles:

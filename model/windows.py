@@ -7,8 +7,11 @@ nothing to mask. Windows of equal size are attended together.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from model.attention import attend
@@ -26,20 +29,30 @@ class Windows:
     """(windows, bundles in each), as they follow each other in `order_Q`."""
 
 
+@lru_cache
 def cut_windows(per_side: int, width: int, *, shifted: bool, device: torch.device) -> Windows:
     """Return the cut of per_side x per_side bundles into windows of width x width.
 
     A shifted cut has its lines at width / 2, 3 width / 2, ...; per_side is a multiple of width.
+    It depends on these numbers alone, so it is computed once, on the processor: a graphics card
+    would have to be waited for, in every pass, to say how many windows of each size there are.
     """
     offset = width // 2 if shifted else 0
-    cell_S = (torch.arange(per_side, device=device) + offset) // width
-    window_Q = (cell_S[:, None] * per_side + cell_S).flatten()
-    _, window_Q, sizes_K = window_Q.unique(return_inverse=True, return_counts=True)
-    large_first_Q = -sizes_K[window_Q] * len(window_Q) + window_Q
-    order_Q = large_first_Q.argsort(stable=True)
-    sizes, counts = sizes_K.unique(return_counts=True)
-    groups = sorted(zip(counts.tolist(), sizes.tolist(), strict=True), key=lambda group: -group[1])
-    return Windows(order_Q=order_Q, back_Q=order_Q.argsort(), groups=tuple(groups))
+    cell_S = (np.arange(per_side) + offset) // width
+    window_Q = (cell_S[:, None] * per_side + cell_S).ravel()
+    _, window_Q, sizes_K = np.unique(window_Q, return_inverse=True, return_counts=True)
+    order_Q = np.lexsort((window_Q, -sizes_K[window_Q]))  # larger windows first
+    sizes, counts = np.unique(sizes_K, return_counts=True)
+    groups = zip(counts[::-1].tolist(), sizes[::-1].tolist(), strict=True)
+    return Windows(
+        order_Q=_on(device, order_Q), back_Q=_on(device, order_Q.argsort()), groups=tuple(groups)
+    )
+
+
+@torch.inference_mode(False)
+def _on(device: torch.device, indices: NDArray[np.int64]) -> Tensor:
+    """Return indices that training may use too, even where inference asked for them first."""
+    return torch.from_numpy(indices).to(device)
 
 
 def attend_in_windows(q_MHQD: Tensor, k_MHQD: Tensor, v_MHQD: Tensor, windows: Windows) -> Tensor:

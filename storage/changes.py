@@ -1,11 +1,13 @@
 """Settings with some values changed, by dotted names such as `lights.count`.
 
 A name leads through groups of settings; where it leads through a list of groups, each of them is
-changed. Values come as JSON has them, and must be of the kind that they replace.
+changed. Values come as JSON has them, and must be of the kind that they replace. A group whose
+class has `PRESETS`, makers by name, may also be replaced as a whole by one of those, and single
+settings of it are then changes of the preset: model=large with model.window_bundles=0.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from storage.errors import TrilightError
@@ -25,7 +27,7 @@ def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
 
     Raises:
         TrilightError: a name that does not exist, a value of another kind, or one that the
-            settings themselves refuse.
+            settings themselves refuse; a name that is nearly right is asked back.
     """
     found: Settings = _changed(settings, [(n.split("."), v, n) for n, v in changes.items()])
     return found
@@ -40,7 +42,9 @@ def _changed(group: Any, changes: Sequence[Change]) -> Any:
     for field, own in _by_field(group, changes).items():
         old = getattr(group, field)
         if _is_group(old):
-            values[field] = _changed(old, [(path[1:], value, name) for path, value, name in own])
+            inner = [(path[1:], value, name) for path, value, name in own]
+            base = _preset(old, [change for change in inner if not change[0]])
+            values[field] = _changed(base, [change for change in inner if change[0]])
         else:
             ((_, value, name),) = own
             values[field] = _like(old, value, name)
@@ -64,12 +68,33 @@ def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Ch
                 f"setting {name!r} does not exist: {path[0]!r} is unknown there; "
                 f"{expected_one_of(path[0], fields)}."
             )
-        is_group = _is_group(getattr(group, path[0]))
-        if is_group != (len(path) > 1):
-            kind = "a group: name one of its settings" if is_group else "a single setting"
-            raise TrilightError(f"setting {name!r}: {path[0]!r} is {kind}.")
+        old = getattr(group, path[0])
+        if _is_group(old) and len(path) == 1 and not _presets(old):
+            raise TrilightError(
+                f"setting {name!r}: {path[0]!r} is a group: name one of its settings."
+            )
+        if not _is_group(old) and len(path) > 1:
+            raise TrilightError(f"setting {name!r}: {path[0]!r} is a single setting.")
         found.setdefault(path[0], []).append((path, value, name))
     return found
+
+
+def _presets(group: Any) -> Mapping[str, Callable[[], Any]]:
+    """Return what a group may be replaced by, by name."""
+    return getattr(group, "PRESETS", {})
+
+
+def _preset(group: Any, changes: Sequence[Change]) -> Any:
+    """Return the preset that was named for a group, or the group where none was."""
+    presets = _presets(group)
+    for _, value, name in changes:
+        if not isinstance(value, str) or value not in presets:
+            raise TrilightError(
+                f"setting {name!r} is {value!r}; {expected_one_of(str(value), presets)}, or one "
+                f"of its settings by name, such as {name}.{dataclasses.fields(group)[0].name}."
+            )
+        group = presets[value]()
+    return group
 
 
 def _is_group(value: Any) -> bool:

@@ -6,7 +6,8 @@ from pathlib import Path
 from model.checkpoints import checkpoint_path, open_checkpoint
 from model.renderformer import RenderFormer
 from model.trained_range import trained_range
-from storage.safe_read import read_safetensors
+from storage.errors import TrilightError
+from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
 from train.folder import RunFolder
 from train.loop.checkpoint import is_checkpoint, read_checkpoint
 from train.loop.checkpoints import checkpoint_path as path_of_step
@@ -24,10 +25,8 @@ def open_network(place: str | Path) -> RenderFormer:
         TrilightError: there is none, or it is damaged.
     """
     path = _run_file(Path(place))
-    if path.suffix == ".safetensors" and path.is_file():
-        _, metadata = read_safetensors(path.read_bytes(), name=str(path))
-        if is_checkpoint(metadata):
-            return read_checkpoint(path).network()
+    if path.suffix == ".safetensors" and path.is_file() and is_checkpoint(_metadata(path)):
+        return read_checkpoint(path).network()
     return open_checkpoint(str(path))
 
 
@@ -39,7 +38,7 @@ def trained_resolution(place: str | Path) -> int | None:
         return int(record["settings"]["resolution"])
     path = checkpoint_path(str(place))
     if path.is_file():
-        _, metadata = read_safetensors(path.read_bytes(), name=str(path))
+        metadata = _metadata(path)
         if is_checkpoint(metadata):
             return int(read_checkpoint(path).header["settings"]["resolution"])
         known = trained_range(metadata)
@@ -54,3 +53,14 @@ def _run_file(path: Path) -> Path:
         if steps := saved_steps(folder.checkpoints):
             return path_of_step(folder.checkpoints, steps[-1])
     return path
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    """Return what the header of a safetensors file says beside its tensors."""
+    with path.open("rb") as file:
+        start = file.read(8 + MAX_HEADER_BYTES)
+    try:
+        found: dict[str, str] = safetensors_header(start).get("__metadata__", {})
+    except TrilightError as error:
+        raise TrilightError(f"{path}: {error}") from error
+    return found

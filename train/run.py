@@ -21,8 +21,8 @@ from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable
 from train.evaluation.judge import Judge, median_picture
 from train.folder import RunFolder
-from train.loop.checkpoint import Checkpoint, read_checkpoint, resumed_state
-from train.loop.checkpoints import newest_checkpoint, saved_steps
+from train.loop.checkpoint import Checkpoint, resumed_state
+from train.loop.checkpoints import resumed_checkpoint, saved_steps
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState, new_state
@@ -84,7 +84,7 @@ def train_run(
     opened, folder = open_training_data(data), RunFolder(out)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         progress.noted(note)
-    objective = Objective(settings.loss, load_lpips(start.lpips))
+    objective = Objective(settings.loss, load_lpips(start.lpips)).to(crew.device)
     _check_data(opened, settings)
     settings, state = _begin(settings, folder, opened, start, crew, progress)
     judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
@@ -153,7 +153,7 @@ def _begin(
 ) -> tuple[TrainSettings, TrainState]:
     """Return the state that the run begins or goes on with, and the settings with its network."""
     if start.resume:
-        checkpoint = read_checkpoint(newest_checkpoint(folder.checkpoints))
+        checkpoint = resumed_checkpoint(folder.checkpoints, crew, progress.noted)
         if settings.from_weights:
             config = decode_config(checkpoint.header["model"])
             settings = dataclasses.replace(settings, model=config)

@@ -36,7 +36,8 @@ class TrainSettings:
     from_weights: bool = False
     """Whether the run begins with given weights (`--from`) instead of random ones."""
     resolution: Annotated[int, Within(1, 2048, unit="pixels")]
-    """Pixels across the training pictures: a divisor of the data's, a multiple of the bundle's."""
+    """Pixels across the training pictures: a divisor of the data's, a multiple of the bundle's, or
+    of a window of bundles."""
     most_triangles: Annotated[int, Within(0, 1_000_000, unit="triangles")] = 0
     """Scenes with more triangles are unusable; 0: none is."""
     seed: Seed = 0
@@ -92,9 +93,9 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         check_ranges(self, "train settings: ")
-        patch_px = self.model.patch_px
-        if self.resolution % patch_px:
-            _wrong("resolution", self.resolution, f"a multiple of {patch_px}")
+        picture_px = self.model.picture_px
+        if self.resolution % picture_px:
+            _wrong("resolution", self.resolution, f"a multiple of {picture_px} for this network")
         for name in ("validate_every", "checkpoint_every"):
             if getattr(self, name) % self.log_every:
                 _wrong(name, getattr(self, name), f"a multiple of log_every, {self.log_every}")

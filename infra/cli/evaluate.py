@@ -122,13 +122,13 @@ def _contest(
     shards = opened.split(split)
     if resolution is None:
         resolution = trained_resolution(checkpoint) or stored_resolution(shards)
-    network.to(choose_device(device))
+    place, distance = choose_device(device), load_lpips(lpips)
     return Contest(
-        network=network,
+        network=network.to(place),
         shards=shards,
         resolution=resolution,
         rivals=make_rivals(rivals.split("train"), resolution) if "train" in rivals.splits else None,
-        lpips=load_lpips(lpips),
+        lpips=None if distance is None else distance.to(place),
         most_scenes=most_scenes,
     )
 

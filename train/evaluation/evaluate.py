@@ -50,7 +50,7 @@ class Contest:
     rivals: Rivals | None
     """None where no training data is at hand."""
     lpips: Lpips | None
-    """None where its weights are not at hand: LPIPS is then n/a."""
+    """Likewise. None where its weights are not at hand: LPIPS is then n/a."""
     most_scenes: Annotated[int, Within(1, 10**9, unit="scenes")]
     """The first so many scenes of the split are judged."""
 

@@ -5,6 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from model.precision import tf32
 from storage.conventions import log10_radiance
 from train.evaluation.scores import score_view
 from train.loss.lpips import Lpips
@@ -47,16 +48,12 @@ def picture_scores(
     """
     score = score_view(radiance_rgb, target_rgb, hits)
     ours_13RR, target_13RR = (_tone_mapped(picture) for picture in (radiance_rgb, target_rgb))
-    distance = None
-    if lpips is not None:
-        with torch.no_grad():
-            distance = float(lpips(ours_13RR.float(), target_13RR.float()))
     return {
         "psnr_log_db": score.psnr_log_db,
         "object_psnr_log_db": score.object_psnr_log_db,
         "psnr_linear_db": score.psnr_linear_db,
         "ssim": float(ssim(ours_13RR, target_13RR)),
-        "lpips": distance,
+        "lpips": None if lpips is None else _distance(lpips, ours_13RR, target_13RR),
         "hdr_flip": hdr_flip(radiance_rgb, target_rgb),
         "log_l1": score.log_l1,
     }
@@ -71,6 +68,14 @@ def hdr_flip(radiance_rgb: NDArray, target_rgb: NDArray) -> float | None:
     pictures = [np.ascontiguousarray(p, np.float32) for p in (target_rgb, radiance_rgb)]
     _, mean, _ = flip_evaluator.evaluate(*pictures, "HDR", applyMagma=False)
     return float(mean)
+
+
+@torch.no_grad()
+def _distance(lpips: Lpips, a_13RR: Tensor, b_13RR: Tensor) -> float:
+    """Return LPIPS, computed where its weights are; in all bits of float32, as it was published."""
+    device = lpips.shift_311.device
+    with tf32(False):
+        return float(lpips(a_13RR.float().to(device), b_13RR.float().to(device)))
 
 
 def _tone_mapped(radiance_rgb: NDArray) -> Tensor:

@@ -1,9 +1,11 @@
 """Checkpoints: one safetensors file with all that changes while a run goes on.
 
 It appears by rename, so a kill while saving leaves the previous one whole. It also names the
-settings and the data, because going on with others would be neither the old run nor a new one.
+settings and the data, because going on with others would be neither the old run nor a new one; and
+it holds the sha256 of itself, because safetensors would not notice a weight that a disk changed.
 """
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +19,7 @@ from torch import Tensor
 
 from model.renderformer import RenderFormer
 from model.weights import decode_config, encode_config, load_tensors
-from storage.atomic import write_atomically
+from storage.atomic import atomic_writer
 from storage.errors import TrilightError
 from storage.safe_read import read_safetensors
 from train.data.unusable import Unusable
@@ -26,6 +28,9 @@ from train.settings import TrainSettings, completed_record, settings_record
 
 HEADER_KEY = "trilight_checkpoint"
 """Metadata entry with counters, damage met, settings, digest of the data, number of processes."""
+
+UNSEALED = "0" * 64
+"""Stands where the sha256 will, while it is taken. Checkpoints from before it existed have none."""
 
 
 def save_checkpoint(
@@ -46,9 +51,14 @@ def save_checkpoint(
         "model": encode_config(settings.model),
         "data_digest": data_digest,
         "world_size": world_size,
+        "sha256": UNSEALED,
     }
     contiguous = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
-    write_atomically(path, save(contiguous, metadata={HEADER_KEY: json.dumps(header)}))
+    data = save(contiguous, metadata={HEADER_KEY: json.dumps(header)})
+    before, after = _around(data, UNSEALED)
+    with atomic_writer(path) as stream:
+        for part in (before, _seal(before, after).encode(), after):
+            stream.write(part)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,11 +83,31 @@ def is_checkpoint(metadata: Mapping[str, str]) -> bool:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint; raises TrilightError where it is damaged or none."""
-    arrays, metadata = read_safetensors(path.read_bytes())
-    if not is_checkpoint(metadata):
-        raise TrilightError(f"{path}: not a checkpoint of a run; expected one that train wrote.")
-    return Checkpoint(header=json.loads(metadata[HEADER_KEY]), arrays=arrays)
+    """Read a checkpoint; raises TrilightError, with its path, where it is damaged or none."""
+    try:
+        data = path.read_bytes()
+        arrays, metadata = read_safetensors(data)
+        if not is_checkpoint(metadata):
+            raise TrilightError("it is none of a run; expected one that train wrote")
+        header = json.loads(metadata[HEADER_KEY])
+        if "sha256" in header and header["sha256"] != _seal(*_around(data, header["sha256"])):
+            raise TrilightError("its bytes are not those that were written")
+    except (OSError, ValueError, TypeError, TrilightError) as error:
+        raise TrilightError(f"checkpoint {path} is not readable: {error}.") from error
+    return Checkpoint(header=header, arrays=arrays)
+
+
+def _around(data: bytes, sha256: str) -> tuple[memoryview, memoryview]:
+    """Return what stands before and after the place of the sha256, which is in the header."""
+    start = data.index(sha256.encode())
+    view = memoryview(data)
+    return view[:start], view[start + len(UNSEALED) :]
+
+
+def _seal(before: memoryview, after: memoryview) -> str:
+    digest = hashlib.sha256(before)
+    digest.update(after)
+    return digest.hexdigest()
 
 
 def resumed_state(

@@ -1,10 +1,12 @@
-"""Which checkpoints a run has, and which of them stay."""
+"""Which checkpoints a run has, which it goes on from, and which of them stay."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from storage.atomic import remove_leftovers
 from storage.errors import TrilightError
-from train.loop.checkpoint import save_checkpoint
+from train.loop.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
+from train.loop.crew import Crew
 from train.loop.state import TrainState
 from train.settings import TrainSettings
 
@@ -23,14 +25,49 @@ def checkpoint_path(folder: Path, step: int) -> Path:
     return folder / f"{PREFIX}{step:09d}{SUFFIX}"
 
 
-def newest_checkpoint(folder: Path) -> Path:
-    """Return the newest checkpoint; raises TrilightError where there is none."""
+def resumed_checkpoint(folder: Path, crew: Crew, noted: Callable[[str], None]) -> Checkpoint:
+    """Return the newest checkpoint that is whole.
+
+    Args:
+        folder: of the checkpoints.
+        crew: the processes that go on together; all must call it.
+        noted: is told of those that are not, and which one took their place.
+
+    Raises:
+        TrilightError: there is none, none is whole, or a process reads another than this one.
+    """
     steps = saved_steps(folder)
     if not steps:
         raise TrilightError(
             f"{folder.parent}: no checkpoint here to resume from; start the run without --resume."
         )
-    return checkpoint_path(folder, steps[-1])
+    checkpoint = _newest_whole(folder, steps, noted)
+    step = checkpoint.header["step"]
+    # a mean is exact to rounding; checkpoints are at least one step apart
+    if crew.any(abs(crew.mean([step])[0] - step) > 0.5 / crew.world_size):
+        raise TrilightError(
+            f"{folder.parent}: the processes do not read the same checkpoint; this one reads that "
+            f"of step {step}. Look whether the folder is the same on every machine, and resume "
+            "again."
+        )
+    return checkpoint
+
+
+def _newest_whole(folder: Path, steps: list[int], noted: Callable[[str], None]) -> Checkpoint:
+    damaged = []
+    for step in reversed(steps):
+        try:
+            checkpoint = read_checkpoint(checkpoint_path(folder, step))
+        except TrilightError as error:
+            damaged.append(str(error))
+            continue
+        if damaged:
+            noted(f"{' '.join(damaged)} The run goes on from the one before, of step {step}")
+        return checkpoint
+    raise TrilightError(
+        f"{folder.parent}: none of its checkpoints can be resumed from. {' '.join(damaged)} "
+        "Restore one from a copy, or start the run again in another folder."
+    )
 
 
 def keep_checkpoint(
@@ -38,7 +75,8 @@ def keep_checkpoint(
 ) -> None:
     """Save the state, whole or not at all, and only then delete what the run does not keep.
 
-    Kept are the newest `checkpoints_kept` and every multiple of `keep_every`.
+    Kept are the newest `checkpoints_kept` and every multiple of `keep_every`. One of a later step
+    could not be read when the run went on from an earlier one, and takes nobody's place.
 
     Raises:
         TrilightError: the folder is full or cannot be written; the older ones are still there.
@@ -46,6 +84,7 @@ def keep_checkpoint(
     path = checkpoint_path(folder, state.step)
     save_checkpoint(path, state, settings, data_digest=data_digest, world_size=world_size)
     remove_leftovers(folder)
-    for step in saved_steps(folder)[: -settings.checkpoints_kept]:
+    passed = [step for step in saved_steps(folder) if step <= state.step]
+    for step in passed[: -settings.checkpoints_kept]:
         if not settings.keep_every or step % settings.keep_every:
             checkpoint_path(folder, step).unlink(missing_ok=True)

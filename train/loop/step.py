@@ -59,7 +59,7 @@ class Stepper:
         state = self._state
         state.updater.zero_grad()
         num_views = sum(batch.noise_BV.numel() for batch in batches)
-        sums = torch.zeros(4, dtype=torch.float64)
+        sums = torch.zeros(4, dtype=torch.float64, device=self._crew.device)
         for index, batch in enumerate(batches):
             last = index == len(batches) - 1
             with contextlib.nullcontext() if last else self._apart():
@@ -87,7 +87,7 @@ class Stepper:
         shown_BV = prediction.detach().clamp(min=0).mean(dim=(2, 3, 4))
         wanted_BV = batch.target_BVRR3.mean(dim=(2, 3, 4))
         parts = [losses.total_BV.detach(), losses.l1_BV, shown_BV, wanted_BV]
-        return torch.stack([part.sum() for part in parts]).cpu().double()
+        return torch.stack([part.sum() for part in parts]).double()
 
     def _apart(self) -> contextlib.AbstractContextManager[Any]:
         """Return what keeps the processes from exchanging a gradient that is not complete."""

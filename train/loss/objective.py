@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from storage.errors import TrilightError
 from train.loss.lpips import Lpips
@@ -23,8 +23,8 @@ class ViewLosses:
     """The first term alone, neither weighed nor part of any gradient."""
 
 
-class Objective:
-    """Compares pictures as a run's settings say."""
+class Objective(nn.Module):
+    """Compares pictures as a run's settings say, on the device that it was moved to."""
 
     def __init__(self, settings: LossSettings, lpips: Lpips | None) -> None:
         """Take the settings, and LPIPS where they ask for it.
@@ -33,10 +33,12 @@ class Objective:
             TrilightError: they ask for LPIPS and its weights are not here. No other term takes its
                 place by itself.
         """
+        super().__init__()
         self.settings = settings
+        # a module among them becomes a part of this one, and moves with it
         self._dissimilarity = _dissimilarity(settings, lpips)
 
-    def __call__(
+    def forward(
         self, prediction_BVRR3: Tensor, target_BVRR3: Tensor, noise_BV: Tensor
     ) -> ViewLosses:
         """Return the losses of each view.
