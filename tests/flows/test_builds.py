@@ -66,7 +66,7 @@ def test_licences_are_added_and_sorted() -> None:
 
 
 def test_mistakes_are_named() -> None:
-    with pytest.raises(TrilightError, match="'smok' is unknown; expected one of smoke"):
+    with pytest.raises(TrilightError, match=r"'smok' is unknown; did you mean smoke\? Expected"):
         named_build("smok")
     with pytest.raises(TrilightError, match=r"scenes\.lights\.number"):
         named_build("smoke", changes={"scenes.lights.number": 3})
