@@ -15,7 +15,7 @@ from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
 from train.loop.checkpoint import HEADER_KEY, read_checkpoint, resumed_state, save_checkpoint
-from train.loop.checkpoints import newest_checkpoint
+from train.loop.checkpoints import resumed_checkpoint
 from train.loop.crew import Crew
 from train.loop.metrics_log import MetricsLog, read_rows
 from train.loop.state import TrainState, new_state
@@ -122,13 +122,13 @@ def test_another_run_or_other_data_is_refused_by_field(
 
 
 def test_a_checkpoint_from_before_a_setting_existed_resumes(tmp_path: Path) -> None:
-    """With the setting's default, which is what was done then; and with no other value."""
+    """With the default of the setting, which is what was done then; and with no other value."""
     path = tmp_path / "c"
     save(path, new_state(tiny_run()))
     tensors = load_file(path)
     with safe_open(path, "pt") as file:
         header = json.loads(file.metadata()[HEADER_KEY])
-    del header["settings"]["recompute_activations"]
+    del header["sha256"], header["settings"]["recompute_activations"]
     del header["settings"]["model"]["window_bundles"]
     save_file(tensors, path, metadata={HEADER_KEY: json.dumps(header)})
     assert load(path).step == 0
@@ -138,7 +138,7 @@ def test_a_checkpoint_from_before_a_setting_existed_resumes(tmp_path: Path) -> N
 
 def test_a_missing_or_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
-        newest_checkpoint(tmp_path / "checkpoints")
+        resumed_checkpoint(tmp_path / "checkpoints", Crew(device=torch.device("cpu")), noted=print)
     save(tmp_path / "c", new_state(tiny_run()))
     data = (tmp_path / "c").read_bytes()
     for damaged in (b"", data[:100], data[:-1], b"PK\x03\x04" + data):
