@@ -34,7 +34,7 @@ LIGHT_PATHS = 0.25
 
 
 class VectorTracer:
-    """A scene on the LLVM backend; see `Tracer` for the meaning of its methods."""
+    """A scene on the LLVM or CUDA backend; see `Tracer` for the meaning of its methods."""
 
     def __init__(self, scene: Scene, *, max_depth: int, rr_depth: int) -> None:
         surfaces, emitters = split_triangles(scene)

@@ -1,5 +1,6 @@
 """Choosing what Mitsuba runs on: by trying, once, without harm."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -9,10 +10,11 @@ from pathlib import Path
 import pytest
 
 from pipeline.flows.environment import environment
+from pipeline.renders import denoiser
 from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts
 from pipeline.renders.llvm_libraries import llvm_libraries
-from pipeline.renders.variant import Variant, _Probed, choose_variant
+from pipeline.renders.variant import Variant, _Probed, activate, choose_variant
 from storage.errors import TrilightError
 from tests.conftest import ROOT
 
@@ -118,6 +120,12 @@ def test_pictures_are_denoised_on_the_card_or_it_is_said(
     assert chosen.denoiser == ("CPU" if problem else "CUDA")
     assert bool(chosen.note) == bool(problem) and chosen.note.startswith(problem)
     assert ("denoiser_device" in environment(chosen)) == (not problem)
+
+
+def test_a_process_denoises_where_its_variant_says(variant: Variant) -> None:
+    for device in ("CUDA", "CPU"):
+        activate(dataclasses.replace(variant, denoiser=device))
+        assert denoiser._device == device
 
 
 def test_where_llvm_is_asked_for_and_missing_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

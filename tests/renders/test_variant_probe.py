@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.renders import vector_tracer
+from pipeline.renders import variant_probe, vector_tracer
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from pipeline.renders.variant_probe import BLOCK, probe_scene, wrong_picture
 from tests.renders.kernel_bsdf import exact_twin
@@ -56,6 +56,20 @@ def test_a_kernel_that_misses_one_scene_is_found(
     sighted = getattr(vector_tracer, kernel)
     monkeypatch.setattr(vector_tracer, kernel, _with_blind(sighted, blind))
     assert wrong_picture().startswith("a wrong picture: block ")
+
+
+def test_only_a_right_picture_on_a_card_leads_to_the_denoiser(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(variant_probe.sys, "argv", ["variant_probe", "cuda_ad_rgb"])
+    monkeypatch.setattr(variant_probe.mitsuba, "set_variant", lambda name: None)
+    monkeypatch.setattr(variant_probe, "denoiser_problem", lambda: "the card is too old")
+    variant_probe.main()
+    assert capsys.readouterr().out == "the card is too old"
+    monkeypatch.setattr(variant_probe, "wrong_picture", lambda: "a wrong picture")
+    with pytest.raises(SystemExit, match="a wrong picture"):
+        variant_probe.main()
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.slow
