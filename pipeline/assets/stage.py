@@ -127,10 +127,10 @@ def _outcome(
     except Rejected as rejection:
         return rejection
     except ChildFailed as failure:
-        rejection = Rejected(failure.reason, failure.message)
+        refusal = Rejected(failure.reason, failure.message)
         if failure.is_verdict:
-            return rejection
-        raise rejection from failure
+            return refusal
+        raise refusal from failure
 
 
 def _by_any_method(

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,7 @@ def hurried(bench: Bench) -> Iterator[Hurried]:
     """The same bench with other limits."""
     with contextlib.ExitStack() as stack:
 
-        def make(**limits: float) -> Bench:
+        def make(**limits: Any) -> Bench:
             other = Bench(bench.root, limits=dataclasses.replace(LIMITS, **limits))
             stack.callback(other.child.close)
             return other

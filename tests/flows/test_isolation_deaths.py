@@ -16,7 +16,7 @@ from pipeline.isolation import (
 )
 from pipeline.isolation.deaths import ENDS
 from storage.errors import EnvironmentFailure
-from tests.flows.test_isolation import crash, divide, double, kill_itself
+from tests.flows.test_isolation import _nothing, crash, divide, double, kill_itself
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=120, calls_per_child=9)
 
@@ -49,7 +49,7 @@ def child_with(setup, *args: object) -> IsolatedChild:  # type: ignore[no-untype
 
 @pytest.fixture
 def child() -> Iterator[IsolatedChild]:
-    child = child_with(int)
+    child = child_with(_nothing)
     yield child
     child.close()
 
@@ -96,7 +96,7 @@ def test_tries_end(function, tries: int, is_verdict: bool) -> None:  # type: ign
             calls += 1
             return super().call(function, *args)
 
-    child = Counting(limits=LIMITS, setup=int)
+    child = Counting(limits=LIMITS, setup=_nothing)
     try:
         with pytest.raises(ChildFailed) as caught:
             call_with_retries(child, function)

@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, waiting
 from tests.conftest import ROOT
-from tests.flows.test_isolation import process_id
+from tests.flows.test_isolation import _nothing, process_id
 
 LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
 
@@ -30,7 +30,7 @@ def child(monkeypatch: pytest.MonkeyPatch) -> Iterator[IsolatedChild]:
     """Looked at twenty times a second, and given up after one."""
     monkeypatch.setattr(waiting, "LOOK_S", 0.05)
     monkeypatch.setattr(waiting, "LOOKS_BEFORE_KILL", 20)
-    child = IsolatedChild(limits=LIMITS, setup=int)
+    child = IsolatedChild(limits=LIMITS, setup=_nothing)
     yield child
     child.close()
 

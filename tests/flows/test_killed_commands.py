@@ -52,11 +52,15 @@ def test_converting(tmp_path: Path) -> None:
     samples = [dataclasses.replace(tiny_sample(seed=n), key=sample_key(n)) for n in range(2)]
     write_shard(shard, [(sample.key, encode_sample(sample, profile)) for sample in samples])
 
-    def converted(folder: Path, between: Callable[[], int]) -> list[bytes]:
+    def converted(folder: Path, between: Callable[[], object]) -> list[bytes]:
         folder.mkdir()
         target = folder / "scene.safetensors"
         source = SceneSource(path=shard, key=None)
-        found = convert_scene(source, target, budget=None, done=lambda n, of: between())
+
+        def done(finished: int, of: int) -> None:
+            between()
+
+        found = convert_scene(source, target, budget=None, done=done)
         return [path.read_bytes() for path in found.files]
 
     whole = converted(tmp_path / "whole", lambda: 0)
