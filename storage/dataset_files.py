@@ -13,6 +13,7 @@ from storage.remote.cache import shard_cache
 from storage.remote.fetch import download, facts_of, unreadable
 from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
+from storage.safe_read import open_plain
 
 MAX_BESIDE_BYTES = 1 << 30
 """Largest file beside the shards: a manifest takes about 200 bytes a member."""
@@ -44,7 +45,7 @@ class LocalFiles(_Files):
 
     def open_beside(self, name: str) -> BinaryIO | None:
         try:
-            return (self.root / name).open("rb")
+            return open_plain(self.root / name)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
@@ -69,7 +70,7 @@ class LocalFiles(_Files):
         """
         path = self.root / shard.name
         try:
-            stream = path.open("rb")
+            stream = open_plain(path)
         except FileNotFoundError as error:
             raise TrilightError(
                 f"{path}: the shard is missing; run `trilight generate` again to make it."

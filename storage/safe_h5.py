@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
+from storage.safe_read import open_plain
 
 MAX_BLOCK_BYTES = 64 << 20
 """Most memory that one block of an array may take."""
@@ -57,12 +58,14 @@ def opened_h5(path: Path) -> Iterator[Any]:
     import h5py  # not at the top: few need it
 
     try:
+        open_plain(path).close()
         with h5py.File(path, "r", locking=False) as file:
             yield file
     except TrilightError as error:
         raise TrilightError(f"{path.name}: {error}") from error
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise TrilightError(f"{path.name}: not a readable HDF5 file ({error}).") from error
+        why = str(error).replace(str(path), path.name)
+        raise TrilightError(f"{path.name}: not a readable HDF5 file ({why}).") from error
 
 
 def names_in(group: Any) -> list[str]:

@@ -1,7 +1,11 @@
-"""Reading safetensors bytes from outside: the header is bounded before any memory is taken."""
+"""Reading from outside: only plain files, and no header decides how much memory is taken."""
 
+import errno
 import json
-from typing import Any
+import os
+import stat
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +16,19 @@ from storage.errors import TrilightError
 
 MAX_HEADER_BYTES = 1 << 20
 """A scene's header takes about 1 KiB."""
+
+
+def open_plain(path: Path) -> BinaryIO:
+    """Open a regular file for reading.
+
+    Raises:
+        OSError: as `open`, or it is something else: opening a FIFO would wait for ever.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # of regular files, it changes nothing
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "not a plain file", str(path))
+    return os.fdopen(descriptor, "rb")
 
 
 def read_safetensors(

@@ -11,6 +11,7 @@ from storage.conventions import SPLITS
 from storage.errors import TrilightError
 from storage.remote.cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_url
+from storage.safe_read import open_plain
 from storage.safe_url import printable, safe_text
 
 MAX_SHARDS = 100_000
@@ -44,7 +45,7 @@ class ShardPlace:
         if isinstance(self.place, RemoteUrl):
             return shard_cache().open(self.place, num_bytes=None, sha256=None)
         try:
-            return self.place.open("rb")
+            return open_plain(self.place)
         except OSError as error:
             raise TrilightError(
                 f"shard {self.shown!r}: cannot be read ({error.strerror}); expected a file. Check "

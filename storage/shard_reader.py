@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from storage.errors import TrilightError
+from storage.safe_read import open_plain
 
 MAX_MEMBER_BYTES = 1 << 30
 """A 512 x 512 picture takes about 1 MiB; a gigabyte is a mistake or an attack."""
@@ -132,9 +133,9 @@ def read_members(path: Path, key: str, suffixes: Collection[str]) -> dict[str, b
 
 def _opened(path: Path) -> BinaryIO:
     try:
-        return path.open("rb")
+        return open_plain(path)
     except OSError as error:
-        raise TrilightError(f"{path.name}: not a readable shard ({error}).") from error
+        raise TrilightError(f"{path.name}: not a readable shard ({error.strerror}).") from error
 
 
 def _read(stream: BinaryIO, member: Member) -> bytes:

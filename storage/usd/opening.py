@@ -62,22 +62,25 @@ class OpenedUsd:
 
         plain, arguments = Sdf.Layer.SplitIdentifier(asset_path)
         if arguments:
-            self._refuse(plain, "with arguments for its file format; expected a name alone")
+            self._refuse(plain, " with arguments for its file format; expected a name alone")
         if _SCHEME.match(plain):
-            self._refuse(plain, "expected files below its own folder: nothing is fetched")
+            self._refuse(plain, "; expected files below its own folder: nothing is fetched")
         if plain.startswith("`"):
-            self._refuse(plain, "a variable expression; expected the name of a file. Write it out")
+            self._refuse(plain, ", a variable expression; expected a name. Write it out")
         with Ar.ResolverContextBinder(self._context):
             identifier = Sdf.ComputeAssetPathRelativeToLayer(layer, plain)
             found = str(Ar.GetResolver().Resolve(identifier))
         outer = Path((found or identifier).partition("[")[0])
         if not found and not outer.is_absolute():
             return None  # looked for in several folders
-        target = outer.resolve()
+        try:
+            target = outer.resolve()
+        except (OSError, RuntimeError):
+            self._refuse(plain, ", which is a link without an end")
         if not target.is_relative_to(self.folder) or ".." in Path(plain.partition("[")[2]).parts:
-            self._refuse(plain, "which is outside of its folder; copy it there")
+            self._refuse(plain, ", which is outside of its folder; copy it there")
         if found and not target.is_file():  # opening a FIFO would wait for ever
-            self._refuse(plain, "which is no plain file")
+            self._refuse(plain, ", which is no plain file")
         return found or None
 
     def compose(self) -> Any:
@@ -152,7 +155,7 @@ class OpenedUsd:
         return self._open(found)
 
     def _refuse(self, named: str, why: str) -> NoReturn:
-        raise TrilightError(f"{self.path.name}: names {named!r:.100}, {why}.")
+        raise TrilightError(f"{self.path.name}: names {named!r:.100}{why}.")
 
     def _note(self, text: str) -> None:
         if text not in self.lost:

@@ -110,7 +110,7 @@ def test_variable_expressions_name_no_files(
     folder.mkdir()
     monkeypatch.chdir(folder)  # where a person who converts a file often is
     (folder / "a.usda").write_text(f"#usda 1.0\n{text}\n")
-    with pytest.raises(TrilightError, match="a variable expression; expected the name of a file"):
+    with pytest.raises(TrilightError, match="a variable expression; expected a name"):
         prims_of(folder / "a.usda")
 
 

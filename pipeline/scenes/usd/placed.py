@@ -12,7 +12,7 @@ from storage.errors import TrilightError
 
 MAX_PLACED = 100_000
 """Most prims that are looked at, instances counted each."""
-MAX_NESTED = 300
+MAX_NESTED = 150
 """Most prims within prims, through prototypes too."""
 
 _READ = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight")
@@ -41,7 +41,7 @@ def placed_prims(stage: Any, time: Any, lost: list[str]) -> list[Placed]:
     found: list[Placed] = []
     unread: Counter[str] = Counter()
     visits = 0
-    for prim, to_world in _visited(stage.GetPseudoRoot(), _base(stage), time, 0):
+    for prim, to_world in _visited(stage.GetPseudoRoot(), _base(stage), time):
         visits += 1
         if visits > MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
@@ -68,29 +68,39 @@ def _base(stage: Any) -> NDArray[np.float64]:
 
 
 def _visited(
-    prim: Any, above: NDArray[np.float64], time: Any, depth: int
+    root: Any, base: NDArray[np.float64], time: Any
 ) -> Iterator[tuple[Any, NDArray[np.float64]]]:
-    from pxr import Usd, UsdGeom
+    """Yield what is seen below a prim with its place, in the order of the tree."""
+    from pxr import UsdGeom
 
-    if depth > MAX_NESTED:
-        raise TrilightError(
-            f"{prim.GetPath()}: nested more than {MAX_NESTED} deep, prototypes counted."
-        )
-    to_world = above
-    if not prim.IsPseudoRoot():
+    levels = [_children(root, base)]
+    while levels:
+        found = next(levels[-1], None)
+        if found is None:
+            levels.pop()
+            continue
+        prim, above = found
+        if len(levels) > MAX_NESTED:
+            raise TrilightError(
+                f"{prim.GetPath()}: nested more than {MAX_NESTED} deep, prototypes counted."
+            )
         seen = UsdGeom.Imageable(prim)
-        if seen:
-            if seen.GetVisibilityAttr().Get(time) == UsdGeom.Tokens.invisible:
-                return
-            if seen.GetPurposeAttr().Get(time) in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
-                return
+        if seen and seen.GetVisibilityAttr().Get(time) == UsdGeom.Tokens.invisible:
+            continue
+        if seen and seen.GetPurposeAttr().Get(time) in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
+            continue
         to_world = _moved(prim, above, time)
         yield prim, to_world
-    if prim.IsA(UsdGeom.PointInstancer):
-        yield from _instances(prim, to_world, time, depth)
-        return
-    for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies()):
-        yield from _visited(child, to_world, time, depth + 1)
+        below = _instances if prim.IsA(UsdGeom.PointInstancer) else _children
+        levels.append(below(prim, to_world, time))
+
+
+def _children(
+    prim: Any, to_world: NDArray[np.float64], time: Any = None
+) -> Iterator[tuple[Any, NDArray[np.float64]]]:
+    from pxr import Usd
+
+    return ((child, to_world) for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies()))
 
 
 def _moved(prim: Any, above: NDArray[np.float64], time: Any) -> NDArray[np.float64]:
@@ -105,7 +115,7 @@ def _moved(prim: Any, above: NDArray[np.float64], time: Any) -> NDArray[np.float
 
 
 def _instances(
-    prim: Any, to_world: NDArray[np.float64], time: Any, depth: int
+    prim: Any, to_world: NDArray[np.float64], time: Any
 ) -> Iterator[tuple[Any, NDArray[np.float64]]]:
     from pxr import UsdGeom
 
@@ -126,4 +136,4 @@ def _instances(
         prototype = prim.GetStage().GetPrimAtPath(targets[index])
         if prototype:
             place = np.einsum("ij,jk->ik", to_world, np.array(move).T)
-            yield from _visited(prototype, place, time, depth + 1)
+            yield prototype, place

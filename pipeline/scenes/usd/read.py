@@ -83,7 +83,8 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
     try:
         scene = scene_of_stage(stage, _time(chosen), opened, licence)
     except TrilightError as error:
-        raise TrilightError(f"{path.name}: {error}") from error
+        text = str(error).removeprefix(f"{path.name}: ")
+        raise TrilightError(f"{path.name}: {text}") from error
     return UsdScene(key=chosen, scene=scene, lost=_limited(opened.lost), exact=False)
 
 

@@ -1,0 +1,163 @@
+"""Scenes as plain arrays, safetensors and HDF5, of somebody who means harm."""
+
+import json
+import os
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from safetensors.numpy import load, save
+
+from storage.renderformer_h5 import write_renderformer_h5
+from storage.scene_file import encode_scene
+from tests.scenes_by_hand import tiny_scene
+
+Make = Callable[[Path], None]
+NAN, INF = float("nan"), float("inf")
+
+
+def _safetensors(change: Callable[[bytes], bytes]) -> Make:
+    return lambda folder: (
+        (folder / "s.safetensors").write_bytes(change(encode_scene(tiny_scene()))) and None
+    )
+
+
+def _arrays(change: Callable[[dict[str, Any]], Any]) -> Make:
+    def changed(data: bytes) -> bytes:
+        arrays = {name: values.copy() for name, values in load(data).items()}
+        length = int.from_bytes(data[:8], "little")
+        metadata = json.loads(data[8 : 8 + length])["__metadata__"]
+        change(arrays)
+        return save(arrays, metadata)
+
+    return _safetensors(changed)
+
+
+def _header(change: Callable[[dict[str, Any]], Any]) -> Make:
+    def changed(data: bytes) -> bytes:
+        length = int.from_bytes(data[:8], "little")
+        header = json.loads(data[8 : 8 + length])
+        change(header)
+        text = json.dumps(header).encode()
+        return struct.pack("<Q", len(text)) + text + data[8 + length :]
+
+    return _safetensors(changed)
+
+
+def safetensors_cases() -> Iterator[tuple[str, Make, str]]:
+    """Yield name, what writes `s.safetensors`, and what has to come of it."""
+    for name in ("vertex_positions", "vertex_normals", "materials", "c2w", "fov_deg"):
+        for value in (NAN, INF):
+            put = _arrays(lambda a, n=name, v=value: a[n].reshape(-1).__setitem__(0, v))
+            yield f"{name} {value}", put, "refused"
+    for name in ("faces", "material_index", "object_index"):
+        put = _arrays(lambda a, n=name: a[n].reshape(-1).__setitem__(0, 60_000))
+        yield f"{name} out of range", put, "refused"
+    yield "an array missing", _arrays(lambda a: a.pop("faces")), "refused"
+    yield "an array too many", _arrays(lambda a: a.update(x=np.zeros(3))), "refused"
+    of_doubles = _arrays(lambda a: a.update(faces=a["faces"].astype(np.float64)))
+    yield "another type", of_doubles, "refused"
+    for shape in ([2**62, 3], [-1, 3], [10**9, 3], "x", None, [3.5, 3], [[1], 3]):
+        claim = _header(lambda h, s=shape: h["faces"].update(shape=s))
+        yield f"shape {shape}", claim, "refused"
+    for offsets in ([0, 2**60], [-5, 9], [9, 0], "x", [0]):
+        claim = _header(lambda h, o=offsets: h["faces"].update(data_offsets=o))
+        yield f"offsets {offsets}", claim, "refused"
+    yield "no metadata", _header(lambda h: h.pop("__metadata__")), "refused"
+    for text in ("", "[]", "{}", "[" * 10**5, '{"schema_version": 99}', "\0"):
+        claim = _header(lambda h, t=text: h["__metadata__"].update(trilight_scene=t))
+        yield f"metadata {text[:20]!r}", claim, "refused"
+    for kind, data in {
+        "empty": b"", "8 bytes": b"\xff" * 8, "a header of 2^63": struct.pack("<Q", 2**63) + b"{}",
+        "noise": bytes(range(256)) * 9, "a deep header": struct.pack("<Q", 10**6) + b"[" * 10**6,
+    }.items():  # fmt: skip
+        yield f"safetensors is {kind}", _safetensors(lambda _, d=data: d), "refused"
+    for part in (0.1, 0.5, 0.99):
+        yield f"cut at {part}", _safetensors(lambda d, p=part: d[: int(len(d) * p)]), "refused"
+    yield "bytes too many", _safetensors(lambda d: d + b"x"), "refused"
+    yield "safetensors is a fifo", lambda f: os.mkfifo(f / "s.safetensors"), "refused"
+
+    def sparse(folder: Path) -> None:
+        (folder / "s.safetensors").touch()
+        os.truncate(folder / "s.safetensors", 8 << 40)
+
+    yield "safetensors of 8 TB", sparse, "refused"
+
+
+def _h5(change: Callable[[h5py.File, Path], Any]) -> Make:
+    def make(folder: Path) -> None:
+        write_renderformer_h5(folder / "s.h5", tiny_scene())
+        with h5py.File(folder / "s.h5", "r+") as file:
+            change(file, folder)
+
+    return make
+
+
+def _replaced(name: str, **options: Any) -> Make:
+    def change(file: h5py.File, folder: Path) -> None:
+        del file[name]
+        file.create_dataset(name, **options)
+
+    return _h5(change)
+
+
+def _h5_links() -> Iterator[tuple[str, Make, str]]:
+    def linked(make_link: Callable[[h5py.File, Path], Any]) -> Make:
+        def change(file: h5py.File, folder: Path) -> None:
+            del file["triangles"]
+            file["triangles"] = make_link(file, folder)
+
+        return _h5(change)
+
+    outside = "../outside/secret.h5"
+    yield "external link", linked(lambda f, d: h5py.ExternalLink(outside, "/triangles")), "refused"
+    yield "soft link", linked(lambda f, d: h5py.SoftLink("/vn")), "refused"
+    yield "link to itself", linked(lambda f, d: h5py.SoftLink("/triangles")), "refused"
+    yield "a group", _h5(lambda f, d: (f.pop("triangles"), f.create_group("triangles"))), "refused"
+
+    def virtual(file: h5py.File, folder: Path) -> None:
+        layout = h5py.VirtualLayout((3, 3, 3), np.float32)
+        layout[:] = h5py.VirtualSource(outside, "triangles", (3, 3, 3))
+        del file["triangles"]
+        file.create_virtual_dataset("triangles", layout)
+
+    yield "virtual dataset", _h5(virtual), "refused"
+    raw = [(str(Path("..") / "outside" / "secret.usda"), 0, 108)]
+    yield (
+        "external bytes",
+        _replaced("triangles", shape=(3, 3, 3), dtype="f4", external=raw),
+        "refused",
+    )
+
+
+def h5_cases() -> Iterator[tuple[str, Make, str]]:
+    """Yield name, what writes `s.h5`, and what has to come of it."""
+    yield from _h5_links()
+    for name in ("triangles", "vn", "texture", "c2w", "fov"):
+        yield f"{name} missing", _h5(lambda f, d, n=name: f.pop(n) and None), "refused"
+        yield f"{name} of text", _replaced(name, data=["a", "b"]), "refused"
+        yield f"{name} is a number", _replaced(name, data=1.0), "refused"
+        huge = {"shape": (10**9, 3, 3), "dtype": "f4", "chunks": (1, 3, 3)}
+        yield f"{name} of 36 GB, not written", _replaced(name, **huge), "refused"
+        nan = _h5(lambda f, d, n=name: f[n].__setitem__((0,) * f[n].ndim, NAN))
+        yield f"{name} NaN", nan, "refused"
+    compound = np.zeros(3, [("a", "f4"), ("b", "i8")])
+    yield "a compound type", _replaced("triangles", data=compound), "refused"
+    yield "no triangle", _replaced("triangles", data=np.zeros((0, 3, 3), "f4")), "refused"
+    for kind, data in {"empty": b"", "noise": bytes(range(256)) * 99}.items():
+        make = lambda f, d=data: (f / "s.h5").write_bytes(d) and None  # noqa: E731
+        yield f"HDF5 is {kind}", make, "refused"
+    for seed in range(8):
+
+        def flipped(folder: Path, seed: int = seed) -> None:
+            write_renderformer_h5(folder / "s.h5", tiny_scene())
+            data = np.frombuffer((folder / "s.h5").read_bytes(), np.uint8).copy()
+            rng = np.random.default_rng(seed)
+            data[rng.integers(0, len(data), 20)] = rng.integers(0, 256, 20)
+            (folder / "s.h5").write_bytes(data[: len(data) - seed * 500].tobytes())
+
+        yield f"HDF5 damaged {seed}", flipped, "any"
+    yield "HDF5 is a fifo", lambda folder: os.mkfifo(folder / "s.h5"), "refused"

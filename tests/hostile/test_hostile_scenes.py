@@ -1,0 +1,123 @@
+"""Every hostile scene file ends in seconds: in a line, or as a scene with nothing of the outside.
+
+The files are read as `trilight convert` reads them, in a child with limits. Those of the child are
+smaller here than for users, so that what is left at a limit is left in a second.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.flows.scene_source import load_source, scene_source, source_keys
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from storage.errors import TrilightError
+from storage.renderformer_h5 import write_renderformer_h5
+from tests.hostile import array_cases, json_cases, tar_cases, usd_cases
+from tests.scenes_by_hand import tiny_scene
+
+LIMITS = ChildLimits(memory_bytes=8 << 30, wall_s=300, cpu_s=30, calls_per_child=1000)
+CASES = [
+    *(("usd", *case) for case in usd_cases.cases()),
+    *(("json", *case) for case in json_cases.cases()),
+    *(("safetensors", *case) for case in array_cases.safetensors_cases()),
+    *(("h5", *case) for case in array_cases.h5_cases()),
+    *(("tar", *case) for case in tar_cases.cases()),
+]
+FILES = ("s.usda", "s.usdz", "s.json", "s.safetensors", "s.h5", "s.tar")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a file; sent by the child."""
+
+    said: str
+    """All that a user would read."""
+    farthest: float
+    """Coordinate of the scene; that of the file outside is 777."""
+    names: str
+    """Of its objects."""
+
+
+def smaller_limits() -> None:
+    """Prepare a child."""
+    from pipeline.scenes.usd import placed, textures
+    from storage.usd import composition
+
+    composition.MAX_PRIMS, composition.MAX_COMPOSITION_S = 2000, 1.0
+    placed.MAX_PLACED, textures.MAX_PIXELS = 2000, 1 << 20
+
+
+def outcome(path: str) -> Outcome:
+    """Read the first scene of a file; only children come here."""
+    source = scene_source(path, many=True)
+    if source.path.suffix == ".tar":
+        source = scene_source(f"{path}::{tar_cases.KEY}")
+    else:
+        source_keys(source)
+    found = load_source(source)
+    found.scene.check()
+    return Outcome(
+        said=json.dumps(found.notes),
+        farthest=float(np.abs(found.scene.vertex_positions).max()),
+        names=" ".join(entry.name for entry in found.scene.objects),
+    )
+
+
+@pytest.fixture(scope="module")
+def child() -> Iterator[IsolatedChild]:
+    child = IsolatedChild(limits=LIMITS, setup=smaller_limits)
+    yield child
+    child.close()
+
+
+def lay_out(folder: Path) -> Path:
+    """Make the folder of the file, and another beside it that nothing may read."""
+    outside, inner = folder / "outside", folder / "inner"
+    outside.mkdir()
+    inner.mkdir()
+    (outside / "secret.usda").write_text(usd_cases.SECRET)
+    (outside / "secret.obj").write_text(json_cases.LEAK_OBJ)
+    Image.fromarray(np.full((4, 4, 3), 77, np.uint8)).save(outside / "secret.png")
+    write_renderformer_h5(outside / "secret.h5", tiny_scene())
+    for suffix in ("usda", "obj"):
+        (inner / f"link.{suffix}").symlink_to(outside / f"secret.{suffix}")
+    (inner / "linked").symlink_to(outside)
+    return inner
+
+
+def read(child: IsolatedChild, folder: Path, make: usd_cases.Make) -> tuple[str, Outcome]:
+    """Return `read`, `refused` or `ended`, and what came of the file that is made."""
+    inner = lay_out(folder)
+    make(inner)
+    (path,) = (
+        inner / name for name in FILES if (inner / name).is_symlink() or (inner / name).exists()
+    )
+    try:
+        return "read", child.call(outcome, str(path))
+    except TrilightError as error:
+        return "refused", Outcome(said=str(error), farthest=0.0, names="")
+    except ChildFailed as failure:
+        assert failure.reason != "exception", failure.message
+        return "ended", Outcome(said=str(failure), farthest=0.0, names="")
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [pytest.param(*case[2:], id=f"{case[0]}: {case[1]}") for case in CASES],
+)
+def test_every_file_ends_well(
+    tmp_path: Path,
+    child: IsolatedChild,
+    make: usd_cases.Make,
+    expected: str,
+) -> None:
+    kind, found = read(child, tmp_path, make)
+    assert "LEAK" not in found.names and found.farthest != 778.0
+    outside = str(tmp_path / "outside")  # which some of the files name themselves
+    assert found.said.isprintable() and str(tmp_path) not in found.said.replace(outside, "")
+    assert kind in (("read", "refused") if expected == "any" else (expected,)), found

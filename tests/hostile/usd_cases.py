@@ -1,0 +1,299 @@
+"""USD files of somebody who means harm: they lead out, multiply, contradict themselves."""
+
+import os
+import socket
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+HEAD = "#usda 1.0\n"
+SEEN = """
+def SphereLight "lamp" {
+    float inputs:radius = 0.2
+    float inputs:intensity = 5
+    double3 xformOp:translate = (0, 0, 3)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+def Mesh "floor" (prepend apiSchemas = ["MaterialBindingAPI"]) {
+    rel material:binding = </m>
+    point3f[] points = [(-1, -1, 0), (1, -1, 0), (0, 1, 0)]
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    texCoord2f[] primvars:st = [(0, 0), (1, 0), (0, 1)] (interpolation = "vertex")
+}
+"""
+"""What makes a scene, so that nothing but the harm is a reason to refuse."""
+
+LEAK = """
+def Mesh "LEAK" {
+    point3f[] points = [(777, 0, 0), (778, 0, 0), (777, 1, 0)]
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+}
+"""
+SECRET = f'{HEAD}def "B" {{{LEAK}}}\ndef "A" {{\ndef "LEAK" {{{LEAK}}}\n}}\n'
+"""A file outside of the folder."""
+
+MATERIAL = """
+def Material "m" {
+    token outputs:surface.connect = </m/p.outputs:surface>
+    def Shader "p" {
+        uniform token info:id = "UsdPreviewSurface"
+        color3f inputs:diffuseColor.connect = </m/t.outputs:rgb>
+        token outputs:surface
+    }
+    def Shader "t" {
+        uniform token info:id = "UsdUVTexture"
+        asset inputs:file = @FILE@
+        token inputs:sourceColorSpace = "raw"
+        float2 inputs:st.connect = </m/r.outputs:result>
+        float3 outputs:rgb
+    }
+    def Shader "r" {
+        uniform token info:id = "UsdPrimvarReader_float2"
+        string inputs:varname = "st"
+        float2 outputs:result
+    }
+}
+"""
+
+Make = Callable[[Path], None]
+
+
+def text(body: str, seen: str = SEEN, head: str = HEAD) -> Make:
+    """Return what writes a stage that may name OUT and PICTURE, the files outside."""
+
+    def make(folder: Path) -> None:
+        outside = folder.parent / "outside"
+        named = body.replace("PICTURE", str(outside / "secret.png"))
+        whole = head + seen + named
+        (folder / "s.usda").write_text(whole.replace("OUT", str(outside / "secret.usda")))
+
+    return make
+
+
+def with_file(name: str, content: str, body: str) -> Make:
+    def make(folder: Path) -> None:
+        text(content, seen="")(folder)
+        (folder / "s.usda").rename(folder / name)
+        text(body)(folder)
+
+    return make
+
+
+def textured(spoil: Callable[[Path], object], named: str = "./t.png", head: str = HEAD) -> Make:
+    def make(folder: Path) -> None:
+        spoil(folder / "t.png")
+        text(MATERIAL.replace("FILE", named), head=head)(folder)
+
+    return make
+
+
+def _png(path: Path, size: tuple[int, int] = (4, 4)) -> None:
+    Image.fromarray(np.zeros((*size, 3), np.uint8)).save(path, "PNG")
+
+
+def _socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(path))
+
+
+def leaks() -> Iterator[tuple[str, Make, str]]:
+    """Yield what leads out: by every arc, from every place, named in every way."""
+    arcs = {
+        "reference": 'def "x" (references = @N@</B>) {}',
+        "payload": 'def "x" (payload = @N@</B>) {}',
+        "prepended": 'def "x" (prepend references = @N@</B>) {}',
+        "in a variant": 'def "x" (variants = {string v = "a"}\nvariantSets = "v") {\n'
+        'variantSet "v" = {\n"a" (references = @N@</B>) {}\n}\n}',
+        "of an ancestor": 'def "Y" (references = @N@</A>) {}\ndef "x" (references = </Y/LEAK>) {}',
+        "of a class": 'class "_c" (references = @N@</B>) {}\ndef "x" (inherits = </_c>) {}',
+        "of a base": 'def "b" (references = @N@</B>) {}\ndef "x" (specializes = </b>) {}',
+        "of a prototype": 'def "b" (references = @N@</B>) {}\n'
+        'def "x" (instanceable = true\nreferences = </b>) {}',
+        "default prim": 'def "x" (references = @N@) {}',
+        "with arguments": 'def "x" (references = @N:SDF_FORMAT_ARGS:a=1@</B>) {}',
+    }
+    names = {
+        "absolute": "OUT",
+        "upwards": "../outside/secret.usda",
+        "by a link": "./link.usda",
+        "by a linked folder": "./linked/secret.usda",
+        "by an expression": '`"${X}"`',
+        "as a URL": "file:OUT",
+    }
+    head = '#usda 1.0\n(expressionVariables = {string X = "../outside/secret.usda"})\n'
+    for arc, body in arcs.items():
+        for kind, name in names.items():
+            yield f"{arc} {kind}", text(body.replace("N", name), head=head), "refused"
+    for kind, name in names.items():
+        sub = '#usda 1.0\n(expressionVariables = {string X = "../outside/secret.usda"}\n'
+        yield f"sublayer {kind}", text("", head=f"{sub}subLayers = [@{name}@])\n"), "refused"
+        deep = f'def "A" (references = @{name}@</A>) {{\ndef "LEAK" {{}}\n}}'
+        far = with_file("lib.usda", deep, 'def "x" (references = @./lib.usda@</A/LEAK>) {}')
+        yield f"of another file's ancestor {kind}", far, "refused"
+        picture = name.replace("secret.usda", "secret.png").replace("OUT", "PICTURE")
+        variable = head.replace("secret.usda", "secret.png")
+        yield f"texture {kind}", textured(_png, picture, variable), "refused"
+    clip = 'def "A" (clips = {dictionary default = {asset[] assetPaths = [@OUT@]}}) {}'
+    yield "value clips", text(clip), "refused"
+
+
+def packages() -> Iterator[tuple[str, Make, str]]:
+    def package(members: dict[str, str], **options: int) -> Make:
+        def make(folder: Path) -> None:
+            outside = str(folder.parent / "outside" / "secret.usda")
+            with zipfile.ZipFile(folder / "s.usdz", "w") as archive:
+                for name, content in members.items():
+                    archive.writestr(name, content.replace("OUT", outside), **options)
+
+        return make
+
+    root = f"{HEAD}{SEEN}"
+    arcs = {
+        "absolute": f'{root}def "x" (references = @OUT@</B>) {{}}',
+        "upwards": f'{root}def "x" (references = @../outside/secret.usda@</B>) {{}}',
+        "ancestral": f'{root}def "Y" (references = @OUT@</A>) {{}}\n'
+        'def "x" (references = </Y/LEAK>) {}',
+        "texture": root + MATERIAL.replace("FILE", "../outside/secret.png"),
+    }
+    for kind, content in arcs.items():
+        within = kind in ("upwards", "texture")  # what leads out of an archive is not in it
+        yield f"usdz {kind}", package({"s.usda": content}), "read" if within else "refused"
+    yield (
+        "usdz compressed",
+        package({"s.usda": root * 99}, compress_type=zipfile.ZIP_DEFLATED),
+        "refused",
+    )
+    yield "usdz with a path out", package({"s.usda": root, "../x.usda": root}), "refused"
+    yield "usdz with an absolute path", package({"s.usda": root, "/x.usda": root}), "refused"
+    yield "usdz without a layer", package({"readme.txt": "x"}), "refused"
+    yield "usdz of nothing", package({}), "refused"
+    yield "usdz as it should be", package({"s.usda": root}), "any"
+
+
+def bombs() -> Iterator[tuple[str, Make, str]]:
+    doubled = "".join(
+        f'def "L{i}" {{\ndef "a" (ARC = </L{i + 1}>) {{}}\ndef "b" (ARC = </L{i + 1}>) {{}}\n}}\n'
+        for i in range(40)
+    )
+    for arc in ("references", "payload", "inherits", "specializes"):
+        yield f"2^40 prims by {arc}", text(doubled.replace("ARC", arc)), "refused"
+    inner = "".join(
+        f'def "L{i}" (references = </L{i + 1}>) {{\ndef "in" {{\n'
+        f'def "a" (references = </L{i + 1}/in>) {{}}\n'
+        f'def "b" (references = </L{i + 1}/in>) {{}}\n}}\n}}\n'
+        for i in range(40)
+    )
+    yield "2^40 prims by ancestors", text(inner), "refused"
+    instanced = doubled.replace("ARC", "instanceable = true\nreferences") + 'def Mesh "L40" {}'
+    yield "2^40 instances", text(instanced), "refused"
+    chain = "".join(f'def "L{i}" (references = </L{i + 1}>) {{}}\n' for i in range(3000))
+    yield "a chain of 3000", text(chain), "refused"
+    met = "".join(
+        f'def "{n}{i}" (references = [</A{i + 1}>, </B{i + 1}>]) {{}}\n'
+        for i in range(30)
+        for n in "AB"
+    )
+    yield "2^30 sites in one prim", text(met), "refused"
+    for deep in (200, 100_000):
+        nested = text('def "a" {\n' * deep + "}\n" * deep)
+        # USD's parser calls itself at every level, and crashes: that costs the child
+        yield f"{deep} prims deep", nested, "refused" if deep < 1000 else "ended"
+    for count in (100_001, 400_000):
+        many = "[" + "0, " * count + "]"
+        places = "[" + "(0, 0, 0), " * count + "]"
+        yield (
+            f"{count} instances",
+            text(
+                'def PointInstancer "i" {\nrel prototypes = </floor>\n'
+                f"int[] protoIndices = {many}\npoint3f[] positions = {places}\n}}"
+            ),
+            "refused",
+        )
+    own = 'def PointInstancer "i" {\nrel prototypes = </i>\nint[] protoIndices = [0]\n'
+    yield "an instancer of itself", text(own + "point3f[] positions = [(0, 0, 0)]\n}"), "refused"
+    for end in ("1e18", "inf", "nan"):
+        head = f"#usda 1.0\n(startTimeCode = 0\nendTimeCode = {end})\n"
+        still, moving = "intensity = 5", "intensity.timeSamples = {0: 1, 1: 2}"
+        yield f"time codes to {end}", text("", SEEN.replace(still, moving), head), "refused"
+
+
+def circles() -> Iterator[tuple[str, Make, str]]:
+    pairs = {
+        "itself": 'def "x" (references = </x>) {}',
+        "its file": 'def "x" (references = @./s.usda@</x>) {}',
+        "each other": 'def "x" (references = </y>) {}\ndef "y" (references = </x>) {}',
+        "its parent": 'def "x" {\ndef "y" (inherits = </x>) {}\n}',
+    }
+    for kind, body in pairs.items():
+        yield f"circle: {kind}", text(body), "refused"
+    yield "sublayer of itself", text("", head="#usda 1.0\n(subLayers = [@./s.usda@])\n"), "refused"
+
+
+def odd_files() -> Iterator[tuple[str, Make, str]]:
+    kinds: dict[str, Callable[[Path], object]] = {
+        "fifo": os.mkfifo,
+        "socket": _socket,
+        "folder": lambda path: path.mkdir(),
+        "device": lambda path: path.symlink_to("/dev/zero"),
+        "link to itself": lambda path: path.symlink_to(path.name),
+    }
+    for kind, make_odd in kinds.items():
+
+        def layer(folder: Path, make_odd: Callable[[Path], object] = make_odd) -> None:
+            make_odd(folder / "odd.usda")
+            text('def "x" (references = @./odd.usda@</A>) {}')(folder)
+
+        yield f"layer is a {kind}", layer, "refused"
+        yield f"texture is a {kind}", textured(make_odd), "refused"
+    for kind, data in {
+        "empty": b"",
+        "cut": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
+        "noise": bytes(range(256)) * 9,
+    }.items():
+        yield f"texture is {kind}", textured(lambda path, data=data: path.write_bytes(data)), "read"
+    yield "texture of too many pixels", textured(lambda p: _png(p, (1100, 1100))), "any"
+    yield "a layer that is missing", text('def "x" (references = @./no.usda@</A>) {}'), "read"
+    yield (
+        "a layer of another kind",
+        with_file("x.png", "", 'def "x" (references = @./x.png@</A>) {}'),
+        "read",
+    )
+
+
+def contradictions() -> Iterator[tuple[str, Make, str]]:
+    points, counts, indices = SEEN.splitlines()[9:12]
+    moved = "    double3 xformOp:translate = (0, 0, 3)"
+    values = {
+        "points NaN": (points, "point3f[] points = [(nan, 0, 0), (1, 0, 0), (0, 1, 0)]"),
+        "points 1e38": (points, "point3f[] points = [(1e38, 0, 0), (1, 0, 0), (0, 1, 0)]"),
+        "points of text": (points, 'string points = "x"'),
+        "no points": (points, ""),
+        "indices beyond": (indices, "int[] faceVertexIndices = [0, 1, 2147483647]"),
+        "indices negative": (indices, "int[] faceVertexIndices = [0, 1, -1]"),
+        "counts negative": (counts, "int[] faceVertexCounts = [-3]"),
+        "counts huge": (counts, "int[] faceVertexCounts = [2147483647]"),
+        "place NaN": (moved, "double3 xformOp:translate = (nan, 0, 0)"),
+        "place 1e300": (moved, "double3 xformOp:translate = (1e300, 0, 0)"),
+        "intensity NaN": ("inputs:intensity = 5", "inputs:intensity = nan"),
+        "intensity infinite": ("inputs:intensity = 5", "inputs:intensity = inf"),
+        "intensity negative": ("inputs:intensity = 5", "inputs:intensity = -1"),
+        "intensity 1e38": ("inputs:intensity = 5", "inputs:intensity = 1e38"),
+        "radius 1e38": ("inputs:radius = 0.2", "inputs:radius = 1e38"),
+        "radius NaN": ("inputs:radius = 0.2", "inputs:radius = nan"),
+    }
+    for kind, (old, new) in values.items():
+        assert old in SEEN
+        yield f"mesh or light with {kind}", text("", seen=SEEN.replace(old, new)), "any"
+    for kind, body in {"no prim": "", "half a prim": 'def "x" {', "zeros": "\0" * 99}.items():
+        head = "" if kind == "zeros" else HEAD
+        yield f"text: {kind}", text(body, seen="", head=head), "refused"
+
+
+def cases() -> Iterator[tuple[str, Make, str]]:
+    for group in (leaks, packages, bombs, circles, odd_files, contradictions):
+        yield from group()
