@@ -17,7 +17,7 @@ MAX_PRIMS = 500_000
 """That composition may make; instances of one prototype count once."""
 MAX_DEPTH = 150
 """Of prims within prims."""
-MAX_COMPOSITION_S = 30.0
+MAX_COMPOSITION_S = 20.0
 """Processor seconds for all prims: 500,000 of few arcs each take 4 to 10, chains of thousands of
 references or prims of thousands of sites take hours."""
 

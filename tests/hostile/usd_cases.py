@@ -200,7 +200,9 @@ def bombs() -> Iterator[tuple[str, Make, str]]:
     )
     yield "2^30 sites in one prim", text(met), "refused"
     for deep in (200, 100_000):
-        yield f"{deep} prims deep", text('def "a" {\n' * deep + "}\n" * deep), "refused"
+        nested = text('def "a" {\n' * deep + "}\n" * deep)
+        # USD's parser calls itself at every level, and crashes: that costs the child
+        yield f"{deep} prims deep", nested, "refused" if deep < 1000 else "ended"
     for count in (100_001, 400_000):
         many = "[" + "0, " * count + "]"
         places = "[" + "(0, 0, 0), " * count + "]"
