@@ -65,8 +65,9 @@ def reachable(*roots: type) -> list[type]:
     found: dict[type, None] = {}
     for root in roots:
         found[root] = None
-        for hint in typing.get_type_hints(root).values():
-            for kind in _kinds(hint):
+        hints = typing.get_type_hints(root)
+        for field in dataclasses.fields(root):
+            for kind in _kinds(hints[field.name]):
                 if dataclasses.is_dataclass(kind):
                     found |= dict.fromkeys(reachable(kind))
     return list(found)
