@@ -4,6 +4,7 @@ import json
 import os
 import struct
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,12 @@ from storage.renderformer_h5 import write_renderformer_h5
 from storage.scene_file import encode_scene
 from tests.scenes_by_hand import tiny_scene
 
-Make = Callable[[Path], None]
+Make = Callable[[Path], object]
 NAN, INF = float("nan"), float("inf")
 
 
 def _safetensors(change: Callable[[bytes], bytes]) -> Make:
-    return lambda folder: (
-        (folder / "s.safetensors").write_bytes(change(encode_scene(tiny_scene()))) and None
-    )
+    return lambda folder: (folder / "s.safetensors").write_bytes(change(encode_scene(tiny_scene())))
 
 
 def _arrays(change: Callable[[dict[str, Any]], Any]) -> Make:
@@ -47,36 +46,51 @@ def _header(change: Callable[[dict[str, Any]], Any]) -> Make:
     return _safetensors(changed)
 
 
+def _put(name: str, value: float) -> Make:
+    return _arrays(lambda arrays: arrays[name].reshape(-1).__setitem__(0, value))
+
+
+def _claim(field: str, value: Any) -> Make:
+    return _header(lambda header: header["faces"].update({field: value}))
+
+
+def _metadata(text: str) -> Make:
+    return _header(lambda header: header["__metadata__"].update(trilight_scene=text))
+
+
+def _bytes(name: str, data: bytes) -> Make:
+    return lambda folder: (folder / name).write_bytes(data)
+
+
+def _cut(part: float) -> Make:
+    return _safetensors(lambda data: data[: int(len(data) * part)])
+
+
 def safetensors_cases() -> Iterator[tuple[str, Make, str]]:
     """Yield name, what writes `s.safetensors`, and what has to come of it."""
     for name in ("vertex_positions", "vertex_normals", "materials", "c2w", "fov_deg"):
         for value in (NAN, INF):
-            put = _arrays(lambda a, n=name, v=value: a[n].reshape(-1).__setitem__(0, v))
-            yield f"{name} {value}", put, "refused"
+            yield f"{name} {value}", _put(name, value), "refused"
     for name in ("faces", "material_index", "object_index"):
-        put = _arrays(lambda a, n=name: a[n].reshape(-1).__setitem__(0, 60_000))
-        yield f"{name} out of range", put, "refused"
+        yield f"{name} out of range", _put(name, 60_000), "refused"
     yield "an array missing", _arrays(lambda a: a.pop("faces")), "refused"
     yield "an array too many", _arrays(lambda a: a.update(x=np.zeros(3))), "refused"
     of_doubles = _arrays(lambda a: a.update(faces=a["faces"].astype(np.float64)))
     yield "another type", of_doubles, "refused"
     for shape in ([2**62, 3], [-1, 3], [10**9, 3], "x", None, [3.5, 3], [[1], 3]):
-        claim = _header(lambda h, s=shape: h["faces"].update(shape=s))
-        yield f"shape {shape}", claim, "refused"
+        yield f"shape {shape}", _claim("shape", shape), "refused"
     for offsets in ([0, 2**60], [-5, 9], [9, 0], "x", [0]):
-        claim = _header(lambda h, o=offsets: h["faces"].update(data_offsets=o))
-        yield f"offsets {offsets}", claim, "refused"
-    yield "no metadata", _header(lambda h: h.pop("__metadata__")), "refused"
+        yield f"offsets {offsets}", _claim("data_offsets", offsets), "refused"
+    yield "no metadata", _header(lambda header: header.pop("__metadata__")), "refused"
     for text in ("", "[]", "{}", "[" * 10**5, '{"schema_version": 99}', "\0"):
-        claim = _header(lambda h, t=text: h["__metadata__"].update(trilight_scene=t))
-        yield f"metadata {text[:20]!r}", claim, "refused"
+        yield f"metadata {text[:20]!r}", _metadata(text), "refused"
     for kind, data in {
         "empty": b"", "8 bytes": b"\xff" * 8, "a header of 2^63": struct.pack("<Q", 2**63) + b"{}",
         "noise": bytes(range(256)) * 9, "a deep header": struct.pack("<Q", 10**6) + b"[" * 10**6,
     }.items():  # fmt: skip
-        yield f"safetensors is {kind}", _safetensors(lambda _, d=data: d), "refused"
+        yield f"safetensors is {kind}", _bytes("s.safetensors", data), "refused"
     for part in (0.1, 0.5, 0.99):
-        yield f"cut at {part}", _safetensors(lambda d, p=part: d[: int(len(d) * p)]), "refused"
+        yield f"cut at {part}", _cut(part), "refused"
     yield "bytes too many", _safetensors(lambda d: d + b"x"), "refused"
     yield "safetensors is a fifo", lambda f: os.mkfifo(f / "s.safetensors"), "refused"
 
@@ -94,6 +108,14 @@ def _h5(change: Callable[[h5py.File, Path], Any]) -> Make:
             change(file, folder)
 
     return make
+
+
+def _without(name: str, file: h5py.File, folder: Path) -> None:
+    del file[name]
+
+
+def _not_a_number(name: str, file: h5py.File, folder: Path) -> None:
+    file[name][(0,) * file[name].ndim] = NAN
 
 
 def _replaced(name: str, **options: Any) -> Make:
@@ -137,19 +159,17 @@ def h5_cases() -> Iterator[tuple[str, Make, str]]:
     """Yield name, what writes `s.h5`, and what has to come of it."""
     yield from _h5_links()
     for name in ("triangles", "vn", "texture", "c2w", "fov"):
-        yield f"{name} missing", _h5(lambda f, d, n=name: f.pop(n) and None), "refused"
+        yield f"{name} missing", _h5(partial(_without, name)), "refused"
         yield f"{name} of text", _replaced(name, data=["a", "b"]), "refused"
         yield f"{name} is a number", _replaced(name, data=1.0), "refused"
         huge = {"shape": (10**9, 3, 3), "dtype": "f4", "chunks": (1, 3, 3)}
         yield f"{name} of 36 GB, not written", _replaced(name, **huge), "refused"
-        nan = _h5(lambda f, d, n=name: f[n].__setitem__((0,) * f[n].ndim, NAN))
-        yield f"{name} NaN", nan, "refused"
+        yield f"{name} NaN", _h5(partial(_not_a_number, name)), "refused"
     compound = np.zeros(3, [("a", "f4"), ("b", "i8")])
     yield "a compound type", _replaced("triangles", data=compound), "refused"
     yield "no triangle", _replaced("triangles", data=np.zeros((0, 3, 3), "f4")), "refused"
     for kind, data in {"empty": b"", "noise": bytes(range(256)) * 99}.items():
-        make = lambda f, d=data: (f / "s.h5").write_bytes(d) and None  # noqa: E731
-        yield f"HDF5 is {kind}", make, "refused"
+        yield f"HDF5 is {kind}", _bytes("s.h5", data), "refused"
     for seed in range(8):
 
         def flipped(folder: Path, seed: int = seed) -> None:

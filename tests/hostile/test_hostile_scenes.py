@@ -48,7 +48,7 @@ def smaller_limits() -> None:
     from pipeline.scenes.usd import placed, textures
     from storage.usd import composition
 
-    composition.MAX_PRIMS, composition.MAX_COMPOSITION_S = 2000, 1.0
+    composition.MAX_PRIMS, composition.MAX_COMPOSITION_S = 2000, 0.3
     placed.MAX_PLACED, textures.MAX_PIXELS = 2000, 1 << 20
 
 

@@ -28,7 +28,7 @@ BAD, GOOD = "bad-000000.tar", "good-000000.tar"
 Members = dict[str, bytes]
 
 
-def array(name: str, change: Callable[[np.ndarray], Any]) -> Callable[[Members], None]:
+def array(name: str, change: Callable[[np.ndarray], Any]) -> Callable[[Members], object]:
     """Return what changes one array of a sample."""
 
     def spoil(members: Members) -> None:
@@ -41,11 +41,11 @@ def array(name: str, change: Callable[[np.ndarray], Any]) -> Callable[[Members],
     return spoil
 
 
-def put(name: str, at: Any, value: float) -> Callable[[Members], None]:
+def put(name: str, at: Any, value: float) -> Callable[[Members], object]:
     return array(name, lambda values: values.__setitem__(at, value))
 
 
-def record(change: Callable[[dict[str, Any]], Any]) -> Callable[[Members], None]:
+def record(change: Callable[[dict[str, Any]], Any]) -> Callable[[Members], object]:
     """Return what changes the JSON of a sample."""
 
     def spoil(members: Members) -> None:
@@ -56,7 +56,7 @@ def record(change: Callable[[dict[str, Any]], Any]) -> Callable[[Members], None]
     return spoil
 
 
-def view(field: str, value: Any) -> Callable[[Members], None]:
+def view(field: str, value: Any) -> Callable[[Members], object]:
     return record(lambda read: read["views"][0].__setitem__(field, value))
 
 
@@ -69,10 +69,10 @@ def other_picture(members: Members) -> None:
 
 
 NAN, INF = float("nan"), float("inf")
-CASES: dict[str, tuple[Callable[[Members], None], str]] = {
+CASES: dict[str, tuple[Callable[[Members], object], str]] = {
     "deeply nested JSON": (nested, "not JSON"),
     "JSON of another kind": (lambda m: m.update(json=b"[1]"), "schema version None"),
-    "no JSON": (lambda m: m.pop("json") and None, "json is missing"),
+    "no JSON": (lambda m: m.pop("json"), "json is missing"),
     "views are a number": (record(lambda r: r.update(views=3)), "not iterable"),
     "a view too few": (record(lambda r: r["views"].pop()), "1 pictures .* expected 2 of both"),
     "an object of another kind": (record(lambda r: r["objects"][0].update(kind="x")), "kind"),
@@ -98,12 +98,12 @@ CASES: dict[str, tuple[Callable[[Members], None], str]] = {
     "material out of range": (put("material_index", 0, 999), r"material_index\[0\] is 999"),
     "faces are halves": (array("faces", lambda a: a.astype(np.float16)), "dtype float16"),
     "faces of four": (array("faces", lambda a: np.zeros((4, 4), np.uint32)), "shape"),
-    "no picture": (lambda m: m.pop("0.exr") and None, "0.exr.* is missing"),
+    "no picture": (lambda m: m.pop("0.exr"), "0.exr.* is missing"),
     "pictures not square": (other_picture, "8 x 4 pixels"),
 }
 
 
-def write_shards(folder: Path, spoil: Callable[[Members], None], bad_samples: int) -> list[str]:
+def write_shards(folder: Path, spoil: Callable[[Members], object], bad_samples: int) -> list[str]:
     """Write a shard whose first samples are spoilt and one without fault; return their paths."""
     for name, first, count in ((BAD, 0, 3), (GOOD, 3, 2)):
         samples = []
