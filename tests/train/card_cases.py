@@ -1,0 +1,143 @@
+"""What is done on the fake card (fake_card), in a process of its own; each function is one case."""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from typer.testing import CliRunner
+
+from infra.cli.app import app
+from model.checkpoints import save_published
+from model.config import SIZES
+from model.layers import Norm
+from model.neural_renderer import NeuralRenderer
+from model.renderformer import RenderFormer
+from storage.training_data import open_training_data
+from tests.train.fake_card import CARD, fake_card
+from tests.train.toy import toy_sample, toy_scene
+from train.data.buckets import make_batch
+from train.data.scenes import training_scene
+from train.evaluation.evaluate import Contest, judged_views
+from train.loop.checkpoint import save_checkpoint
+from train.loop.crew import Crew
+from train.loop.state import new_state
+from train.loop.step import predicted
+from train.loss.lpips_weights import load_lpips
+from train.run import train_run
+from train.runs import changed_run
+from train.settings import TrainSettings
+from train.start import Start
+
+RESOLUTION = 64
+"""One window of the large network's."""
+
+
+def one_step_of(run: str, size: str) -> TrainSettings:
+    """Return a named run at a named size, with one step of two scenes of the toy's."""
+    changes = {
+        "model": size,
+        "resolution": RESOLUTION,
+        "num_steps": 1,
+        "warmup_steps": 0,
+        "scenes_per_step": 2,
+        "scenes_per_pass": 2,
+        "views_per_scene": 1,
+        "log_every": 1,
+        "validate_every": 1,
+        "checkpoint_every": 1,
+        "validation_scenes": 1,
+        "from_weights": False,
+    }
+    return changed_run(run, changes)
+
+
+def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> None:
+    """Train by train_run, evaluate, render, and export what can be exported."""
+    settings = one_step_of(run, size)
+    with fake_card():
+        start, crew = Start(lpips=lpips), Crew(device=CARD)
+        result = train_run(settings, data=[data], out=out, start=start, crew=crew)
+        assert result is not None and result.skipped_steps == 0
+        network = RenderFormer(settings.model).to(CARD)
+        distance = load_lpips(lpips)
+        assert distance is not None
+        contest = Contest(
+            network=network,
+            shards=open_training_data([data]).split("validation"),
+            resolution=RESOLUTION,
+            rivals=None,
+            lpips=distance.to(CARD),
+            most_scenes=1,
+        )
+        (view, *_) = judged_views(contest, lambda: None)
+        assert view.scores["network"]["lpips"] == 1.0, "a number that was on the card"
+        assert NeuralRenderer(network).render(toy_scene(0), RESOLUTION).shape[1:] == (64, 64, 3)
+        if settings.model.head == "dpt":
+            save_published(network, out / "published")
+
+
+def resume(data: str, lpips: str, out: Path) -> None:
+    """Go on with a run on the card, and begin a second stage with it."""
+    first = dataclasses.replace(one_step_of("builtin", "smoke"), num_steps=2, warmup_steps=1)
+    second = dataclasses.replace(one_step_of("finetune", "smoke"), from_weights=True)
+    with fake_card():
+        crew = Crew(device=CARD)
+        train_run(first, data=[data], out=out / "first", crew=crew)
+        checkpoint = out / "first" / "checkpoints" / "step-000000002.safetensors"
+        checkpoint.unlink()
+        train_run(first, data=[data], out=out / "first", start=Start(resume=True), crew=crew)
+        start = Start(begin_with=str(checkpoint), lpips=lpips)
+        train_run(second, data=[data], out=out / "second", start=start, crew=crew)
+
+
+def evaluate_command(data: str, lpips: str, out: Path) -> str:
+    """Return what `trilight evaluate` says of a network, on the card that it finds by itself."""
+    settings, network = one_step_of("smoke", "smoke"), out / "checkpoint.safetensors"
+    save_checkpoint(network, new_state(settings), settings, data_digest="", world_size=1)
+    arguments = ["evaluate", network, "--data", data, "--split", "validation", "--out", out]
+    with fake_card():
+        result = CliRunner().invoke(app, [*map(str, arguments), "--lpips", lpips])
+        if result.exception is not None:
+            raise result.exception
+    return result.output
+
+
+def types_on_the_card(size: str) -> dict[str, str]:
+    """Return `types_under_autocast` of a network on the card."""
+    with fake_card():
+        return types_under_autocast(RenderFormer(SIZES[size]()).to(CARD))
+
+
+def types_under_autocast(network: RenderFormer) -> dict[str, str]:
+    """Return the types of what modules return while training in bfloat16, by name.
+
+    A norm is `kept` where it returns the type that it was given.
+    """
+    found: dict[str, str] = {}
+
+    def note(name: str, module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        kept = isinstance(module, Norm) and output.dtype == inputs[0].dtype
+        found[name] = "kept" if kept else str(output.dtype).removeprefix("torch.")
+
+    for name, module in network.named_modules():
+        if isinstance(module, Norm | nn.Linear | nn.Conv2d):
+            module.register_forward_hook(functools.partial(note, name))
+    device = network.decoder.token_W.device
+    batch = make_batch([training_scene(toy_sample(row, resolution=64), 64) for row in (0, 1)])
+    picture = predicted(network, batch.to(device), RESOLUTION, "bfloat16")
+    found["picture"] = str(picture.dtype).removeprefix("torch.")
+    return found
+
+
+def mixed_on_the_card(name: str) -> None:
+    """Make a mistake that a card would not forgive."""
+    with fake_card():
+        on_card = torch.zeros(4, 3, 16, 16, device=CARD)
+        mistakes = {
+            "processor": lambda: on_card + torch.zeros(4, 1, 1, 1),
+            "numpy": lambda: on_card.numpy(),
+            "unique": lambda: on_card.unique(),
+        }
+        mistakes[name]()
