@@ -15,7 +15,7 @@ from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
 from train.loop.checkpoint import HEADER_KEY, read_checkpoint, resumed_state, save_checkpoint
-from train.loop.checkpoints import newest_checkpoint
+from train.loop.checkpoints import resumed_checkpoint
 from train.loop.crew import Crew
 from train.loop.metrics_log import MetricsLog, read_rows
 from train.loop.state import TrainState, new_state
@@ -130,6 +130,7 @@ def test_a_checkpoint_from_before_a_setting_existed_resumes(tmp_path: Path) -> N
         header = json.loads(file.metadata()[HEADER_KEY])
     del header["settings"]["recompute_activations"]
     del header["settings"]["model"]["window_bundles"]
+    del header["sha256"]
     save_file(tensors, path, metadata={HEADER_KEY: json.dumps(header)})
     assert load(path).step == 0
     with pytest.raises(TrilightError, match="recompute_activations is True, .* made with False"):
@@ -138,13 +139,30 @@ def test_a_checkpoint_from_before_a_setting_existed_resumes(tmp_path: Path) -> N
 
 def test_a_missing_or_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
-        newest_checkpoint(tmp_path / "checkpoints")
+        resumed_checkpoint(tmp_path / "checkpoints", Crew(device=torch.device("cpu")), print)
     save(tmp_path / "c", new_state(tiny_run()))
     data = (tmp_path / "c").read_bytes()
     for damaged in (b"", data[:100], data[:-1], b"PK\x03\x04" + data):
         (tmp_path / "c").write_bytes(damaged)
-        with pytest.raises(TrilightError):
+        with pytest.raises(TrilightError, match=f"checkpoint {tmp_path / 'c'} is not readable"):
             load(tmp_path / "c")
+
+
+def test_no_bit_may_flip(tmp_path: Path) -> None:
+    """In the header, its sha256, the weights, the last byte: each would still be a weight."""
+    path = tmp_path / "c"
+    save(path, trained(1))
+    data = path.read_bytes()
+    end = 8 + int.from_bytes(data[:8], "little")
+    places = [0, 8, *range(9, end, end // 40), data.index(b"sha256") + 20]
+    for place in [*places, end, end + 4321, len(data) - 1]:
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with pytest.raises(TrilightError, match="is not readable"):
+            read_checkpoint(path)
+    path.write_bytes(data)
+    assert load(path).step == 1
 
 
 def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:
