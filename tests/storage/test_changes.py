@@ -2,8 +2,9 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from hypothesis import given
@@ -210,3 +211,47 @@ def test_values_that_only_fit_each_other_come_in_any_order(names: tuple[str, str
         changed(Spans(), {f"one.{name}": {"low": 9, "high": 8}[name] for name in names})
     with pytest.raises(TrilightError, match=r"^setting 'many\.high': 32 to 8; expected"):
         changed(Spans(), {"many.high": 8})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Engine:
+    power: int = 1
+    fuel: str = "wood"
+
+    PRESETS: ClassVar[dict[str, Callable[[], "Engine"]]] = {
+        "small": lambda: Engine(power=2),
+        "large": lambda: Engine(power=9, fuel="coal"),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Car:
+    engine: Engine = field(default_factory=Engine)
+    wheels: int = 4
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_group_with_presets_may_be_named_and_then_changed(backwards: bool) -> None:
+    changes = {"engine": "large", "engine.power": 8, "wheels": 3}
+    ordered = dict(reversed(changes.items())) if backwards else changes
+    assert changed(Car(), ordered) == Car(engine=Engine(power=8, fuel="coal"), wheels=3)
+    assert changed(Car(), {"engine": "small"}) == Car(engine=Engine(power=2))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"engine": "lrage"},
+            r"'engine' is 'lrage'; expected one of small, large, .*engine\.power",
+        ),
+        ({"engine": "lrage"}, r"Did you mean large\?$"),
+        ({"engine": ["large"]}, r"'engine' is \['large'\]; expected one of small, large"),
+        ({"engine": {"power": 3}}, r"expected one of small, large"),
+        ({"engine.powr": 3}, r"'engine\.powr' does not exist.* Did you mean power\?$"),
+        ({"engine.power": "large"}, "something like 1"),
+    ],
+)
+def test_a_wrong_preset_or_name_is_asked_back(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        changed(Car(), changes)

@@ -122,14 +122,15 @@ def test_another_run_or_other_data_is_refused_by_field(
 
 
 def test_a_checkpoint_from_before_a_setting_existed_resumes(tmp_path: Path) -> None:
-    """With the default of the setting, which is what was done then; and with no other value."""
+    """With the setting's default, which is what was done then; and with no other value."""
     path = tmp_path / "c"
     save(path, new_state(tiny_run()))
     tensors = load_file(path)
     with safe_open(path, "pt") as file:
         header = json.loads(file.metadata()[HEADER_KEY])
-    del header["sha256"], header["settings"]["recompute_activations"]
+    del header["settings"]["recompute_activations"]
     del header["settings"]["model"]["window_bundles"]
+    del header["sha256"]
     save_file(tensors, path, metadata={HEADER_KEY: json.dumps(header)})
     assert load(path).step == 0
     with pytest.raises(TrilightError, match="recompute_activations is True, .* made with False"):
@@ -138,13 +139,30 @@ def test_a_checkpoint_from_before_a_setting_existed_resumes(tmp_path: Path) -> N
 
 def test_a_missing_or_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="no checkpoint here to resume from"):
-        resumed_checkpoint(tmp_path / "checkpoints", Crew(device=torch.device("cpu")), noted=print)
+        resumed_checkpoint(tmp_path / "checkpoints", Crew(device=torch.device("cpu")), print)
     save(tmp_path / "c", new_state(tiny_run()))
     data = (tmp_path / "c").read_bytes()
     for damaged in (b"", data[:100], data[:-1], b"PK\x03\x04" + data):
         (tmp_path / "c").write_bytes(damaged)
-        with pytest.raises(TrilightError):
+        with pytest.raises(TrilightError, match=f"checkpoint {tmp_path / 'c'} is not readable"):
             load(tmp_path / "c")
+
+
+def test_no_bit_may_flip(tmp_path: Path) -> None:
+    """In the header, its sha256, the weights, the last byte: each would still be a weight."""
+    path = tmp_path / "c"
+    save(path, trained(1))
+    data = path.read_bytes()
+    end = 8 + int.from_bytes(data[:8], "little")
+    places = [0, 8, *range(9, end, end // 40), data.index(b"sha256") + 20]
+    for place in [*places, end, end + 4321, len(data) - 1]:
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with pytest.raises(TrilightError, match="is not readable"):
+            read_checkpoint(path)
+    path.write_bytes(data)
+    assert load(path).step == 1
 
 
 def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:

@@ -5,9 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -16,18 +16,13 @@ from storage.errors import TrilightError
 from tests.conftest import ROOT
 from tests.train.kit import tiny_run
 from train.folder import RunFolder
-from train.loop.checkpoint import read_checkpoint, resumed_state
-from train.loop.checkpoints import (
-    checkpoint_path,
-    keep_checkpoint,
-    resumed_checkpoint,
-    saved_steps,
-)
+from train.loop.checkpoint import resumed_state
+from train.loop.checkpoints import checkpoint_path, keep_checkpoint, resumed_checkpoint, saved_steps
 from train.loop.crew import Crew
 from train.loop.state import new_state
 from train.networks import open_network
 
-CREW = Crew(device=torch.device("cpu"))
+ALONE = Crew(device=torch.device("cpu"))
 
 CHILD = """
 import os, signal, sys
@@ -56,56 +51,6 @@ keep(2)
 """
 
 
-def no_note(text: str) -> None:
-    raise AssertionError(text)
-
-
-def kept(folder: Path, *steps: int) -> list[Path]:
-    """Keep a checkpoint of each step; return their paths."""
-    settings = tiny_run(checkpoints_kept=len(steps))
-    state = new_state(settings)
-    for state.step in steps:
-        keep_checkpoint(folder, state, settings, data_digest="d", world_size=1)
-    return [checkpoint_path(folder, step) for step in steps]
-
-
-@pytest.mark.parametrize("damage", ["empty", "cut", "one byte of the header", "one of a weight"])
-def test_a_damaged_newest_one_is_named_and_the_one_before_it_used(
-    tmp_path: Path, damage: str
-) -> None:
-    _, newest = kept(tmp_path, 4, 8)
-    data = bytearray(newest.read_bytes())
-    place = {"one byte of the header": 300, "one of a weight": len(data) - 100}.get(damage)
-    if place is not None:
-        data[place] ^= 1
-    newest.write_bytes(data[: {"empty": 0, "cut": len(data) // 2}.get(damage, len(data))])
-    notes: list[str] = []
-    assert resumed_checkpoint(tmp_path, CREW, noted=notes.append).header["step"] == 4
-    (note,) = notes
-    assert str(newest) in note and "goes on from the one before, of step 4" in note
-
-
-def test_where_all_are_damaged_each_is_named(tmp_path: Path) -> None:
-    paths = kept(tmp_path, 4, 8)
-    for path in paths:
-        path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(TrilightError, match="none of its checkpoints can be resumed") as refused:
-        resumed_checkpoint(tmp_path, CREW, noted=no_note)
-    assert all(str(path) in str(refused.value) for path in paths)
-
-
-def test_any_byte_that_changed_is_found(tmp_path: Path) -> None:
-    """A flip in a weight is a legal number, which no reader of safetensors would refuse."""
-    (path,) = kept(tmp_path, 1)
-    data = path.read_bytes()
-    for place in np.random.default_rng(0).integers(len(data), size=40).tolist():
-        flipped = bytearray(data)
-        flipped[place] ^= 4
-        path.write_bytes(flipped)
-        with pytest.raises(TrilightError, match="is not readable"):
-            read_checkpoint(path)
-
-
 def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
     settings = tiny_run(checkpoints_kept=2, keep_every=10)
     state = new_state(settings)
@@ -113,7 +58,7 @@ def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
         state.step = step
         keep_checkpoint(tmp_path, state, settings, data_digest="d", world_size=1)
     assert saved_steps(tmp_path) == [10, 20, 24]
-    assert resumed_checkpoint(tmp_path, CREW, noted=no_note).header["step"] == 24
+    assert resumed_checkpoint(tmp_path, ALONE, pytest.fail).header["step"] == 24
     (tmp_path / "step-notes.safetensors").write_bytes(b"")
     assert saved_steps(tmp_path) == [10, 20, 24]
 
@@ -127,13 +72,84 @@ def test_killed_while_saving_leaves_a_whole_one(tmp_path: Path, call: str, when:
         [sys.executable, "-c", CHILD, str(tmp_path), call, when], cwd=ROOT, check=False
     )
     assert killed.returncode == -signal.SIGKILL
-    newest = resumed_checkpoint(tmp_path, CREW, noted=no_note)
+    newest = resumed_checkpoint(tmp_path, ALONE, pytest.fail)
     step = resumed_state(newest, tiny_run(), "d").step
     assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
     state = new_state(tiny_run())
     state.step = state.skipped_steps = 3
     keep_checkpoint(tmp_path, state, tiny_run(), data_digest="d", world_size=1)
     assert not list(tmp_path.glob("*.part")), "what the killed one left is cleared away"
+
+
+def keep(folder: Path, *steps: int, kept: int = 3) -> None:
+    state = new_state(tiny_run())
+    for step in steps:
+        state.step = state.skipped_steps = step
+        settings = tiny_run(checkpoints_kept=kept)
+        keep_checkpoint(folder, state, settings, data_digest="d", world_size=1)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-1000] ^= 1
+    path.write_bytes(data)
+
+
+def lock(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+@pytest.mark.parametrize("damage", [cut, flip, lock])
+def test_a_damaged_newest_one_is_named_and_the_one_before_it_is_used(
+    damage: Callable[[Path], None], tmp_path: Path
+) -> None:
+    keep(tmp_path, 4, 8, 12)
+    damage(checkpoint_path(tmp_path, 12))
+    notes: list[str] = []
+    assert resumed_checkpoint(tmp_path, ALONE, notes.append).header["step"] == 8
+    (note,) = notes
+    assert f"checkpoint {checkpoint_path(tmp_path, 12)} is not readable: " in note
+    assert note.endswith("The run goes on from that of step 8")
+    for step in (8, 4):
+        damage(checkpoint_path(tmp_path, step))
+    with pytest.raises(
+        TrilightError, match="none of its checkpoints can be resumed from"
+    ) as caught:
+        resumed_checkpoint(tmp_path, ALONE, pytest.fail)
+    for step in (4, 8, 12):
+        assert f"{checkpoint_path(tmp_path, step)} is not readable" in str(caught.value)
+
+
+def test_a_damaged_later_one_takes_nobodys_place(tmp_path: Path) -> None:
+    keep(tmp_path, 4, 12)
+    flip(checkpoint_path(tmp_path, 12))
+    keep(tmp_path, 8, kept=1)
+    assert resumed_checkpoint(tmp_path, ALONE, lambda _: None).header["step"] == 8
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Two(Crew):
+    """Two processes, of which the other reads another step."""
+
+    other: int
+    world_size: int = 2
+
+    def mean(self, values: Sequence[float]) -> list[float]:
+        theirs = [self.other >> bit & 1 for bit in range(len(values))]
+        return [(own + other) / 2 for own, other in zip(values, theirs, strict=True)]
+
+
+def test_processes_that_read_different_checkpoints_do_not_go_on(tmp_path: Path) -> None:
+    keep(tmp_path, 4, 8)
+    same = Two(device=ALONE.device, other=8)
+    assert resumed_checkpoint(tmp_path, same, pytest.fail).header["step"] == 8
+    with pytest.raises(TrilightError, match="do not read the same checkpoint; this one .* step 8"):
+        resumed_checkpoint(tmp_path, Two(device=ALONE.device, other=4), pytest.fail)
 
 
 def test_a_full_disk_leaves_the_older_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,7 +175,7 @@ def test_a_network_is_found_in_folder_checkpoint_and_file(tmp_path: Path) -> Non
     with pytest.raises(TrilightError, match="no checkpoint here"):
         open_network(tmp_path)
     keep_checkpoint(folder.checkpoints, state, settings, data_digest="d", world_size=1)
-    for place in (tmp_path, checkpoint_path(folder.checkpoints, state.step)):
+    for place in (tmp_path, checkpoint_path(folder.checkpoints, 0)):
         assert (open_network(place).decoder.token_W == 0.25).all(), "the mean is what is shown"
     folder.weights.write_bytes(encode_weights(state.model))
     for place in (tmp_path, folder.weights):

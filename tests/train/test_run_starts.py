@@ -11,9 +11,12 @@ from storage.errors import TrilightError
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
+from train.loop.metrics_log import read_rows
 from train.loss.settings import LossSettings
 from train.networks import open_network
+from train.progress import Silent
 from train.run import train_run
+from train.runs import changed_run
 from train.settings import TrainSettings
 from train.start import Start
 
@@ -100,3 +103,72 @@ def test_lights_that_are_not_apart_cannot_be_mixed(dataset: Dataset, tmp_path: P
     mixing = dataclasses.replace(tiny_run().augmentation, light_mix=4.0)
     with pytest.raises(TrilightError, match="its lights are not kept apart"):
         run(tiny_run(augmentation=mixing), dataset, tmp_path, Start())
+
+
+class Notes(Silent):
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def noted(self, text: str) -> None:
+        self.texts.append(text)
+
+
+def test_a_run_goes_on_past_a_damaged_checkpoint_to_the_same_weights(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    settings, data = tiny_run(checkpoints_kept=3), [str(dataset.folder.root)]
+    whole = trained(settings, data, tmp_path)
+    weights, newest = whole.folder.weights.read_bytes(), whole.folder.checkpoints
+    path = newest / "step-000000012.safetensors"
+    damaged = bytearray(path.read_bytes())
+    damaged[-4] ^= 4
+    path.write_bytes(damaged)
+    with pytest.raises(TrilightError, match=f"{path} is not readable"):
+        open_network(path)
+    notes = Notes()
+    again = trained(settings, data, tmp_path, resume=True, progress=notes)
+    assert [str(path) in text for text in notes.texts] == [True]
+    assert again.folder.weights.read_bytes() == weights
+    assert open_network(path).config == settings.model, "it was written again"
+
+
+def test_a_network_with_windows_is_trained(dataset: Dataset, tmp_path: Path) -> None:
+    """As the large one is: a DPT on windows, whole ones and shifted ones."""
+    model = dataclasses.replace(
+        TINY_MODEL,
+        decoder_layers=2,
+        window_bundles=2,
+        head="dpt",
+        dpt_features=4,
+        dpt_channels=(4, 4, 4, 4),
+        dpt_taps=(0, 1, 0, 1),
+    )
+    settings = tiny_run(model=model, resolution=32, num_steps=40, learning_rate=5e-3)
+    result = trained(settings, [str(dataset.folder.root)], tmp_path)
+    # 0.61 and 0.79 of it with two seeds
+    assert result.skipped_steps == 0 and result.loss_at_end < 0.9 * result.loss_at_start
+
+
+@pytest.mark.slow
+def test_the_large_network_is_trained(tmp_path: Path) -> None:
+    """483 M parameters, one window of 64 pixels, on a processor; 8 GB of memory."""
+    data = write_toy_dataset(tmp_path / "data", train=1, validation=1, resolution=64)
+    changes = {
+        "resolution": 64,
+        "num_steps": 3,
+        "warmup_steps": 0,
+        "scenes_per_step": 1,
+        "views_per_scene": 1,
+        "log_every": 1,
+        "validate_every": 3,
+        "checkpoint_every": 3,
+        "precision": "float32",
+        "loss.perceptual": "ms_ssim",
+        "augmentation.rotation": "none",
+        "augmentation.translation": 0.0,
+    }
+    settings = changed_run("paper-pretrain-large", changes)
+    result = trained(settings, [str(data.folder.root)], tmp_path / "run")
+    assert result.num_parameters > 480e6 and result.skipped_steps == 0
+    losses = [row["loss"] for row in read_rows(result.folder.metrics) if "loss" in row]
+    assert losses[2] < losses[0], "one scene, seen three times"

@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from model.config import SIZES, large
 from storage.changes import changed
 from storage.errors import TrilightError
 from tests.train.kit import tiny_run
@@ -104,6 +105,34 @@ def test_the_paper_runs_are_the_papers() -> None:
         assert (run.augmentation.rotation, run.augmentation.translation) == ("recipe", 0.25)
         assert run.ema_decay == run.muon_rate == 0 and not run.augmentation.mirror
     assert second.from_weights and not first.from_weights
+
+
+def test_the_large_runs_are_the_published_large_recipe() -> None:
+    """Of its training code: rates, warm-up and steps; 4 and 6 scenes on each of 8 cards."""
+    first, second = named_run("paper-pretrain-large"), named_run("paper-finetune-large")
+    for run, base in ((first, "paper-pretrain"), (second, "paper-finetune")):
+        small = named_run(base)
+        assert run.model == large()
+        for name in ("loss", "augmentation", "resolution", "most_triangles", "views_per_scene"):
+            assert getattr(run, name) == getattr(small, name), name
+        for name in ("betas", "weight_decay", "grad_clip", "final_rate_share", "precision"):
+            assert getattr(run, name) == getattr(small, name), name
+    assert (first.num_steps, first.warmup_steps, first.learning_rate) == (600_000, 8_000, 1e-4)
+    assert (second.num_steps, second.warmup_steps, second.learning_rate) == (50_000, 4_000, 5e-5)
+    assert (first.scenes_per_step, second.scenes_per_step) == (4 * 8, 6 * 8)
+    assert second.recompute_activations and not first.recompute_activations
+    assert second.from_weights and not first.from_weights
+
+
+def test_every_size_can_be_asked_for_by_name() -> None:
+    for name, make in SIZES.items():
+        assert changed_run("smoke", {"model": name}).model == make()
+    without = changed_run("pretrain", {"model.window_bundles": 0, "model": "large"})
+    assert without.model == dataclasses.replace(large(), window_bundles=0)
+    with pytest.raises(TrilightError, match="'model' is 'larg'; .* Did you mean large"):
+        changed_run("smoke", {"model": "larg"})
+    with pytest.raises(TrilightError, match="resolution is 72; expected a multiple of 64"):
+        changed_run("smoke", {"model": "large", "resolution": 72})
 
 
 def test_any_field_can_be_replaced_by_name() -> None:

@@ -62,7 +62,7 @@ def _newest_whole(folder: Path, steps: list[int], noted: Callable[[str], None]) 
             damaged.append(str(error))
             continue
         if damaged:
-            noted(f"{' '.join(damaged)} The run goes on from the one before, of step {step}")
+            noted(f"{' '.join(damaged)} The run goes on from that of step {step}")
         return checkpoint
     raise TrilightError(
         f"{folder.parent}: none of its checkpoints can be resumed from. {' '.join(damaged)} "
