@@ -141,7 +141,7 @@ class OpenedUsd:
             raise TrilightError(f"{self.path.name}: refers to itself in a circle ({text:.160}).")
         if isinstance(error, Pcp.ErrorCapacityExceeded):
             raise TrilightError(f"{self.path.name}: too many arcs meet in one prim ({text:.160}).")
-        self._note(f"composition: {text:.160}")
+        self.lost.append(f"composition: {text:.160}")
 
     def _named_layer(self, anchor: Any, asset_path: str) -> Any:
         """Return the layer that another one names, or None where it is missing (it is noted)."""
@@ -150,16 +150,12 @@ class OpenedUsd:
         found = self.inside(anchor, asset_path)
         if found is None or Sdf.FileFormat.FindByExtension(found) is None:
             why = "is missing" if found is None else "is no USD file"
-            self._note(f"file {asset_path!r:.100} {why}")
+            self.lost.append(f"file {asset_path!r:.100} {why}")
             return None
         return self._open(found)
 
     def _refuse(self, named: str, why: str) -> NoReturn:
         raise TrilightError(f"{self.path.name}: names {named!r:.100}{why}.")
-
-    def _note(self, text: str) -> None:
-        if text not in self.lost:
-            self.lost.append(text)
 
     def _open(self, resolved: str) -> Any:
         from pxr import Sdf, Tf

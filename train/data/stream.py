@@ -184,7 +184,7 @@ class _SceneMaker:
                 return found
             self._given_up.add(number)
         raise TrilightError(
-            f"data: all samples of {count} shards are unusable. The last: "
+            f"data: no sample of {count} shards is usable. The last that was tried: "
             f"{self._unusable.messages[-1]}"
         )
 
