@@ -243,12 +243,14 @@ def test_a_group_with_presets_may_be_named_and_then_changed(backwards: bool) -> 
     [
         (
             {"engine": "lrage"},
-            r"'engine' is 'lrage'; expected one of small, large, .*engine\.power",
+            r"'engine' is 'lrage'; did you mean large\? Expected one of small, large, .*engine\.power",
         ),
-        ({"engine": "lrage"}, r"Did you mean large\?$"),
-        ({"engine": ["large"]}, r"'engine' is \['large'\]; expected one of small, large"),
+        ({"engine": ["large"]}, r"'engine' is \['large'\]; .*xpected one of small, large"),
         ({"engine": {"power": 3}}, r"expected one of small, large"),
-        ({"engine.powr": 3}, r"'engine\.powr' does not exist.* Did you mean power\?$"),
+        (
+            {"engine.powr": 3},
+            r"'engine\.powr' does not exist.* did you mean power\? Expected one of",
+        ),
         ({"engine.power": "large"}, "something like 1"),
     ],
 )
