@@ -243,7 +243,7 @@ def test_a_group_with_presets_may_be_named_and_then_changed(backwards: bool) -> 
     [
         (
             {"engine": "lrage"},
-            r"'engine' is 'lrage'; did you mean large\? Expected one of small, large, .*engine\.power",
+            r"'engine' is 'lrage'; did you mean large\? Expected one of small, .*engine\.power",
         ),
         ({"engine": ["large"]}, r"'engine' is \['large'\]; .*xpected one of small, large"),
         ({"engine": {"power": 3}}, r"expected one of small, large"),
