@@ -70,8 +70,8 @@ def test_a_run_goes_on_and_a_second_one_begins_on_a_card(
 def test_evaluate_has_everything_on_the_card(
     card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
 ) -> None:
-    shown = card.submit(card_cases.evaluate_command, data, lpips, tmp_path).result()
-    assert "Evaluation" in shown
+    asked = card.submit(card_cases.evaluate_command, data, lpips, tmp_path).result()
+    assert asked == {"RenderFormer": {"cuda"}, "Lpips": {"cuda"}}
 
 
 @pytest.mark.parametrize("size", ["smoke", "tiny"])

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from model.renderformer import count_parameters
 from tests.train.kit import tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, bucket_scenes, make_batch
@@ -18,6 +19,7 @@ from train.loop.optim import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loop.step import Stepper, StepReport, predicted
 from train.loss.objective import Objective, view_l1
+from train.runs import changed_run
 from train.settings import Precision, TrainSettings
 
 RESOLUTION = 16
@@ -209,3 +211,19 @@ def test_a_fresh_network_learns_eight_pictures() -> None:
     assert reports[0].loss == pytest.approx(targets.mean().item(), rel=1e-4)  # a black start
     assert reports[-1].loss < 0.7 * median_error  # measured: 0.53
     assert min(report.grad_norm for report in reports) > 0.01
+
+
+@pytest.mark.slow
+def test_the_large_network_takes_steps() -> None:
+    """All 483 M parameters, on a processor: one scene, one window of 64 pixels, 8 GB of memory."""
+    changes = {"resolution": 64, "precision": "float32", "loss.perceptual": "ms_ssim"}
+    settings = changed_run("paper-pretrain-large", changes)
+    state = new_state(settings)
+    assert count_parameters(state.model) > 480e6
+    batch = make_batch([training_scene(toy_sample(0, resolution=64), 64)])
+    before = state.model.decoder.layers[11].self_attention.qkv.weight[0].clone()
+    stepped = stepper(state, settings)
+    reports = [stepped.step([batch], 1e-5) for _ in range(3)]
+    assert all(report.applied for report in reports)
+    assert reports[2].loss < 0.99 * reports[0].loss
+    assert not torch.equal(state.model.decoder.layers[11].self_attention.qkv.weight[0], before)

@@ -11,12 +11,10 @@ from storage.errors import TrilightError
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
-from train.loop.metrics_log import read_rows
 from train.loss.settings import LossSettings
 from train.networks import open_network
 from train.progress import Silent
 from train.run import train_run
-from train.runs import changed_run
 from train.settings import TrainSettings
 from train.start import Start
 
@@ -147,28 +145,3 @@ def test_a_network_with_windows_is_trained(dataset: Dataset, tmp_path: Path) -> 
     result = trained(settings, [str(dataset.folder.root)], tmp_path)
     # 0.61 and 0.79 of it with two seeds
     assert result.skipped_steps == 0 and result.loss_at_end < 0.9 * result.loss_at_start
-
-
-@pytest.mark.slow
-def test_the_large_network_is_trained(tmp_path: Path) -> None:
-    """483 M parameters, one window of 64 pixels, on a processor; 8 GB of memory."""
-    data = write_toy_dataset(tmp_path / "data", train=1, validation=1, resolution=64)
-    changes = {
-        "resolution": 64,
-        "num_steps": 3,
-        "warmup_steps": 0,
-        "scenes_per_step": 1,
-        "views_per_scene": 1,
-        "log_every": 1,
-        "validate_every": 3,
-        "checkpoint_every": 3,
-        "precision": "float32",
-        "loss.perceptual": "ms_ssim",
-        "augmentation.rotation": "none",
-        "augmentation.translation": 0.0,
-    }
-    settings = changed_run("paper-pretrain-large", changes)
-    result = trained(settings, [str(data.folder.root)], tmp_path / "run")
-    assert result.num_parameters > 480e6 and result.skipped_steps == 0
-    losses = [row["loss"] for row in read_rows(result.folder.metrics) if "loss" in row]
-    assert losses[2] < losses[0], "one scene, seen three times"
