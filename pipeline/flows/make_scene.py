@@ -84,16 +84,17 @@ def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
     key = sample_key(scene_index)
     settings = _state.source.settings
     failures: list[Failure] = []
+    told = ViewProgress(_state.source.folder, scene_index)
     stage = "scenes"
     try:
         scene = _scene(split, scene_index, attempt)
         stage = "renders"
-        sample = _render_sample(key, scene, settings, failures)
+        sample = _render_sample(key, scene, settings, failures, told)
     except Rejected as rejection:
         failures.append(_failure(stage, key, rejection, attempt))
         return SceneAttempt(sample=None, failures=failures)
     finally:
-        ViewProgress(_state.source.folder, scene_index).end()
+        told.end()
     return SceneAttempt(sample=sample, failures=failures)
 
 
@@ -126,14 +127,17 @@ def assets_of(split: str) -> Sequence[PooledAsset]:
 
 
 def _render_sample(
-    key: str, scene: Scene, settings: BuildSettings, failures: list[Failure]
+    key: str,
+    scene: Scene,
+    settings: BuildSettings,
+    failures: list[Failure],
+    told: ViewProgress,
 ) -> Sample:
     """Render every view, replacing the cameras of rejected ones by their next attempts.
 
     The cameras of a scene that was read from a file are what they are: a rejected one is fatal.
     """
     renderer, sight = SceneRenderer(scene, settings.renders), Sight(scene)
-    told = ViewProgress(_state.source.folder, int(key))
     pictures, records = [], []
     lights: list[NDArray[np.float32]] = []
     for view in range(scene.num_views):

@@ -50,11 +50,11 @@ def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> Non
     (tmp_path / "ab" / "train-000001.tar").unlink()
     found = CliRunner().invoke(app, ["verify", str(tmp_path / "ab")])
     assert found.exit_code == 1
-    assert "make it again of its sources: trilight shards merge" in found.output
+    assert "Make it again of its sources: trilight shards merge" in found.output
     with pytest.raises(TrilightError, match=r"made by `trilight shards merge`; expected one of"):
         repair(str(tmp_path / "ab"), ["train-000001.tar"], objects=None, scenes_from=None)
-    found = CliRunner().invoke(app, ["verify", str(_without_a_shard(a))])
-    assert "trilight verify --repair makes the named shards anew" in found.output
+    found = CliRunner().invoke(app, ["verify", str(damaged := _without_a_shard(a))])
+    assert f"Next: trilight verify {damaged} --repair" in found.output
 
 
 def _without_a_shard(root: Path) -> Path:

@@ -14,7 +14,6 @@ from infra.cli.app import app
 from infra.excursion_plots import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
-from pipeline.flows.judging_builds import JUDGING_BUILDS
 from storage.conventions import ROUGHNESS
 from storage.dataset import Dataset
 from storage.errors import TrilightError
@@ -38,7 +37,6 @@ from train.evaluation.groups import by_group, summary
 from train.evaluation.judge import judged_scene, median_picture, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
 from train.evaluation.picture_scores import MEANING, hdr_flip, picture_scores
-from train.evaluation.published import BENCHMARK
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals
 from train.loop.state import new_state
@@ -259,14 +257,6 @@ def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> N
     assert found["light passes"]["groups"]["views"] == 1
     page = markdown(found)
     assert "| groups | 1 | 31.00 | 31.00 | 31.00 | 0.5000 |" in page, page
-
-
-def test_the_benchmark_stands_beside_the_paper() -> None:
-    assert record([row(0)], {"build": "smoke"})["published"] is None
-    page = markdown(record([row(0)], {"build": BENCHMARK}))
-    assert BENCHMARK in JUDGING_BUILDS
-    assert "| psnr_linear_db | 29.77 | 30.00 |" in page and "| lpips | 0.0551 | n/a |" in page
-    assert "400 scenes" in page and "256 x 256" in page
 
 
 def test_facts_come_from_the_scene() -> None:

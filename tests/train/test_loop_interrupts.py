@@ -4,6 +4,7 @@ import ctypes
 import signal
 import threading
 import time
+from collections.abc import Iterator
 
 import pytest
 
@@ -17,6 +18,14 @@ TIMED_OUT = 110
 
 class TimeSpec(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+@pytest.fixture(autouse=True)
+def handled() -> Iterator[None]:
+    """Tests that run in the background of a shell begin with a SIGINT that is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def test_it_is_answered_while_the_main_thread_is_in_a_call_that_does_not_return() -> None:
