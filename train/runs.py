@@ -17,6 +17,7 @@ from model.config import large as large_model
 from model.config import smoke as smoke_model
 from storage.changes import changed
 from storage.errors import TrilightError
+from storage.suggestion import expected_one_of
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
 from train.settings import TrainSettings
@@ -194,9 +195,7 @@ _INTERVALS = ("log_every", "validate_every", "checkpoint_every", "keep_every")
 def named_run(name: str) -> TrainSettings:
     """Return the settings of a run; raises TrilightError for an unknown name."""
     if name not in RUNS:
-        raise TrilightError(
-            f"run {name!r}: no such run; expected one of {', '.join(sorted(RUNS))}."
-        )
+        raise TrilightError(f"run {name!r}: no such run; {expected_one_of(name, sorted(RUNS))}.")
     return RUNS[name]()
 
 

@@ -48,7 +48,7 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
         assert done.returncode == 1
         return done.stdout, done.stderr
 
-    assert "run 'smok': no such run; expected one of" in said("smok")[1]
+    assert "run 'smok': no such run; did you mean smoke?" in said("smok")[1]
     assert "setting 'widht' does not exist" in said("smoke", "--set", "widht=3")[1]
     assert "name one with --from" in said("finetune")[1]
     words, mistake = said("smoke", "--steps", "24")

@@ -23,7 +23,9 @@ def test_named_runs_carry_their_name_and_survive_json(name: str) -> None:
 
 
 def test_an_unknown_run_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(TrilightError, match="'smoek': no such run; expected one of builtin, fine"):
+    with pytest.raises(
+        TrilightError, match="'smoek': no such run; did you mean smoke.* builtin, fine"
+    ):
         named_run("smoek")
 
 
