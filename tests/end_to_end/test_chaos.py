@@ -185,7 +185,9 @@ def test_kills_of_everything_end_in_the_same_digest(tmp_path: Path) -> None:
 def _nothing_was_made_twice(out: Path) -> None:
     """A scene gets its row after it was staged for good: one in flight at a kill has none yet, and
     the kill may come between the two, so that at most one row for each kill is missing."""
-    rows = [json.loads(line)["scene"] for path in (out / "logs").iterdir() for line in path.open()]
+    rows = [
+        json.loads(line)["scene"] for path in (out / "logs").glob("*.jsonl") for line in path.open()
+    ]
     assert [scene for scene, number in Counter(rows).items() if number > 1] == []
     assert SCENES - KILLS <= len(rows) <= SCENES
 

@@ -88,7 +88,9 @@ def test_four_ways_one_digest(tmp_path: Path) -> None:
 
 def _makers(out: Path) -> set[int]:
     """Return the processes that made scenes of a dataset."""
-    return {json.loads(line)["pid"] for path in (out / "logs").iterdir() for line in path.open()}
+    return {
+        json.loads(line)["pid"] for path in (out / "logs").glob("*.jsonl") for line in path.open()
+    }
 
 
 def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
@@ -162,5 +164,5 @@ def test_ranges_at_the_same_time_and_who_is_last_finishes(tmp_path: Path) -> Non
     _generate(tmp_path / "plain", FEW)
     assert _verified(tmp_path / "set") == _verified(tmp_path / "plain")
     # nothing was made twice
-    rows = [line for path in (tmp_path / "set" / "logs").iterdir() for line in path.open()]
+    rows = [line for path in (tmp_path / "set" / "logs").glob("*.jsonl") for line in path.open()]
     assert len(rows) == FEW
