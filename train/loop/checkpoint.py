@@ -93,7 +93,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
         if "sha256" in header and header["sha256"] != _seal(*_around(data, header["sha256"])):
             raise TrilightError("its bytes are not those that were written")
     except (OSError, ValueError, TypeError, TrilightError) as error:
-        raise TrilightError(f"checkpoint {path} is not readable: {error}.") from error
+        raise TrilightError(
+            f"checkpoint {path} is not readable: {str(error).rstrip('.')}."
+        ) from error
     return Checkpoint(header=header, arrays=arrays)
 
 
