@@ -3,7 +3,14 @@
 import pytest
 
 from pipeline.objects.licences import DEFAULT_ALLOWED, UNKNOWN, USER_PROVIDED
-from storage.licences import DUTIES, duties_of, licence_url, share_alike_camp, union_of_duties
+from storage.licences import (
+    DUTIES,
+    duties_of,
+    licence_url,
+    mixed_share_alike,
+    share_alike_camp,
+    union_of_duties,
+)
 
 
 @pytest.mark.parametrize(
@@ -54,3 +61,10 @@ def test_camps_are_single_licences() -> None:
     assert share_alike_camp("CC-BY-SA-4.0") != share_alike_camp("CC-BY-SA-3.0")
     assert share_alike_camp("CC-BY-SA-3.0") != share_alike_camp("CC-BY-SA-3.0-DE")
     assert share_alike_camp("CC-BY-4.0") == share_alike_camp("CC-BY-ND-4.0") == ""
+
+
+def test_two_share_alike_licences_may_not_meet() -> None:
+    """Writing one in small letters makes no second licence of it."""
+    assert mixed_share_alike(["CC0-1.0", "CC-BY-SA-4.0", "cc-by-sa-4.0", "MIT"]) == []
+    both = ["CC-BY-SA-4.0", "MIT", "CC-BY-SA-3.0"]
+    assert mixed_share_alike(both) == ["CC-BY-SA-3.0", "CC-BY-SA-4.0"]
