@@ -91,9 +91,10 @@ def test_a_bundle_reaches_its_own_window_only(shifted: bool) -> None:
 
 def test_a_cut_is_made_once_and_asks_no_device() -> None:
     """On the meta device there is nobody to ask; what inference cut, training may use."""
-    meta = cut_windows(8, 4, shifted=True, device=torch.device("meta"))
     with torch.inference_mode():
+        meta = cut_windows(8, 4, shifted=True, device=torch.device("meta"))
         cut = cut_windows(8, 4, shifted=True, device=CPU)
     assert cut is cut_windows(8, 4, shifted=True, device=CPU)
     assert meta.groups == cut.groups == ((1, 16), (4, 8), (4, 4))
-    assert meta.order_Q.shape == cut.order_Q.shape and not cut.order_Q.is_inference()
+    assert meta.order_Q.shape == cut.order_Q.shape
+    assert not meta.order_Q.is_inference() and not cut.back_Q.is_inference()
