@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: setup setup-all dataset test test-slow test-elsewhere train serve stop lint lock third-party ranges clean
+.PHONY: setup setup-all dataset test test-slow test-elsewhere train serve stop lint lock third-party settings clean
 
 setup: $(VENV)/.dataset-ready  ## what making data needs
 
@@ -48,8 +48,8 @@ lock: setup-all  ## write the lock files anew from requirements/*.in
 third-party: setup-all  ## write docs/third_party.md anew
 	python -m infra.setup.third_party
 
-ranges: setup-all  ## write docs/ranges.md anew
-	python -m infra.setup.ranges
+settings: setup-all  ## write docs/reference/settings.md anew
+	python -m infra.setup.settings_page
 
 clean:  ## everything that make has made, except data/ and runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache *.egg-info

@@ -5,11 +5,11 @@ size cannot change: two stages, QK-norm over the full width, SwiGLU, RMSNorm bef
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 from storage.errors import TrilightError
-from storage.ranges import Within, check_ranges
+from storage.ranges import Within
+from storage.settings import checked
 
 Head = Literal["dpt", "linear"]
 
@@ -23,7 +23,7 @@ LAYERS = 256
 """Most layers of a stage: twenty times the largest published network's."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("model config")
 class ModelConfig:
     """All numbers of one network."""
 
@@ -63,7 +63,6 @@ class ModelConfig:
     """Decoder layers that feed those grids, in the same order; empty with a linear head."""
 
     def __post_init__(self) -> None:
-        check_ranges(self, "model config: ")
         if self.width % self.num_heads or self.head_width % 2:
             _wrong(f"width {self.width} in {self.num_heads} heads", "even heads of equal width")
         if 2 * VERTEX_COORDINATES * self.rope_num_freqs > self.head_width:
@@ -71,8 +70,6 @@ class ModelConfig:
             _wrong(f"rope_num_freqs {self.rope_num_freqs}", f"at most {most} for this head width")
         if self.window_bundles % 2:
             _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
-        if self.head not in ("dpt", "linear"):
-            _wrong(f"head {self.head!r}", "dpt or linear")
         if self.head == "dpt":
             self._check_dpt()
         elif self.dpt_features or self.dpt_channels or self.dpt_taps:

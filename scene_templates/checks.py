@@ -1,14 +1,14 @@
-"""Checks that every group of settings makes of its numbers; a complaint names the field."""
+"""Ranges that several groups of scene settings share, and complaints about laws between fields."""
 
-from typing import Any
+from typing import Annotated
 
 from storage.errors import TrilightError
-from storage.ranges import Within, check_ranges, declared_ranges
+from storage.ranges import LowFirst, Within
 
-Range = tuple[float, float]
+Range = Annotated[tuple[float, float], LowFirst()]
 """Least and greatest value, both included."""
 
-Counts = tuple[int, int]
+Counts = Annotated[tuple[int, int], LowFirst()]
 """Fewest and most, each number between equally likely."""
 
 SIZE = Within(1e-3, 1e3)
@@ -25,17 +25,3 @@ def require(law: bool, name: str, value: object, expected: str) -> None:
     """Raise TrilightError unless `law` holds."""
     if not law:
         raise TrilightError(f"scene settings: {name} is {value!r}; expected {expected}.")
-
-
-def check_numbers(settings: Any) -> None:
-    """Check the numbers of a settings dataclass: each in its range, and pairs in order.
-
-    Raises:
-        TrilightError: the first field that breaks a law.
-    """
-    check_ranges(settings, "scene settings: ")
-    kind: Any = type(settings)
-    for field in declared_ranges(kind):
-        if field.shape == "pair":
-            low, high = value = getattr(settings, field.name)
-            require(low <= high, field.name, value, "the lower number first")

@@ -6,10 +6,10 @@ state for a cube of side 2 are halved on use (fields that hold such numbers say 
 """
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Literal
 
-from scene_templates.checks import OFFSET, check_numbers, require
+from scene_templates.checks import OFFSET, require
 from scene_templates.contents.cameras import CameraSettings
 from scene_templates.contents.lights import LightSettings
 from scene_templates.contents.materials import MaterialSettings
@@ -18,6 +18,7 @@ from scene_templates.families.excursions import Excursion
 from scene_templates.families.family import Family
 from storage.changes import changed
 from storage.ranges import Share, Within
+from storage.settings import checked
 
 MAX_TRIANGLES = 65_535
 """Materials and objects are counted in 16 bits (storage.scene); a triangle may be a material."""
@@ -26,7 +27,7 @@ MIN_TRIANGLES = 129
 """A floor and one emitter."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class ViewLaws:
     """What a camera must see for its view to be rendered."""
 
@@ -41,11 +42,8 @@ class ViewLaws:
     min_depth: Annotated[float, OFFSET] = 0.01
     """Least distance from the camera to anything, and to the bounding box of any object."""
 
-    def __post_init__(self) -> None:
-        check_numbers(self)
 
-
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class SceneSettings:
     """What scenes are drawn from. Ranges are (low, high), both ends included."""
 
@@ -80,12 +78,9 @@ class SceneSettings:
     """Where given, scenes leave the ranges above along one axis each, in turn."""
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         require(len(self.families) > 0, "families", self.families, "at least one")
         names = [family.name for family in self.families]
         require(len(set(names)) == len(names), "families", names, "unique names")
-        known = self.centring in ("vertex_mean", "box")
-        require(known, "centring", self.centring, "vertex_mean or box")
         self._check_budget()
         for excursion in self.excursions:
             self._after(excursion)

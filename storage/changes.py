@@ -1,9 +1,10 @@
 """Settings with some values changed, by dotted names such as `lights.count`.
 
-A name leads through groups of settings; where it leads through a list of groups, each of them is
-changed. Values come as JSON has them, and must be of the kind that they replace. A group whose
-class has `PRESETS`, makers by name, may also be replaced as a whole by one of those, and single
-settings of it are then changes of the preset: model=large with model.window_bundles=0.
+A name leads through groups of settings, and through a list of them by the number of an entry, as in
+`families.0.weight`; without a number each entry is changed. Values come as JSON has them, lists and
+whole groups included. A group whose class has `PRESETS`, makers by name, may also be replaced by
+one of those, and single settings of it are then changes of the preset: model=large with
+model.window_bundles=0.
 """
 
 import dataclasses
@@ -11,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from storage.errors import TrilightError
+from storage.settings import field_value
 from storage.suggestion import expected_one_of
 
 Settings = TypeVar("Settings")
@@ -34,20 +36,9 @@ def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
 
 
 def _changed(group: Any, changes: Sequence[Change]) -> Any:
-    if not changes:
-        return group
-    if _is_group(group) and isinstance(group, tuple):
-        return tuple(_changed(entry, changes) for entry in group)
-    values = {}
-    for field, own in _by_field(group, changes).items():
-        old = getattr(group, field)
-        if _is_group(old):
-            inner = [(path[1:], value, name) for path, value, name in own]
-            base = _preset(old, [change for change in inner if not change[0]])
-            values[field] = _changed(base, [change for change in inner if change[0]])
-        else:
-            ((_, value, name),) = own
-            values[field] = _like(old, value, name)
+    values = {
+        field: _changed_field(group, field, own) for field, own in _by_field(group, changes).items()
+    }
     try:
         return dataclasses.replace(group, **values)
     except TrilightError as error:
@@ -68,67 +59,66 @@ def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Ch
                 f"setting {name!r} does not exist: {path[0]!r} is unknown there; "
                 f"{expected_one_of(path[0], fields)}."
             )
-        old = getattr(group, path[0])
-        if _is_group(old) and len(path) == 1 and not _presets(old):
-            raise TrilightError(
-                f"setting {name!r}: {path[0]!r} is a group: name one of its settings."
-            )
-        if not _is_group(old) and len(path) > 1:
-            raise TrilightError(f"setting {name!r}: {path[0]!r} is a single setting.")
-        found.setdefault(path[0], []).append((path, value, name))
+        found.setdefault(path[0], []).append((path[1:], value, name))
     return found
 
 
-def _presets(group: Any) -> Mapping[str, Callable[[], Any]]:
-    """Return what a group may be replaced by, by name."""
-    return getattr(group, "PRESETS", {})
+def _changed_field(group: Any, field: str, changes: Sequence[Change]) -> Any:
+    """Return a field's new value: first as a whole, then single settings within it."""
+    value = getattr(group, field)
+    for path, new, name in changes:
+        if not path:
+            value = _whole(type(group), field, value, new, name)
+    return _within(value, [change for change in changes if change[0]])
 
 
-def _preset(group: Any, changes: Sequence[Change]) -> Any:
-    """Return the preset that was named for a group, or the group where none was."""
-    presets = _presets(group)
-    for _, value, name in changes:
-        if not isinstance(value, str) or value not in presets:
+def _whole(kind: type, field: str, old: Any, new: Any, name: str) -> Any:
+    presets: Mapping[str, Callable[[], Any]] = getattr(old, "PRESETS", {})
+    if presets and not isinstance(new, Mapping):
+        if not isinstance(new, str) or new not in presets:
             raise TrilightError(
-                f"setting {name!r} is {value!r}; {expected_one_of(str(value), presets)}, or one "
-                f"of its settings by name, such as {name}.{dataclasses.fields(group)[0].name}."
+                f"setting {name!r} is {new!r}; {expected_one_of(str(new), presets)}, or one of its "
+                f"settings by name, such as {name}.{dataclasses.fields(old)[0].name}."
             )
-        group = presets[value]()
-    return group
+        return presets[new]()
+    if dataclasses.is_dataclass(old) and not isinstance(new, Mapping):
+        raise TrilightError(
+            f"setting {name!r} is {new!r}, but it is a group; expected names with values, or one "
+            f"of its settings by name, such as {name}.{dataclasses.fields(old)[0].name}."
+        )
+    return field_value(kind, field, new, name)
 
 
-def _is_group(value: Any) -> bool:
-    first = value[0] if isinstance(value, tuple) and value else value
-    return dataclasses.is_dataclass(first)
+def _within(value: Any, changes: Sequence[Change]) -> Any:
+    """Return a group, or a list of groups, with single settings of it changed."""
+    if not changes:
+        return value
+    if dataclasses.is_dataclass(value):
+        for path, new, name in changes:
+            if not path:
+                raise TrilightError(
+                    f"setting {name!r} is {new!r}; expected one of its settings by name, such as "
+                    f"{name}.{dataclasses.fields(value)[0].name}."
+                )
+        return _changed(value, changes)
+    if not isinstance(value, tuple) or not all(map(dataclasses.is_dataclass, value)):
+        _, _, name = changes[0]
+        raise TrilightError(f"setting {name!r} does not exist: it leads into a single setting.")
+    own: list[list[Change]] = [[] for _ in value]
+    for path, new, name in changes:
+        for index in _entries(path[0], len(value), name):
+            inner = path[1:] if path[0].isdigit() else path
+            own[index].append((inner, new, name))
+    return tuple(map(_within, value, own))
 
 
-def _like(old: Any, value: Any, name: str) -> Any:
-    """Return a JSON value as the kind of the value that it replaces."""
-    if isinstance(value, list):
-        value = tuple(value)
-    if not _same_kind(old, value):
-        shown = list(old) if isinstance(old, tuple) else old
-        expected = "true or false" if isinstance(old, bool) else f"something like {shown!r}"
-        raise TrilightError(f"setting {name!r} is {value!r}; expected {expected}.")
-    if isinstance(old, tuple) and all(isinstance(part, float) for part in old):
-        return tuple(float(part) for part in value)
-    return float(value) if isinstance(old, float) else value
-
-
-def _same_kind(old: Any, value: Any) -> bool:
-    if isinstance(old, bool) or isinstance(value, bool):
-        return isinstance(old, bool) and isinstance(value, bool)
-    if isinstance(old, tuple):
-        if not isinstance(value, tuple):
-            return False
-        if not old:
-            return not value
-        of_numbers = all(_is_number(part) for part in old)
-        return all(_is_number(part) == of_numbers for part in value)
-    if isinstance(old, float):
-        return isinstance(value, int | float)
-    return old is None or isinstance(value, type(old))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _entries(step: str, count: int, name: str) -> Sequence[int]:
+    """Return which entries of a list a step means: the one of its number, or all."""
+    if not step.isdigit():
+        return range(count)
+    if int(step) >= count:
+        raise TrilightError(
+            f"setting {name!r} does not exist: the list has {count} entries; expected a number "
+            f"from 0 to {count - 1}."
+        )
+    return [int(step)]

@@ -15,7 +15,6 @@ a view that no level serves, or serves in fewer bytes, is packed without loss.
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -43,20 +42,6 @@ MAX_ARRAY_BYTES = 1 << 28
 
 _GZIP = 31
 """zlib's name for a gzip stream; its header then holds no time."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StorageSettings:
-    """How a dataset is packed."""
-
-    profile: Profile = "compact"
-    """`lossless`, or `compact`: about five times smaller, within the law of the tenth."""
-
-    def __post_init__(self) -> None:
-        if self.profile not in PROFILES:
-            raise TrilightError(
-                f"profile is {self.profile!r}; expected one of {', '.join(PROFILES)}."
-            )
 
 
 def pack_picture(

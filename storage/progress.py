@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically, write_error
+from storage.dataset_settings import SplitSettings
 from storage.derived import derivation_of
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder, numbered
 from storage.manifest import Manifest, read_manifest
-from storage.splits import SplitSettings, scenes_of_shard, shard_name, shards_for
+from storage.splits import scenes_of_shard, shard_name, shards_for
 
 _AT_WORK_S = 600.0
 """What is told of a scene is not older than a pass of samples takes; else a kill has left it."""

@@ -2,22 +2,19 @@
 
     fov_deg: Annotated[Range, Within(1, 170, unit="degrees")] = (30.0, 60.0)
 
-`check_ranges` is what `__post_init__` calls, `docs/ranges.md` is printed from the same declarations
-(infra.setup.ranges), and tests/extremes goes to both ends of each and one step outside. Laws
-between fields are none of this: they stay in `__post_init__`, or in `Scene.check`.
+`storage.settings` checks them, and tests/extremes goes to both ends of each and one step outside.
+Laws between fields are none of this: they stay in `__post_init__`, or in `Scene.check`.
 """
 
 import functools
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
-
-from storage.errors import TrilightError
 
 
 @dataclass(frozen=True)
@@ -41,6 +38,16 @@ class Within:
         below = value < self.high if self.high_open else value <= self.high
         return above & below
 
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Let pydantic check the range after the type: of a number, or of each in a tuple."""
+        from pydantic_core import core_schema  # whoever only reads scenes has no need of it
+
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+        """Let forms show the range, at the number or at the entries of a list."""
+        return self._bounded(handler(schema))
+
     def __str__(self) -> str:
         """Return the range as the end of a sentence, such as `from 1 to 170 degrees`."""
         low, high = shown_number(self.low), shown_number(self.high)
@@ -50,6 +57,54 @@ class Within:
         else:
             end = f", up to {high}" if self.low_open else f" to {high}"
         return start + end + (f" {self.unit}" if self.unit else "")
+
+    def _checked(self, value: Any) -> Any:
+        from pydantic_core import PydanticCustomError
+
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not all(number is None or self.holds(number) for number in numbers):
+            raise PydanticCustomError(
+                "outside_range", "expected numbers {range}", {"range": str(self)}
+            )
+        return value
+
+    def _bounded(self, form: dict[str, Any]) -> dict[str, Any]:
+        """Return a JSON schema with the ends of the range, but for those that are no limit."""
+        if "anyOf" in form:
+            return form | {"anyOf": [self._bounded(option) for option in form["anyOf"]]}
+        if form.get("type") == "array":  # pairs as lists too: forms know no tuples
+            rest = {name: part for name, part in form.items() if name != "prefixItems"}
+            return rest | {"items": self._bounded(form.get("items") or form["prefixItems"][0])}
+        if form.get("type") not in ("integer", "number"):
+            return form
+        bounds: dict[str, Any] = {}
+        if abs(self.low) <= _EXACT:
+            bounds["exclusiveMinimum" if self.low_open else "minimum"] = self.low
+        if abs(self.high) <= _EXACT:
+            bounds["exclusiveMaximum" if self.high_open else "maximum"] = self.high
+        return form | bounds
+
+
+_EXACT = 2**53
+"""Beyond it forms show other numbers than were meant: JavaScript has no larger integers."""
+
+
+@dataclass(frozen=True)
+class LowFirst:
+    """Of a pair: the first number is at most the second."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Let pydantic check the order after the type."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def _checked(self, pair: tuple[float, float]) -> tuple[float, float]:
+        from pydantic_core import PydanticCustomError
+
+        if pair[0] > pair[1]:
+            raise PydanticCustomError("not_in_order", "expected the lower number first")
+        return pair
 
 
 @dataclass(frozen=True)
@@ -99,22 +154,16 @@ class Declared:
     """Whether None is admitted."""
     within: Within
     """Where every number lies."""
+    ordered: bool = False
+    """Whether the lower number of a pair must come first."""
     part: Columns | None = None
     """The columns that are meant, where it is not the whole array."""
 
     @property
     def expected(self) -> str:
         """What to write, for a person; not of arrays."""
-        return f"{_EXPECTED[self.shape, self.kind]} {self.within}"
-
-    def admits(self, value: Any) -> bool:
-        """Return whether a field may have this value; not of arrays."""
-        if value is None:
-            return self.optional
-        if self.shape == "one":
-            return self._admits_number(value)
-        fits = isinstance(value, tuple) and (self.shape == "many" or len(value) == 2)
-        return fits and all(self._admits_number(part) for part in value)
+        order = ", the lower one first" if self.ordered else ""
+        return f"{_EXPECTED[self.shape, self.kind]} {self.within}{order}"
 
     def outside(self, array: NDArray) -> NDArray[np.bool_]:
         """Return where an array breaks the range, in its shape."""
@@ -124,29 +173,6 @@ class Declared:
         columns = self.part.columns
         wrong[..., columns] = ~self.within.holds(array[..., columns])
         return wrong
-
-    def _admits_number(self, value: Any) -> bool:
-        kinds = int if self.kind is int else (int, float)
-        if not isinstance(value, kinds) or isinstance(value, bool):
-            return False
-        return bool(self.within.holds(value))
-
-
-def check_ranges(settings: Any, where: str = "", named: Callable[[str], str] = str) -> None:
-    """Raise TrilightError for the first field of a dataclass that is outside of its range.
-
-    Args:
-        settings: an instance without arrays; fields without a declaration are passed over.
-        where: begins the message, such as `train settings: `.
-        named: what a field is called where it was written, such as its option.
-    """
-    kind: Any = type(settings)
-    for field in declared_ranges(kind):
-        value = getattr(settings, field.name)
-        if not field.admits(value):
-            raise TrilightError(
-                f"{where}{named(field.name)} is {value!r}; expected {field.expected}."
-            )
 
 
 @functools.cache
@@ -167,11 +193,12 @@ def shown_number(number: float) -> str:
 
 
 def _declarations_of(name: str, hint: Any) -> Iterator[Declared]:
-    optional, found = False, list[Within | Columns]()
+    optional, ordered, found = False, False, list[Within | Columns]()
     while True:
         if get_origin(hint) is Annotated:
             hint, *notes = get_args(hint)
             found += [note for note in notes if isinstance(note, Within | Columns)]
+            ordered = any(isinstance(note, LowFirst) for note in notes)
         elif get_origin(hint) in (typing.Union, types.UnionType) and type(None) in get_args(hint):
             optional = True
             hint = next(arg for arg in get_args(hint) if arg is not type(None))
@@ -184,6 +211,7 @@ def _declarations_of(name: str, hint: Any) -> Iterator[Declared]:
             kind=kind,
             shape=shape,
             optional=optional,
+            ordered=ordered,
             within=note.within if isinstance(note, Columns) else note,
             part=note if isinstance(note, Columns) else None,
         )
@@ -192,6 +220,8 @@ def _declarations_of(name: str, hint: Any) -> Iterator[Declared]:
 def _kind_and_shape(hint: Any) -> tuple[type, Shape]:
     if hint in (int, float):
         return hint, "one"
+    if hint == int | float:  # a whole number stays one
+        return float, "one"
     if get_origin(hint) is tuple:
         first, second = get_args(hint)
         return first, "many" if second is ... else "pair"

@@ -14,6 +14,7 @@ from model.weights import decode_config, encode_weights
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.settings import settings_record
 from storage.training_data import TrainingData, open_training_data
 from train.data.scenes import training_scene
 from train.data.splits import first_samples
@@ -32,7 +33,7 @@ from train.loss.objective import Objective
 from train.networks import open_network
 from train.progress import Progress, Silent
 from train.result import TrainResult, finished, pretty_json
-from train.settings import TrainSettings, settings_record
+from train.settings import TrainSettings
 from train.start import Start
 
 MEDIAN_SCENES = 256

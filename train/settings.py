@@ -4,14 +4,13 @@ A run is a Python function that returns the whole description (train.runs); the 
 one and may replace fields. What is not here cannot be changed.
 """
 
-import dataclasses
-import json
-from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, get_args
+from dataclasses import field
+from typing import Annotated, Literal
 
 from model.config import ModelConfig
 from storage.errors import TrilightError
-from storage.ranges import Seed, Share, Within, check_ranges
+from storage.ranges import Seed, Share, Within
+from storage.settings import checked
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
 
@@ -25,7 +24,7 @@ BelowOne = Within(0, 1, high_open=True)
 """Of the decay of a running mean; at 1 it would never move."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("train settings")
 class TrainSettings:
     """Everything that decides which weights come out, beside the data."""
 
@@ -92,7 +91,6 @@ class TrainSettings:
     """Most scenes of the validation split that are judged."""
 
     def __post_init__(self) -> None:
-        check_ranges(self, "train settings: ")
         picture_px = self.model.picture_px
         if self.resolution % picture_px:
             _wrong("resolution", self.resolution, f"a multiple of {picture_px} for this network")
@@ -101,53 +99,6 @@ class TrainSettings:
                 _wrong(name, getattr(self, name), f"a multiple of log_every, {self.log_every}")
         if self.warmup_steps >= self.num_steps:
             _wrong("warmup_steps", self.warmup_steps, f"0 to {self.num_steps - 1}")
-        if self.precision not in get_args(Precision):
-            _wrong("precision", self.precision, " or ".join(get_args(Precision)))
-
-
-GROUPS = {"model": ModelConfig, "loss": LossSettings, "augmentation": AugmentationSettings}
-"""The settings that have fields of their own."""
-
-
-def settings_record(settings: TrainSettings) -> dict[str, Any]:
-    """Return the settings as JSON values."""
-    record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(settings)))
-    return record
-
-
-def stated_record(settings: TrainSettings) -> dict[str, Any]:
-    """Return the settings that are not at their default.
-
-    A digest of these stays what it is when a field is added, with what was done before as default.
-    """
-    record = settings_record(settings)
-    stated = _without(record, _defaults(TrainSettings))
-    for name, kind in GROUPS.items():
-        stated[name] = _without(record[name], _defaults(kind))
-    return stated
-
-
-def completed_record(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the record of older settings with the fields that came later.
-
-    A field came with a default that is what was done before.
-    """
-    completed = {name: _defaults(kind) | record.get(name, {}) for name, kind in GROUPS.items()}
-    return _defaults(TrainSettings) | record | completed
-
-
-def _defaults(settings: type) -> dict[str, Any]:
-    given = {
-        field.name: field.default
-        for field in dataclasses.fields(settings)
-        if field.default is not dataclasses.MISSING and not dataclasses.is_dataclass(field.default)
-    }
-    record: dict[str, Any] = json.loads(json.dumps(given))
-    return record
-
-
-def _without(record: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in record.items() if (name, value) not in defaults.items()}
 
 
 def _wrong(name: str, got: object, expected: str) -> None:

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from model.config import ModelConfig
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.settings import settings_record
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
 from train.runs import smoke
-from train.settings import TrainSettings, stated_record
+from train.settings import TrainSettings
 
 BASELINE = "ours"
 
@@ -74,7 +75,9 @@ class Job:
 
     def digest(self) -> str:
         """Return what a result is known by: all settings, those at their default unsaid."""
-        return sha256_hex(canonical_json(stated_record(self.settings())))
+        return sha256_hex(
+            canonical_json({"augmentation": {}, **settings_record(self.settings(), stated=True)})
+        )
 
 
 def _network(width: int, layers: int) -> ModelConfig:

@@ -23,7 +23,8 @@ from pipeline.renders.settings import PASS_SPP, NoiseFloor, RenderSettings, Reso
 from pipeline.renders.variant import choose_variant
 from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.errors import TrilightError
-from storage.ranges import Seed, Within, check_ranges
+from storage.ranges import Seed, Within
+from storage.settings import checked
 
 if TYPE_CHECKING:
     from pipeline.renders.renderer import Sampling
@@ -37,7 +38,12 @@ FIRST_SPP = 2 * PASS_SPP[1]
 """Fewer samples, and the noise floor may flatter (pipeline.renders.noise_floor)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+def _option(name: str) -> str:
+    """Return the option that a field stands for."""
+    return "--" + re.sub("_(db|deg|ev)$", "", name).replace("_", "-")
+
+
+@checked(option=_option)
 class Asked:
     """What the user asked for; names are those of the options."""
 
@@ -81,9 +87,6 @@ class Asked:
     """Of the processor; None for all cores."""
     albedo_over_one: AlbedoOverOne = "scale"
     """Of RenderFormer's JSON, where diffuse and specular albedos add up to more than 1."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, named=_option)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -188,11 +191,6 @@ def _require_torch() -> None:
         raise TrilightError(
             "--engine neural needs PyTorch, which is not installed; expected it: make setup-all."
         ) from error
-
-
-def _option(name: str) -> str:
-    """Return the option that a field stands for."""
-    return "--" + re.sub("_(db|deg|ev)$", "", name).replace("_", "-")
 
 
 def _settings(asked: Asked) -> RenderSettings:

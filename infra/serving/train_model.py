@@ -8,7 +8,7 @@ import contextlib
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Any, Literal
 
 from prefect import flow
@@ -20,7 +20,8 @@ from pipeline.flows.served.limits import GPU_LIMIT
 from pipeline.flows.served.process import run_to_end
 from pipeline.flows.served.schema import PublicUrl, changed_values, changes_form, parameters_of
 from storage.errors import TrilightError
-from storage.ranges import Within, check_ranges
+from storage.ranges import Within
+from storage.settings import checked
 from train.runs import RUNS, changed_run, smoke
 from train.settings import TrainSettings
 from train.start import Start
@@ -31,7 +32,7 @@ RunChanges = changes_form(TrainSettings, smoke())
 """Every setting of a run; what stays empty is as the run has it."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked()
 class TrainOrder:
     """What a person says of a training run."""
 
@@ -57,7 +58,6 @@ class TrainOrder:
     """Processes on this machine, started by torchrun; one for each graphics card."""
 
     def __post_init__(self) -> None:
-        check_ranges(self)
         if not self.data:
             raise TrilightError("data is empty; expected at least one dataset.")
 

@@ -1,11 +1,11 @@
 """Settings of the mesh stage."""
 
 import dataclasses
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from storage.errors import TrilightError
-from storage.ranges import Within, check_ranges
+from storage.ranges import Within
+from storage.settings import checked
 
 Profile = Literal["faithful", "uniform"]
 
@@ -13,7 +13,7 @@ PART = Within(0, 1, low_open=True)
 """A share that is more than nothing."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked()
 class GateSettings:
     """What a level must keep of its source, whatever made it."""
 
@@ -33,12 +33,11 @@ class GateSettings:
 
     def __post_init__(self) -> None:
         """Raise TrilightError for values that no level, or any, could meet."""
-        check_ranges(self)
         if not self.area_ratio[0] < 1 < self.area_ratio[1]:
             raise TrilightError(f"area_ratio is {self.area_ratio}; expected numbers around 1.")
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked()
 class AssetSettings:
     """How finely objects are kept, and what is refused. Importing it loads no mesh library."""
 
@@ -68,9 +67,6 @@ class AssetSettings:
 
     def __post_init__(self) -> None:
         """Raise TrilightError for values that contradict each other or their meaning."""
-        check_ranges(self)
-        if self.profile not in ("faithful", "uniform"):
-            raise TrilightError(f"profile is {self.profile!r}; expected faithful or uniform.")
         falling = all(a > b for a, b in zip(self.budgets, self.budgets[1:], strict=False))
         if not self.budgets or not falling:
             raise TrilightError(f"budgets is {self.budgets}; expected falling numbers.")

@@ -9,6 +9,7 @@ from pipeline.flows.publication import Publication, begin, require_free
 from pipeline.flows.settings import BuildSettings
 from pipeline.shards.mirror import Mirror
 from storage.dataset import Dataset
+from storage.dataset_settings import SplitSettings
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry, read_manifest
@@ -16,7 +17,7 @@ from storage.objects_lock import encode_objects_lock
 from storage.records import LockedObject
 from storage.remote.bucket import Bucket
 from storage.remote.url import RemoteUrl, parse_url
-from storage.splits import SplitSettings, shard_name
+from storage.splits import shard_name
 
 
 class BucketPublication(Publication):

@@ -8,8 +8,7 @@ from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.flows.settings import BuildSettings
 from pipeline.renders.settings import RenderSettings
 from scene_templates.families.frozen_v1 import SCENES_V1
-from storage.profiles import StorageSettings
-from storage.splits import SplitSettings
+from storage.dataset_settings import SplitSettings, StorageSettings
 
 _LICENCES = (
     "CC0-1.0",

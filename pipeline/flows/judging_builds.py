@@ -9,7 +9,7 @@ from pipeline.flows.frozen_v1 import BUILD_V1, JUDGING_SPLITS
 from pipeline.flows.settings import BuildSettings, NamedBuild
 from pipeline.objects.generated import BENCHMARK
 from scene_templates.families.out_of_range import out_of_range_settings
-from storage.profiles import StorageSettings
+from storage.dataset_settings import StorageSettings
 
 _EXACT = StorageSettings(profile="lossless")
 

@@ -11,11 +11,12 @@ from pipeline.flows.settings import BuildSettings
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.shards.pack import pack_shard
 from storage.claims import claimed
+from storage.dataset_settings import SplitSettings
 from storage.layout import DatasetFolder, numbered
 from storage.manifest import ShardEntry
 from storage.records import Failure
 from storage.sample import Sample, sample_key
-from storage.splits import SplitSettings, scenes_of_shard, shard_name, split_of_shard
+from storage.splits import scenes_of_shard, shard_name, split_of_shard
 from storage.staging import is_staged, stage_scene
 
 log = logging.getLogger("trilight.scenes")

@@ -2,22 +2,23 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, Any
 
 from pipeline.flows.builds import BUILDS
 from pipeline.renders.settings import NoiseFloor, Resolution
-from pipeline.scenes.described_albedos import AlbedoOverOne, require_choice
+from pipeline.scenes.described_albedos import AlbedoOverOne
+from storage.dataset_settings import MOST_SCENES
 from storage.errors import TrilightError
 from storage.output import dataset_folder
-from storage.ranges import Seed, Share, Within, check_ranges
-from storage.splits import MOST_SCENES
+from storage.ranges import Seed, Share, Within
+from storage.settings import checked
 from storage.suggestion import expected_one_of
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked()
 class DatasetOrder:
     """Which dataset to make, or which part of it, and how."""
 
@@ -66,7 +67,6 @@ class DatasetOrder:
         if self.build not in BUILDS:
             expected = expected_one_of(self.build, BUILDS)
             raise TrilightError(f"build {self.build!r} is unknown; {expected}.")
-        check_ranges(self)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(
                 f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "
@@ -74,7 +74,6 @@ class DatasetOrder:
             )
         if self.scenes_from is None and self.views is not None:
             raise TrilightError(f"--views is {self.views}; expected it only with --scenes-from.")
-        require_choice(self.albedo_over_one)
         dataset_folder(self.out)
         self.shard_range()
 

@@ -8,8 +8,9 @@ one, each when it is handed out.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from storage.dataset_settings import SplitSettings
 from storage.errors import EnvironmentFailure
-from storage.splits import SplitSettings, scenes_of_shard
+from storage.splits import scenes_of_shard
 
 MOST_TASKS = 1000
 """Task runs of one flow run: Prefect's server takes in about 20 a second, of 19 kB each."""

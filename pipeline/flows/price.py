@@ -1,9 +1,9 @@
 """What computing costs: one range for the options and the environment."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
-from storage.ranges import Within, check_ranges
+from storage.ranges import Within
+from storage.settings import checked
 
 USD_PER_CORE_HOUR = 0.04
 """Unless somebody says otherwise."""
@@ -11,12 +11,9 @@ PRICES = Within(0, 1000, unit="USD per core-hour")
 """Ten thousand times what a core is rented for."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked(option="--{}".format)
 class CorePrice:
     """What `--price` says, of `plan`, `status` and `bench`."""
 
     price: Annotated[float, PRICES] = USD_PER_CORE_HOUR
     """An hour of one core."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, named=lambda name: f"--{name}")

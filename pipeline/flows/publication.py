@@ -10,6 +10,7 @@ from pipeline.flows.settings import BuildSettings, differences
 from pipeline.shards.notes import forget_note, note_shard, noted_shard
 from pipeline.shards.pack import rejections_of_shard
 from storage.dataset import Dataset, open_dataset
+from storage.dataset_settings import SplitSettings
 from storage.derived import derivation_of
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -18,13 +19,7 @@ from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry, read_manifest, write_manifest
 from storage.objects_lock import encode_objects_lock, write_objects_lock
 from storage.records import Failure, LockedObject
-from storage.splits import (
-    SplitSettings,
-    planned_scenes,
-    scenes_of_shard,
-    shard_name,
-    shards_for,
-)
+from storage.splits import planned_scenes, scenes_of_shard, shard_name, shards_for
 
 _LOOKS = 7
 """For a shard that a worker says it has packed; network file systems may show it a minute later."""

@@ -1,8 +1,6 @@
 """`BuildSettings`: everything that decides what a dataset holds, except how many scenes."""
 
 import dataclasses
-import types
-import typing
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,14 +8,14 @@ from typing import Any
 from pipeline.assets.settings import AssetSettings
 from pipeline.renders.settings import RenderSettings
 from scene_templates.settings import SceneSettings
+from storage.dataset_settings import SplitSettings, StorageSettings
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.profiles import StorageSettings
-from storage.ranges import Seed, check_ranges
-from storage.splits import SplitSettings
+from storage.ranges import Seed
+from storage.settings import checked, settings_record
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked()
 class BuildSettings:
     """The settings of one dataset. They stand in its manifest and never change."""
 
@@ -41,16 +39,12 @@ class BuildSettings:
     """How arrays and pictures are packed."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.source, str | None):
-            raise TrilightError(f"source is {self.source!r}; expected a source of objects.")
-        check_ranges(self)
         if not self.allowed_licences:
             raise TrilightError("allowed_licences is empty; expected at least one licence.")
 
     def as_json(self) -> dict[str, Any]:
         """Return the settings as JSON values."""
-        plain = dataclasses.asdict(self)
-        return typing.cast(dict[str, Any], _plain(plain))
+        return settings_record(self)
 
     @property
     def digest(self) -> str:
@@ -80,13 +74,3 @@ def differences(
             yield from differences(old, new, f"{prefix}{name}.")
         elif old != new:
             yield f"{prefix}{name}", old, new
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON would give it back: tuples become lists."""
-    if isinstance(value, Mapping):
-        return {name: _plain(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    assert isinstance(value, str | int | float | bool | types.NoneType), value
-    return value

@@ -28,7 +28,7 @@ from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.renders.settings import RenderSettings
 from scene_templates.families.default_families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
-from storage.splits import SplitSettings
+from storage.dataset_settings import SplitSettings
 
 
 def smoke() -> BuildSettings:

@@ -1,12 +1,12 @@
 """`RenderSettings`: how good a picture must be, and how much it may cost."""
 
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB
-from storage.ranges import Within, check_ranges
+from storage.ranges import Within
+from storage.settings import checked
 
 PASS_SPP = (64, 16, 4)
 """Samples per pixel of one pass of a half, from best to cheapest: squares, as the sampler needs.
@@ -34,7 +34,7 @@ Depth = Annotated[int, Within(1, 1024, unit="edges")]
 """Length of a path."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("render settings")
 class RenderSettings:
     """The target, the budget and the estimator of every picture of a build."""
 
@@ -67,7 +67,6 @@ class RenderSettings:
     about as many times as long as there are emitters."""
 
     def __post_init__(self) -> None:
-        check_ranges(self, "render settings: ")
         _require(
             self.resolution % 8 == 0,
             f"resolution is {self.resolution}; expected a multiple of 8",
@@ -83,10 +82,6 @@ class RenderSettings:
             f"and a cap of a multiple of {2 * PASS_SPP[0]} for the best sampling",
         )
         _require(self.aux_spp in PASS_SPP, f"aux_spp is {self.aux_spp}; expected one of {PASS_SPP}")
-        _require(
-            self.denoiser in ("high", "fast", "off"),
-            f"denoiser is {self.denoiser!r}; expected high, fast or off",
-        )
 
 
 def _require(law: bool, complaint: str) -> None:

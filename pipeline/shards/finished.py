@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from storage.dataset_settings import SplitSettings
 from storage.derived import derivation_of
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
@@ -16,7 +17,7 @@ from storage.objects_lock import read_objects_lock
 from storage.profiles import PACKED, PLAIN, unpack_arrays
 from storage.records import LockedObject
 from storage.safe_url import safe_url
-from storage.splits import SplitSettings, shards_for
+from storage.splits import shards_for
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

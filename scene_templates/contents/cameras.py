@@ -1,18 +1,18 @@
 """Cameras: they look near the origin from the open side of a layout."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from scene_templates.checks import OFFSET, SIZE, Range, check_numbers
+from scene_templates.checks import OFFSET, SIZE, Range
 from scene_templates.layout import CameraPose
 from scene_templates.templates.sectors import Sector
 from storage.conventions import look_at_c2w
 from storage.ranges import Within
+from storage.settings import checked
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class CameraSettings:
     """What cameras are drawn from, as published."""
 
@@ -24,9 +24,6 @@ class CameraSettings:
     """Most offset per axis of a camera's up vector from +Z."""
     fov_deg: Annotated[Range, Within(1, 170, unit="degrees")] = (30.0, 60.0)
     """Full field of view, horizontal and vertical."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self)
 
 
 def camera_rand(rng: np.random.Generator, settings: CameraSettings, sector: Sector) -> CameraPose:

@@ -1,17 +1,17 @@
 """Emitters: a few small bright triangles outside the room, on its open side."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.checks import OFFSET, SIZE, Counts, Range, check_numbers, require
-from scene_templates.contents.rotations import ORIENTATIONS, Orientation, rotated, rotation_rand
+from scene_templates.checks import OFFSET, SIZE, Counts, Range
+from scene_templates.contents.rotations import Orientation, rotated, rotation_rand
 from scene_templates.layout import Emitter
 from scene_templates.templates.sectors import Sector
 from storage.ranges import Share, Within
+from storage.settings import checked
 
 TRIANGLE = 0.025 * np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
 """The published emitter before scaling: equilateral, edge 0.0707."""
@@ -30,7 +30,7 @@ PALEST = 0.2
 """Least channel of a coloured light before its mean is made 1: no light is quite monochrome."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class LightSettings:
     """What emitters are drawn from."""
 
@@ -56,11 +56,6 @@ class LightSettings:
     with an albedo of 1."""
     num_inside: Annotated[int, Within(0, MOST_LIGHTS, unit="emitters")] = 0
     """How many of the emitters hang in the middle of objects instead, for tests out of range."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self)
-        known = self.orientation in ORIENTATIONS
-        require(known, "orientation", self.orientation, " or ".join(ORIENTATIONS))
 
 
 def emitters_rand(

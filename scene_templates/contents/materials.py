@@ -6,17 +6,17 @@ albedo everywhere.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
-from scene_templates.checks import Range, check_numbers, require
+from scene_templates.checks import Range, require
 from scene_templates.layout import Surface
 from storage.ranges import Share, Within
+from storage.settings import checked
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class MaterialSettings:
     """What surfaces are drawn from."""
 
@@ -43,7 +43,6 @@ class MaterialSettings:
     """An edge sharper than this separates shading groups."""
 
     def __post_init__(self) -> None:
-        check_numbers(self)
         low, bias = self.roughness_log[0], self.roughness_bias
         require(low >= bias, "roughness_bias", bias, "at most roughness_log's low")
 

@@ -13,13 +13,14 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.checks import Range, check_numbers, require
-from scene_templates.contents.rotations import ORIENTATIONS, Orientation, rotated, rotation_rand
+from scene_templates.checks import Range
+from scene_templates.contents.rotations import Orientation, rotated, rotation_rand
 from scene_templates.layout import Plane, Pose
 from scene_templates.shell.patches import SIDES
 from scene_templates.shell.rooms import Room
 from storage.errors import Rejected
 from storage.ranges import Share
+from storage.settings import checked
 
 ARRANGEMENT_TRIES = 100
 """Draws of all sizes before the scene is given up."""
@@ -31,7 +32,7 @@ TOUCHING = 1e-9
 """World units below which a resting object still counts as inside: rounding of float64 sums."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class PlacementSettings:
     """How objects are put into the room."""
 
@@ -45,11 +46,6 @@ class PlacementSettings:
     inside: bool = True
     """Objects stay on the room's side of the floor and walls. Otherwise, as published, their
     centres are uniform in the cube [-0.5, 0.5]^3 and they may stick through."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self)
-        known = self.orientation in ORIENTATIONS
-        require(known, "orientation", self.orientation, " or ".join(ORIENTATIONS))
 
 
 class Shape(Protocol):

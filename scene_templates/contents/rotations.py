@@ -9,10 +9,6 @@ Orientation = Literal["uniform", "euler"]
 """`uniform` on SO(3), or three `euler` angles as published, which prefer the poles."""
 
 
-ORIENTATIONS: tuple[Orientation, ...] = ("uniform", "euler")
-"""All of them."""
-
-
 def rotation_rand(rng: np.random.Generator, orientation: Orientation) -> NDArray[np.float64]:
     """Return a rotation [3, 3] of the stated distribution."""
     if orientation == "euler":

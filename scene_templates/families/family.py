@@ -1,16 +1,16 @@
 """A family: one layout with how many objects of which size it holds, and how often it is drawn."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
-from scene_templates.checks import SIZE, Counts, Range, check_numbers, require
+from scene_templates.checks import SIZE, Counts, Range, require
 from scene_templates.shell.rooms import SharedRoom
 from scene_templates.shell.separate_sides import SeparateSides
 from scene_templates.templates.registry import TEMPLATES
 from storage.ranges import Share, Within
+from storage.settings import checked
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class Family:
     """One row of the table that scenes are drawn from."""
 
@@ -33,7 +33,6 @@ class Family:
     def __post_init__(self) -> None:
         known = ", ".join(TEMPLATES)
         require(self.template in TEMPLATES, "template", self.template, f"one of {known}")
-        check_numbers(self)
 
     @property
     def shell_triangles(self) -> int:

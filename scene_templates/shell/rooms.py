@@ -15,10 +15,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.checks import OFFSET, SHIFT, SIZE, Range, check_numbers
+from scene_templates.checks import OFFSET, SHIFT, SIZE, Range
 from scene_templates.layout import Plane
 from scene_templates.shell.patches import SIDES, PatchPlacement
 from storage.ranges import Share, Within
+from storage.settings import checked
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,7 +36,7 @@ class Room:
     """How far a tilted wall may stand inside of these bounds at most."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class SharedRoom:
     """Ranges of rooms whose parts meet."""
 
@@ -51,9 +52,6 @@ class SharedRoom:
     """Most tilt of a floor or wall out of its plane, in rooms that are not square. The recipes
     allow 10 for open layouts and 3 for the box; parts tilted by 10 must be half as large again
     for their seams to stay closed."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self)
 
     def room_rand(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
         """Draw a room with the parts `names`."""

@@ -7,18 +7,18 @@ that (they call it a de-bias): squares spin freely, and floors move. The numbers
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from scene_templates.checks import SHIFT, SIZE, Range, check_numbers
+from scene_templates.checks import SHIFT, SIZE, Range
 from scene_templates.shell.patches import SIDES, PatchPlacement
 from scene_templates.shell.rooms import Room
 from storage.ranges import Within
+from storage.settings import checked
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class SideRanges:
     """From what the place of one floor or wall is drawn."""
 
@@ -35,9 +35,6 @@ class SideRanges:
     shift_z: Annotated[Range, SHIFT] = (0.0, 0.0)
     """Move along Z, before halving."""
 
-    def __post_init__(self) -> None:
-        check_numbers(self)
-
     def placement_rand(self, rng: np.random.Generator, axis: int) -> PatchPlacement:
         """Draw the place of a side that is perpendicular to `axis` before it is turned."""
         angles_deg = rng.uniform(-self.tilt_deg, self.tilt_deg, size=3)
@@ -51,7 +48,7 @@ class SideRanges:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("scene settings")
 class SeparateSides:
     """Ranges of each floor and wall."""
 

@@ -31,6 +31,14 @@ def test_the_waist_and_the_templates_are_light(statement: str) -> None:
     assert not _loaded_by(statement) & set(HEAVY)
 
 
+@pytest.mark.parametrize(
+    "statement", ["import storage.training_data, storage.sample", "import train.data.stream"]
+)
+def test_what_streams_shards_needs_no_checker_of_settings(statement: str) -> None:
+    """Workers start often, and only read: nobody sets anything there."""
+    assert not _loaded_by(statement) & {"pydantic", "prefect", "mitsuba", "pxr"}
+
+
 def test_settings_are_light() -> None:
     assert not _loaded_by("import pipeline.flows.builds") & set(HEAVY)
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from infra.rendering.session import Asked
 from infra.serving.train_model import TrainOrder
-from infra.setup.ranges import ROOTS, reachable
+from infra.setup.settings_page import ROOTS, reachable
 from model.config import ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.flows.builds import named_build
@@ -27,9 +27,9 @@ from scene_templates.families.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.settings import MAX_TRIANGLES, SceneSettings, ViewLaws
 from scene_templates.shell.rooms import SharedRoom
 from scene_templates.shell.separate_sides import SideRanges
+from storage.dataset_settings import SplitSettings
 from storage.ranges import Declared, declared_ranges
 from storage.scene import Scene
-from storage.splits import SplitSettings
 from train.data.augmentation import AugmentationSettings
 from train.evaluation.evaluate import Contest
 from train.loss.settings import LossSettings

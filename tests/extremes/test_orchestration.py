@@ -13,8 +13,9 @@ from pipeline.flows.runners import in_window
 from pipeline.flows.served.generate_scenes import generate_scenes
 from pipeline.flows.served.orders import dataset_order
 from storage.dataset import open_dataset
+from storage.dataset_settings import MOST_SCENES, SplitSettings
 from storage.errors import TrilightError
-from storage.splits import MOST_SCENES, SplitSettings, shards_for
+from storage.splits import shards_for
 from storage.verify import verify_dataset
 from tests.flows.test_served_schema import _defaults
 from tests.flows.tiny_scenes_kit import Undocumented, tiny_order, without_rendering

@@ -24,9 +24,10 @@ from scene_templates.families.family import Family
 from scene_templates.settings import SceneSettings, ViewLaws
 from scene_templates.shell.rooms import SharedRoom
 from storage.changes import changed
+from storage.dataset_settings import MOST_SCENES, SplitSettings
 from storage.errors import Rejected, TrilightError
 from storage.ranges import Declared
-from storage.splits import MOST_SCENES, SplitSettings, scenes_of_shard, shard_name, shards_for
+from storage.splits import scenes_of_shard, shard_name, shards_for
 from tests.extremes.range_examples import FIELDS, SCENE_REASONS, SMOKE, End
 from tests.model.kit import awake, random_scene, tiny_config
 from tests.renders.scene_kit import join, light, material, quad

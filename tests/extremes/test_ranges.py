@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.setup.ranges import FILE, ROOTS, ranges_page, reachable
+from infra.setup.settings_page import FILE, ROOTS, reachable, settings_page
 from storage.conventions import EMISSION
 from storage.errors import TrilightError
-from storage.ranges import Columns, Declared, Within, check_ranges, declared_ranges
+from storage.ranges import Columns, Declared, Within, declared_ranges
 from storage.scene import Scene, SceneObject
+from storage.settings import checked
 from tests.conftest import ROOT
 from tests.extremes.range_examples import EXAMPLES, FIELDS, End, at_end
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
@@ -149,12 +150,9 @@ def test_no_class_of_settings_is_forgotten() -> None:
 def test_what_is_checked_is_what_is_declared() -> None:
     """A field is looked at by its range and by nothing before it: the first wrong one is named."""
 
-    @dataclasses.dataclass(frozen=True, kw_only=True)
+    @checked("group", option=str.upper)
     class Group:
         share: Annotated[float, Within(0, 1, high_open=True, unit="parts")] = 0.5
-
-        def __post_init__(self) -> None:
-            check_ranges(self, "group: ", named=str.upper)
 
     Group(share=0.0)
     with pytest.raises(TrilightError) as caught:
@@ -164,7 +162,7 @@ def test_what_is_checked_is_what_is_declared() -> None:
 
 
 def test_the_page_of_ranges_is_current() -> None:
-    assert FILE.read_text() == ranges_page(), "run make ranges"
+    assert FILE.read_text() == settings_page(), "run make settings"
 
 
 ARRAYS = declared_ranges(Scene)

@@ -70,7 +70,7 @@ def test_mistakes_are_named() -> None:
         named_build("smok")
     with pytest.raises(TrilightError, match=r"scenes\.lights\.number"):
         named_build("smoke", changes={"scenes.lights.number": 3})
-    with pytest.raises(TrilightError, match="seed is -1"):
+    with pytest.raises(TrilightError, match="'seed' is -1"):
         named_build("smoke", seed=-1)
 
 

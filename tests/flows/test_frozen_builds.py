@@ -135,20 +135,26 @@ def test_a_layout_that_is_registered_later_changes_no_build() -> None:
 def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
     """They are made where no field of any group of settings has a default to fall back on."""
     found = _digests_after("""
-        import dataclasses
         from pipeline.assets import settings as assets
         from pipeline.flows import settings as builds
         from pipeline.renders import settings as renders
         from scene_templates import settings as scenes
         from scene_templates.families import excursions, family
         from scene_templates.shell import rooms, separate_sides
-        from storage import profiles, splits
+        from storage import dataset_settings
         modules = (assets, builds, renders, scenes, excursions, family, rooms, separate_sides)
-        kinds = {kind for module in (*modules, profiles, splits) for kind in vars(module).values()
-                 if isinstance(kind, type) and dataclasses.is_dataclass(kind)}
-        assert len(kinds) > 16
-        for kind in kinds - {builds.NamedBuild}:
-            kind.__init__.__kwdefaults__ = None
+        kinds = {kind for module in (*modules, dataset_settings) for kind in vars(module).values()
+                 if hasattr(kind, "__pydantic_fields__")}
+        assert len(kinds) > 14
+        def without_defaults(kind):
+            plain, names = kind.__init__, set(kind.__pydantic_fields__)
+            def stating_all(self, **values):
+                if missing := names - set(values):
+                    raise TypeError(f"{kind.__name__} lacks {missing}")
+                plain(self, **values)
+            kind.__init__ = stating_all
+        for kind in kinds:
+            without_defaults(kind)
         try:
             scenes.ViewLaws()
         except TypeError:

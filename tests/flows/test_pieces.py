@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.pieces import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
+from storage.dataset_settings import SplitSettings
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.splits import SplitSettings, scenes_of_shard
+from storage.splits import scenes_of_shard
 
 
 def _scenes(tasks: list[tuple[Piece, ...]]) -> list[int]:

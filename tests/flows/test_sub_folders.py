@@ -9,11 +9,12 @@ from pipeline.flows.publication import Publication
 from pipeline.objects.generated import generate_objects
 from storage import layout
 from storage.dataset import open_dataset
+from storage.dataset_settings import SplitSettings
 from storage.errors import TrilightError
 from storage.manifest import index_shard, read_manifest
 from storage.progress import read_progress
 from storage.sample import sample_key
-from storage.splits import SplitSettings, shard_name
+from storage.splits import shard_name
 from storage.staging import is_staged, stage_scene
 from storage.verify import verify_dataset
 from tests.documents.dataset_by_hand import edit_manifest

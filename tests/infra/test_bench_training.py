@@ -17,9 +17,9 @@ from infra.bench.training_report import PAPER, mean_ratio, of_newest_data, reach
 from infra.bench.training_table import read_table, run_jobs
 from storage.errors import TrilightError
 from storage.seeds import rng_for
+from storage.settings import settings_record
 from tests.train.kit import TINY_MODEL
 from tests.train.toy import write_toy_dataset
-from train.settings import settings_record
 
 
 def job(**changes: object) -> Job:

@@ -59,7 +59,7 @@ def test_the_form_has_every_run_and_every_setting() -> None:
         ({"changes": {"warm_up": 3}}, "changes.warm_up"),
         ({"changes": {"loss": {"perceptual": "vgg"}}}, "changes.loss.perceptual"),
         ({"changes": {"model": {"width": 0}}}, "changes.model.width"),
-        ({"changes": {"betas": [0.9, 1.0]}}, "changes.betas.1"),
+        ({"changes": {"betas": [0.9, 1.0]}}, "changes.betas: expected numbers from 0 to below 1"),
         ({"changes": {"loss.perceptual": "none"}}, "changes.loss.perceptual"),
     ],
 )

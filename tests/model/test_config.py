@@ -54,7 +54,7 @@ def test_base_takes_a_batch_on_the_meta_device() -> None:
         ({"rope_num_freqs": 0}, "from 1"),
         ({"rope_max_freq": 0.5}, "from 1"),
         ({"dpt_features": 4}, "dpt fields beside a linear head"),
-        ({"head": "mlp"}, "head 'mlp'; expected dpt or linear"),
+        ({"head": "mlp"}, "head is 'mlp'; expected dpt or linear"),
         ({"head": "dpt", "dpt_features": 4}, "four of each"),
     ],
 )

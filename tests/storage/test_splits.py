@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from storage.conventions import SPLITS
+from storage.dataset_settings import SplitSettings
 from storage.errors import TrilightError
 from storage.seeds import rng_for, seed_for
 from storage.splits import (
-    SplitSettings,
     require_objects,
     scenes_of_shard,
     shard_name,

@@ -8,6 +8,7 @@ every decoding thread, and they wait for cores in loops that took four times the
 """
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 import roma
@@ -16,13 +17,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from storage.conventions import DIFFUSE, EMISSION, SPECULAR
-from train.data.augmentation import AugmentationSettings, Rotation
 from train.data.relight import with_light_scaled, with_lights_mixed
 from train.data.scenes import TrainingScene
 
+if TYPE_CHECKING:
+    from train.data.augmentation import AugmentationSettings, Rotation
+
 
 def augmented(
-    scene: TrainingScene, settings: AugmentationSettings, rng: np.random.Generator
+    scene: TrainingScene, settings: "AugmentationSettings", rng: np.random.Generator
 ) -> TrainingScene:
     """Return the scene under random symmetries; those that settings leave out draw nothing."""
     if settings.light_mix > 1:
@@ -45,7 +48,7 @@ def augmented(
     return scene
 
 
-def rotation_rand(kind: Rotation, rng: np.random.Generator) -> Tensor:
+def rotation_rand(kind: "Rotation", rng: np.random.Generator) -> Tensor:
     """Return a random rotation matrix [3, 3], float64; the unit matrix for `none`."""
     if kind == "recipe":
         return roma.rotvec_to_rotmat(torch.from_numpy(rng.normal(0, 1, 3)))

@@ -1,17 +1,16 @@
 """Which symmetries of light transport a run shows its scenes under."""
 
-from dataclasses import dataclass
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
-from storage.errors import TrilightError
-from storage.ranges import Within, check_ranges
+from storage.ranges import Within
+from storage.settings import checked
 
 Rotation = Literal["none", "recipe", "uniform"]
 """`recipe`: a rotation vector of three normal numbers, which favours small turns; `uniform`: every
 orientation alike."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("train settings")
 class AugmentationSettings:
     """What is drawn anew at every visit of a scene. The default changes nothing."""
 
@@ -29,10 +28,3 @@ class AugmentationSettings:
     """Largest factor by which all light is made stronger or weaker, log-uniform."""
     light_mix: Annotated[float, Within(1, 1000)] = 1.0
     """The same for each light alone; needs a dataset that keeps lights apart (`per_light`)."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "train settings: ")
-        if self.rotation not in get_args(Rotation):
-            raise TrilightError(
-                f"train settings: rotation is {self.rotation!r}; expected none, recipe or uniform."
-            )

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext, suppress
-from dataclasses import dataclass, field
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from storage.sample import Sample
 from storage.seeds import rng_for
 from storage.shard_set import OpenShard, ShardSet
 from train.data.augment import augmented, with_views
-from train.data.augmentation import AugmentationSettings
 from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
@@ -33,6 +32,9 @@ from train.data.order import (
 from train.data.scenes import TrainingScene, training_scene
 from train.data.splits import lost_with
 from train.data.unusable import Unusable
+
+if TYPE_CHECKING:
+    from train.data.augmentation import AugmentationSettings
 
 PREFETCHED_SCENES = 16
 """Scenes decoded ahead of the network, at least one batch."""
@@ -56,8 +58,8 @@ class StreamSettings:
     """Views that are drawn of each scene."""
     most_triangles: int = 0
     """Samples with more are unusable; 0: none is."""
-    augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
-    """Symmetries that are drawn at each visit."""
+    augmentation: "AugmentationSettings | None" = None
+    """Symmetries that are drawn at each visit; none by default."""
 
     @property
     def order(self) -> OrderSettings:
@@ -164,7 +166,8 @@ class _SceneMaker:
         scene = self._usable(place)
         rng = rng_for(settings.seed, "visit", place.position)
         views = rng.permutation(len(scene.target_VRR3))[: settings.views_per_scene]
-        return augmented(with_views(scene, np.sort(views)), settings.augmentation, rng)
+        seen = with_views(scene, np.sort(views))
+        return augmented(seen, settings.augmentation, rng) if settings.augmentation else seen
 
     def _usable(self, place: Place) -> TrainingScene:
         count = len(self._shards.names)
@@ -210,7 +213,7 @@ class _SceneMaker:
             sample,
             settings.resolution,
             most_triangles=settings.most_triangles,
-            lights_apart=settings.augmentation.light_mix > 1,
+            lights_apart=settings.augmentation is not None and settings.augmentation.light_mix > 1,
         )
 
 

@@ -2,20 +2,21 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import SkipValidation
 
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors
 from storage.conventions import radiance_from_log10
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
-from storage.ranges import Within, check_ranges
+from storage.ranges import Within
 from storage.sample import Sample
 from storage.seeds import rng_for
+from storage.settings import checked
 from storage.shard_set import ShardSet
 from train.data.scenes import TrainingScene, training_scene
 from train.data.splits import first_samples
@@ -37,25 +38,22 @@ SHEET_VIEWS = 8
 """Views on a sheet."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked("evaluate")
 class Contest:
     """Who is judged, on what, and by what."""
 
-    network: RenderFormer
+    network: SkipValidation[RenderFormer]
     """On the device where it is to run."""
-    shards: ShardSet
+    shards: SkipValidation[ShardSet]
     """The split."""
     resolution: Annotated[int, Within(1, 8192, unit="pixels")]
     """Pixels across, a divisor of the data's."""
-    rivals: Rivals | None
+    rivals: SkipValidation[Rivals | None]
     """None where no training data is at hand."""
-    lpips: Lpips | None
+    lpips: SkipValidation[Lpips | None]
     """Likewise. None where its weights are not at hand: LPIPS is then n/a."""
     most_scenes: Annotated[int, Within(1, 10**9, unit="scenes")]
     """The first so many scenes of the split are judged."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "evaluate: ")
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; one that is damaged ends it, since it would be another set."""

@@ -22,9 +22,10 @@ from model.weights import decode_config, encode_config, load_tensors
 from storage.atomic import atomic_writer
 from storage.errors import TrilightError
 from storage.safe_read import read_safetensors
+from storage.settings import from_record, settings_record
 from train.data.unusable import Unusable
 from train.loop.state import TrainState, new_state
-from train.settings import TrainSettings, completed_record, settings_record
+from train.settings import TrainSettings
 
 HEADER_KEY = "trilight_checkpoint"
 """Metadata entry with counters, damage met, settings, digest of the data, number of processes."""
@@ -125,7 +126,8 @@ def resumed_state(
             differs is named.
     """
     header = checkpoint.header
-    _require_same("settings", completed_record(header["settings"]), settings_record(settings))
+    begun = from_record(TrainSettings, header["settings"])  # a field that came later is at default
+    _require_same("settings", settings_record(begun), settings_record(settings))
     _require_same("data", {"digest": header["data_digest"]}, {"digest": data_digest})
     state = new_state(settings, device)
     state.step, state.skipped_steps = header["step"], header["skipped_steps"]

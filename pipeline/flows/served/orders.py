@@ -1,7 +1,6 @@
 """Flow parameters to orders: the forms of Prefect's page and our own records."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 from pipeline.flows.order import DatasetOrder
@@ -14,6 +13,7 @@ from pipeline.flows.served.schema import (
 )
 from storage.errors import TrilightError
 from storage.ranges import Within
+from storage.settings import checked
 from storage.shard_places import MAX_SHARDS
 
 DATASET_FORMS: Mapping[str, Any] = {
@@ -25,7 +25,7 @@ DATASET_FORMS: Mapping[str, Any] = {
 """Types of parameters that are narrower in a form than in an order."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@checked()
 class DatasetInRuns(DatasetOrder):
     """A dataset whose ranges of shards are flow runs of their own, for as many workers."""
 

@@ -1,72 +1,46 @@
 """Typed parameters of flows, made of our frozen settings: Prefect's forms show names and docs.
 
-A flow takes the fields of a dataclass as its parameters. Types, defaults, ranges (storage.ranges)
-and the sentence under each field become the schema that Prefect checks before a run exists, and of
-which it draws a form.
+A flow takes the fields of a class of settings as its parameters: what is described there
+(storage.settings) becomes the schema that Prefect checks before a run exists, and of which it draws
+a form.
 The groups of a build's settings become forms within the form, where every field may stay empty.
 """
 
-import ast
 import dataclasses
 import inspect
-import textwrap
-import types
 import typing
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, TypeVar, get_args, get_origin
+from dataclasses import MISSING
+from typing import Annotated, Any, TypeVar, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from pipeline.flows.builds import BUILDS
 from pipeline.flows.settings import BuildSettings
-from storage.ranges import Within
+from storage.settings import described
 
 Returned = TypeVar("Returned")
 
 
-def field_docs(settings: type) -> dict[str, str]:
-    """Return the sentence under each field of a dataclass, its bases included, by name."""
-    docs: dict[str, str] = {}
-    for cls in reversed(settings.__mro__[:-1]):
-        tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
-        assert isinstance(tree, ast.ClassDef)
-        for field, doc in zip(tree.body, tree.body[1:], strict=False):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(field.target, ast.Name)
-                and isinstance(doc, ast.Expr)
-                and isinstance(doc.value, ast.Constant)
-            ):
-                docs[field.target.id] = " ".join(str(doc.value.value).split())
-    return docs
-
-
 def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
-    """Give a function that takes keywords the signature of a dataclass; for flows.
+    """Give a function that takes keywords the signature of a class of settings; for flows.
 
     Args:
-        settings: the dataclass.
+        settings: the class.
         annotations: types that take the place of those of some fields.
     """
-    docs = field_docs(settings)
-    hints = typing.get_type_hints(settings, include_extras=True)
 
     def with_signature(function: Callable[..., Returned]) -> Callable[..., Returned]:
-        parameters, lines = [], []
-        for field in dataclasses.fields(settings):
-            kind = annotations.get(field.name, _form_type(hints[field.name]))
-            default = None if _has_factory(field) else field.default
-            if _has_factory(field):
-                kind = kind | None
-            parameters.append(
-                inspect.Parameter(
-                    field.name,
-                    inspect.Parameter.KEYWORD_ONLY,
-                    default=inspect.Parameter.empty if default is dataclasses.MISSING else default,
-                    annotation=kind,
-                )
+        parameters = [
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=inspect.Parameter.empty if field.default is MISSING else field.default,
+                annotation=annotations.get(field.name, _form_type(field.hint)),
             )
-            lines.append(f"    {field.name}: {docs[field.name]}")
+            for field in described(settings)
+        ]
+        lines = [f"    {field.name}: {field.sentence}" for field in described(settings)]
         function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         text = inspect.getdoc(function) or ""
         function.__doc__ = "\n".join([text, "", "Args:", *lines])
@@ -76,21 +50,19 @@ def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
 
 
 def changes_form(settings: type, example: Any) -> type[BaseModel]:
-    """Return a form of all settings of a dataclass in which every field may stay empty.
+    """Return a form of all settings of a class in which every field may stay empty.
 
     Args:
-        settings: the dataclass, whose fields may be groups, or tuples of groups.
+        settings: the class, whose fields may be groups, or tuples of groups.
         example: an instance, which says what the groups within tuples are.
     """
-    docs = field_docs(settings)
-    hints = typing.get_type_hints(settings, include_extras=True)
     fields: dict[str, Any] = {}
-    for field in dataclasses.fields(settings):
-        value, kind = getattr(example, field.name), _form_type(hints[field.name])
+    for field in described(settings):
+        value, kind = getattr(example, field.name), _form_type(field.hint)
         first = value[0] if isinstance(value, tuple) and value else value
         if dataclasses.is_dataclass(first) and not isinstance(first, type):
             kind = changes_form(type(first), first)
-        fields[field.name] = (kind | None, Field(default=None, description=docs[field.name]))
+        fields[field.name] = (kind | None, Field(default=None, description=field.sentence))
     return create_model(
         f"{settings.__name__}Changes", __config__=ConfigDict(extra="forbid"), **fields
     )
@@ -108,43 +80,9 @@ def changed_values(form: BaseModel | None) -> dict[str, Any]:
     return values
 
 
-def _has_factory(field: "dataclasses.Field[Any]") -> bool:
-    return field.default_factory is not dataclasses.MISSING
-
-
-_EXACT = 2**53
-"""Beyond it forms show other numbers than were meant: JavaScript has no larger integers."""
-
-
-def _form_type(hint: Any, within: Within | None = None) -> Any:
-    """Return a type as JSON has it: tuples of one kind are lists, mappings are objects.
-
-    Args:
-        hint: the type.
-        within: the range of its numbers, where one was declared around it.
-    """
-    origin, args = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        declared = [note for note in args[1:] if isinstance(note, Within)]
-        return _form_type(args[0], declared[0] if declared else within)
-    if origin in (typing.Union, types.UnionType):
-        return typing.Union[tuple(_form_type(arg, within) for arg in args)]  # noqa: UP007
-    if origin is tuple:
-        one_kind = args[1:] == (...,) or len(set(args)) == 1
-        return list[_form_type(args[0], within)] if one_kind else list[Any]  # type: ignore[misc]
-    if origin in (Mapping, dict):
-        return dict[str, Any]
-    return Annotated[hint, _bounds(within)] if within and hint in (int, float) else hint
-
-
-def _bounds(within: Within) -> Any:
-    """Return a range as pydantic and the schema have it; ends that are no limit are left out."""
-    bounds: dict[str, Any] = {}
-    if abs(within.low) <= _EXACT:
-        bounds["gt" if within.low_open else "ge"] = within.low
-    if abs(within.high) <= _EXACT:
-        bounds["lt" if within.high_open else "le"] = within.high
-    return Field(**bounds)
+def _form_type(hint: Any) -> Any:
+    """Return a type as forms know it: mappings are objects with any values."""
+    return dict[str, Any] if get_origin(hint) in (Mapping, dict) else hint
 
 
 _NO_SECRET = (

@@ -1,4 +1,4 @@
-"""Writes docs/ranges.md: every numeric field that a person may set, and what it may be."""
+"""Writes docs/reference/settings.md: everything that a person may set, and what it may be."""
 
 import dataclasses
 import inspect
@@ -10,17 +10,18 @@ from typing import Any, get_args
 
 from infra.rendering.session import Asked
 from infra.serving.train_model import TrainOrder
+from model.config import ModelConfig
 from pipeline.documents.markdown import table
 from pipeline.flows.price import CorePrice
 from pipeline.flows.served.orders import DatasetInRuns
-from pipeline.flows.served.schema import field_docs
 from pipeline.flows.settings import BuildSettings
-from storage.ranges import Declared, declared_ranges, shown_number
+from storage.ranges import declared_ranges, shown_number
 from storage.scene import Scene
+from storage.settings import described, field_sentences
 from train.evaluation.evaluate import Contest
 from train.settings import TrainSettings
 
-FILE = Path(__file__).parents[2] / "docs/ranges.md"
+FILE = Path(__file__).parents[2] / "docs/reference/settings.md"
 
 ROOTS: dict[str, tuple[type, ...]] = {
     "Scene": (Scene,),
@@ -32,23 +33,26 @@ ROOTS: dict[str, tuple[type, ...]] = {
 }
 """What each command is told; the settings within settings are found from here."""
 
-_HEAD = """# Ranges
+_HEAD = """# Settings
 
-Made by `make ranges` from the declarations at the fields, which are also what is checked
-(`storage/ranges.py`): a value outside is refused in one line that names the field. Tests go to both
-ends of every range and one step outside (`tests/extremes/test_ranges.py`), and run what both ends
-make where that is cheap. Laws between fields, such as `min_spp` of at most `max_spp`, are not here:
-the complaint about one says what it expects.
+Made by `make settings` from the descriptions at the fields (`storage/settings.py`), which are also
+what is checked and what the command line and Prefect's forms show: a value outside is refused in
+one line that names the field. Tests go to both ends of every range and one step outside
+(`tests/extremes/test_ranges.py`), and run what both ends make where that is cheap. Laws between
+fields, such as `min_spp` of at most `max_spp`, are not here: the complaint about one says what it
+expects. Every setting of a build or a run can be changed with `--set NAME=VALUE`, by its dotted
+name, such as `--set scenes.lights.count=[2,4]`, `--set scenes.families.0.weight=2` or `--set
+model=large`.
 """
 
 
 def main() -> None:
     """Write the file."""
-    FILE.write_text(ranges_page())
+    FILE.write_text(settings_page())
 
 
-def ranges_page() -> str:
-    """Return docs/ranges.md."""
+def settings_page() -> str:
+    """Return docs/reference/settings.md."""
     parts = [_HEAD]
     for command, roots in ROOTS.items():
         parts.append(f"## {command}\n")
@@ -56,7 +60,7 @@ def ranges_page() -> str:
             if rows := list(_rows(settings)):
                 first = _first_sentence(inspect.getdoc(settings) or "")
                 parts.append(f"### `{settings.__name__}`\n\n{first}\n")
-                parts.append(table(("field", "meaning", "range", "unit", "default"), rows) + "\n")
+                parts.append(table(("field", "meaning", "expected", "default"), rows) + "\n")
     return "\n".join(parts)
 
 
@@ -81,35 +85,34 @@ def _kinds(hint: Any) -> Iterator[type]:
         yield from _kinds(part)
 
 
-def _rows(settings: type) -> Iterator[tuple[str, ...]]:
-    docs = field_docs(settings)
-    assert dataclasses.is_dataclass(settings)
-    defaults = {field.name: field.default for field in dataclasses.fields(settings)}
-    for declared in declared_ranges(settings):
-        part = "" if declared.part is None else f", {declared.part.name}"
+def _rows(kind: type) -> Iterator[tuple[str, ...]]:
+    if kind is Scene:  # arrays, which no person writes as settings
+        for declared in declared_ranges(Scene):
+            part = "" if declared.part is None else f", {declared.part.name}"
+            sentence = _first_sentence(field_sentences(Scene)[declared.name])
+            yield f"`{declared.name}`{part}", sentence, str(declared.within), ""
+        return
+    for field in described(kind) if hasattr(kind, "__pydantic_fields__") else ():
+        groups = [found.__name__ for found in _kinds(field.hint) if hasattr(found, "PRESETS")]
+        presets = f", or one of {', '.join(ModelConfig.PRESETS)}" if groups else ""
         yield (
-            f"`{declared.name}`{part}",
-            _first_sentence(docs[declared.name]).replace("|", "\\|"),
-            _range(declared),
-            declared.within.unit,
-            _shown(defaults[declared.name]),
+            f"`{field.name}`",
+            _first_sentence(field.sentence).replace("|", "\\|"),
+            (field.expected + presets).replace("|", "\\|"),
+            _shown(field.default),
         )
 
 
-def _range(declared: Declared) -> str:
-    bounds = str(dataclasses.replace(declared.within, unit=""))
-    whole = "whole, " if declared.kind is int else ""
-    return f"{whole}{bounds}" + (", or none" if declared.optional else "")
-
-
 def _shown(default: Any) -> str:
-    if default is dataclasses.MISSING:
+    if default is dataclasses.MISSING or dataclasses.is_dataclass(default):
         return ""
-    if default is None:
+    if default is None or default in ((), {}):
         return "none"
     if isinstance(default, tuple):
-        return ", ".join(shown_number(part) for part in default) or "none"
-    return shown_number(default)
+        return ", ".join(map(_shown, default))
+    if isinstance(default, bool):
+        return str(default).lower()
+    return shown_number(default) if isinstance(default, int | float) else f"`{default}`"
 
 
 def _first_sentence(doc: str) -> str:
