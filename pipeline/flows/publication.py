@@ -19,6 +19,7 @@ from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry, read_manifest, write_manifest
 from storage.objects_lock import encode_objects_lock, write_objects_lock
 from storage.records import Failure, LockedObject
+from storage.settings import from_record, settings_record
 from storage.splits import planned_scenes, scenes_of_shard, shard_name, shards_for
 
 _LOOKS = 7
@@ -226,7 +227,8 @@ def _require_same_dataset(
     accept_environment: bool,
 ) -> None:
     _require_generated(folder, manifest)
-    _require_same(folder, "setting", manifest.settings, settings.as_json(), "choose another --out")
+    begun = settings_record(from_record(BuildSettings, manifest.settings))  # fields may come later
+    _require_same(folder, "setting", begun, settings.as_json(), "choose another --out")
     if not accept_environment:
         _require_same(
             folder,

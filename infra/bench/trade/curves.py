@@ -50,7 +50,8 @@ class Knob:
     title: str
     """Heading of its section."""
     covers: tuple[str, ...]
-    """Dotted names of the settings that this curve is about, as in infra.bench.trade.without_curve;
+    """Dotted names of the settings that this curve is about, `build.` as in `--set` of generate,
+    `order.` what a dataset order says, `train.` as in `--set` of train, `render.` an option;
     none where the choice is made in the code."""
     cost: str
     """Unit of the cost, in words."""

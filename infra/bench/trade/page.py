@@ -12,7 +12,6 @@ from infra.bench.trade.curves import COST_NOISE, JudgedPoint, Knob, default_poin
 from infra.bench.trade.figures import FIGURES, shown, shown_error
 from infra.bench.trade.knobs import KNOBS, knob_named
 from infra.bench.trade.saved import SavedCurve, saved_curves
-from infra.bench.trade.without_curve import WITHOUT_CURVE
 from infra.bench.trade.workshop import CAREFUL, QUICK
 from storage.errors import TrilightError
 
@@ -26,7 +25,7 @@ def block(folder: Path) -> str:
     lines = [*_head(curves)]
     for knob in KNOBS:
         lines += _section(knob, curves.get(knob.name))
-    lines += [*_choices(curves), *_without_curve()]
+    lines += _choices(curves)
     return "\n".join(lines) + "\n"
 
 
@@ -140,14 +139,3 @@ def _choices(curves: Mapping[str, SavedCurve]) -> Iterator[str]:
         cost = f"{shown(one.cost_ratio)} x {knob.cost}"
         how = choice.how if one.on_front else f"{choice.how} (not on the front: {choice.despite})"
         yield f"| {choice.need} | {how} | {cost} | {error} {knob.error} |"
-
-
-def _without_curve() -> Iterator[str]:
-    yield ""
-    yield "### Settings without a curve"
-    yield ""
-    reasons: dict[str, list[str]] = {}
-    for name, why in WITHOUT_CURVE.items():
-        reasons.setdefault(why, []).append(name)
-    for why, names in reasons.items():
-        yield f"- {why} {', '.join(f'`{name}`' for name in names)}"
