@@ -238,10 +238,10 @@ def test_every_build_is_json_and_has_a_stable_digest(name: str) -> None:
     ("arguments", "message"),
     [
         ({"name": "nonsense"}, "build 'nonsense' is unknown; expected one of smoke"),
-        ({"name": "smoke", "seed": -1}, "seed is -1"),
+        ({"name": "smoke", "seed": -1}, "'seed' is -1"),
         ({"name": "smoke", "resolution": 100}, "resolution"),
         ({"name": "smoke", "noise_floor_db": -3.0}, "noise_floor_db"),
-        ({"name": "smoke", "changes": {"storage.profile": "tiny"}}, "profile is 'tiny'; expected"),
+        ({"name": "smoke", "changes": {"storage.profile": "tiny"}}, "profile' is 'tiny'; expected"),
     ],
 )
 def test_wrong_settings_are_named(arguments: dict[str, Any], message: str) -> None:
