@@ -14,6 +14,7 @@ from storage.asked import read_asked, value_of
 from storage.dataset import Dataset, open_dataset
 from storage.derived import derivation_of
 from storage.errors import TrilightError
+from storage.extensions import recorded, require_same_extensions
 from storage.manifest import Manifest
 from storage.remote.url import parse_url
 
@@ -53,6 +54,7 @@ def repair(
     opened = open_dataset(str(root))
     manifest = opened.manifest
     _require_generated(manifest, scenes_from)
+    require_same_extensions(str(root), manifest.extensions, recorded("data"))
     changes, licence = _changes(manifest), _stated_licence(opened)
     asked = read_asked(opened) or ()
     for name in bad_shards:

@@ -3,7 +3,8 @@
 A name leads through groups of settings; where it leads through a list of groups, each of them is
 changed. Values come as JSON has them, and must be of the kind that they replace. A group whose
 class has `PRESETS`, makers by name, may also be replaced as a whole by one of those, and single
-settings of it are then changes of the preset: model=large with model.window_bundles=0.
+settings of it are then changes of the preset: model=large with model.window_bundles=0. A list of
+such groups may be replaced by a list of names.
 """
 
 import dataclasses
@@ -81,19 +82,26 @@ def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Ch
 
 def _presets(group: Any) -> Mapping[str, Callable[[], Any]]:
     """Return what a group may be replaced by, by name."""
-    return getattr(group, "PRESETS", {})
+    return getattr(group[0] if isinstance(group, tuple) else group, "PRESETS", {})
 
 
 def _preset(group: Any, changes: Sequence[Change]) -> Any:
-    """Return the preset that was named for a group, or the group where none was."""
-    presets = _presets(group)
+    """Return the preset that was named for a group, or the group where none was.
+
+    For a list of groups a list of presets may be named.
+    """
+    presets, many = _presets(group), isinstance(group, tuple)
     for _, value, name in changes:
-        if not isinstance(value, str) or value not in presets:
+        named = value if many and isinstance(value, list) and value else [value]
+        unknown = [each for each in named if not isinstance(each, str) or each not in presets]
+        if unknown:
+            first = dataclasses.fields(group[0] if many else group)[0].name
             raise TrilightError(
-                f"setting {name!r} is {value!r}; {expected_one_of(str(value), presets)}, or one "
-                f"of its settings by name, such as {name}.{dataclasses.fields(group)[0].name}."
+                f"setting {name!r} is {value!r}; {expected_one_of(str(unknown[0]), presets)}, or "
+                f"one of its settings by name, such as {name}.{first}."
             )
-        group = presets[value]()
+        made = tuple(presets[each]() for each in named)
+        group = made if many else made[0]
     return group
 
 

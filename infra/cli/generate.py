@@ -12,11 +12,13 @@ from infra.cli.completion import builds
 from infra.cli.console import first_words, note
 from infra.cli.generate_progress import watched
 from infra.cli.generate_report import report
+from pipeline.flows.builds import typed_build
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.renders.variant import choose_variant
 from pipeline.scenes.described_albedos import require_choice
 from storage.errors import TrilightError
+from storage.extensions import function_name
 from storage.output import dataset_folder
 
 if TYPE_CHECKING:
@@ -25,7 +27,11 @@ if TYPE_CHECKING:
 
 def generate(
     build: Annotated[
-        str, typer.Argument(help="named settings, such as smoke", autocompletion=builds)
+        str,
+        typer.Argument(
+            help="named settings, such as smoke, or your own FILE.py:FUNCTION",
+            autocompletion=builds,
+        ),
     ],
     objects: Annotated[
         str | None,
@@ -98,9 +104,9 @@ def generate(
 ) -> None:
     """Turn objects into a verified, resumable dataset; run it again to go on after any stop."""
     order = DatasetOrder(
-        build=build,
+        build=typed_build(build),
         objects=objects,
-        out=out or f"data/{build}",
+        out=out or f"data/{function_name(build)}",
         scenes=scenes,
         seed=seed,
         resolution=resolution,

@@ -12,7 +12,6 @@ from storage.errors import TrilightError
 from storage.output import dataset_folder
 from storage.ranges import Seed, Share, Within, check_ranges
 from storage.splits import MOST_SCENES
-from storage.suggestion import expected_one_of
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
@@ -63,9 +62,7 @@ class DatasetOrder:
     """Other settings of the build by dotted name, such as scenes.lights.count."""
 
     def __post_init__(self) -> None:
-        if self.build not in BUILDS:
-            expected = expected_one_of(self.build, BUILDS)
-            raise TrilightError(f"build {self.build!r} is unknown; {expected}.")
+        BUILDS.find(self.build)
         check_ranges(self)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(

@@ -13,6 +13,7 @@ from storage.dataset import Dataset, open_dataset
 from storage.derived import derivation_of
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.extensions import recorded, require_same_extensions
 from storage.failures import read_failures, write_failures
 from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry, read_manifest, write_manifest
@@ -217,6 +218,7 @@ def begin(
                 num_views=settings.scenes.num_views,
                 objects_lock_sha256="",
                 shards=(),
+                extensions=recorded("data"),
             )
         manifest = dataclasses.replace(manifest, num_scenes=whole)
         write_manifest(folder.manifest, manifest)
@@ -231,6 +233,7 @@ def _require_same_dataset(
     accept_environment: bool,
 ) -> None:
     _require_generated(folder, manifest)
+    require_same_extensions(folder.shown, manifest.extensions, recorded("data"))
     _require_same(folder, "setting", manifest.settings, settings.as_json(), "choose another --out")
     if not accept_environment:
         _require_same(
