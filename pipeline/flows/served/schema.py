@@ -9,6 +9,7 @@ The groups of a build's settings become forms within the form, where every field
 import ast
 import dataclasses
 import inspect
+import re
 import textwrap
 import types
 import typing
@@ -19,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from pipeline.flows.builds import BUILDS
 from pipeline.flows.settings import BuildSettings
+from pipeline.objects.registry import SOURCES
 from storage.ranges import Within
 
 Returned = TypeVar("Returned")
@@ -147,8 +149,9 @@ def _bounds(within: Within) -> Any:
     return Field(**bounds)
 
 
+_NAMED = "|".join(re.escape(name) for name, source in SOURCES.items() if not source.is_place)
 _NO_SECRET = (
-    r"^(?:env:TRILIGHT_SOURCE_\w*|(?:builtin|objaverse):[^@?]*"
+    rf"^(?:env:TRILIGHT_SOURCE_\w*|(?:{_NAMED}):[^@?]*"
     r"|[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|[^:]*)$"
 )
 """URLs without a user, a password or a query: whoever may see the server would see them too. The
