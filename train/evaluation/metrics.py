@@ -1,4 +1,4 @@
-"""Every figure that one picture is judged by: what it is, which way is better, how it is printed."""
+"""Every figure that a picture is judged by: what it is, which way is better, how it is printed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
