@@ -151,7 +151,10 @@ def opened(reference: str) -> Iterator[Any]:
     """
     match = _REFERENCE.fullmatch(reference)
     assert match is not None, reference
-    extension = load_extension(match["file"])
+    file = match["file"]
+    if file in _loaded and not Path(file).exists():  # as a record says it, without the folder
+        file = str(_loaded[file].path)
+    extension = load_extension(file)
     members = vars(extension.module)
     if match["function"] not in members:
         own = [

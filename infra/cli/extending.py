@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from storage.errors import TrilightError
-from storage.extensions import load_extension, load_named_extensions
+from storage.extensions import load_extension, load_named_extensions, loaded_files
 
 OPTION = "--extend"
 
@@ -34,3 +34,8 @@ def extended(words: Sequence[str]) -> list[str]:
             )
         load_extension(file)
     return left
+
+
+def extend_words() -> list[str]:
+    """Return the words that load what is loaded here, for a command that goes on from this one."""
+    return [word for path, _ in loaded_files() for word in (OPTION, path)]

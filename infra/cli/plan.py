@@ -15,6 +15,7 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
+from infra.cli.extending import extend_words
 from infra.cli.leaving import temporary_folder
 from pipeline.flows.builds import typed_build
 from pipeline.flows.order import DatasetOrder
@@ -87,6 +88,5 @@ def plan(
     )
     for text in found.notes:
         note(text)
-    next_step(
-        ("generate", build, *generate_words(order)[2:], "--out", f"data/{function_name(build)}")
-    )
+    asked = ("generate", build, *generate_words(order)[2:], *extend_words())
+    next_step((*asked, "--out", f"data/{function_name(build)}"))
