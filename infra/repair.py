@@ -105,6 +105,8 @@ def _changes(manifest: Manifest) -> dict[str, object]:
     """Return in what the settings of a dataset differ from those of its build's name."""
     build = named_build(manifest.build).as_json()
     changed = {name: now for name, _, now in differences(build, manifest.settings)}
+    if isinstance(families := changed.get("scenes.families"), list):
+        changed["scenes.families"] = [family["name"] for family in families]  # compared in full
     if manifest.settings["splits"].get("listed_scenes") is not None:
         return {name: now for name, now in changed.items() if name not in _OF_SCENE_FILES}
     return changed
