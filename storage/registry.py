@@ -6,7 +6,7 @@ executors. Whoever wants to know what there is lists the table.
 """
 
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar
 
 from storage.errors import TrilightError
@@ -27,7 +27,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         kind: Any,
         entries: Mapping[str, Entry],
         *,
-        decides: Collection[Decided] = (),
+        decides: tuple[Decided, ...] = (),
     ) -> None:
         """Begin a table.
 
@@ -48,8 +48,16 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Add an entry; call this in a file that `--extend` names.
 
         Raises:
-            TrilightError: the name is taken or no word, or the entry is of another kind.
+            TrilightError: the name is taken or no word, the entry is of another kind, or something
+                is made of it and no file is being loaded, so that nothing could record it.
         """
+        extension = loading()
+        if extension is None and self._decides:
+            raise TrilightError(
+                f"{self.what} {name!r} is registered by no extension, so that nothing made of it "
+                "could record where it comes from; expected this in a file that --extend names, or "
+                "that storage.extensions.load_extension loads."
+            )
         if not isinstance(name, str) or not _NAME.fullmatch(name):
             raise TrilightError(
                 f"{self.what} {name!r}: no name; expected up to 64 letters, digits and _ . + : -"
@@ -69,7 +77,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 f"{self.what} {name!r} calls itself {own!r}; expected one name for both."
             )
         self._entries[name] = entry
-        if extension := loading():
+        if extension:
             self._origins[name] = extension
             extension.decides.update(self._decides)
             extension.undo.append(lambda: self._remove(name))

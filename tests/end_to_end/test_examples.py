@@ -161,8 +161,8 @@ def test_data_of_one_s_own_files_by_the_real_command(
     for name in FILES:
         copied(name)
     own = ("--extend", "template.py", "--extend", "object_source.py")
-    asked = ("generate", "smoke", *own, "--objects", "dice:40", "--scenes", "6", *TINY)
-    asked = (*asked, "--set", 'scenes.families=["corridor", "plane-single"]')
+    families = ("--set", 'scenes.families=["corridor", "plane-single"]')
+    asked = ("generate", "smoke", *own, "--objects", "dice:40", "--scenes", "6", *TINY, *families)
     ran = trilight(*asked, "--extend", "executor.py", "--runner", "commands", "--out", "a")
     assert ran.returncode == 0, ran.stderr
     assert trilight(*asked, "--out", "b").returncode == 0

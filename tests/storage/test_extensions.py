@@ -142,6 +142,12 @@ def test_other_extensions_are_refused_with_a_next_step(
     assert message in str(caught.value)
 
 
+def test_what_decides_something_is_registered_by_a_file() -> None:
+    """Else a dataset would be made of it that could not say so, and children would not know it."""
+    with pytest.raises(TrilightError, match="word 'two' is registered by no extension, so that"):
+        WORDS.register("two", "2")
+
+
 def test_functions_of_a_file_are_named_by_both(tmp_path: Path) -> None:
     path = written(tmp_path, "def seven():\n    return '7'\n\ndef bad():\n    return 1 / 0\n")
     assert is_reference(f"{path}:seven")
