@@ -4,11 +4,12 @@ The architecture is written once; a size is only numbers. `SIZES` names those th
 size cannot change: two stages, QK-norm over the full width, SwiGLU, RMSNorm before each block.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, ClassVar, Literal
 
 from storage.errors import TrilightError
 from storage.ranges import Within
+from storage.registry import Registry
 from storage.settings import checked
 
 Head = Literal["dpt", "linear"]
@@ -27,7 +28,7 @@ LAYERS = 256
 class ModelConfig:
     """All numbers of one network."""
 
-    PRESETS: ClassVar[dict[str, Callable[[], "ModelConfig"]]] = {}
+    PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
     """The named sizes, by which a setting of this kind may be given (storage.changes)."""
     width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)]
     """Width of every token."""
@@ -184,10 +185,16 @@ def large() -> ModelConfig:
     )
 
 
-SIZES = ModelConfig.PRESETS
-"""Every named size, smallest first."""
+SIZES: Registry[Callable[[], ModelConfig]] = Registry(
+    "size",
+    Callable,
+    {"smoke": smoke, "tiny": tiny, "small": small, "base": base, "large": large},
+    decides=("weights",),
+)
+"""Every named size, ours first and smallest first. A checkpoint holds all numbers of its network,
+and no name, so that it opens where its size is not registered."""
 
-SIZES.update(smoke=smoke, tiny=tiny, small=small, base=base, large=large)
+ModelConfig.PRESETS = SIZES
 
 
 def _wrong(got: str, expected: str) -> None:

@@ -14,6 +14,7 @@ from model.weights import decode_config, encode_weights
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.extensions import recorded
 from storage.settings import settings_record
 from storage.training_data import TrainingData, open_training_data
 from train.data.scenes import training_scene
@@ -174,6 +175,7 @@ def _begin(
             "settings": settings_record(settings),
             "begun_with_sha256": sha256_hex(encode_weights(network)) if network else None,
             "data_digest": data.digest,
+            **({"extensions": found} if (found := recorded("weights")) else {}),
             "versions": {"torch": torch.__version__, "python": platform.python_version()},
             "threads": torch.get_num_threads(),
             "processes": crew.world_size,

@@ -7,6 +7,7 @@ import sys
 from types import FrameType
 
 from infra.cli.commands import app
+from infra.cli.extending import extended
 from infra.cli.leaving import leave
 from storage.errors import TrilightError
 
@@ -18,7 +19,9 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     signal.signal(signal.SIGINT, _interrupted)
     try:
-        app(prog_name="trilight")  # in usage lines and in completion, also under `python -m`
+        app(
+            extended(sys.argv[1:]), prog_name="trilight"
+        )  # in usage lines and in completion, also under `python -m`
     except TrilightError as mistake:
         leave(f"trilight: {mistake}", 1)
 

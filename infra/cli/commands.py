@@ -86,7 +86,8 @@ def _keep_brackets(command: Any) -> None:
 app = typer.Typer(
     name="trilight",
     cls=_Commands,
-    help="Triangles in, light out: make data for, train and judge RenderFormer-style renderers.",
+    help="Triangles in, light out: make data for, train and judge RenderFormer-style renderers. "
+    "With --extend FILE.py, anywhere on the line, a file of your own adds to them: docs/how-to.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,

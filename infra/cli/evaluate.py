@@ -165,7 +165,7 @@ def _num_scenes(contest: "Contest") -> int:
 
 
 def _report(found: dict[str, Any], out: Path) -> None:
-    from train.evaluation.picture_scores import DECIMALS
+    from train.evaluation.metrics import METRICS
 
     contestants = found["contestants"]
     table = Table(box=None, title_justify="left", header_style="dim")
@@ -173,10 +173,10 @@ def _report(found: dict[str, Any], out: Path) -> None:
     table.add_column("", style="dim", no_wrap=True)
     for name in contestants:
         table.add_column(Text(name), justify="right")
-    for metric, places in DECIMALS.items():
-        medians = [scores[metric]["median"] for scores in contestants.values()]
-        shown = ["n/a" if value is None else f"{value:.{places}f}" for value in medians]
-        table.add_row(metric, *shown)
+    for name, metric in METRICS.items():
+        medians = [scores[name]["median"] for scores in contestants.values()]
+        shown = ["n/a" if value is None else f"{value:.{metric.decimals}f}" for value in medians]
+        table.add_row(name, *shown)
     near = [scores.get("near_floor") for scores in contestants.values()]
     table.add_row(
         "within 3 dB of the noise", *("" if share is None else f"{share:.1%}" for share in near)

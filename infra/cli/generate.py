@@ -1,9 +1,8 @@
 """`trilight generate`: objects, or scenes in files, to shards."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -12,20 +11,22 @@ from infra.cli.completion import builds
 from infra.cli.console import first_words, note
 from infra.cli.generate_progress import watched
 from infra.cli.generate_report import report
+from pipeline.flows.builds import typed_build
+from pipeline.flows.executors import find_executor
 from pipeline.flows.order import DatasetOrder
-from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.renders.variant import choose_variant
 from pipeline.scenes.described_albedos import require_choice
-from storage.errors import TrilightError
+from storage.extensions import function_name
 from storage.output import dataset_folder
-
-if TYPE_CHECKING:
-    from pipeline.flows.dataset_run import Outcome
 
 
 def generate(
     build: Annotated[
-        str, typer.Argument(help="named settings, such as smoke", autocompletion=builds)
+        str,
+        typer.Argument(
+            help="named settings, such as smoke, or your own FILE.py:FUNCTION",
+            autocompletion=builds,
+        ),
     ],
     objects: Annotated[
         str | None,
@@ -98,9 +99,9 @@ def generate(
 ) -> None:
     """Turn objects into a verified, resumable dataset; run it again to go on after any stop."""
     order = DatasetOrder(
-        build=build,
+        build=typed_build(build),
         objects=objects,
-        out=out or f"data/{build}",
+        out=out or f"data/{function_name(build)}",
         scenes=scenes,
         seed=seed,
         resolution=resolution,
@@ -118,41 +119,9 @@ def generate(
     )
     folder, started = dataset_folder(order.out), time.monotonic()
     first_words(f"Making {folder.shown} with the build {build}", silent=json)
-    make = _runner(runner, address, workers)
+    executor = find_executor(runner, address, workers)
     if (text := choose_variant().note) and not json:
         note(f"{text}; see trilight doctor")
     with watched(folder, silent=json):
-        outcome = make(order)
+        outcome = executor.make(order, address)
     report(folder, outcome, time.monotonic() - started, as_json=json)
-
-
-def _runner(
-    name: str, address: str | None, workers: int | None
-) -> "Callable[[DatasetOrder], Outcome]":
-    """Return what makes an order; imports are slow, since they bring every stage."""
-    if name not in ("threads", "dask"):
-        raise TrilightError(f"--runner is {name!r}; expected threads or dask.")
-    if (name == "dask") != (address is not None):
-        raise TrilightError(
-            f"--runner is {name} and --address is {address}; expected an address with --runner "
-            "dask, and only then."
-        )
-    if name == "dask" and workers is not None:
-        raise TrilightError(
-            f"--workers is {workers}; expected it without --runner dask: how many tasks run at a "
-            "time is how many threads the cluster's workers have. Leave it away."
-        )
-    if address is None:
-        from pipeline.flows.dataset_run import make_dataset
-        from pipeline.flows.runners import ThreadRunner
-
-        return lambda order: make_dataset(order, ThreadRunner())
-    quiet_prefect()
-
-    def on_cluster(order: DatasetOrder) -> "Outcome":
-        with prefect_server():
-            from pipeline.flows.served.on_dask import make_on_dask
-
-            return make_on_dask(order, address)
-
-    return on_cluster

@@ -15,10 +15,13 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
+from infra.cli.extending import extend_words
 from infra.cli.leaving import temporary_folder
+from pipeline.flows.builds import typed_build
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.order_words import generate_words
 from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
+from storage.extensions import function_name
 
 
 def plan(
@@ -49,7 +52,7 @@ def plan(
     """Measure a few scenes and predict time, cores, bytes and cost, each with an interval."""
     core_price = CorePrice(price=price)
     order = DatasetOrder(
-        build=build,
+        build=typed_build(build),
         objects=objects,
         scenes=scenes,
         seed=seed,
@@ -85,4 +88,5 @@ def plan(
     )
     for text in found.notes:
         note(text)
-    next_step((*generate_words(order), "--out", f"data/{build}"))
+    asked = ("generate", build, *generate_words(order)[2:], *extend_words())
+    next_step((*asked, "--out", f"data/{function_name(build)}"))

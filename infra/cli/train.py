@@ -15,6 +15,7 @@ from rich.text import Text
 from infra.cli.changes import parse_changes
 from infra.cli.console import console, print_rows, progress_bars
 from storage.errors import TrilightError
+from storage.extensions import function_name
 
 if TYPE_CHECKING:
     from train.result import TrainResult
@@ -73,7 +74,9 @@ class _BarProgress:
 
 
 def train(
-    run: Annotated[str, typer.Argument(help="named run, such as smoke")],
+    run: Annotated[
+        str, typer.Argument(help="named run, such as smoke, or your own FILE.py:FUNCTION")
+    ],
     data: Annotated[
         list[str],
         typer.Option(
@@ -121,19 +124,20 @@ def train(
 
     For several processes, on one machine or many: torchrun -m infra.cli.app train ...
     """
-    from train.runs import changed_run  # without torch, so that mistakes are named at once
+    from train.runs import changed_run, typed_run  # no torch, so that mistakes are named at once
     from train.start import Start
 
     changes = parse_changes(set_ or ())
-    settings = changed_run(run, changes, steps=steps, most_unusable=skip_unusable)
+    named = typed_run(run)
+    settings = changed_run(named, changes, steps=steps, most_unusable=skip_unusable)
     start = Start(resume=resume, begin_with=from_, lpips=lpips)
     start.check(settings)
     if os.environ.get("RANK", "0") == "0" and not json:
-        _announce(settings, steps, changes)
+        _announce(settings, named, steps, changes)
     result = _trained(
         settings,
         data=data,
-        out=out or Path("runs") / run,
+        out=out or Path("runs") / function_name(run),
         start=start,
         device=device,
         workers=workers,
@@ -173,12 +177,14 @@ def _trained(
             ) from stopped
 
 
-def _announce(settings: "TrainSettings", steps: int | None, changes: Mapping[str, Any]) -> None:
+def _announce(
+    settings: "TrainSettings", run: str, steps: int | None, changes: Mapping[str, Any]
+) -> None:
     """Say what begins, before torch is imported."""
     from train.runs import in_proportion, named_run
 
     if steps is not None:
-        shorter = in_proportion(named_run(settings.run), steps, changes)
+        shorter = in_proportion(named_run(run), steps, changes)
         if shorter:
             shown = ", ".join(f"{name}={value}" for name, value in shorter.items())
             console.print(f"In proportion to {steps} steps: {shown}")

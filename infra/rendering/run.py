@@ -21,7 +21,7 @@ from infra.rendering.picture_file import (
 from infra.rendering.places import Place
 from pipeline.documents.png import encode_png
 from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_source import LoadedScene, SceneSource
+from pipeline.flows.scene_formats import FORMATS, LoadedScene, SceneSource
 from storage.atomic import write_atomically
 from storage.lights import num_lights
 from storage.metrics import psnr_log_db
@@ -90,7 +90,7 @@ class _OpenScene:
 
 def _is_next_frame(source: SceneSource, before: SceneSource) -> bool:
     """Return whether two sources are moments of one stage; a shard's scenes are strangers."""
-    return source.path == before.path and source.path.suffix != ".tar"
+    return source.path == before.path and not FORMATS[source.path.suffix.lower()].always_many
 
 
 class ShotRun:

@@ -13,7 +13,6 @@ from storage.errors import TrilightError
 from storage.output import dataset_folder
 from storage.ranges import Seed, Share, Within
 from storage.settings import checked
-from storage.suggestion import expected_one_of
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
@@ -64,9 +63,7 @@ class DatasetOrder:
     """Other settings of the build by dotted name, such as scenes.lights.count."""
 
     def __post_init__(self) -> None:
-        if self.build not in BUILDS:
-            expected = expected_one_of(self.build, BUILDS)
-            raise TrilightError(f"build {self.build!r} is unknown; {expected}.")
+        BUILDS.find(self.build)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(
                 f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "

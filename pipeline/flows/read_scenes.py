@@ -4,17 +4,9 @@ import dataclasses
 from collections.abc import Callable
 from types import TracebackType
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipeline.flows.file_child import file_child
-from pipeline.flows.scene_source import (
-    LoadedScene,
-    SceneSource,
-    load_cameras,
-    load_source,
-    source_keys,
-)
+from pipeline.flows.scene_formats import Cameras, LoadedScene, SceneSource
+from pipeline.flows.scene_source import load_cameras, load_source, source_keys
 from pipeline.isolation import ChildFailed, Result, call_with_retries
 from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.errors import TrilightError
@@ -48,7 +40,7 @@ class SceneReader:
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
         return self._call(load_source, source)
 
-    def cameras(self, source: SceneSource) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def cameras(self, source: SceneSource) -> Cameras:
         """Return poses and angles; raises TrilightError as `scene_source.load_cameras`."""
         return self._call(load_cameras, source)
 

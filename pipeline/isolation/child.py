@@ -17,6 +17,7 @@ from pipeline.isolation.deaths import ChildFailed, Result, with_retries
 from pipeline.isolation.inside import serve
 from pipeline.isolation.waiting import wait_for_answer
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from storage.extensions import load_same, loaded_files
 
 _START_UP_S = 180.0
 _LAUNCHES = 3
@@ -113,6 +114,8 @@ class IsolatedChild:
         self._stop()
         self._process, self._connection = _launched(self._limits)
         try:
+            if files := loaded_files():  # first: what follows may be made of what they define
+                self._exchange((load_same, (files,)), _START_UP_S)
             self._exchange(self._setup, _START_UP_S)
         except ChildFailed as failure:
             if self._closed:

@@ -252,7 +252,12 @@ def _identity(manifest: Manifest | None) -> object:
     """Return what scenes that are not in a shard yet depend on."""
     if manifest is None:
         return None
-    return (manifest.settings, manifest.environment, manifest.objects_lock_sha256)
+    return (
+        manifest.settings,
+        manifest.environment,
+        manifest.objects_lock_sha256,
+        manifest.extensions,
+    )
 
 
 def _clear(folder: DatasetFolder) -> None:

@@ -98,11 +98,11 @@ def test_what_emitters_reflect_is_lost_in_the_published_arrays(tmp_path: Path) -
 
 def test_the_names_of_members_are_those_of_a_scene() -> None:
     """A claim that is mistyped would claim nothing, and be noticed only as a note too many."""
-    from pipeline.flows.convert_scene import _CARRIED
+    from pipeline.flows.scene_formats import FORMATS
 
     known = {f"objects.{field.name}" for field in dataclasses.fields(SceneObject)}
     known |= {f"materials.{name}" for name in conventions.MATERIAL_COLUMNS}
     known |= {field.name for field in dataclasses.fields(Scene)}
-    for members in _CARRIED.values():
-        assert members <= known
+    for form in FORMATS.values():
+        assert set(form.carried) <= known
     assert carried.lost_members(tiny_scene(), known) == ()

@@ -36,7 +36,7 @@ from train.evaluation.grouped_lights import GROUPED, grouped_pictures
 from train.evaluation.groups import by_group, summary
 from train.evaluation.judge import judged_scene, median_picture, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
-from train.evaluation.picture_scores import MEANING, hdr_flip, picture_scores
+from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals
 from train.loop.state import new_state
@@ -75,7 +75,7 @@ def test_what_cannot_be_measured_is_not_a_number() -> None:
     picture = rng_for(0, "picture").uniform(0, 2, (16, 16, 3))
     hits = np.ones((16, 16), bool)
     without = picture_scores(picture, picture, hits, None)
-    assert list(without) == list(MEANING)
+    assert list(without) == list(METRICS)
     assert without["lpips"] is None
     assert (without["psnr_log_db"], without["ssim"], without["log_l1"]) == (100.0, 1.0, 0.0)
     with_weights = picture_scores(picture * 0.5, picture, hits, Lpips(*small_weights()))
@@ -112,7 +112,7 @@ def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
         judged_views(dataclasses.replace(contest(dataset), resolution=24), lambda: None)
 
 
-SCORES = dict.fromkeys(MEANING, 31.0) | {"lpips": None, "log_l1": 0.1}
+SCORES = dict.fromkeys(METRICS, 31.0) | {"lpips": None, "log_l1": 0.1}
 
 
 def with_lights(scene: Scene, lights: int) -> Scene:
@@ -137,7 +137,7 @@ def with_lights(scene: Scene, lights: int) -> Scene:
 
 
 def row(number: int, **changes: object) -> JudgedView:
-    scores = {name: 30.0 + number for name in MEANING} | {"lpips": None, "log_l1": 0.1}
+    scores = {name: 30.0 + number for name in METRICS} | {"lpips": None, "log_l1": 0.1}
     base = JudgedView(
         key=f"{number:09d}",
         view=0,

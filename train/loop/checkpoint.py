@@ -21,6 +21,7 @@ from model.renderformer import RenderFormer
 from model.weights import decode_config, encode_config, load_tensors
 from storage.atomic import atomic_writer
 from storage.errors import TrilightError
+from storage.extensions import recorded, require_same_extensions
 from storage.safe_read import read_safetensors
 from storage.settings import from_record, settings_record
 from train.data.unusable import Unusable
@@ -52,6 +53,7 @@ def save_checkpoint(
         "model": encode_config(settings.model),
         "data_digest": data_digest,
         "world_size": world_size,
+        **({"extensions": found} if (found := recorded("weights")) else {}),
         "sha256": UNSEALED,
     }
     contiguous = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
@@ -126,6 +128,7 @@ def resumed_state(
             differs is named.
     """
     header = checkpoint.header
+    require_same_extensions("resume: the run", header.get("extensions", {}), recorded("weights"))
     begun = from_record(TrainSettings, header["settings"])  # a field that came later is at default
     _require_same("settings", settings_record(begun), settings_record(settings))
     _require_same("data", {"digest": header["data_digest"]}, {"digest": data_digest})
