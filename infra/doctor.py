@@ -16,6 +16,7 @@ from typing import Literal
 from pipeline.renders.facts import render_facts
 from pipeline.renders.variant import choose_variant
 from storage.cache import cache_folder
+from storage.installation import IMPORT_ROOT
 
 State = Literal["ok", "slower", "missing"]
 
@@ -215,7 +216,7 @@ def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> 
     try:
         result = subprocess.run(
             [sys.executable, "-c", code],
-            cwd=Path(__file__).parents[1],
+            cwd=IMPORT_ROOT,
             capture_output=True,
             text=True,
             timeout=_PROBE_S,
