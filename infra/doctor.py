@@ -16,7 +16,7 @@ from typing import Literal
 from pipeline.renders.facts import render_facts
 from pipeline.renders.variant import choose_variant
 from storage.cache import cache_folder
-from storage.installation import IMPORT_ROOT
+from storage.installation import IMPORT_ROOT, module_name
 
 State = Literal["ok", "slower", "missing"]
 
@@ -142,7 +142,8 @@ def _mesh_filters() -> Finding:
             mend="pip install -r requirements/dataset.txt",
         )
     code = (
-        "from pipeline.assets.environment import missing_filters; m = missing_filters(); "
+        f"from {module_name('pipeline.assets.environment')} import missing_filters; "
+        "m = missing_filters(); "
         "raise SystemExit(', '.join(m) if m else 0)"
     )
     return _probe(

@@ -38,8 +38,8 @@ def write_wheel_tree(checkout: Path, tree: Path) -> None:
         shutil.copytree(checkout / package, tree / FACE / package, ignore=_LEFT_OUT)
     shutil.copy2(checkout / "prefect.yaml", tree / FACE)
     for path in (tree / FACE).rglob("*.py"):
-        source = path.read_text(encoding="utf-8")
-        path.write_text(with_prefix(source, path.name), encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
+        path.write_text(with_prefix(text, str(path.relative_to(tree / FACE))), encoding="utf-8")
 
 
 def with_prefix(source: str, name: str = "<source>") -> str:

@@ -64,9 +64,7 @@ def convert_scene(
         TrilightError: the source is unusable, the target's form cannot hold it, or it cannot be
             written.
     """
-    suffix = target.suffix.lower()
-    if suffix not in _CARRIED or target.is_dir():
-        raise TrilightError(f"{target}: cannot be written as a scene; {_EXPECTED}.")
+    suffix = _require_form(target)
     child = file_child()
     try:
         keys = call_with_retries(child, source_keys, source)
@@ -106,7 +104,7 @@ def write_scene(
     Raises:
         TrilightError: the form cannot hold it, or it cannot be written.
     """
-    suffix = target.suffix.lower()
+    suffix = _require_form(target)
     lost = lost_members(scene, _CARRIED[suffix])
     if suffix in SUFFIXES:
         write_usd(target, scene)
@@ -118,6 +116,14 @@ def write_scene(
     else:
         write_atomically(target, encode_scene(scene))
     return lost
+
+
+def _require_form(target: Path) -> str:
+    """Return the suffix that chooses the form; raises TrilightError where it means none."""
+    suffix = target.suffix.lower()
+    if suffix not in _CARRIED or target.is_dir():
+        raise TrilightError(f"{target}: cannot be written as a scene; {_EXPECTED}.")
+    return suffix
 
 
 def _one(source: SceneSource, target: Path, budget: int | None) -> Converted:

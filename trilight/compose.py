@@ -1,0 +1,343 @@
+"""A scene from Python: meshes with materials, a floor, lamps and cameras, put together.
+
+The builder writes down what a RenderFormer scene file would say, and what gives such files their
+meaning (pipeline.scenes.from_description) makes the scene.
+"""
+
+import dataclasses
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.flows.read_scenes import SceneReader
+from pipeline.objects.generated import builtin_mesh
+from pipeline.objects.licences import USER_PROVIDED
+from pipeline.scenes.description import (
+    DescribedCamera,
+    DescribedMaterial,
+    DescribedObject,
+    DescribedTransform,
+    SceneDescription,
+    Vector,
+)
+from pipeline.scenes.from_description import SHELL_FOLDER, LoadedMesh, scene_from_description
+from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from storage.conventions import look_at_c2w
+from storage.errors import TrilightError
+from storage.ranges import FLOAT32_MAX, Within, check_ranges
+from storage.scene import Scene
+
+_CC0 = "CC0-1.0"
+_TEMPLATE = "python"
+_TRIANGLE = np.array([[0.0, 1.0, 0.0], [-(0.75**0.5), -0.5, 0.0], [0.75**0.5, -0.5, 0.0]]) / 3**0.5
+"""Equilateral, edge 1, its middle at the origin."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """How a surface reflects or shines: Lambert and GGX, as storage.conventions says."""
+
+    diffuse: Annotated[tuple[float, ...], Within(0, 1)] = (0.5, 0.5, 0.5)
+    """Diffuse albedo, linear red, green, blue; with `specular` at most 1 in each."""
+    specular: Annotated[tuple[float, ...], Within(0, 1)] = (0.0, 0.0, 0.0)
+    """Specular albedo."""
+    roughness: Annotated[float, Within(0, 1)] = 0.5
+    """The GGX width is its square."""
+    emission: Annotated[tuple[float, ...], Within(0, FLOAT32_MAX)] = (0.0, 0.0, 0.0)
+    """Radiance of both sides; every triangle of a mesh that shines is an emitter of its own."""
+    smooth: bool = True
+    """Whether normals are interpolated across edges of up to 30 degrees; flat otherwise."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "material: ")
+        for name in ("diffuse", "specular", "emission"):
+            _vector(f"material: {name}", getattr(self, name))
+
+
+class SceneBuilder:
+    """Gathers what a scene is made of; `scene` makes it. Every method returns the builder."""
+
+    def __init__(self, name: str = "scene") -> None:
+        """Begin an empty scene; `name` stands in messages and in its provenance."""
+        self._name = name
+        self._objects: list[DescribedObject] = []
+        self._meshes: list[LoadedMesh | Path] = []
+        self._cameras: list[DescribedCamera] = []
+
+    def add_mesh(
+        self,
+        mesh: str | os.PathLike[str] | tuple[ArrayLike, ArrayLike],
+        material: Material | None = None,
+        *,
+        name: str | None = None,
+        at: Vector = (0.0, 0.0, 0.0),
+        size: float | None = None,
+        rotation_deg: Vector = (0.0, 0.0, 0.0),
+        licence: str = USER_PROVIDED,
+    ) -> Self:
+        """Add an object.
+
+        Args:
+            mesh: a file `.glb .gltf .obj .ply .stl .off`, which `scene` reads; or vertices [V, 3]
+                and triangles [F, 3] of their rows, counter-clockwise seen from outside.
+            material: of the whole object; grey by default.
+            name: unique in the scene; after the file, or `objectN`, by default.
+            at: where the origin of the mesh comes to lie, metres; with `size` the mean of its
+                vertices.
+            size: diameter in metres of the sphere around that mean that holds it; by default the
+                mesh keeps the units of its file.
+            rotation_deg: angles about the world's X, then Y, then Z.
+            licence: SPDX identifier, or `LicenseRef-...`.
+
+        Raises:
+            TrilightError: no such file, arrays that are no mesh, or numbers that mean nothing.
+        """
+        if isinstance(mesh, tuple):
+            name = name or f"object{len(self._objects)}"
+            found: LoadedMesh | Path = _loaded(*mesh, uid=name, licence=licence)
+        else:
+            found = Path(mesh)
+            if not found.is_file():
+                raise TrilightError(f"{found}: no such file; expected a mesh.")
+            name = name or self._unused(found.stem)
+        if size is not None and not 0 < size < np.inf:
+            raise TrilightError(f"{name}: size is {size}; expected metres above 0.")
+        scale = 1.0 if size is None else float(size)
+        transform = DescribedTransform(
+            translation=_vector(f"{name}: at", at),
+            rotation_deg=_vector(f"{name}: rotation_deg", rotation_deg),
+            scale=(scale, scale, scale),
+            normalize=size is not None,
+        )
+        return self._add(name, found, transform, material or Material())
+
+    def add_builtin(
+        self,
+        family: str,
+        material: Material | None = None,
+        *,
+        number: int = 0,
+        name: str | None = None,
+        at: Vector = (0.0, 0.0, 0.0),
+        size: float = 0.6,
+        rotation_deg: Vector = (0.0, 0.0, 0.0),
+    ) -> Self:
+        """Add a procedural object, such as the 3rd `rock` or `torus_knot` of `builtin:`.
+
+        Args:
+            family: a name of pipeline.objects.builtin.families.
+            number: which of the family, from 0.
+            material, name, at, size, rotation_deg: as `add_mesh`.
+
+        Raises:
+            TrilightError: there is no such family, or as `add_mesh`.
+        """
+        return self.add_mesh(
+            builtin_mesh(family, number),
+            material,
+            name=name or self._unused(family),
+            at=at,
+            size=size,
+            rotation_deg=rotation_deg,
+            licence=_CC0,
+        )
+
+    def add_floor(
+        self, material: Material | None = None, *, size: float = 2.0, height: float = -0.5
+    ) -> Self:
+        """Add a level square of 128 triangles, as the rooms of our datasets have.
+
+        Args:
+            material: of the floor; grey by default.
+            size: side in metres; its middle is above the origin.
+            height: where it lies, metres; the floor of the nominal room is at -0.5.
+        """
+        placement = PatchPlacement(
+            rotation_deg=(0, 0, 0),
+            reach=1,
+            scale=(size, size, 1),
+            translation=(0, 0, 1 + 2 * height),
+        )
+        name = self._unused("floor")
+        square = (patch(SIDES["floor"], placement), PATCH_FACES)
+        mesh = _loaded(*square, uid=f"{SHELL_FOLDER}{name}", licence=_CC0)
+        flat = dataclasses.replace(material or Material(), smooth=False)
+        return self._add(name, mesh, _STAYS, flat)
+
+    def add_lamp(
+        self,
+        *,
+        at: Vector,
+        radiance: float | Vector = 2000.0,
+        size: float = 0.15,
+        towards: Vector = (0.0, 0.0, 0.0),
+    ) -> Self:
+        """Add an emitter: one triangle with equal sides, hidden from the camera, bright on both.
+
+        Args:
+            at: its middle, metres.
+            radiance: linear red, green, blue, or one number for white.
+            size: its side in metres; the power grows with its square.
+            towards: the point that it faces.
+
+        Raises:
+            TrilightError: numbers that mean nothing.
+        """
+        name = self._unused("lamp")
+        middle, target = (
+            _vector(f"{name}: {what}", value) for what, value in (("at", at), ("towards", towards))
+        )
+        if middle == target or not 0 < size < np.inf:
+            raise TrilightError(
+                f"{name}: size is {size} and towards is {target} from {middle}; expected metres "
+                "above 0, and another point."
+            )
+        up = (0.0, 0.0, 1.0) if middle[:2] != target[:2] else (0.0, 1.0, 0.0)
+        pose = look_at_c2w(eye=middle, target=target, up=up)
+        corners = size * _TRIANGLE @ pose[:3, :3].T + np.array(middle)
+        rgb = (radiance, radiance, radiance) if isinstance(radiance, float | int) else radiance
+        shining = Material(diffuse=(0.0, 0.0, 0.0), roughness=1.0, emission=rgb)
+        mesh = _loaded(corners, [[0, 1, 2]], uid=name, licence=_CC0)
+        return self._add(name, mesh, _STAYS, shining)
+
+    def add_camera(
+        self,
+        *,
+        at: Vector,
+        look_at: Vector = (0.0, 0.0, 0.0),
+        fov_deg: float = 40.0,
+        up: Vector = (0.0, 0.0, 1.0),
+    ) -> Self:
+        """Add a view.
+
+        Args:
+            at: where the camera is, metres.
+            look_at: the point in the middle of the picture.
+            fov_deg: full angle of view, equal in width and height.
+            up: roughly upwards in the picture; not along the view.
+        """
+        row = len(self._cameras)
+        camera = DescribedCamera(
+            position=_vector(f"camera {row}: at", at),
+            look_at=_vector(f"camera {row}: look_at", look_at),
+            up=_vector(f"camera {row}: up", up),
+            fov_deg=float(fov_deg),
+        )
+        self._cameras.append(camera)
+        return self
+
+    def scene(self) -> Scene:
+        """Return the scene; it passes `Scene.check`. Files are read here, by a child process.
+
+        Raises:
+            TrilightError: a file is unusable, two objects have one name, albedos add up to more
+                than 1, or there is no lamp, no camera or no surface.
+        """
+        if not self._objects:
+            raise TrilightError(f"{self._name}: holds no object; expected add_mesh and its kin.")
+        description = SceneDescription(
+            file=self._name,
+            scene_name=self._name,
+            objects=tuple(self._objects),
+            cameras=tuple(self._cameras),
+            unknown_fields=(),
+        )
+        return scene_from_description(
+            description,
+            self._read(),
+            num_views=len(self._cameras),
+            provenance={"template": _TEMPLATE, "name": self._name},
+            albedo_over_one="refuse",
+        )
+
+    def _read(self) -> list[LoadedMesh]:
+        with SceneReader() as reader:  # starts no child where no mesh is a file
+            return [
+                reader.mesh(mesh, USER_PROVIDED) if isinstance(mesh, Path) else mesh
+                for mesh in self._meshes
+            ]
+
+    def _add(
+        self, name: str, mesh: LoadedMesh | Path, transform: DescribedTransform, material: Material
+    ) -> Self:
+        described = DescribedObject(
+            name=name,
+            mesh_path=str(mesh) if isinstance(mesh, Path) else mesh.uid,
+            transform=transform,
+            material=_described(material),
+            remesh=False,
+            remesh_target_face_num=0,
+        )
+        self._objects.append(described)
+        self._meshes.append(mesh)
+        return self
+
+    def _unused(self, name: str) -> str:
+        """Return a name that no object has yet: `name`, `name1`, `name2`."""
+        taken = {described.name for described in self._objects}
+        tries = (f"{name}{number or ''}" for number in range(len(taken) + 1))
+        return next(text for text in tries if text not in taken)
+
+
+_STAYS = DescribedTransform(
+    translation=(0.0, 0.0, 0.0),
+    rotation_deg=(0.0, 0.0, 0.0),
+    scale=(1.0, 1.0, 1.0),
+    normalize=False,
+)
+
+
+def _described(material: Material) -> DescribedMaterial:
+    return DescribedMaterial(
+        diffuse=_vector("diffuse", material.diffuse),
+        specular=_vector("specular", material.specular),
+        roughness=material.roughness,
+        emissive=_vector("emission", material.emission),
+        smooth_shading=material.smooth,
+        random_diffuse_max=1.0,
+        random_diffuse_type="per-triangle",
+        rand_tri_diffuse_seed=None,
+    )
+
+
+def _vector(name: str, values: ArrayLike) -> Vector:
+    array = np.asarray(values, np.float64)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise TrilightError(f"{name} is {values!r}; expected three finite numbers.")
+    x, y, z = array.tolist()
+    return x, y, z
+
+
+def _loaded(positions: ArrayLike, faces: ArrayLike, *, uid: str, licence: str) -> LoadedMesh:
+    """Return arrays as a mesh; raises TrilightError where they are none."""
+    points: NDArray[np.float64] = np.asarray(positions, np.float64)
+    rows = np.asarray(faces)
+    if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
+        raise TrilightError(
+            f"{uid}: vertices have shape {points.shape}; expected [V, 3] finite metres."
+        )
+    whole = np.issubdtype(rows.dtype, np.integer)
+    if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0 or not whole:
+        raise TrilightError(
+            f"{uid}: triangles have shape {rows.shape} and dtype {rows.dtype}; expected [F, 3] "
+            "whole numbers."
+        )
+    if rows.min() < 0 or rows.max() >= len(points):
+        raise TrilightError(
+            f"{uid}: triangles name vertices {rows.min()} to {rows.max()}; expected 0 to "
+            f"{len(points) - 1}."
+        )
+    centre = points.mean(axis=0)
+    reach = float(np.sqrt(np.sum(np.square(points - centre), axis=1).max()))
+    return LoadedMesh(
+        uid=uid,
+        licence=licence,
+        positions=points,
+        faces=rows.astype(np.int64),
+        centre=centre,
+        reach=reach,
+    )
