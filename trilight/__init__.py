@@ -18,7 +18,6 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from trilight.compose import Material as Material
     from trilight.compose import SceneBuilder as SceneBuilder
     from trilight.datasets import Dataset as Dataset
     from trilight.datasets import DatasetOrder as DatasetOrder
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from trilight.learning import named_run as named_run
     from trilight.learning import train_network as train_network
     from trilight.learning import write_judgement as write_judgement
+    from trilight.parts import Material as Material
     from trilight.pictures import FirstHits as FirstHits
     from trilight.pictures import NeuralRenderer as NeuralRenderer
     from trilight.pictures import RenderedView as RenderedView
@@ -52,12 +52,13 @@ if TYPE_CHECKING:
     from trilight.scenes import write_scene as write_scene
 
 _NAMES = {
-    "compose": "Material SceneBuilder",
+    "compose": "SceneBuilder",
     "datasets": "Dataset DatasetOrder Outcome Sample Statistics "
     "dataset_statistics generate open_dataset",
     "errors": "TrilightError",
     "learning": "Judgement TrainResult TrainSettings "
     "judge_network named_run train_network write_judgement",
+    "parts": "Material",
     "pictures": "FirstHits NeuralRenderer RenderedView "
     "first_hits open_network render render_views write_picture",
     "scenes": "Scene SceneObject read_scene read_scenes within_budget write_scene",

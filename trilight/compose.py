@@ -8,17 +8,16 @@ import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pipeline.flows.read_scenes import SceneReader
 from pipeline.objects.generated import builtin_mesh
 from pipeline.objects.licences import USER_PROVIDED
 from pipeline.scenes.description import (
     DescribedCamera,
-    DescribedMaterial,
     DescribedObject,
     DescribedTransform,
     SceneDescription,
@@ -28,8 +27,8 @@ from pipeline.scenes.from_description import SHELL_FOLDER, LoadedMesh, scene_fro
 from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
-from storage.ranges import FLOAT32_MAX, Within, check_ranges
 from storage.scene import Scene
+from trilight.parts import Material, described_material, mesh_of_arrays, vector
 
 _CC0 = "CC0-1.0"
 _TEMPLATE = "python"
@@ -37,25 +36,20 @@ _TRIANGLE = np.array([[0.0, 1.0, 0.0], [-(0.75**0.5), -0.5, 0.0], [0.75**0.5, -0
 """Equilateral, edge 1, its middle at the origin."""
 
 
+_STAYS = DescribedTransform(
+    translation=(0.0, 0.0, 0.0),
+    rotation_deg=(0.0, 0.0, 0.0),
+    scale=(1.0, 1.0, 1.0),
+    normalize=False,
+)
+
+
 @dataclass(frozen=True, kw_only=True)
-class Material:
-    """How a surface reflects or shines: Lambert and GGX, as storage.conventions says."""
+class _MeshFile:
+    """A file that is read when the scene is made."""
 
-    diffuse: Annotated[tuple[float, ...], Within(0, 1)] = (0.5, 0.5, 0.5)
-    """Diffuse albedo, linear red, green, blue; with `specular` at most 1 in each."""
-    specular: Annotated[tuple[float, ...], Within(0, 1)] = (0.0, 0.0, 0.0)
-    """Specular albedo."""
-    roughness: Annotated[float, Within(0, 1)] = 0.5
-    """The GGX width is its square."""
-    emission: Annotated[tuple[float, ...], Within(0, FLOAT32_MAX)] = (0.0, 0.0, 0.0)
-    """Radiance of both sides; every triangle of a mesh that shines is an emitter of its own."""
-    smooth: bool = True
-    """Whether normals are interpolated across edges of up to 30 degrees; flat otherwise."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "material: ")
-        for name in ("diffuse", "specular", "emission"):
-            _vector(f"material: {name}", getattr(self, name))
+    path: Path
+    licence: str
 
 
 class SceneBuilder:
@@ -65,7 +59,7 @@ class SceneBuilder:
         """Begin an empty scene; `name` stands in messages and in its provenance."""
         self._name = name
         self._objects: list[DescribedObject] = []
-        self._meshes: list[LoadedMesh | Path] = []
+        self._meshes: list[LoadedMesh | _MeshFile] = []
         self._cameras: list[DescribedCamera] = []
 
     def add_mesh(
@@ -98,18 +92,20 @@ class SceneBuilder:
         """
         if isinstance(mesh, tuple):
             name = name or f"object{len(self._objects)}"
-            found: LoadedMesh | Path = _loaded(*mesh, uid=name, licence=licence)
+            found: LoadedMesh | _MeshFile = mesh_of_arrays(*mesh, uid=name, licence=licence)
         else:
-            found = Path(mesh)
-            if not found.is_file():
-                raise TrilightError(f"{found}: no such file; expected a mesh.")
-            name = name or self._unused(found.stem)
+            found = _MeshFile(path=Path(mesh), licence=licence)
+            if not found.path.is_file():
+                raise TrilightError(f"{found.path}: no such file; expected a mesh.")
+            name = name or self._unused(found.path.stem)
         if size is not None and not 0 < size < np.inf:
             raise TrilightError(f"{name}: size is {size}; expected metres above 0.")
+        if size is not None and isinstance(found, LoadedMesh) and found.reach == 0:
+            raise TrilightError(f"{name}: all vertices are one point; expected a mesh.")
         scale = 1.0 if size is None else float(size)
         transform = DescribedTransform(
-            translation=_vector(f"{name}: at", at),
-            rotation_deg=_vector(f"{name}: rotation_deg", rotation_deg),
+            translation=vector(f"{name}: at", at),
+            rotation_deg=vector(f"{name}: rotation_deg", rotation_deg),
             scale=(scale, scale, scale),
             normalize=size is not None,
         )
@@ -164,7 +160,7 @@ class SceneBuilder:
         )
         name = self._unused("floor")
         square = (patch(SIDES["floor"], placement), PATCH_FACES)
-        mesh = _loaded(*square, uid=f"{SHELL_FOLDER}{name}", licence=_CC0)
+        mesh = mesh_of_arrays(*square, uid=f"{SHELL_FOLDER}{name}", licence=_CC0)
         flat = dataclasses.replace(material or Material(), smooth=False)
         return self._add(name, mesh, _STAYS, flat)
 
@@ -189,7 +185,7 @@ class SceneBuilder:
         """
         name = self._unused("lamp")
         middle, target = (
-            _vector(f"{name}: {what}", value) for what, value in (("at", at), ("towards", towards))
+            vector(f"{name}: {what}", value) for what, value in (("at", at), ("towards", towards))
         )
         if middle == target or not 0 < size < np.inf:
             raise TrilightError(
@@ -201,7 +197,7 @@ class SceneBuilder:
         corners = size * _TRIANGLE @ pose[:3, :3].T + np.array(middle)
         rgb = (radiance, radiance, radiance) if isinstance(radiance, float | int) else radiance
         shining = Material(diffuse=(0.0, 0.0, 0.0), roughness=1.0, emission=rgb)
-        mesh = _loaded(corners, [[0, 1, 2]], uid=name, licence=_CC0)
+        mesh = mesh_of_arrays(corners, [[0, 2, 1]], uid=name, licence=_CC0)
         return self._add(name, mesh, _STAYS, shining)
 
     def add_camera(
@@ -222,9 +218,9 @@ class SceneBuilder:
         """
         row = len(self._cameras)
         camera = DescribedCamera(
-            position=_vector(f"camera {row}: at", at),
-            look_at=_vector(f"camera {row}: look_at", look_at),
-            up=_vector(f"camera {row}: up", up),
+            position=vector(f"camera {row}: at", at),
+            look_at=vector(f"camera {row}: look_at", look_at),
+            up=vector(f"camera {row}: up", up),
             fov_deg=float(fov_deg),
         )
         self._cameras.append(camera)
@@ -257,18 +253,22 @@ class SceneBuilder:
     def _read(self) -> list[LoadedMesh]:
         with SceneReader() as reader:  # starts no child where no mesh is a file
             return [
-                reader.mesh(mesh, USER_PROVIDED) if isinstance(mesh, Path) else mesh
+                reader.mesh(mesh.path, mesh.licence) if isinstance(mesh, _MeshFile) else mesh
                 for mesh in self._meshes
             ]
 
     def _add(
-        self, name: str, mesh: LoadedMesh | Path, transform: DescribedTransform, material: Material
+        self,
+        name: str,
+        mesh: LoadedMesh | _MeshFile,
+        transform: DescribedTransform,
+        material: Material,
     ) -> Self:
         described = DescribedObject(
             name=name,
-            mesh_path=str(mesh) if isinstance(mesh, Path) else mesh.uid,
+            mesh_path=str(mesh.path) if isinstance(mesh, _MeshFile) else mesh.uid,
             transform=transform,
-            material=_described(material),
+            material=described_material(material),
             remesh=False,
             remesh_target_face_num=0,
         )
@@ -281,63 +281,3 @@ class SceneBuilder:
         taken = {described.name for described in self._objects}
         tries = (f"{name}{number or ''}" for number in range(len(taken) + 1))
         return next(text for text in tries if text not in taken)
-
-
-_STAYS = DescribedTransform(
-    translation=(0.0, 0.0, 0.0),
-    rotation_deg=(0.0, 0.0, 0.0),
-    scale=(1.0, 1.0, 1.0),
-    normalize=False,
-)
-
-
-def _described(material: Material) -> DescribedMaterial:
-    return DescribedMaterial(
-        diffuse=_vector("diffuse", material.diffuse),
-        specular=_vector("specular", material.specular),
-        roughness=material.roughness,
-        emissive=_vector("emission", material.emission),
-        smooth_shading=material.smooth,
-        random_diffuse_max=1.0,
-        random_diffuse_type="per-triangle",
-        rand_tri_diffuse_seed=None,
-    )
-
-
-def _vector(name: str, values: ArrayLike) -> Vector:
-    array = np.asarray(values, np.float64)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise TrilightError(f"{name} is {values!r}; expected three finite numbers.")
-    x, y, z = array.tolist()
-    return x, y, z
-
-
-def _loaded(positions: ArrayLike, faces: ArrayLike, *, uid: str, licence: str) -> LoadedMesh:
-    """Return arrays as a mesh; raises TrilightError where they are none."""
-    points: NDArray[np.float64] = np.asarray(positions, np.float64)
-    rows = np.asarray(faces)
-    if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
-        raise TrilightError(
-            f"{uid}: vertices have shape {points.shape}; expected [V, 3] finite metres."
-        )
-    whole = np.issubdtype(rows.dtype, np.integer)
-    if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0 or not whole:
-        raise TrilightError(
-            f"{uid}: triangles have shape {rows.shape} and dtype {rows.dtype}; expected [F, 3] "
-            "whole numbers."
-        )
-    if rows.min() < 0 or rows.max() >= len(points):
-        raise TrilightError(
-            f"{uid}: triangles name vertices {rows.min()} to {rows.max()}; expected 0 to "
-            f"{len(points) - 1}."
-        )
-    centre = points.mean(axis=0)
-    reach = float(np.sqrt(np.sum(np.square(points - centre), axis=1).max()))
-    return LoadedMesh(
-        uid=uid,
-        licence=licence,
-        positions=points,
-        faces=rows.astype(np.int64),
-        centre=centre,
-        reach=reach,
-    )

@@ -20,8 +20,7 @@ from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.assets.stage import prepare_assets
 from pipeline.assets.store import AssetStore
 from pipeline.flows.children import ChildPool
-from pipeline.flows.prepare_isolated import asset_child
-from pipeline.flows.prepare_isolated import preload_mesh_libraries
+from pipeline.flows.prepare_isolated import asset_child, preload_mesh_libraries
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
 from pipeline.objects.sources import find_objects

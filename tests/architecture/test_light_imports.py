@@ -31,6 +31,16 @@ def test_the_waist_and_the_templates_are_light(statement: str) -> None:
     assert not _loaded_by(statement) & set(HEAVY)
 
 
+def test_the_face_is_light_until_it_is_used() -> None:
+    loaded = _loaded_by("import trilight")
+    assert not {name for name in loaded if name.startswith(("numpy", "storage", "pipeline"))}
+    every_module = (
+        "import trilight.compose, trilight.datasets, trilight.extend, trilight.learning, "
+        "trilight.pictures, trilight.scenes"
+    )
+    assert not _loaded_by(every_module) & set(HEAVY)
+
+
 def test_settings_are_light() -> None:
     assert not _loaded_by("import pipeline.flows.builds") & set(HEAVY)
 

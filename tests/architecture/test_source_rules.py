@@ -71,8 +71,8 @@ def test_the_top_level_holds_what_the_design_names() -> None:
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
     ).stdout
     allowed = {
-        *PACKAGES, "tests", "docs", "examples", "requirements", "README.md", "LICENSE", "DECISIONS.md",
-        "LOG.md", "Makefile", "pyproject.toml", "prefect.yaml",
+        *PACKAGES, "tests", "docs", "examples", "requirements", "README.md", "LICENSE",
+        "DECISIONS.md", "LOG.md", "Makefile", "pyproject.toml", "prefect.yaml",
     }  # fmt: skip
     top = {line.split("/")[0] for line in tracked.splitlines()}
     assert {name for name in top if not name.startswith(".")} <= allowed
