@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from trilight.pictures import RenderedView as RenderedView
     from trilight.pictures import first_hits as first_hits
     from trilight.pictures import open_network as open_network
+    from trilight.pictures import preview_srgb8 as preview_srgb8
     from trilight.pictures import render as render
     from trilight.pictures import render_views as render_views
     from trilight.pictures import write_picture as write_picture
@@ -60,7 +61,7 @@ _NAMES = {
     "judge_network named_run train_network write_judgement",
     "parts": "Material",
     "pictures": "FirstHits NeuralRenderer RenderedView "
-    "first_hits open_network render render_views write_picture",
+    "first_hits open_network preview_srgb8 render render_views write_picture",
     "scenes": "Scene SceneObject read_scene read_scenes within_budget write_scene",
 }
 """What there is, by the module of this package that has it. No name is one of a package of ours:

@@ -27,6 +27,7 @@ __all__ = [
     "RenderedView",
     "first_hits",
     "open_network",
+    "preview_srgb8",
     "render",
     "render_views",
     "write_picture",
