@@ -194,14 +194,16 @@ def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
 
 @contextlib.contextmanager
 def _without_main() -> Iterator[None]:
-    """Hide the program that runs: multiprocessing would run it again in the child.
+    """Hide a program that runs from a file: multiprocessing would run it again in the child.
 
     Children import by name what they are asked to call, and need none of it. A program of a user's
     that does not guard its last lines by `if __name__ == "__main__"` would start children there.
+    What runs by `python -m` is a module, and may be asked for functions of its own.
     """
     with _one_start:
         program = sys.modules["__main__"]
-        sys.modules["__main__"] = ModuleType("__main__")
+        if program.__spec__ is None:
+            sys.modules["__main__"] = ModuleType("__main__")
         try:
             yield
         finally:
