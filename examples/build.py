@@ -8,14 +8,12 @@ the file has changed is refused, since its other scenes would not be of the same
 
 import dataclasses
 
-from pipeline.flows.settings import BuildSettings, NamedBuild
-from pipeline.flows.training_builds import smoke
-from scene_templates.contents.lights import LightSettings
+from trilight.extend import BuildSettings, LightSettings, NamedBuild, named_build
 
 
 def sunsets() -> NamedBuild:
     """Return the smoke build with one or two coloured lights, far apart from each other."""
-    base: BuildSettings = smoke()
+    base: BuildSettings = named_build("smoke")
     lights: LightSettings = dataclasses.replace(
         base.scenes.lights, count=(1, 2), coloured_share=1.0
     )

@@ -11,14 +11,19 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
-from pipeline.flows.dataset_run import Outcome, make_dataset, prepare_dataset
-from pipeline.flows.executors import EXECUTORS, Executor
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.order_words import generate_words
-from pipeline.flows.runners import ThreadRunner
-from storage.errors import TrilightError
+from trilight.extend import (
+    EXECUTORS,
+    DatasetOrder,
+    Executor,
+    Outcome,
+    ThreadRunner,
+    TrilightError,
+    generate_words,
+    make_dataset,
+    prepare_dataset,
+)
 
-TRILIGHT = (sys.executable, "-m", "infra.cli.app")
+TRILIGHT = (sys.executable, "-m", "trilight")
 
 
 def by_commands(order: DatasetOrder, address: str | None) -> Outcome:

@@ -6,9 +6,7 @@ No build asks for all families there are: a build of your own lists this one (se
 `--set scenes.families` names it in place of the build's.
 """
 
-from scene_templates.families.default_families import FAMILIES
-from scene_templates.families.family import Family
-from scene_templates.shell.rooms import SharedRoom
+from trilight.extend import FAMILIES, Family, SharedRoom
 
 
 def crowd() -> Family:

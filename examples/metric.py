@@ -8,7 +8,7 @@ template, triangles and lights, and against what the noise of the targets alone 
 
 import numpy as np
 
-from train.evaluation.metrics import METRICS, JudgedPicture, Metric
+from trilight.extend import METRICS, JudgedPicture, Metric
 
 DARK = 0.01
 """Added below the fraction, so that black pixels do not decide it."""

@@ -7,7 +7,7 @@ A checkpoint holds the numbers and not the name, so that it opens where nobody k
 a size cannot change, and what each number means, stands in model/config.py.
 """
 
-from model.config import SIZES, ModelConfig
+from trilight.extend import SIZES, ModelConfig
 
 
 def nano() -> ModelConfig:

@@ -11,13 +11,17 @@ import itertools
 
 import numpy as np
 
-from pipeline.objects.listing import Listing
-from pipeline.objects.registry import SOURCES, Asked, ObjectSource
-from storage.atomic import write_atomically
-from storage.errors import TrilightError
-from storage.ply import encode_ply
-from storage.records import ObjectRecord
-from storage.seeds import rng_for
+from trilight.extend import (
+    SOURCES,
+    Asked,
+    Listing,
+    ObjectRecord,
+    ObjectSource,
+    TrilightError,
+    encode_ply,
+    rng_for,
+    write_atomically,
+)
 
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 FACES = np.array(

@@ -8,13 +8,12 @@ after the file has changed is refused. The trained network opens anywhere, witho
 
 import dataclasses
 
-from train.runs import smoke
-from train.settings import TrainSettings
+from trilight.extend import TrainSettings, named_run
 
 
 def quick_lights() -> TrainSettings:
     """Return a short run that is shown every scene under lights of many strengths."""
-    base = smoke()
+    base = named_run("smoke")
     return dataclasses.replace(
         base,
         run="quick-lights",

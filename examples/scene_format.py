@@ -3,8 +3,7 @@
     trilight convert data/smoke/train-000000.tar::000000000 scene.npz --extend scene_format.py
     trilight render scene.npz --extend scene_format.py --out picture.exr
 
-`carried` says what the form holds. Whatever else a scene has, such as names, licences and where it
-comes from here, is named as lost when one is converted; nobody has to remember to say so.
+`carried` says what the form holds; what else a scene has is named as lost when one is converted.
 """
 
 import io
@@ -14,17 +13,24 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.flows.scene_formats import FORMATS, LoadedScene, Pictures, SceneFormat, SceneSource
-from storage.atomic import write_atomically
-from storage.conventions import EMISSION
-from storage.errors import TrilightError
-from storage.scene import Scene, SceneObject
+from trilight.extend import (
+    EMISSION,
+    FORMATS,
+    LoadedScene,
+    Scene,
+    SceneFormat,
+    SceneObject,
+    SceneSource,
+    TrilightError,
+    write_atomically,
+)
 
 ARRAYS = ("vertex_positions", "vertex_normals", "faces", "material_index", "materials")
 CAMERAS = ("c2w", "fov_deg")
+SURFACES = SceneObject(name="surfaces", kind="object", licence="LicenseRef-unknown")
 
 
-def write_npz(target: Path, scene: Scene, pictures: Pictures) -> Iterable[str]:
+def write_npz(target: Path, scene: Scene, pictures: object) -> Iterable[str]:
     """Write a scene; return what of `carried` got lost in this one, which is nothing."""
     stream = io.BytesIO()
     np.savez_compressed(stream, **{name: getattr(scene, name) for name in ARRAYS + CAMERAS})
@@ -43,10 +49,7 @@ def read_npz(source: SceneSource, pictures: bool) -> LoadedScene:
     scene = Scene(
         **arrays,
         object_index=emits.astype(np.uint16),  # which triangles are one thing the file cannot say
-        objects=(
-            SceneObject(name="surfaces", kind="object", licence="LicenseRef-unknown"),
-            SceneObject(name="lamps", kind="emitter"),
-        ),
+        objects=(SURFACES, SceneObject(name="lamps", kind="emitter")),
         provenance={"template": "npz"},
     )
     return LoadedScene(scene=scene, notes=())

@@ -6,12 +6,7 @@ A template is data: which sides of the room it has, from where it is seen, and f
 A family draws from it: how the room is placed, how many objects of which size it holds.
 """
 
-from scene_templates.families.default_families import FAMILIES
-from scene_templates.families.family import Family
-from scene_templates.shell.rooms import SharedRoom
-from scene_templates.templates.registry import TEMPLATES
-from scene_templates.templates.sectors import Sector
-from scene_templates.templates.template import Template
+from trilight.extend import FAMILIES, TEMPLATES, Family, Sector, SharedRoom, Template
 
 TEMPLATES.register(
     "corridor",

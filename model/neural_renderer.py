@@ -93,21 +93,28 @@ class NeuralRenderer:
         """The sha256 of configuration and weights, whatever file they came from."""
         return network_digest(self._model)
 
-    def render(self, scene: Scene, resolution: int) -> NDArray[np.float32]:
+    def render(self, scene: Scene, resolution: int | None = None) -> NDArray[np.float32]:
         """Return the pictures of all cameras of a scene.
 
         Warns where `prepare` has notes.
 
         Args:
             scene: passes `Scene.check`; `scene.with_cameras` gives it others.
-            resolution: width and height in pixels, a multiple of the network's ray bundles.
+            resolution: width and height in pixels, a multiple of the network's ray bundles; what
+                the network was trained at by default, where that is known.
 
         Returns:
             Linear radiance [V, R, R, 3] of at least 0.
 
         Raises:
-            TrilightError: as `prepare` and `view`.
+            TrilightError: as `prepare` and `view`, or no width is known.
         """
+        resolution = resolution or self.trained.resolution
+        if resolution is None:
+            raise TrilightError(
+                "resolution is None, and the network does not say what it was trained at; expected "
+                "a number of pixels."
+            )
         self.require_resolution(resolution)
         prepared = self.prepare(scene)
         for note in (*prepared.notes, *self.resolution_notes(resolution)):

@@ -63,7 +63,7 @@ def _before_a_command(
 
 def _loaded(name: str) -> Any:
     """Return a command, or a group of them, from the file of its name."""
-    module = import_module(f"infra.cli.{name}")
+    module = import_module(f"{__package__}.{name}")
     found = getattr(module, "app", None)
     if found is None:
         found = typer.Typer(add_completion=False)

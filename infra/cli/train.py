@@ -122,7 +122,7 @@ def train(
 ) -> None:
     """Train a model; writes checkpoints, metrics.jsonl, TensorBoard curves and a sheet.
 
-    For several processes, on one machine or many: torchrun -m infra.cli.app train ...
+    For several processes, on one machine or many: torchrun -m trilight train ...
     """
     from train.runs import changed_run, typed_run  # no torch, so that mistakes are named at once
     from train.start import Start

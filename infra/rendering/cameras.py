@@ -55,11 +55,11 @@ def shots(sources: Sequence[SceneSource], cameras: Sequence[Camera] | None) -> l
     ]
 
 
-def own_camera(scene: Scene, view: int) -> Camera:
-    """Return a camera of a scene; raises TrilightError where it has no such view."""
+def own_camera(scene: Scene, view: int, named: str = "--view") -> Camera:
+    """Return a camera of a scene; raises TrilightError, with `named`, where it has no such view."""
     if not 0 <= view < scene.num_views:
         raise TrilightError(
-            f"--view is {view}; expected 0 to {scene.num_views - 1}: the scene has "
+            f"{named} is {view}; expected 0 to {scene.num_views - 1}: the scene has "
             f"{scene.num_views} cameras."
         )
     return Camera(c2w=scene.c2w[view], fov_deg=float(scene.fov_deg[view]))

@@ -17,9 +17,17 @@ from infra.rendering.run import FinishedShot, ShotRun
 from infra.rendering.sources import scene_sources
 from infra.rendering.tone_maps import require_tone_map
 from infra.rendering.video import write_video
+from infra.torch_library import require_torch
 from pipeline.flows.read_scenes import SceneReader
 from pipeline.flows.scene_source import SceneSource, scene_source
-from pipeline.renders.settings import PASS_SPP, NoiseFloor, RenderSettings, Resolution, Samples
+from pipeline.renders.settings import (
+    FIRST_SPP,
+    NoiseFloor,
+    RenderSettings,
+    Resolution,
+    Samples,
+    one_picture,
+)
 from pipeline.renders.variant import choose_variant
 from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.errors import TrilightError
@@ -33,9 +41,6 @@ ENGINES = {"mitsuba": ("mitsuba",), "neural": ("neural",), "both": ("mitsuba", "
 """What `--engine` may be."""
 
 _RESOLUTION = 512
-
-FIRST_SPP = 2 * PASS_SPP[1]
-"""Fewer samples, and the noise floor may flatter (pipeline.renders.noise_floor)."""
 
 
 def _option(name: str) -> str:
@@ -172,7 +177,7 @@ def _completed(asked: Asked) -> Asked:
     """Return it with the network and the width that are taken where none is named."""
     checkpoint, resolution = asked.checkpoint, asked.resolution
     if asked.engine != "mitsuba":
-        _require_torch()
+        require_torch("--engine neural")
         from model.checkpoints import BUILTIN
         from train.networks import trained_resolution
 
@@ -184,23 +189,12 @@ def _completed(asked: Asked) -> Asked:
     return dataclasses.replace(asked, checkpoint=checkpoint, resolution=resolution)
 
 
-def _require_torch() -> None:
-    try:
-        import torch  # noqa: F401
-    except ImportError as error:
-        raise TrilightError(
-            "--engine neural needs PyTorch, which is not installed; expected it: make setup-all."
-        ) from error
-
-
 def _settings(asked: Asked) -> RenderSettings:
     assert asked.resolution is not None
-    return RenderSettings(
+    return one_picture(
         resolution=asked.resolution,
         noise_floor_db=asked.noise_floor_db,
-        min_spp=min(FIRST_SPP, asked.max_spp),
         max_spp=asked.max_spp,
-        min_mean_radiance=0.0,  # who asks for a dark picture gets it
     )
 
 

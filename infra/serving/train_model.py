@@ -63,7 +63,7 @@ class TrainOrder:
 
     def command(self) -> list[str]:
         """Return the command line that trains."""
-        launch = ["-m", "infra.cli.app"]
+        launch = ["-m", "trilight"]
         if self.processes > 1:
             several = f"--nproc-per-node={self.processes}"
             launch = ["-m", "torch.distributed.run", "--standalone", several, *launch]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.conftest import ROOT
 
-PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra")
+PACKAGES = ("trilight", "storage", "scene_templates", "pipeline", "model", "train", "infra")
 MAX_FILE_LINES, MAX_FUNCTION_LINES = 300, 40
 
 
@@ -72,7 +72,8 @@ def test_the_top_level_holds_what_the_design_names() -> None:
     ).stdout
     allowed = {
         *PACKAGES, "tests", "docs", "examples", "requirements", "README.md", "LICENSE",
-        "CONTRIBUTING.md", "DECISIONS.md", "LOG.md", "Makefile", "pyproject.toml", "prefect.yaml",
+        "CONTRIBUTING.md", "DECISIONS.md", "LOG.md", "MANIFEST.in", "Makefile", "pyproject.toml",
+        "prefect.yaml",
     }  # fmt: skip
     top = {line.split("/")[0] for line in tracked.splitlines()}
     assert {name for name in top if not name.startswith(".")} <= allowed

@@ -68,7 +68,7 @@ def _run(words: list[str], environment: dict[str, str]) -> "subprocess.Completed
 
 
 def test_usage_names_the_command_and_no_module() -> None:
-    found = _run([sys.executable, "-m", "infra.cli.app", "verify"], dict(os.environ))
+    found = _run([sys.executable, "-m", "trilight", "verify"], dict(os.environ))
     assert found.returncode == 2
     assert "infra.cli" not in found.stderr
     assert "Usage: trilight verify" in found.stderr

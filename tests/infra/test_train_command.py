@@ -14,7 +14,7 @@ from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
 from train.loop.metrics_log import read_rows
 
-TRILIGHT = [sys.executable, "-m", "infra.cli.app"]
+TRILIGHT = [sys.executable, "-m", "trilight"]
 TINY = {
     "resolution": 16,
     "model.width": 36,

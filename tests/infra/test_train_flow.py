@@ -30,7 +30,7 @@ def test_training_is_launched_by_torchrun_where_there_are_several_processes() ->
     assert (
         one[1:]
         == (
-            "-m infra.cli.app train smoke --out runs/smoke --workers 1 --data a --data b --resume "
+            "-m trilight train smoke --out runs/smoke --workers 1 --data a --data b --resume "
             "--steps 5"
         ).split()
     )
