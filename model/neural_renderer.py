@@ -109,7 +109,8 @@ class NeuralRenderer:
         Raises:
             TrilightError: as `prepare` and `view`, or no width is known.
         """
-        resolution = resolution or self.trained.resolution
+        if resolution is None:
+            resolution = self.trained.resolution
         if resolution is None:
             raise TrilightError(
                 "resolution is None, and the network does not say what it was trained at; expected "

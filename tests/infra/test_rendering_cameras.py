@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +24,8 @@ from tests.scenes_by_hand import tiny_sample, tiny_scene
 class HereReader(SceneReader):
     """Reads in this process: the tests' own files crash nobody."""
 
-    def _call(self, function: Callable[[SceneSource], Result], source: SceneSource) -> Result:
-        return function(source)
+    def _call(self, name: str, function: Callable[..., Result], *args: Any) -> Result:
+        return function(*args)
 
 
 def sources(count: int) -> list[SceneSource]:

@@ -207,3 +207,10 @@ def test_what_memory_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
         renderer.prepare(tiny_scene())
     monkeypatch.setattr(neural_renderer, "_free_bytes", lambda device: None)
     renderer.prepare(tiny_scene())
+
+
+def test_pictures_are_as_wide_as_those_that_it_was_trained_on() -> None:
+    known = NeuralRenderer(network(), TrainedRange(max_triangles=None, resolution=16))
+    assert known.render(tiny_scene()).shape == (2, 16, 16, 3)
+    with pytest.raises(TrilightError, match="resolution is None, and the network does not say"):
+        NeuralRenderer(network()).render(tiny_scene())
