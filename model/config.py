@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 from storage.errors import TrilightError
+from storage.material import PUBLISHED_COLUMNS, material_columns
 from storage.ranges import Within, check_ranges
 
 Head = Literal["dpt", "linear"]
@@ -61,6 +62,8 @@ class ModelConfig:
     """Widths of the DPT's four grids, finest first; empty with a linear head."""
     dpt_taps: Annotated[tuple[int, ...], Within(0, LAYERS - 1)] = ()
     """Decoder layers that feed those grids, in the same order; empty with a linear head."""
+    material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
+    """Columns of a material that the network reads, in the order of its input."""
 
     def __post_init__(self) -> None:
         check_ranges(self, "model config: ")
@@ -73,6 +76,7 @@ class ModelConfig:
             _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
         if self.head not in ("dpt", "linear"):
             _wrong(f"head {self.head!r}", "dpt or linear")
+        _check_columns(self.material_columns)
         if self.head == "dpt":
             self._check_dpt()
         elif self.dpt_features or self.dpt_channels or self.dpt_taps:
@@ -191,6 +195,17 @@ SIZES = ModelConfig.PRESETS
 """Every named size, smallest first."""
 
 SIZES.update(smoke=smoke, tiny=tiny, small=small, base=base, large=large)
+
+
+def _check_columns(names: tuple[str, ...]) -> None:
+    declared = [column.name for column in material_columns()]
+    known = isinstance(names, tuple) and all(name in declared for name in names)
+    if not names or not known or len(set(names)) != len(names):
+        _wrong(
+            f"material_columns {names!r}",
+            f"some of {', '.join(declared)}, each once; a column that is not among them has to be "
+            "declared first (storage.material.register_column)",
+        )
 
 
 def _wrong(got: str, expected: str) -> None:

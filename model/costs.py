@@ -17,7 +17,7 @@ from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
 from model.renderformer import RenderFormer, count_parameters
 from model.windows import cut_windows
-from storage.conventions import MATERIAL_WIDTH
+from storage.material import material_width
 
 TRAINING_BYTES = 16
 """Per parameter while training in float32: weight, gradient, and AdamW's two memories."""
@@ -80,7 +80,9 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
     n = config.num_registers + workload.triangles
     per_side = workload.resolution // config.patch_px
     q, views = per_side**2, workload.views
-    token_inputs = MATERIAL_WIDTH + encoded_normal_width(config.normal_octaves)
+    token_inputs = material_width(config.material_columns) + encoded_normal_width(
+        config.normal_octaves
+    )
     layers = {
         "cross-attention": 4 * q * d * d + 4 * q * n * d,
         "bundle self-attention": 8 * q * d * d + 4 * d * _pairs(config, per_side),

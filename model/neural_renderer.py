@@ -26,6 +26,7 @@ from model.scene_tensors import Cameras, batch_scenes, scene_tensors
 from model.trained_range import MAX_LIGHTS, PUBLISHED, TrainedRange, trained_range
 from model.weights import CONFIG_KEY, network_digest
 from storage.errors import TrilightError
+from storage.material import unread_columns
 from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
 from storage.scene import Scene
 
@@ -196,6 +197,10 @@ class NeuralRenderer:
                 f"the {int(scene.triangle_emits.sum())} emitting triangles are rendered in "
                 f"{num_groups} groups, whose pictures are added"
             )
+        if unread := unread_columns(scene.materials, self._model.config.material_columns):
+            notes.append(
+                f"the network does not read {', '.join(unread)}, which materials of the scene have"
+            )
         most = self._trained.max_triangles
         if most is not None and scene.num_triangles > most:
             notes.append(
@@ -219,12 +224,12 @@ class NeuralRenderer:
 
 def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> EncodedScene:
     """Return one scene after the view-independent stage."""
-    batch = batch_scenes([scene_tensors(scene)])
+    batch = batch_scenes([scene_tensors(scene, model.config.material_columns)])
     moved = dataclasses.replace(
         batch,
         triangles_BT33=batch.triangles_BT33.to(device),
         normals_BT33=batch.normals_BT33.to(device),
-        material_BT10=batch.material_BT10.to(device),
+        material_BTM=batch.material_BTM.to(device),
     )
     return model.encode(moved)
 

@@ -15,6 +15,7 @@ from model.config import ModelConfig
 from model.renderformer import RenderFormer
 from model.trained_range import TrainedRange
 from storage.errors import TrilightError
+from storage.material import PUBLISHED_COLUMNS
 from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
 
 CONFIG_KEY = "trilight_model"
@@ -153,8 +154,15 @@ def require_tensors(got: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -
 
 
 def encode_config(config: ModelConfig) -> str:
-    """Return the JSON of a configuration."""
-    return json.dumps(dataclasses.asdict(config), sort_keys=True)
+    """Return the JSON of a configuration.
+
+    Material columns stand there where they are not the published ones, so that the bytes and the
+    digest of every other network stay what they were before there was a choice.
+    """
+    fields = dataclasses.asdict(config)
+    if config.material_columns == PUBLISHED_COLUMNS:
+        del fields["material_columns"]
+    return json.dumps(fields, sort_keys=True)
 
 
 def decode_config(text: str) -> ModelConfig:

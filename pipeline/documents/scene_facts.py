@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.sample import SceneRecord
 from storage.scene import Scene
 

@@ -16,9 +16,10 @@ from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.atomic import write_atomically
-from storage.conventions import EMISSION, look_at_c2w, preview_srgb8
+from storage.conventions import look_at_c2w, preview_srgb8
 from storage.errors import Rejected, TrilightError
 from storage.lights import num_lights
+from storage.material import EMISSION
 from storage.scene import Scene
 from storage.scene_file import scene_digest
 

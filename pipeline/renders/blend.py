@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import DIFFUSE, ROUGHNESS, SPECULAR, alpha_ggx
+from storage.conventions import alpha_ggx
+from storage.material import DIFFUSE, ROUGHNESS, SPECULAR
 
 MIN_ALPHA = 1e-4
 """Floor of the GGX width: a roughness of 0.01, the smoothest that scenes draw.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
+from pipeline.scenes.drawn_columns import with_drawn_columns
 from pipeline.scenes.laws import require_laws
 from pipeline.scenes.pieces import Piece, emitter_piece, joined, object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
@@ -67,8 +68,12 @@ def compose_scene(
     ]
     layout = layout_rand(rng, settings, plan, shapes)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng)
+    arrays = joined(pieces)
+    arrays["materials"] = with_drawn_columns(
+        arrays["materials"], seed=seed, scene_index=scene_index, attempt=attempt
+    )
     scene = Scene(
-        **joined(pieces),
+        **arrays,
         c2w=np.zeros((0, 4, 4), np.float32),
         fov_deg=np.zeros(0, np.float32),
         objects=tuple(piece.entry for piece in pieces),

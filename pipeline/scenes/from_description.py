@@ -31,15 +31,9 @@ from pipeline.scenes.pieces import Piece, joined
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
 from scene_templates.contents.rotations import rotated, rotation_xyz
-from storage.conventions import (
-    DIFFUSE,
-    EMISSION,
-    MATERIAL_WIDTH,
-    ROUGHNESS,
-    SPECULAR,
-    look_at_c2w,
-)
+from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
+from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.scene import ObjectKind, Scene, SceneObject
 
 SHELL_FOLDER = "templates/backgrounds/"
@@ -185,9 +179,9 @@ def _surface(
 def _reflecting(
     diffuse: NDArray[np.float64], material: DescribedMaterial, over_one: AlbedoOverOne
 ) -> tuple[NDArray[np.float32], float]:
-    """Return rows [M, 10] that do not emit, for diffuse albedos [M, 3], and the least factor."""
+    """Return rows that do not emit, for diffuse albedos [M, 3], and the least factor."""
     diffuse, specular, scale = lawful_albedos(diffuse, np.array(material.specular), over_one)
-    materials = np.zeros((len(diffuse), MATERIAL_WIDTH), np.float32)
+    materials = default_rows(len(diffuse))
     materials[:, DIFFUSE] = diffuse
     materials[:, SPECULAR] = specular
     materials[:, ROUGHNESS] = material.roughness

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
 from scene_templates.layout import Emitter, ShellPart, Surface
-from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, ROUGHNESS, SPECULAR
 from storage.errors import Rejected
+from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.scene import SceneObject
 
 
@@ -23,7 +23,7 @@ class Piece:
     mesh: ShadedMesh
     """In world space."""
     materials: NDArray[np.float32]
-    """[M, 10]."""
+    """[M, 10 or more], every declared column (storage.material)."""
     material_index: NDArray[np.int64]
     """[T] row of `materials`."""
 
@@ -57,7 +57,7 @@ def object_piece(
 def emitter_piece(emitter: Emitter, row: int) -> Piece:
     """Return an emitter: one triangle with a material row of its own."""
     mesh = flat_shaded(emitter.triangle.astype(np.float32), np.array([[0, 1, 2]], np.uint32))
-    materials = np.zeros((1, MATERIAL_WIDTH), np.float32)
+    materials = default_rows(1)
     materials[:, DIFFUSE] = emitter.reflectance
     materials[:, ROUGHNESS] = 1.0
     materials[:, EMISSION] = emitter.radiance_rgb
@@ -88,7 +88,7 @@ def _surfaced(
     diffuse = np.array([surface.diffuse_rgb])
     if surface.colours != "one":
         diffuse = surface.diffuse_scale * rng.random((int(rows.max()) + 1, 3))
-    materials = np.zeros((len(diffuse), MATERIAL_WIDTH), np.float32)
+    materials = default_rows(len(diffuse))
     materials[:, DIFFUSE] = diffuse
     materials[:, SPECULAR] = surface.specular_rgb
     materials[:, ROUGHNESS] = surface.roughness

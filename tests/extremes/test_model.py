@@ -60,9 +60,9 @@ def network(request: pytest.FixtureRequest) -> RenderFormer:
 def lit(emission: float) -> SceneBatch:
     """Return a scene all of whose triangles emit so much, and the brightest other materials."""
     scene = random_scene(20, num_views=1, dtype=torch.float32)
-    material = torch.ones_like(scene.material_T10)
+    material = torch.ones_like(scene.material_TM)
     material[:, 7:] = math.log10(1 + emission)
-    return batch_scenes([dataclasses.replace(scene, material_T10=material)])
+    return batch_scenes([dataclasses.replace(scene, material_TM=material)])
 
 
 def products(model: RenderFormer) -> dict[str, nn.Module]:
@@ -179,7 +179,7 @@ def test_emission_is_read_from_darkness_to_a_million() -> None:
         materials = scene.materials.copy()
         materials[-1, 7:] = emission
         tensors = scene_tensors(dataclasses.replace(scene, materials=materials))
-        read = 10 ** tensors.material_T10[-1, 7].double().item() - 1
+        read = 10 ** tensors.material_TM[-1, 7].double().item() - 1
         # float32 of a logarithm up to 6: 3e-7 of it, times ln 10
         assert read == pytest.approx(emission, rel=2e-6, abs=1e-7)
 

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from infra.setup.ranges import FILE, ROOTS, ranges_page, reachable
-from storage.conventions import EMISSION
 from storage.errors import TrilightError
+from storage.material import EMISSION
 from storage.ranges import Columns, Declared, Within, check_ranges, declared_ranges
 from storage.scene import Scene, SceneObject
 from tests.conftest import ROOT

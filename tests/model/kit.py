@@ -69,7 +69,7 @@ def random_scene(
     return SceneTensors(
         triangles_T33=torch.randn(num_triangles, 3, 3, generator=generator).to(dtype),
         normals_T33=(normals / normals.norm(dim=-1, keepdim=True)).to(dtype),
-        material_T10=torch.rand(num_triangles, 10, generator=generator).to(dtype),
+        material_TM=torch.rand(num_triangles, 10, generator=generator).to(dtype),
         c2w_V44=poses.to(dtype),
         fov_deg_V=(30 + 30 * fov_deg).to(dtype),
     )

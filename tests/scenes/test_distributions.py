@@ -19,7 +19,7 @@ from scene_templates.layout import ShellPart, Surface
 from scene_templates.layout_rand import layout_rand
 from scene_templates.plans import scene_plan
 from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
-from storage.conventions import DIFFUSE
+from storage.material import DIFFUSE
 from storage.scene import Scene, SceneObject
 from storage.seeds import rng_for
 from tests.scene_templates.published import DEFAULT, STAGE_1

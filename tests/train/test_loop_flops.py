@@ -44,7 +44,7 @@ def with_triangles(scene: TrainingScene, count: int) -> TrainingScene:
         old,
         triangles_T33=old.triangles_T33[rows],
         normals_T33=old.normals_T33[rows],
-        material_T10=old.material_T10[rows],
+        material_TM=old.material_TM[rows],
     )
     return dataclasses.replace(scene, tensors=tensors)
 

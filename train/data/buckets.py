@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.scene_tensors import SceneBatch, batch_scenes
+from model.scene_tensors import SceneBatch, batch_scenes, tensors_of
 from train.data.scenes import TrainingScene
 
 MOST_WASTE = 0.05
@@ -78,8 +78,6 @@ def make_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
 
 def _fields_to(batch: SceneBatch, device: torch.device) -> SceneBatch:
     tensors = {
-        field.name: tensor.to(device, non_blocking=True)
-        for field in dataclasses.fields(batch)
-        if (tensor := getattr(batch, field.name)) is not None
+        name: tensor.to(device, non_blocking=True) for name, tensor in tensors_of(batch).items()
     }
     return dataclasses.replace(batch, **tensors)

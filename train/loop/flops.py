@@ -82,7 +82,7 @@ def _empty_scene(num_triangles: int, num_views: int) -> SceneBatch:
     return SceneBatch(
         triangles_BT33=empty(num_triangles, 3, 3),
         normals_BT33=empty(num_triangles, 3, 3),
-        material_BT10=empty(num_triangles, 10),
+        material_BTM=empty(num_triangles, 10),
         c2w_BV44=empty(num_views, 4, 4),
         fov_deg_BV=empty(num_views),
         is_triangle_BT=None,

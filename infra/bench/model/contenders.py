@@ -23,7 +23,7 @@ from model.precision import set_precision
 from model.published.config import PublishedConfig
 from model.published.convert import from_published, to_published
 from model.renderformer import ELU_ALPHA, RenderFormer
-from model.scene_tensors import Cameras, SceneTensors, batch_scenes
+from model.scene_tensors import Cameras, SceneTensors, batch_scenes, tensors_of
 
 PUBLISHED, EQUAL, DEFAULT = "published", "float32", "bfloat16"
 SIDES = (PUBLISHED, EQUAL, DEFAULT)
@@ -108,6 +108,5 @@ def _view(cameras: Cameras, view: int) -> Cameras:
 
 
 def _moved(scene: SceneTensors, device: torch.device) -> SceneTensors:
-    return SceneTensors(
-        **{field.name: getattr(scene, field.name).to(device) for field in dataclasses.fields(scene)}
-    )
+    moved = {name: tensor.to(device) for name, tensor in tensors_of(scene).items()}
+    return dataclasses.replace(scene, **moved)

@@ -13,8 +13,8 @@ from pipeline.scenes.usd.lights import light_triangles, radiance
 from pipeline.scenes.usd.materials import Surface, material_rows
 from pipeline.scenes.usd.meshes import TriangleSoup, read_mesh
 from pipeline.scenes.usd.placed import Placed, placed_prims
-from storage.conventions import EMISSION, MATERIAL_WIDTH, ROUGHNESS
 from storage.errors import TrilightError
+from storage.material import EMISSION, ROUGHNESS, default_rows
 from storage.rows import distinct_rows
 from storage.scene import ObjectKind, Scene, SceneObject
 from storage.usd.names import OBJECT_TEXTS
@@ -86,7 +86,7 @@ def _pieces(
         triangles = light_triangles(each, time, opened.lost)
         if triangles is None:
             return []
-        rows = np.zeros((len(triangles), MATERIAL_WIDTH), np.float32)
+        rows = default_rows(len(triangles))
         rows[:, ROUGHNESS] = 1
         rows[:, EMISSION] = radiance(prim, triangles, time)
         corners = triangles.reshape(-1, 3)
