@@ -36,9 +36,10 @@ WAVES = MaterialColumn(
 
 @contextmanager
 def declared(*columns: MaterialColumn) -> Iterator[None]:
-    """Declare columns, and undo it."""
+    """Let these columns be declared beside the published ones, and no others; undo it."""
+    published = {name: material._DECLARED[name] for name in PUBLISHED_COLUMNS}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(material, "_DECLARED", dict(material._DECLARED))
+        patch.setattr(material, "_DECLARED", published)
         for column in columns:
             register_column(column)
         yield

@@ -18,7 +18,6 @@ from model.published.texture import fold, unfold
 from model.renderformer import RenderFormer
 from model.weights import network_of, require_tensors
 from storage.errors import TrilightError
-from storage.material import PUBLISHED_COLUMNS
 
 FREQUENCY_TOLERANCE = 1e-6
 """Largest relative difference of the stored frequencies from the formula's: float32's rounding."""
@@ -59,16 +58,7 @@ def to_published(model: RenderFormer, texture_patch: int) -> dict[str, Tensor]:
     """Return a network's tensors under published names; the texture encoder is unfolded.
 
     Reading them back gives the same network, bit by bit.
-
-    Raises:
-        TrilightError: the network reads other material columns than the published ones.
     """
-    if model.config.material_columns != PUBLISHED_COLUMNS:
-        raise TrilightError(
-            f"published weights: the network reads the material columns "
-            f"{', '.join(model.config.material_columns)}; the published form has "
-            f"{', '.join(PUBLISHED_COLUMNS)}, in this order."
-        )
     state = model.state_dict()
     material = "encoder.tokens.material"
     weight, bias = unfold(state[f"{material}.weight"], state[f"{material}.bias"], texture_patch)

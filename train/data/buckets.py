@@ -48,7 +48,7 @@ def bucket_scenes(
 
     Args:
         scenes: of equal view count.
-        cost: what a scene of so many triangles costs (train.loop.flops); it grows with them.
+        cost: what a scene of so many triangles costs (model.costs); it grows with them.
         most: scenes of a batch.
     """
     by_length = sorted(scenes, key=lambda scene: scene.tensors.num_triangles)

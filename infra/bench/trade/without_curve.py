@@ -106,7 +106,7 @@ _BY_REASON: tuple[tuple[str, tuple[str, ...]], ...] = (
         "recipe, whose worth only long trainings tell; none was run.",
         (
             *_named("train.model.", "num_registers rope_num_freqs rope_max_freq register_eps"),
-            *_named("train.model.", "normal_octaves patch_px window_bundles"),
+            *_named("train.model.", "normal_octaves patch_px window_bundles material_columns"),
             *_named("train.", "weight_decay grad_clip"),
         ),
     ),
