@@ -7,6 +7,7 @@ number of a type: float16 ends at 65504.
 import copy
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -47,7 +48,9 @@ def layer_errors(
     """
     rounded = set_precision(copy.deepcopy(model), precision)
     precise = copy.deepcopy(model).double()
-    doubled = {name: x.double() for name, x in tensors_of(batch).items() if x.is_floating_point()}
+    doubled: dict[str, Any] = {
+        name: x.double() for name, x in tensors_of(batch).items() if x.is_floating_point()
+    }
     as_float64 = dataclasses.replace(batch, **doubled)
     expected = _outputs(precise, as_float64, resolution)
     got = _outputs(rounded, batch, resolution)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from model.open import open_network
 from model.renderformer import count_parameters
 from model.weights import decode_config, encode_weights
 from storage.atomic import write_atomically
@@ -21,15 +22,14 @@ from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable
 from train.evaluation.judge import Judge, median_picture
 from train.folder import RunFolder
-from train.loop.checkpoint import Checkpoint, resumed_state
-from train.loop.checkpoints import resumed_checkpoint, saved_steps
+from train.loop.checkpoints import Checkpoint, resumed_checkpoint, resumed_state, saved_steps
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState, new_state
 from train.loop.trainer import Trainer
 from train.loss.lpips_weights import load_lpips
 from train.loss.objective import Objective
-from train.networks import open_network
+from train.networks import network_of_run
 from train.progress import Progress, Silent
 from train.result import TrainResult, finished, pretty_json
 from train.settings import TrainSettings, settings_record
@@ -165,7 +165,7 @@ def _begin(
             "another --out."
         )
     start.check(settings)
-    network = None if start.begin_with is None else open_network(start.begin_with)
+    network = None if start.begin_with is None else open_network(start.begin_with, network_of_run)
     if network is not None:
         settings = dataclasses.replace(settings, model=network.config)
     if crew.is_first:

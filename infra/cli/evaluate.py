@@ -113,18 +113,20 @@ def _contest(
     lpips: str | None,
     device: str | None,
 ) -> "Contest":
+    from model.open import find_network
     from train.evaluation.evaluate import Contest, make_rivals, stored_resolution
     from train.loop.crew import choose_device
     from train.loss.lpips_weights import load_lpips
-    from train.networks import open_network, trained_resolution
+    from train.networks import network_of_run
 
-    network = open_network(checkpoint)
+    found = find_network(checkpoint, network_of_run)
     shards = opened.split(split)
     if resolution is None:
-        resolution = trained_resolution(checkpoint) or stored_resolution(shards)
+        stored = stored_resolution(shards)
+        resolution = min(found.trained.resolution or stored, stored)
     place, distance = choose_device(device), load_lpips(lpips)
     return Contest(
-        network=network.to(place),
+        network=found.open().to(place),
         shards=shards,
         resolution=resolution,
         rivals=make_rivals(rivals.split("train"), resolution) if "train" in rivals.splits else None,

@@ -170,12 +170,12 @@ def _completed(asked: Asked) -> Asked:
     checkpoint, resolution = asked.checkpoint, asked.resolution
     if asked.engine != "mitsuba":
         _require_torch()
-        from model.checkpoints import BUILTIN
-        from train.networks import trained_resolution
+        from model.open import BUILTIN, find_network
+        from train.networks import network_of_run
 
         checkpoint = checkpoint or BUILTIN
         if resolution is None:
-            resolution = trained_resolution(checkpoint)
+            resolution = find_network(checkpoint, network_of_run).trained.resolution
     if resolution is None:
         resolution = _RESOLUTION
     return dataclasses.replace(asked, checkpoint=checkpoint, resolution=resolution)
@@ -250,12 +250,13 @@ def _neural(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
     import torch
 
     from model.neural_renderer import NeuralRenderer
+    from train.networks import network_of_run
 
     if asked.threads is not None:
         torch.set_num_threads(asked.threads)
     assert asked.checkpoint is not None
     return NeuralEngine(
-        NeuralRenderer.load(asked.checkpoint, precision=asked.precision),
+        NeuralRenderer.load(asked.checkpoint, precision=asked.precision, finders=[network_of_run]),
         checkpoint=asked.checkpoint,
         precision=asked.precision,
         resolution=settings.resolution,

@@ -12,8 +12,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from model.checkpoints import open_checkpoint, save_published
 from model.neural_renderer import NeuralRenderer
+from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.flows.convert_scene import write_scene
 from pipeline.flows.scene_source import load_source, scene_source
@@ -38,7 +38,7 @@ from train.data.scenes import training_scene
 from train.data.stream import stream_batches
 from train.data.unusable import Unusable
 from train.loop.state import new_state
-from train.networks import open_network
+from train.networks import network_of_run
 from train.run import stream_settings
 from train.settings import TrainSettings
 
@@ -142,13 +142,13 @@ def test_a_network_learns_from_it_and_is_opened_again(run: Path) -> None:
     checkpoint = run / "checkpoints" / "step-000000004.safetensors"
     pictures = []
     for place in (run, checkpoint):
-        network = open_network(place)
+        network = open_network(place, network_of_run)
         assert network.config.material_columns == WITH_COAT
         with torch.no_grad():
             pictures.append(network(batch_scenes([scene_tensors(composed(0))]), 16))
     assert torch.equal(*pictures)
     start = new_state(coated_run()).model.encoder.tokens.material.weight
-    learnt = open_network(run).encoder.tokens.material.weight
+    learnt = open_network(run, network_of_run).encoder.tokens.material.weight
     assert learnt.shape == start.shape == (36, 11)
     assert not torch.equal(learnt[:, -1], start[:, -1]), "no gradient reached the column"
 
@@ -165,7 +165,7 @@ def test_a_checkpoint_whose_column_is_not_declared_says_so(run: Path) -> None:
     with declared():
         for place in (run, run / "checkpoints" / "step-000000004.safetensors"):
             with pytest.raises(TrilightError, match="'coat'.*has to be declared first"):
-                open_network(place)
+                open_network(place, network_of_run)
 
 
 def test_the_published_form_refuses_it(tmp_path: Path) -> None:
@@ -190,8 +190,8 @@ def test_other_forms_say_that_they_lose_it(tmp_path: Path, form: str) -> None:
 
 
 def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read() -> None:
-    renderer = NeuralRenderer(open_checkpoint("builtin:"))
-    assert open_checkpoint("builtin:").config.material_columns == PUBLISHED_COLUMNS
+    renderer = NeuralRenderer(open_network("builtin:"))
+    assert open_network("builtin:").config.material_columns == PUBLISHED_COLUMNS
     coated = tiny_scene()
     coated.materials[FLOOR, -1] = 0.9
     with pytest.warns(UserWarning, match="does not read coat"):
@@ -204,4 +204,7 @@ def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read
 
 def test_a_network_of_four_columns_trains_on_the_same_data(data: Dataset, tmp_path: Path) -> None:
     trained(FOUR, [str(data.folder.root)], tmp_path / "four")
-    assert open_network(tmp_path / "four").encoder.tokens.material.weight.shape == (36, 10)
+    assert open_network(tmp_path / "four", network_of_run).encoder.tokens.material.weight.shape == (
+        36,
+        10,
+    )

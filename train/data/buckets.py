@@ -8,6 +8,7 @@ its batches.
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -77,7 +78,7 @@ def make_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
 
 
 def _fields_to(batch: SceneBatch, device: torch.device) -> SceneBatch:
-    tensors = {
+    tensors: dict[str, Any] = {
         name: tensor.to(device, non_blocking=True) for name, tensor in tensors_of(batch).items()
     }
     return dataclasses.replace(batch, **tensors)
