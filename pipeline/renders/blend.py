@@ -35,7 +35,7 @@ class Lobes:
 
 
 def lobes_of(materials: NDArray[np.float32]) -> Lobes:
-    """Return the lobes of material rows [T, 10]."""
+    """Return the lobes of material rows [T, 10 or more]; other columns are not read."""
     rows = materials.astype(np.float64)
     diffuse, specular = rows[:, DIFFUSE], rows[:, SPECULAR]
     d, s = diffuse.max(axis=1), specular.max(axis=1)

@@ -43,7 +43,7 @@ _MOST_REFLECTING = 0.98
 
 
 def add_materials(layer: Any, folder: str, materials: NDArray[np.float32]) -> None:
-    """Write a prim for each material row [M, 10] below `folder`.
+    """Write a prim for each material row below `folder`.
 
     Copies of the first prim get their values: that takes half the time of writing each anew.
     """

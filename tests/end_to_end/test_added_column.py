@@ -6,16 +6,20 @@ import itertools
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import ClassVar, cast
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
+from infra.rendering.engines import MitsubaEngine
 from model.neural_renderer import NeuralRenderer
 from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.flows.convert_scene import write_scene
+from pipeline.flows.inspect_scene import _facts
+from pipeline.flows.render_scene import PathTracer
 from pipeline.flows.scene_source import load_source, scene_source
 from scene_templates.families.default_families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
@@ -200,6 +204,29 @@ def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             assert np.array_equal(renderer.render(tiny_scene(), 16), shown)
+
+
+def test_the_path_tracer_says_what_it_does_not_read() -> None:
+    class Tracer:
+        identity: ClassVar[dict[str, str]] = {}
+
+        def open(self, scene: Scene, name: str) -> None:
+            assert scene.num_triangles
+
+    engine = MitsubaEngine(cast(PathTracer, Tracer()))
+    scene = tiny_scene()
+    assert engine.open(scene, "floor") == ()
+    scene.materials[FLOOR, -1] = 0.9
+    assert engine.open(scene, "floor") == ("floor: the path tracer does not read coat",)
+
+
+def test_inspect_names_the_columns_in_use(tmp_path: Path) -> None:
+    scene = tiny_scene()
+    for coat, named in ((0.9, "coat"), (0.0, None)):
+        scene.materials[FLOOR, -1] = coat
+        write_scene(tmp_path / "a.safetensors", scene)
+        facts = _facts(scene_source(str(tmp_path / "a.safetensors"))).facts
+        assert facts.get("added_columns") == named
 
 
 def test_a_network_of_four_columns_trains_on_the_same_data(data: Dataset, tmp_path: Path) -> None:
