@@ -5,9 +5,7 @@ number of a type: float16 ends at 65504.
 """
 
 import copy
-import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +13,7 @@ from torch import Tensor, nn
 from model.config import ModelConfig
 from model.precision import set_precision
 from model.renderformer import RenderFormer
-from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, tensors_of
+from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, converted
 from storage.material import material_columns, material_width
 
 PROBE_TRIANGLES, PROBE_RESOLUTION = 256, 64
@@ -48,10 +46,7 @@ def layer_errors(
     """
     rounded = set_precision(copy.deepcopy(model), precision)
     precise = copy.deepcopy(model).double()
-    doubled: dict[str, Any] = {
-        name: x.double() for name, x in tensors_of(batch).items() if x.is_floating_point()
-    }
-    as_float64 = dataclasses.replace(batch, **doubled)
+    as_float64 = converted(batch, lambda x: x.double() if x.is_floating_point() else x)
     expected = _outputs(precise, as_float64, resolution)
     got = _outputs(rounded, batch, resolution)
     return [_compare(name, got[name], twin) for name, twin in expected.items()]

@@ -11,8 +11,10 @@ A batch holds scenes of about one length and is padded to the longest of them, n
 the padding is zero, because a mask hides finite garbage but not NaN (0 * NaN is NaN).
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -104,6 +106,9 @@ class SceneBatch:
         return torch.cat([self.material_BTM[..., places[name]] for name in columns], dim=-1)
 
 
+Scenes = TypeVar("Scenes", SceneTensors, SceneBatch)
+
+
 def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> SceneTensors:
     """Return the tensors of a scene that passes `Scene.check`; its arrays stay unchanged.
 
@@ -142,6 +147,12 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
 def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
     """Return the fields that are tensors, by name."""
     return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
+
+
+def converted(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
+    """Return the same scenes with each tensor converted, such as moved to a device."""
+    tensors: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
+    return dataclasses.replace(scenes, **tensors)
 
 
 def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:

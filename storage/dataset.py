@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import BinaryIO
 
 from storage.damage import reading
-from storage.dataset_files import DatasetFiles, RemoteFiles, dataset_files
+from storage.dataset_files import DatasetFiles, RemoteDatasetFiles, dataset_files
 from storage.errors import TrilightError
 from storage.failures import decode_failures
 from storage.layout import DatasetFolder
@@ -30,7 +30,7 @@ class Dataset:
     @property
     def folder(self) -> DatasetFolder:
         """The dataset's folder; raises TrilightError where it is on a server."""
-        if isinstance(self.files, RemoteFiles):
+        if isinstance(self.files, RemoteDatasetFiles):
             raise TrilightError(f"dataset {self.shown!r} is on a server; expected a local folder.")
         return DatasetFolder(self.files.root)
 

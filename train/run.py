@@ -30,7 +30,7 @@ from train.loop.trainer import Trainer
 from train.loss.lpips_weights import load_lpips
 from train.loss.objective import Objective
 from train.networks import network_of_run
-from train.progress import Progress, Silent
+from train.progress import Silent, TrainProgress
 from train.result import TrainResult, finished, pretty_json
 from train.settings import TrainSettings, settings_record
 from train.start import Start
@@ -55,7 +55,7 @@ def train_run(
     start: Start | None = None,
     crew: Crew | None = None,
     workers: int = 1,
-    progress: Progress | None = None,
+    progress: TrainProgress | None = None,
 ) -> TrainResult | None:
     """Train a network and judge it.
 
@@ -149,7 +149,7 @@ def _begin(
     data: TrainingData,
     start: Start,
     crew: Crew,
-    progress: Progress,
+    progress: TrainProgress,
 ) -> tuple[TrainSettings, TrainState]:
     """Return the state that the run begins or goes on with, and the settings with its network."""
     if start.resume:
@@ -181,7 +181,7 @@ def _begin(
     return settings, new_state(settings, crew.device, network)
 
 
-def _note_other_crew(checkpoint: Checkpoint, crew: Crew, progress: Progress) -> None:
+def _note_other_crew(checkpoint: Checkpoint, crew: Crew, progress: TrainProgress) -> None:
     before = checkpoint.header["world_size"]
     if before != crew.world_size:
         progress.noted(
@@ -207,7 +207,7 @@ def _recorder(
     settings: TrainSettings,
     folder: RunFolder,
     judge: Judge | None,
-    progress: Progress,
+    progress: TrainProgress,
 ) -> Recorder:
     progress.begin(
         step=state.step,

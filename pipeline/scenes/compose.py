@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
 from pipeline.scenes.drawn_columns import with_drawn_columns
 from pipeline.scenes.laws import require_laws
-from pipeline.scenes.pieces import Piece, emitter_piece, joined, object_piece, shell_piece
+from pipeline.scenes.pieces import ScenePiece, emitter_piece, joined, object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.posing import posed
 from pipeline.scenes.shapes import MeshShape
@@ -122,7 +122,7 @@ def scene_pieces(
     shapes: Sequence[MeshShape],
     settings: SceneSettings,
     rng: np.random.Generator,
-) -> list[Piece]:
+) -> list[ScenePiece]:
     """Return floor and walls, objects and emitters of a layout, the objects as `shapes`.
 
     Raises:

@@ -36,7 +36,7 @@ from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.augment import with_channels
-from train.data.order import Share
+from train.data.order import RankShare
 from train.data.relight import with_light_scaled
 from train.data.scenes import training_scene
 from train.data.stream import stream_batches
@@ -115,7 +115,7 @@ def test_the_stream_shows_what_was_composed(data: Dataset) -> None:
         open_training_data([str(data.folder.root)]).split("train"),
         settings,
         0,
-        share=Share(rank=0, world_size=1),
+        share=RankShare(rank=0, world_size=1),
         workers=1,
         unusable=Unusable(0),
     )

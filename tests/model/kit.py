@@ -1,6 +1,7 @@
 """Tiny networks with awake heads, and random scenes for them."""
 
 import dataclasses
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -81,5 +82,5 @@ def render(model: RenderFormer, *scenes: SceneTensors, resolution: int = RESOLUT
     return pictures
 
 
-def with_fields(batch: SceneBatch, **fields: Tensor) -> SceneBatch:
+def with_fields(batch: SceneBatch, **fields: Any) -> SceneBatch:
     return dataclasses.replace(batch, **fields)

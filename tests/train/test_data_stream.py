@@ -15,7 +15,7 @@ from storage.errors import TrilightError
 from storage.training_data import TrainingData, open_training_data
 from tests.train.toy import write_toy_dataset
 from train.data.augmentation import AugmentationSettings
-from train.data.order import Share
+from train.data.order import RankShare
 from train.data.scenes import TrainingScene
 from train.data.splits import first_samples
 from train.data.stream import StreamSettings, prefetched, stream_batches
@@ -56,7 +56,7 @@ def take(
         data.split("train"),
         settings,
         first,
-        share=Share(rank=rank, world_size=world_size),
+        share=RankShare(rank=rank, world_size=world_size),
         workers=workers,
         unusable=Unusable(0),
     )

@@ -5,15 +5,13 @@ gradient is therefore of a fair mixture, and the loss is a mean over all views o
 its batches.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from model.scene_tensors import SceneBatch, batch_scenes, tensors_of
+from model.scene_tensors import SceneBatch, batch_scenes, converted
 from train.data.scenes import TrainingScene
 
 MOST_WASTE = 0.05
@@ -36,7 +34,7 @@ class TrainingBatch:
         if device.type == "cpu":
             return self
         return TrainingBatch(
-            scenes=_fields_to(self.scenes, device),
+            scenes=converted(self.scenes, lambda tensor: tensor.to(device, non_blocking=True)),
             target_BVRR3=self.target_BVRR3.to(device, non_blocking=True),
             noise_BV=self.noise_BV.to(device, non_blocking=True),
         )
@@ -75,10 +73,3 @@ def make_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
         target_BVRR3=torch.stack([scene.target_VRR3 for scene in scenes]),
         noise_BV=torch.stack([scene.noise_V for scene in scenes]),
     )
-
-
-def _fields_to(batch: SceneBatch, device: torch.device) -> SceneBatch:
-    tensors: dict[str, Any] = {
-        name: tensor.to(device, non_blocking=True) for name, tensor in tensors_of(batch).items()
-    }
-    return dataclasses.replace(batch, **tensors)

@@ -64,7 +64,7 @@ _LOST = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Surface:
+class MeshToShade:
     """A mesh whose triangles get materials."""
 
     prim: Any
@@ -75,7 +75,7 @@ class Surface:
     """Point of each of its corners."""
 
 
-def material_rows(surface: Surface, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:
+def material_rows(surface: MeshToShade, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:
     """Return the material row of each triangle of a mesh."""
     from pxr import UsdShade
 
@@ -97,7 +97,9 @@ def material_rows(surface: Surface, time: Any, opened: OpenedUsd) -> NDArray[np.
     return rows
 
 
-def _shaded(material: Any, surface: Surface, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:
+def _shaded(
+    material: Any, surface: MeshToShade, time: Any, opened: OpenedUsd
+) -> NDArray[np.float32]:
     """Return rows of a material over the whole mesh; of its display colour without one."""
     shader = _shader(material, opened.lost) if material else None
     rows = default_rows(len(surface.soup.polygons))
@@ -172,7 +174,7 @@ def _shader(material: Any, lost: list[str]) -> Any:
 
 
 def _value(
-    shader: Any, name: str, default: Any, surface: Surface, time: Any, opened: OpenedUsd
+    shader: Any, name: str, default: Any, surface: MeshToShade, time: Any, opened: OpenedUsd
 ) -> NDArray[np.float32]:
     """Return an input for each triangle, [T, 3]; a single number stands in every column."""
     from pxr import UsdShade
@@ -203,7 +205,7 @@ def _value(
 
 
 def _textured(
-    texture: Texture, name: str, surface: Surface, time: Any, opened: OpenedUsd
+    texture: Texture, name: str, surface: MeshToShade, time: Any, opened: OpenedUsd
 ) -> NDArray[np.float32] | None:
     from pxr import UsdGeom
 
@@ -222,7 +224,7 @@ def _textured(
     return means
 
 
-def _display_colour(surface: Surface, time: Any) -> NDArray[np.float32]:
+def _display_colour(surface: MeshToShade, time: Any) -> NDArray[np.float32]:
     from pxr import UsdGeom
 
     primvar = UsdGeom.PrimvarsAPI(surface.prim).FindPrimvarWithInheritance("displayColor")
