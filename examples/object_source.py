@@ -13,10 +13,10 @@ import numpy as np
 
 from trilight.extend import (
     SOURCES,
-    Asked,
     Listing,
     ObjectRecord,
     ObjectSource,
+    SourceQuery,
     TrilightError,
     encode_ply,
     rng_for,
@@ -29,7 +29,7 @@ FACES = np.array(
 )
 
 
-def list_dice(asked: Asked) -> Listing:
+def list_dice(asked: SourceQuery) -> Listing:
     """Write the boxes that a person asks for, and return what they are."""
     if not (asked.after_colon.isdecimal() and 1 <= int(asked.after_colon) <= 1000):
         raise TrilightError(f"objects is {asked.source!r}; expected dice:N with N from 1 to 1000.")

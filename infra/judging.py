@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from infra.excursion_plots import plot_excursions
+from model.open import find_network
 from model.weights import network_digest
 from storage.atomic import write_atomically
 from storage.training_data import TrainingData, open_training_data
@@ -23,7 +24,7 @@ from train.evaluation.report import markdown, record
 from train.evaluation.sheet import drawn_sheet, write_picture
 from train.loop.crew import choose_device
 from train.loss.lpips_weights import load_lpips
-from train.networks import open_network, trained_resolution
+from train.networks import network_of_run
 from train.result import pretty_json
 
 
@@ -69,12 +70,13 @@ def judge_network(
     """
     opened = open_training_data(data)
     rivals = opened if train_data is None else open_training_data(train_data)
-    network, shards = open_network(checkpoint), opened.split(split)
+    found, shards = find_network(checkpoint, network_of_run), opened.split(split)
     if resolution is None:
-        resolution = trained_resolution(checkpoint) or stored_resolution(shards)
+        stored = stored_resolution(shards)
+        resolution = min(found.trained.resolution or stored, stored)
     place, distance = choose_device(device), load_lpips(lpips)
     contest = Contest(
-        network=network.to(place),
+        network=found.open().to(place),
         shards=shards,
         resolution=resolution,
         rivals=make_rivals(rivals.split("train"), resolution) if "train" in rivals.splits else None,

@@ -5,7 +5,7 @@ from typing import BinaryIO
 
 from storage.conventions import SPLITS
 from storage.damage import reading
-from storage.dataset_files import DatasetFiles, RemoteFiles, dataset_files
+from storage.dataset_files import DatasetFiles, RemoteDatasetFiles, dataset_files
 from storage.errors import TrilightError
 from storage.failures import decode_failures
 from storage.layout import DatasetFolder
@@ -31,7 +31,7 @@ class Dataset:
     @property
     def folder(self) -> DatasetFolder:
         """The dataset's folder; raises TrilightError where it is on a server."""
-        if isinstance(self.files, RemoteFiles):
+        if isinstance(self.files, RemoteDatasetFiles):
             raise TrilightError(f"dataset {self.shown!r} is on a server; expected a local folder.")
         return DatasetFolder(self.files.root)
 

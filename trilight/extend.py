@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from pipeline.flows.settings import NamedBuild as NamedBuild
     from pipeline.objects.listing import Listing as Listing
     from pipeline.objects.registry import SOURCES as SOURCES
-    from pipeline.objects.registry import Asked as Asked
     from pipeline.objects.registry import ObjectSource as ObjectSource
+    from pipeline.objects.registry import SourceQuery as SourceQuery
     from pipeline.renders.settings import RenderSettings as RenderSettings
     from scene_templates.contents.lights import LightSettings as LightSettings
     from scene_templates.families.default_families import FAMILIES as FAMILIES
@@ -49,11 +49,13 @@ if TYPE_CHECKING:
     from scene_templates.templates.template import Template as Template
     from storage.atomic import write_atomically as write_atomically
     from storage.changes import changed as changed
-    from storage.conventions import EMISSION as EMISSION
     from storage.dataset_settings import SplitSettings as SplitSettings
     from storage.dataset_settings import StorageSettings as StorageSettings
     from storage.errors import TrilightError as TrilightError
     from storage.extensions import load_extension as load_extension
+    from storage.material import COLUMNS as COLUMNS
+    from storage.material import EMISSION as EMISSION
+    from storage.material import MaterialColumn as MaterialColumn
     from storage.ply import encode_ply as encode_ply
     from storage.ranges import Within as Within
     from storage.records import Failure as Failure
@@ -82,7 +84,7 @@ _NAMES = {
     "pipeline.flows.scene_formats": "FORMATS LoadedScene Pictures SceneFormat SceneSource",
     "pipeline.flows.settings": "BuildSettings NamedBuild",
     "pipeline.objects.listing": "Listing",
-    "pipeline.objects.registry": "Asked ObjectSource SOURCES",
+    "pipeline.objects.registry": "SourceQuery ObjectSource SOURCES",
     "pipeline.renders.settings": "RenderSettings",
     "scene_templates.contents.lights": "LightSettings",
     "scene_templates.families.default_families": "FAMILIES",
@@ -95,10 +97,10 @@ _NAMES = {
     "scene_templates.templates.template": "Template",
     "storage.atomic": "write_atomically",
     "storage.changes": "changed",
-    "storage.conventions": "EMISSION",
     "storage.dataset_settings": "SplitSettings StorageSettings",
     "storage.errors": "TrilightError",
     "storage.extensions": "load_extension",
+    "storage.material": "COLUMNS EMISSION MaterialColumn",
     "storage.ply": "encode_ply",
     "storage.ranges": "Within",
     "storage.records": "Failure ObjectRecord",

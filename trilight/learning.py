@@ -12,7 +12,7 @@ from train.start import Start
 
 if TYPE_CHECKING:
     from infra.judging import Judgement
-    from train.progress import Progress
+    from train.progress import TrainProgress
     from train.result import TrainResult
 
 __all__ = [
@@ -38,7 +38,7 @@ def train_network(
     lpips: str | None = None,
     workers: int = 1,
     device: str | None = None,
-    progress: "Progress | None" = None,
+    progress: "TrainProgress | None" = None,
 ) -> "TrainResult":
     """Train a network on a dataset and judge it, as `trilight train` does, in this process.
 

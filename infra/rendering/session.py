@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol
 
-from infra.rendering.cameras import Camera, Shot, camera_path, orbit, own_camera, shots
+from infra.rendering.cameras import Shot, ShotCamera, camera_path, orbit, own_camera, shots
 from infra.rendering.engines import Engine, MitsubaEngine, NeuralEngine
 from infra.rendering.look import Look
-from infra.rendering.places import Place, place
+from infra.rendering.places import PicturePlaces, place
 from infra.rendering.run import FinishedShot, ShotRun
 from infra.rendering.sources import scene_sources
 from infra.rendering.tone_maps import require_tone_map
@@ -95,12 +95,12 @@ class Asked:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Outcome:
+class RenderOutcome:
     """What came of it."""
 
     asked: Asked
     """With network and width, where none was named."""
-    place: Place
+    place: PicturePlaces
     """Where the files are."""
     shots: tuple[FinishedShot, ...]
     """Picture by picture."""
@@ -110,7 +110,7 @@ class Outcome:
     """What a person should know."""
 
 
-class Watcher(Protocol):
+class RenderWatcher(Protocol):
     """Is told how far a render is."""
 
     def pictures(self, done: int, total: int) -> None:
@@ -120,7 +120,7 @@ class Watcher(Protocol):
         """The path tracer has finished a pass."""
 
 
-def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
+def render_asked(asked: Asked, watcher: RenderWatcher) -> RenderOutcome:
     """Render what was asked for and write its files.
 
     Raises:
@@ -143,7 +143,7 @@ def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
         finished = run.run(wanted, reader, lambda now: watcher.pictures(now, len(wanted)))
     if where.video is not None:
         write_video(where.video, [shot.png for shot in finished], asked.fps)
-    return Outcome(
+    return RenderOutcome(
         asked=asked,
         place=where,
         shots=tuple(finished),
@@ -178,12 +178,12 @@ def _completed(asked: Asked) -> Asked:
     checkpoint, resolution = asked.checkpoint, asked.resolution
     if asked.engine != "mitsuba":
         require_torch("--engine neural")
-        from model.checkpoints import BUILTIN
-        from train.networks import trained_resolution
+        from model.open import BUILTIN, find_network
+        from train.networks import network_of_run
 
         checkpoint = checkpoint or BUILTIN
         if resolution is None:
-            resolution = trained_resolution(checkpoint)
+            resolution = find_network(checkpoint, network_of_run).trained.resolution
     if resolution is None:
         resolution = _RESOLUTION
     return dataclasses.replace(asked, checkpoint=checkpoint, resolution=resolution)
@@ -198,7 +198,7 @@ def _settings(asked: Asked) -> RenderSettings:
     )
 
 
-def _shots(asked: Asked, where: Place, reader: SceneReader) -> list[Shot]:
+def _shots(asked: Asked, where: PicturePlaces, reader: SceneReader) -> list[Shot]:
     if where.is_sequence:
         sources = scene_sources(asked.source, reader)
         return shots(sources, _cameras(asked, sources[0], reader))
@@ -207,7 +207,7 @@ def _shots(asked: Asked, where: Place, reader: SceneReader) -> list[Shot]:
     return shots([scene_source(asked.source)], None)
 
 
-def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[Camera] | None:
+def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[ShotCamera] | None:
     if asked.cameras is not None:
         return camera_path(asked.cameras, reader, asked.view)
     if asked.orbit is None:
@@ -217,7 +217,7 @@ def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[Came
 
 
 def _engine(
-    name: str, asked: Asked, settings: RenderSettings, watcher: Watcher, stack: ExitStack
+    name: str, asked: Asked, settings: RenderSettings, watcher: RenderWatcher, stack: ExitStack
 ) -> Engine:
     make: Callable[..., Engine] = _mitsuba if name == "mitsuba" else _neural
     engine = make(asked, settings, watcher)
@@ -225,7 +225,7 @@ def _engine(
     return engine
 
 
-def _mitsuba(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
+def _mitsuba(asked: Asked, settings: RenderSettings, watcher: RenderWatcher) -> Engine:
     from pipeline.flows.render_scene import PathTracer
 
     tracer = PathTracer(
@@ -238,16 +238,17 @@ def _mitsuba(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine
     return MitsubaEngine(tracer)
 
 
-def _neural(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
+def _neural(asked: Asked, settings: RenderSettings, watcher: RenderWatcher) -> Engine:
     import torch
 
     from model.neural_renderer import NeuralRenderer
+    from train.networks import network_of_run
 
     if asked.threads is not None:
         torch.set_num_threads(asked.threads)
     assert asked.checkpoint is not None
     return NeuralEngine(
-        NeuralRenderer.load(asked.checkpoint, precision=asked.precision),
+        NeuralRenderer.load(asked.checkpoint, precision=asked.precision, finders=[network_of_run]),
         checkpoint=asked.checkpoint,
         precision=asked.precision,
         resolution=settings.resolution,

@@ -11,7 +11,7 @@ from pipeline.flows.accept_objects import AcceptedObjects
 from pipeline.flows.children import ChildPool
 from pipeline.flows.environment import environment
 from pipeline.flows.machine import cores_owned, visible_gpus
-from pipeline.flows.make_scene import SceneSource, set_up_child
+from pipeline.flows.make_scene import SceneRecipe, set_up_child
 from pipeline.flows.make_shard import make_piece
 from pipeline.flows.pieces import Piece
 from pipeline.flows.settings import BuildSettings, differences
@@ -143,7 +143,7 @@ def _new_pool(job: ShardJob) -> ChildPool:
     cards = visible_gpus() if on_card else ()
 
     def render_child(number: int) -> IsolatedChild:
-        source = SceneSource(
+        source = SceneRecipe(
             settings=job.settings,
             variant=variant,
             threads=cores_of_child(job),

@@ -15,7 +15,7 @@ from storage.remote.url import PACKAGES, parse_url
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asked:
+class SourceQuery:
     """What a person asks a source for."""
 
     source: str
@@ -37,16 +37,16 @@ class Asked:
 class ObjectSource:
     """Where objects come from."""
 
-    list: Callable[[Asked], Listing]
+    list: Callable[[SourceQuery], Listing]
     """Returns what the source holds; raises TrilightError where it is missing or malformed."""
-    look: Callable[[Asked], object] | None = None
+    look: Callable[[SourceQuery], object] | None = None
     """Raises the same errors and writes nothing, where `list` would be dear."""
     states_licences: bool = True
     """Whether the licence of every object is known, so that nobody else may state one."""
     is_place: bool = False
     """Whether the name is the scheme of a URL, which may hold a secret."""
 
-    def asked(self, asked: Asked, *, only_look: bool) -> Listing | None:
+    def asked(self, asked: SourceQuery, *, only_look: bool) -> Listing | None:
         """Return what `list` does, or have a look; raises TrilightError as they do."""
         if self.states_licences:
             require_unstated(asked.licence, f"{asked.source.partition(':')[0]}:")
@@ -56,7 +56,7 @@ class ObjectSource:
         return self.list(asked)
 
 
-def _list_place(asked: Asked) -> Listing:
+def _list_place(asked: SourceQuery) -> Listing:
     place = parse_url(asked.source, what="objects")
     if isinstance(place, Path):
         return list_folder(place, asked.licence)

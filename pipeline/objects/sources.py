@@ -14,7 +14,7 @@ from pathlib import Path
 from pipeline.objects.generated import PREFIX as BUILTIN
 from pipeline.objects.licences import check_allowed, refuse_licences, stated_licence
 from pipeline.objects.listing import Listing
-from pipeline.objects.registry import Asked, source_of
+from pipeline.objects.registry import SourceQuery, source_of
 from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
 from storage.records import Failure, ObjectRecord
@@ -175,7 +175,7 @@ def _listed(
     """
     check_allowed(allowed_licences)
     stated_licence(licence)
-    asked = Asked(
+    asked = SourceQuery(
         source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
     )
     listing = source_of(source).asked(asked, only_look=only_look)

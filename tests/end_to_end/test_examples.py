@@ -21,6 +21,7 @@ from pipeline.objects.sources import find_objects, look_at_source
 from storage.changes import changed
 from storage.errors import TrilightError
 from storage.manifest import read_manifest
+from storage.scene_file import decode_scene_file, encode_scene
 from tests.end_to_end.conftest import Trilight
 from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
 from tests.scene_templates.balls import one_drawn
@@ -41,8 +42,8 @@ def copied(tmp_path: Path) -> Callable[[str], Path]:
 
 def test_there_is_one_of_each() -> None:
     assert FILES == [
-        "build.py", "executor.py", "family.py", "metric.py", "model_size.py", "object_source.py",
-        "run.py", "scene_format.py", "template.py",
+        "build.py", "executor.py", "family.py", "material_column.py", "metric.py", "model_size.py",
+        "object_source.py", "run.py", "scene_format.py", "template.py",
     ]  # fmt: skip
 
 
@@ -68,6 +69,18 @@ def test_a_family_makes_scenes(copied: Callable[[str], Path]) -> None:
     with loaded(copied("family.py")):
         settings = named_build("smoke", changes={"scenes.families": "crowd"}).scenes
         assert 5 <= len(one_drawn(settings, 0).layout.objects) <= 8
+
+
+def test_a_material_column_is_drawn_and_stored(copied: Callable[[str], Path]) -> None:
+    with loaded(copied("material_column.py")):
+        scene = tiny_scene()
+        assert scene.materials.shape[1] == 11
+        scene.materials[:, 10] = 0.5
+        stored = encode_scene(scene)
+        assert (decode_scene_file(stored, "scene").materials[:, 10] == 0.5).all()
+        assert SIZES["coated"]().material_columns[-1] == "coat"
+    with pytest.raises(TrilightError, match="'coat' is not declared here"):
+        decode_scene_file(stored, "scene")
 
 
 def test_a_build_of_a_file(copied: Callable[[str], Path]) -> None:

@@ -9,7 +9,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from infra.cli.app import app
-from model.checkpoints import open_checkpoint
+from model.open import open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
 from tests.model.kit import awake, tiny_config
@@ -47,7 +47,7 @@ def test_a_checkpoint_is_described_measured_and_published(tmp_path: Path) -> Non
     errors = json.loads(text)["errors"]
     assert set(errors) == {"float32", "bfloat16"}
     assert errors["bfloat16"][-1]["layer"] == "decoder.head"
-    again = open_checkpoint(str(target))
+    again = open_network(str(target))
     for (name, a), b in zip(again.named_parameters(), model.parameters(), strict=True):
         assert torch.equal(a, b), name
 

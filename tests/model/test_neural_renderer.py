@@ -18,8 +18,9 @@ from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import batch_scenes, scene_tensors
 from model.trained_range import RANGE_KEY, TrainedRange, trained_range
 from model.weights import encode_weights
-from storage.conventions import EMISSION, look_at_c2w
+from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
+from storage.material import EMISSION
 from storage.scene import Scene
 from tests.model.kit import awake, tiny_config
 from tests.renders.scene_kit import flat, join, light, material, quad
@@ -84,7 +85,7 @@ def _light_of(model: RenderFormer, scene: Scene, device: torch.device) -> Tensor
     tensors = scene_tensors(scene)
     a, b, c = tensors.triangles_T33.double().unbind(dim=1)
     area_T = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2
-    emission_T3 = torch.pow(10.0, tensors.material_T10[:, EMISSION].double()) - 1
+    emission_T3 = torch.pow(10.0, tensors.material_TM[:, EMISSION].double()) - 1
     return (area_T[:, None] * emission_T3).sum(dim=0)
 
 

@@ -11,10 +11,10 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 from typer.testing import CliRunner
 
 from infra.cli.app import app
-from model.checkpoints import save_published
 from model.config import SIZES
 from model.layers import Norm
 from model.neural_renderer import NeuralRenderer
+from model.open import save_published
 from model.renderformer import RenderFormer
 from storage.training_data import open_training_data
 from tests.train.fake_card import CARD, fake_card
@@ -22,7 +22,7 @@ from tests.train.toy import toy_sample, toy_scene
 from train.data.buckets import make_batch
 from train.data.scenes import training_scene
 from train.evaluation.evaluate import Contest, judged_views
-from train.loop.checkpoint import save_checkpoint
+from train.loop.checkpoints import save_checkpoint
 from train.loop.crew import Crew
 from train.loop.state import new_state
 from train.loop.step import predicted

@@ -14,9 +14,9 @@ from infra.cli.app import app
 from infra.excursion_plots import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
-from storage.conventions import ROUGHNESS
 from storage.dataset import Dataset
 from storage.errors import TrilightError
+from storage.material import ROUGHNESS
 from storage.metrics import psnr_log_db
 from storage.scene import Scene
 from storage.seeds import rng_for

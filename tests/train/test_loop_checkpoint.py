@@ -15,8 +15,13 @@ from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
-from train.loop.checkpoint import HEADER_KEY, read_checkpoint, resumed_state, save_checkpoint
-from train.loop.checkpoints import resumed_checkpoint
+from train.loop.checkpoints import (
+    HEADER_KEY,
+    read_checkpoint,
+    resumed_checkpoint,
+    resumed_state,
+    save_checkpoint,
+)
 from train.loop.crew import Crew
 from train.loop.metrics_log import MetricsLog, read_rows
 from train.loop.state import TrainState, new_state

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.ply import encode_ply
 from trilight import Material, SceneBuilder, TrilightError, read_scene
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from storage.conventions import ROUGHNESS
 from storage.lights import num_lights
+from storage.material import ROUGHNESS
 from storage.sample import Sample
 from train.evaluation.metrics import METRICS
 
