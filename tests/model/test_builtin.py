@@ -6,6 +6,8 @@ from infra.setup.builtin_network import MOST_BYTES
 from model.neural_renderer import NeuralRenderer
 from model.open import BUILTIN, BUILTIN_WEIGHTS, open_network
 from model.renderformer import count_parameters
+from model.trained_range import trained_range
+from model.weights import encode_weights, from_tensors, read_tensors
 from storage.digests import sha256_hex
 from tests.scenes_by_hand import tiny_scene
 
@@ -30,3 +32,10 @@ def test_it_renders_by_its_name_and_knows_its_range() -> None:
     assert picture.shape[1:] == (64, 64, 3) and picture.min() >= 0 and picture.max() > 0.01
     (note,) = renderer.resolution_notes(128)
     assert "trained on 64" in note and renderer.resolution_notes(64) == ()
+
+
+def test_its_file_is_written_again_byte_for_byte() -> None:
+    """A field of the configuration that came later must not change what older networks are."""
+    tensors, metadata = read_tensors(BUILTIN_WEIGHTS)
+    network = from_tensors(tensors, metadata)
+    assert encode_weights(network, trained_range(metadata)) == BUILTIN_WEIGHTS.read_bytes()
