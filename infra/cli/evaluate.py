@@ -2,15 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
 from rich.table import Table
 from rich.text import Text
 
 from infra.cli.console import console, first_words, look_at, print_json, progress_bars
+from infra.cli.options import Shown, command
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
+from train.evaluation.order import EvaluationOrder
 
 if TYPE_CHECKING:
     from storage.training_data import TrainingData
@@ -18,33 +19,10 @@ if TYPE_CHECKING:
     from train.evaluation.judged_view import JudgedView
 
 
-def evaluate(
-    checkpoint: Annotated[str, typer.Argument(help="run folder, model.safetensors or checkpoint")],
-    data: Annotated[
-        list[str], typer.Option(help="root of a dataset, or shards by name or pattern; repeatable")
-    ],
-    split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
-    train_data: Annotated[
-        list[str] | None,
-        typer.Option(help="data of the rivals' training pictures [the same, if it has any]"),
-    ] = None,
-    resolution: Annotated[
-        int | None,
-        typer.Option(help="pixels across [the run's if known, else the data's]"),
-    ] = None,
-    most_scenes: Annotated[int, typer.Option(min=1, help="judge the first so many scenes")] = 10**6,
-    lpips: Annotated[
-        str | None,
-        typer.Option(help="folder of LPIPS' weights, or hub [$TRILIGHT_LPIPS; else LPIPS is n/a]"),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option(help="cpu or cuda [cuda where there is one]")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="folder of the report")] = Path("evaluation"),
-    json: Annotated[bool, typer.Option(help="print the summary as JSON")] = False,
-) -> None:
-    """Judge a network; writes evaluation.json, evaluation.md and sheets of pictures."""
-    first_words(f"Judging {checkpoint} on the split {split}", silent=json)
+@command("checkpoint")
+def evaluate(order: EvaluationOrder, shown: Shown) -> None:
+    out = order.out
+    first_words(f"Judging {order.checkpoint} on the split {order.split}", silent=shown.json)
     try:
         from storage.training_data import open_training_data
         from train.evaluation.evaluate import judged_views
@@ -53,83 +31,64 @@ def evaluate(
         if error.name != "torch":
             raise
         raise TrilightError("evaluate: torch is not installed; run `make setup-all`.") from error
-    opened = open_training_data(data)
-    rivals = opened if train_data is None else open_training_data(train_data)
-    contest = _contest(
-        checkpoint,
-        opened,
-        rivals,
-        split=split,
-        resolution=resolution,
-        most_scenes=most_scenes,
-        lpips=lpips,
-        device=device,
-    )
+    opened = open_training_data(order.data)
+    rivals = open_training_data(order.train_data) if order.train_data else opened
+    contest = _contest(order, opened, rivals)
     with progress_bars() as bars:
         total = _num_scenes(contest)
-        task = bars.add_task("scenes", total=total, note="", visible=not json)
+        task = bars.add_task("scenes", total=total, note="", visible=not shown.json)
         views = judged_views(contest, lambda: bars.advance(task))
-    first_words(f"Drawing the sheets of {out}", silent=json)
-    found = record(views, _about(checkpoint, opened, contest, split, views))
+    first_words(f"Drawing the sheets of {out}", silent=shown.json)
+    found = record(views, _about(order, opened, contest, views))
     write_atomically(out / "evaluation.json", _encoded(found))
     write_atomically(out / "evaluation.md", markdown(found).encode())
     _write_pictures(out, contest, views)
-    if json:
+    if shown.json:
         print_json({name: found[name] for name in ("about", "contestants")})
     else:
         _report(found, out)
 
 
 def _about(
-    checkpoint: str,
+    order: EvaluationOrder,
     opened: "TrainingData",
     contest: "Contest",
-    split: str,
     views: "Sequence[JudgedView]",
 ) -> dict[str, str | int]:
     """Return what the report says of itself; no path of this machine."""
     from model.weights import network_digest
 
     return {
-        "network": Path(checkpoint).name,
+        "network": Path(order.checkpoint).name,
         "network sha256": network_digest(contest.network),
         "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],
         "build": opened.build or "unknown",
         "data digest": opened.digest,
-        "split": split,
+        "split": order.split,
         "resolution": contest.resolution,
         "scenes": len({view.key for view in views}),
     }
 
 
-def _contest(
-    checkpoint: str,
-    opened: "TrainingData",
-    rivals: "TrainingData",
-    *,
-    split: str,
-    resolution: int | None,
-    most_scenes: int,
-    lpips: str | None,
-    device: str | None,
-) -> "Contest":
+def _contest(order: EvaluationOrder, opened: "TrainingData", rivals: "TrainingData") -> "Contest":
     from train.evaluation.evaluate import Contest, make_rivals, stored_resolution
     from train.loop.crew import choose_device
     from train.loss.lpips_weights import load_lpips
     from train.networks import open_network, trained_resolution
 
-    network = open_network(checkpoint)
-    shards = opened.split(split)
-    if resolution is None:
-        resolution = trained_resolution(checkpoint) or stored_resolution(shards)
-    place, distance = choose_device(device), load_lpips(lpips)
+    network = open_network(order.checkpoint)
+    shards = opened.split(order.split)
+    resolution = (
+        order.resolution or trained_resolution(order.checkpoint) or stored_resolution(shards)
+    )
+    place, distance = choose_device(order.device), load_lpips(order.lpips)
     return Contest(
         network=network.to(place),
         shards=shards,
         resolution=resolution,
         rivals=make_rivals(rivals.split("train"), resolution) if "train" in rivals.splits else None,
         lpips=None if distance is None else distance.to(place),
-        most_scenes=most_scenes,
+        most_scenes=order.most_scenes,
     )
 
 

@@ -2,9 +2,6 @@
 
 import json
 
-from typer.testing import CliRunner
-
-from infra.cli.app import app
 from infra.cli.changes import parse_changes
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.order_words import generate_words
@@ -53,7 +50,7 @@ def test_what_nobody_asked_for_is_not_there() -> None:
 
 
 def test_every_option_of_an_order_is_one_of_the_command() -> None:
-    shown = CliRunner().invoke(app, ["generate", "--help"], env={"COLUMNS": "200"}).output
+    shown = trilight(["generate", "--help"], env={"COLUMNS": "200"}).output
     for word in generate_words(ASKED):
         assert not word.startswith("--") or word in shown
 

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 import typer
 from rich.text import Text
-from typer.testing import CliRunner
 
-from infra.cli.app import app
+from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import command
 
@@ -44,19 +43,19 @@ def test_no_help_text_loses_its_default(name: str) -> None:
 
 
 def test_the_default_of_objects_is_seen() -> None:
-    shown = CliRunner().invoke(app, ["generate", "--help"], env={"COLUMNS": "200"}).output
+    shown = trilight(["generate", "--help"], env={"COLUMNS": "200"}).output
     assert "builtin: or objaverse: [builtin:]" in " ".join(shown.split())
 
 
 def test_the_short_option_helps_everywhere() -> None:
     for words in (["-h"], ["verify", "-h"], ["shards", "-h"], ["shards", "merge", "-h"]):
-        shown = CliRunner().invoke(app, words)
+        shown = trilight(words)
         assert shown.exit_code == 0
         assert "Usage:" in shown.output
 
 
 def test_the_version_is_that_of_the_distribution() -> None:
-    shown = CliRunner().invoke(app, ["--version"])
+    shown = trilight(["--version"])
     assert (shown.exit_code, shown.output.split()[0]) == (0, "trilight")
     assert shown.output.split()[1][0].isdigit()
 
@@ -76,13 +75,13 @@ def test_usage_names_the_command_and_no_module() -> None:
 
 @pytest.mark.parametrize(("typed", "meant"), [("evaluat", "evaluate"), ("shard", "shards")])
 def test_a_mistyped_command_brings_the_near_one(typed: str, meant: str) -> None:
-    shown = CliRunner().invoke(app, [typed])
+    shown = trilight([typed])
     assert shown.exit_code == 2
     assert f"Did you mean '{meant}'" in shown.output
 
 
 def test_a_mistyped_option_brings_the_near_one() -> None:
-    shown = CliRunner().invoke(app, ["generate", "smoke", "--objekts", "x"])
+    shown = trilight(["generate", "smoke", "--objekts", "x"])
     assert "--objects" in shown.output
 
 
