@@ -31,7 +31,8 @@ class Ended:
 def trilight(words: Sequence[str], env: Mapping[str, str] | None = None) -> Ended:
     """Run a command; any exception but a mistake of the user is raised."""
     out, errors = io.StringIO(), io.StringIO()
-    code, caught = 0, None
+    code = 0
+    caught: Exception | None = None
     with (
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(errors),

@@ -65,6 +65,7 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
             for group in [Group.create_ordered(_title(kind))]
             for field in described(kind)
         }
+        assert len(parameters) == sum(len(described(kind)) for kind in kinds.values()), parameters
         in_order = [*arguments, *(name for name in parameters if name not in arguments)]
         signature = inspect.Signature([parameters[name] for name in in_order])
 
@@ -97,7 +98,7 @@ def _parameter(field: Described, group: Group, *, by_place: bool) -> inspect.Par
         name=None if by_place else names,
         help=_help(field, choices, several=several, required=required),
         group=group,
-        metavar=_metavar(field, choices),
+        metavar=None if kind is bool else _metavar(field, choices),
         negative=(),
         show_default=False,
         show_choices=False,

@@ -18,6 +18,7 @@ from infra.cli.options import Shown, command
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.order_words import generate_words
 from pipeline.flows.price import CorePrice
+from storage.errors import TrilightError
 from storage.ranges import Within
 from storage.settings import checked
 
@@ -40,6 +41,11 @@ def plan(
     core: CorePrice,
     shown: Shown,
 ) -> None:
+    if order.scenes_from is not None or order.shards is not None:
+        raise TrilightError(
+            "plan: --scenes-from or --shards was given; expected neither, since a whole dataset of "
+            "new scenes is predicted."
+        )
     order = with_shared(order, shared)
     build, samples, cores = order.build, prognosis.samples, prognosis.cores
     first_words(f"Measuring {samples} scenes of {build}", silent=shown.json)

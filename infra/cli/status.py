@@ -13,10 +13,10 @@ from storage.settings import checked
 
 @checked()
 class Watched:
-    """The dataset."""
+    """What is looked at."""
 
     dataset: str
-    """A folder or a URL."""
+    """The dataset, a folder or a URL."""
 
 
 @command("dataset")

@@ -51,8 +51,9 @@ class DatasetOrder:
     accept_environment: bool = False
     """Go on with a dataset that was begun with other library versions."""
     scenes_from: str | None = None
-    """Folder of scene files (RenderFormer JSON) to render instead of new scenes: scene k is the
-    k-th *.json, all are of the split test, and the build's limits on scenes do not apply."""
+    """Folder of scene files (RenderFormer JSON) to render instead of new scenes, which are the
+    default: scene k is the k-th *.json, all are of the split test, and the build's limits on scenes
+    do not apply."""
     views: Annotated[int | None, Within(1, 1000, unit="cameras")] = None
     """First cameras of each scene file; by default as many as every file has."""
     albedo_over_one: AlbedoOverOne = "scale"

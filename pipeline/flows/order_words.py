@@ -33,9 +33,10 @@ def option_words(order: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]:
         order: an instance.
         leave_out: fields that are no matter.
     """
+    kind: Any = type(order)
     return [
         word
-        for field in described(type(order))
+        for field in described(kind)
         if field.name not in leave_out and getattr(order, field.name) != field.default
         for word in _words(option_of(field.name), getattr(order, field.name))
     ]

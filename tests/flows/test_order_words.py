@@ -5,6 +5,7 @@ import json
 from infra.cli.changes import parse_changes
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.order_words import generate_words
+from tests.command_line import trilight
 
 ASKED = DatasetOrder(
     build="pretrain-256",
@@ -32,16 +33,16 @@ def test_every_option_that_was_given_is_there() -> None:
         ("--scenes", "2000000"),
         ("--seed", "7"),
         ("--resolution", "64"),
-        ("--noise-floor", "25.5"),
-        ("--allow-licence", "CC-BY-NC-4.0"),
-        ("--allow-licence", "MIT"),
+        ("--noise-floor-db", "25.5"),
+        ("--allow-licences", "CC-BY-NC-4.0"),
+        ("--allow-licences", "MIT"),
         ("--licence", "CC0-1.0"),
         ("--failure-budget", "0.2"),
     ):
         at = [i for i, word in enumerate(words) if word == pair[0]]
         assert pair[1] in [words[i + 1] for i in at]
     assert "--accept-environment" in words
-    changes = [words[i + 1] for i, word in enumerate(words) if word == "--set"]
+    changes = [words[i + 1] for i, word in enumerate(words) if word == "--changes"]
     assert parse_changes(changes) == json.loads(json.dumps(dict(ASKED.changes)))
 
 
