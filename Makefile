@@ -48,8 +48,9 @@ lock: setup-all  ## write the lock files anew from requirements/*.in
 third-party: setup-all  ## write docs/third_party.md anew
 	python -m infra.setup.third_party
 
-settings: setup-all  ## write docs/reference/settings.md anew
+settings: setup-all  ## write docs/reference/settings.md and command-line.md anew
 	python -m infra.setup.settings_page
+	python -m infra.setup.command_line_page
 
 clean:  ## everything that make has made, except data/ and runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache *.egg-info

@@ -64,7 +64,7 @@ def train_network(
     require_torch("train_network")
     settings = changed_run(run, changes or {}, steps=steps)
     start = Start(resume=resume, begin_with=begin_with, lpips=lpips)
-    start.check(settings, "begin_with")
+    start.check(settings)
     from train.loop.crew import Crew, choose_device
     from train.run import train_run
 

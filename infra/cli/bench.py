@@ -3,20 +3,20 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
-
-import typer
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from infra.cli.console import console, first_words, print_rows, progress_bars
-from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
+from infra.cli.options import command
+from pipeline.flows.price import CorePrice
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
+from storage.settings import checked
 from storage.suggestion import expected_one_of
 
 if TYPE_CHECKING:
     from infra.bench.harness import Options, Result
 
-_NAMES = (
+Name = Literal[
     "assets",
     "exchange",
     "model",
@@ -27,7 +27,8 @@ _NAMES = (
     "soak",
     "streaming",
     "trade",
-)
+]
+"""Every benchmark."""
 
 _Measured = TypeVar("_Measured", bound="Result")
 
@@ -43,61 +44,55 @@ class _Benchmark(Generic[_Measured]):
     part: str = ""
 
 
-def bench(
-    name: Annotated[str, typer.Argument(help=f"one of: {', '.join(_NAMES)}")],
-    quick: Annotated[bool, typer.Option(help="minutes instead of a careful measurement")] = False,
-    objects: Annotated[
-        list[str] | None, typer.Option(help="source of objects; may be repeated [builtin:]")
-    ] = None,
-    allow_licence: Annotated[
-        list[str] | None, typer.Option(help="measure objects under this licence too")
-    ] = None,
-    part: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="render: frontier, throughput, cost; model: cases, growth; orchestration: "
-            "overhead, workers; may be repeated [all]"
-        ),
-    ] = None,
-    scenes: Annotated[
-        Path | None, typer.Option(help="render: folder of RenderFormer scenes to add to the set")
-    ] = None,
-    cycles: Annotated[
-        str, typer.Option(help="render: Cycles at these samples too, as 128,4096; installs Blender")
-    ] = "",
-    price: Annotated[float, typer.Option(help="render: USD per core-hour")] = USD_PER_CORE_HOUR,
-    resume: Annotated[
-        bool, typer.Option(help="render, trade: go on with the same run where it was interrupted")
-    ] = False,
-    knob: Annotated[
-        list[str] | None, typer.Option(help="trade: this knob alone; may be repeated [all]")
-    ] = None,
-    checkpoint: Annotated[
-        str, typer.Option(help="trade: network to compare with the path tracer [the shipped one]")
-    ] = "builtin:",
-    write_docs: Annotated[
-        bool, typer.Option(help="trade: measure nothing, write docs/tradeoffs.md from the results")
-    ] = False,
-) -> None:
-    """Run a benchmark; writes a dated JSON line and a figure under docs/bench."""
-    if write_docs:
-        _write_docs(name)
+@checked()
+class Measured:
+    """What is measured."""
+
+    name: Name
+    """The benchmark."""
+    quick: bool = False
+    """Take minutes instead of measuring carefully."""
+    objects: tuple[str, ...] = ("builtin:",)
+    """Sources of objects."""
+    allow_licences: tuple[str, ...] = ()
+    """Licences of objects that are measured too; by default the usual ones are."""
+    parts: tuple[str, ...] = ()
+    """Parts of it, by default all. render: frontier, throughput, cost; model: cases, growth;
+    orchestration: overhead, workers."""
+    scenes: Path | None = None
+    """render: folder of RenderFormer scenes to add to the set; by default none."""
+    cycles: str | None = None
+    """render: Cycles at these samples too, such as 128,4096, for which Blender is installed; by
+    default not."""
+    resume: bool = False
+    """render, trade: go on with the same run where it was interrupted."""
+    knobs: tuple[str, ...] = ()
+    """trade: these knobs alone; by default all."""
+    checkpoint: str = "builtin:"
+    """trade: network to compare with the path tracer."""
+    write_docs: bool = False
+    """trade: measure nothing, write docs/tradeoffs.md from the results."""
+
+
+@command("name")
+def bench(asked: Measured, core: CorePrice) -> None:
+    if asked.write_docs:
+        _write_docs(asked.name)
         return
-    if name in _NAMES:
-        first_words(f"Measuring {name}")
-    benchmarks = _chosen(name, part or [])
+    first_words(f"Measuring {asked.name}")
+    benchmarks = _chosen(asked.name, asked.parts)
     from infra.bench.harness import Options
 
     options = Options(
-        quick=quick,
-        objects=tuple(objects or ("builtin:",)),
-        allowed_licences=(*DEFAULT_ALLOWED, *(allow_licence or ())),
-        scenes=scenes,
-        cycles_spp=_samples(cycles),
-        usd_per_core_hour=CorePrice(price=price).price,
-        resume=resume,
-        knobs=tuple(knob or ()),
-        checkpoint=checkpoint,
+        quick=asked.quick,
+        objects=asked.objects,
+        allowed_licences=(*DEFAULT_ALLOWED, *asked.allow_licences),
+        scenes=asked.scenes,
+        cycles_spp=_samples(asked.cycles or ""),
+        usd_per_core_hour=core.price,
+        resume=asked.resume,
+        knobs=asked.knobs,
+        checkpoint=asked.checkpoint,
     )
     for benchmark in benchmarks:
         _measure(benchmark, options)
@@ -140,18 +135,18 @@ def _samples(text: str) -> tuple[int, ...]:
     return tuple(sorted({int(word) for word in words}))
 
 
-def _chosen(name: str, parts: list[str]) -> list[_Benchmark[Any]]:
+def _chosen(name: Name, parts: tuple[str, ...]) -> list[_Benchmark[Any]]:
     """Return a benchmark, or those of its parts that are asked for."""
     benchmarks = _named(name)
     known = [benchmark.part for benchmark in benchmarks if benchmark.part]
     for part in parts:
         if part not in known:
             expected = expected_one_of(part, known) if known else "it has no parts"
-            raise TrilightError(f"--part {part!r}: unknown in benchmark {name!r}; {expected}.")
+            raise TrilightError(f"--parts {part!r}: unknown in benchmark {name!r}; {expected}.")
     return [benchmark for benchmark in benchmarks if not parts or benchmark.part in parts]
 
 
-def _named(name: str) -> list[_Benchmark[Any]]:
+def _named(name: Name) -> list[_Benchmark[Any]]:
     """Import only what is asked for: each benchmark needs other libraries."""
     if name == "assets":
         from infra.bench import assets, assets_report
@@ -186,11 +181,9 @@ def _named(name: str) -> list[_Benchmark[Any]]:
         from infra.bench import streaming, streaming_report
 
         return [_whole(streaming, streaming_report)]
-    if name == "trade":
-        from infra.bench.trade import run as trade
+    from infra.bench.trade import run as trade
 
-        return [_whole(trade, trade)]
-    raise TrilightError(f"benchmark {name!r} is unknown; {expected_one_of(name, _NAMES)}.")
+    return [_whole(trade, trade)]
 
 
 def _whole(module: Any, report: Any, part: str = "") -> _Benchmark[Any]:

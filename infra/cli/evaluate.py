@@ -1,66 +1,43 @@
 """`trilight evaluate`: a trained network against the pictures of a dataset."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.table import Table
 from rich.text import Text
 
 from infra.cli.console import console, first_words, look_at, print_json, progress_bars
+from infra.cli.options import Shown, command
 from infra.torch_library import require_torch
+from train.evaluation.order import EvaluationOrder
 
 
-def evaluate(
-    checkpoint: Annotated[str, typer.Argument(help="run folder, model.safetensors or checkpoint")],
-    data: Annotated[
-        list[str], typer.Option(help="root of a dataset, or shards by name or pattern; repeatable")
-    ],
-    split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
-    train_data: Annotated[
-        list[str] | None,
-        typer.Option(help="data of the rivals' training pictures [the same, if it has any]"),
-    ] = None,
-    resolution: Annotated[
-        int | None,
-        typer.Option(help="pixels across [the run's if known, else the data's]"),
-    ] = None,
-    most_scenes: Annotated[int, typer.Option(min=1, help="judge the first so many scenes")] = 10**6,
-    lpips: Annotated[
-        str | None,
-        typer.Option(help="folder of LPIPS' weights, or hub [$TRILIGHT_LPIPS; else LPIPS is n/a]"),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option(help="cpu or cuda [cuda where there is one]")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="folder of the report")] = Path("evaluation"),
-    json: Annotated[bool, typer.Option(help="print the summary as JSON")] = False,
-) -> None:
-    """Judge a network; writes evaluation.json, evaluation.md and sheets of pictures."""
-    first_words(f"Judging {checkpoint} on the split {split}", silent=json)
+@command("checkpoint")
+def evaluate(order: EvaluationOrder, shown: Shown) -> None:
+    first_words(f"Judging {order.checkpoint} on the split {order.split}", silent=shown.json)
     require_torch("evaluate")
     from infra.judging import judge_network, write_judgement
 
     with progress_bars() as bars:
-        task = bars.add_task("scenes", total=None, note="", visible=not json)
+        task = bars.add_task("scenes", total=None, note="", visible=not shown.json)
         judgement = judge_network(
-            checkpoint,
-            data,
-            split=split,
-            train_data=train_data,
-            resolution=resolution,
-            most_scenes=most_scenes,
-            lpips=lpips,
-            device=device,
+            order.checkpoint,
+            order.data,
+            split=order.split,
+            train_data=order.train_data or None,
+            resolution=order.resolution,
+            most_scenes=order.most_scenes,
+            lpips=order.lpips,
+            device=order.device,
             done=lambda now, total: bars.update(task, completed=now, total=total),
         )
-    first_words(f"Drawing the sheets of {out}", silent=json)
+    first_words(f"Drawing the sheets of {order.out}", silent=shown.json)
     found = judgement.record
-    write_judgement(judgement, out)
-    if json:
+    write_judgement(judgement, order.out)
+    if shown.json:
         print_json({name: found[name] for name in ("about", "contestants")})
     else:
-        _report(found, out)
+        _report(found, order.out)
 
 
 def _report(found: dict[str, Any], out: Path) -> None:

@@ -9,10 +9,11 @@ import numpy as np
 from rich.text import Text
 
 from infra.cli.console import console, print_json, print_rows
+from infra.rendering.asked import Asked
 from infra.rendering.look import enlargement
 from infra.rendering.picture_file import PictureFile
 from infra.rendering.run import FinishedShot, Flicker
-from infra.rendering.session import Asked, RenderOutcome
+from infra.rendering.session import RenderOutcome
 
 Rows = list[tuple[str, str]]
 

@@ -2,13 +2,12 @@
 
 import dataclasses
 import os
-import re
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Protocol
 
+from infra.rendering.asked import Asked
 from infra.rendering.cameras import Shot, ShotCamera, camera_path, orbit, own_camera, shots
 from infra.rendering.engines import Engine, MitsubaEngine, NeuralEngine
 from infra.rendering.look import Look
@@ -20,78 +19,17 @@ from infra.rendering.video import write_video
 from infra.torch_library import require_torch
 from pipeline.flows.read_scenes import SceneReader
 from pipeline.flows.scene_source import SceneSource, scene_source
-from pipeline.renders.settings import (
-    FIRST_SPP,
-    NoiseFloor,
-    RenderSettings,
-    Resolution,
-    Samples,
-    one_picture,
-)
+from pipeline.renders.settings import FIRST_SPP, RenderSettings, one_picture
 from pipeline.renders.variant import choose_variant
-from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.errors import TrilightError
-from storage.ranges import Seed, Within
-from storage.settings import checked
 
 if TYPE_CHECKING:
     from pipeline.renders.renderer import Sampling
 
 ENGINES = {"mitsuba": ("mitsuba",), "neural": ("neural",), "both": ("mitsuba", "neural")}
-"""What `--engine` may be."""
+"""Who renders, by what `--engine` may be."""
 
 _RESOLUTION = 512
-
-
-def _option(name: str) -> str:
-    """Return the option that a field stands for."""
-    return "--" + re.sub("_(db|deg|ev)$", "", name).replace("_", "-")
-
-
-@checked(option=_option)
-class Asked:
-    """What the user asked for; names are those of the options."""
-
-    source: str
-    """SRC."""
-    out: Path
-    """See infra.rendering.places."""
-    engine: str
-    """A key of ENGINES."""
-    checkpoint: str | None
-    """Of the network; None for the one that is shipped."""
-    resolution: Resolution | None
-    """Width of pictures; None for what the network was trained on, or 512."""
-    noise_floor_db: NoiseFloor
-    """Target of the path tracer."""
-    max_spp: Samples
-    """Its cap."""
-    view: Annotated[int, Within(0, 999)]
-    """Row of a scene's own cameras."""
-    orbit: Annotated[int | None, Within(1, 100_000, unit="pictures")]
-    """Number of pictures of a turn."""
-    arc_deg: Annotated[float, Within(0, 360, low_open=True, unit="degrees")]
-    """Its angle."""
-    cameras: str | None
-    """File of a camera path."""
-    fps: Annotated[int, Within(1, 240, unit="pictures a second")]
-    """Pictures a second of a video."""
-    tone_map: str
-    """A name of infra.rendering.tone_maps."""
-    exposure_ev: Annotated[float, Within(-32, 32, unit="stops")]
-    """Brightness of PNG and video."""
-    precision: str
-    """A name of model.precision."""
-    lights_per_pass: Annotated[int, Within(1, 65_535, unit="triangles")]
-    """Most emitting triangles of a group (model.light_groups)."""
-    skip_empty_bundles: bool
-    """Whether the network leaves what no triangle reaches black (model.empty_bundles)."""
-    seed: Seed
-    """Of samples."""
-    threads: Annotated[int | None, Within(1, 1024, unit="threads")]
-    """Of the processor; None for all cores."""
-    albedo_over_one: AlbedoOverOne = "scale"
-    """Of RenderFormer's JSON, where diffuse and specular albedos add up to more than 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,7 +65,6 @@ def render_asked(asked: Asked, watcher: RenderWatcher) -> RenderOutcome:
         TrilightError: an option that means nothing, a source, camera or checkpoint that is
             unusable, a scene that cannot be rendered, or files that cannot be written.
     """
-    _check(asked)
     asked = _completed(asked)
     settings = _settings(asked)
     look = Look(tone_map=require_tone_map(asked.tone_map), exposure_ev=asked.exposure_ev)
@@ -150,27 +87,6 @@ def render_asked(asked: Asked, watcher: RenderWatcher) -> RenderOutcome:
         settings=settings,
         notes=(*run.notes, *_notes(asked, finished)),
     )
-
-
-def _check(asked: Asked) -> None:
-    neural = asked.engine in ("neural", "both")
-    for law, option, got, expected in (
-        (asked.engine in ENGINES, "--engine", asked.engine, "mitsuba, neural or both"),
-        (
-            asked.orbit is None or asked.cameras is None,
-            "--cameras",
-            asked.cameras,
-            "no --orbit beside it",
-        ),
-        (
-            neural or asked.checkpoint is None,
-            "--checkpoint",
-            asked.checkpoint,
-            "--engine neural or both beside it",
-        ),
-    ):
-        if not law:
-            raise TrilightError(f"{option} is {got}; expected {expected}.")
 
 
 def _completed(asked: Asked) -> Asked:

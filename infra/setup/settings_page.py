@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
-from infra.rendering.session import Asked
+from infra.rendering.asked import Asked
 from infra.serving.train_model import TrainOrder
 from pipeline.documents.markdown import table
 from pipeline.flows.price import CorePrice

@@ -114,7 +114,7 @@ def prepare_dataset(order: DatasetOrder) -> Run:
 
 
 def _folder(order: DatasetOrder) -> DatasetFolder:
-    folder = dataset_folder(order.out)
+    folder = dataset_folder(order.place)
     return replace(folder, root=folder.root.resolve())
 
 

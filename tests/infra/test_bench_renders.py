@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
 from infra.bench.harness import Comparison, Options, Spread
 from infra.bench.renders import cost, frontier, frontier_report, throughput, throughput_report
@@ -15,10 +14,10 @@ from infra.bench.renders.claims import Shot
 from infra.bench.renders.cost_scene import MAX_LIGHTS, cost_scene
 from infra.bench.renders.kept import Kept
 from infra.bench.renders.remembering_tracer import RememberingTracer
-from infra.cli.app import app
 from pipeline.renders.camera import Camera
 from pipeline.renders.tracer import Features, HostSum
 from storage.errors import TrilightError
+from tests.command_line import trilight
 
 OPTIONS = Options(quick=True, objects=("builtin:",), allowed_licences=())
 
@@ -34,7 +33,7 @@ OPTIONS = Options(quick=True, objects=("builtin:",), allowed_licences=())
     ],
 )
 def test_mistakes_are_told_before_anything_is_measured(words: list[str], said: str) -> None:
-    result = CliRunner().invoke(app, ["bench", *words])
+    result = trilight(["bench", *words])
     assert isinstance(result.exception, TrilightError), result.output
     assert said in str(result.exception)
 

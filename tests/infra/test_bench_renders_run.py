@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from infra.bench import harness
 from infra.bench.cycles.comparison import NamedScene, sampled
@@ -15,10 +14,10 @@ from infra.bench.cycles.cycles_picture import CyclesPicture, Request
 from infra.bench.renders import cost, frontier, kept, throughput
 from infra.bench.renders.ladder import render_ladder
 from infra.bench.renders.references import Reference
-from infra.cli.app import app
 from pipeline.isolation import IsolatedChild
 from storage.errors import TrilightError
 from storage.scene import Scene
+from tests.command_line import trilight
 
 SCENES = [sampled(0), sampled(5)]
 RESOLUTION = 16
@@ -71,7 +70,7 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def _bench(*words: str) -> None:
-    result = CliRunner().invoke(app, ["bench", "render", "--quick", *words])
+    result = trilight(["bench", "render", "--quick", *words])
     assert result.exit_code == 0, result.exception
 
 
@@ -110,7 +109,7 @@ def test_an_interrupted_part_goes_on(results: Path, monkeypatch: pytest.MonkeyPa
         return _reference(named, child)
 
     monkeypatch.setattr(frontier, "make_reference", interrupted)
-    result = CliRunner().invoke(app, ["bench", "render", "--quick", "--part", "frontier"])
+    result = trilight(["bench", "render", "--quick", "--part", "frontier"])
     assert isinstance(result.exception, TrilightError) and not results.exists()
     monkeypatch.setattr(frontier, "make_reference", _reference)
     _bench("--part", "frontier", "--resume")

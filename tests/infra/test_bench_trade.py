@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from infra.bench import harness
 from infra.bench.harness import Options
@@ -20,8 +19,8 @@ from infra.bench.trade.figures import shown, shown_error
 from infra.bench.trade.knobs import KNOBS, knob_named
 from infra.bench.trade.saved import saved_curves
 from infra.bench.trade.workshop import QUICK, Workshop
-from infra.cli.app import app
 from storage.errors import TrilightError
+from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.infra.trade_kit import TINY
 from tests.scenes_by_hand import tiny_sample
@@ -131,7 +130,7 @@ def test_knobs_are_told_apart_and_say_what_they_are() -> None:
     ],
 )
 def test_mistakes_are_told_before_anything_is_measured(words: list[str], said: str) -> None:
-    result = CliRunner().invoke(app, ["bench", *words])
+    result = trilight(["bench", *words])
     assert isinstance(result.exception, TrilightError), result.output
     assert said in str(result.exception)
 

@@ -18,7 +18,7 @@ from infra.bench.trade.engine_scenes import build_within
 from infra.bench.trade.knobs import knob_named
 from infra.bench.trade.mesh_knobs import EPSILONS, SCENE_BUDGETS, Fit, scene_fits
 from infra.bench.trade.workshop import Workshop
-from infra.cli.bench import bench
+from infra.cli.bench import Measured
 from model.config import smoke
 from model.layer_errors import random_network
 from model.open import BUILTIN
@@ -219,4 +219,4 @@ def test_what_is_kept_is_known_by_all_that_was_asked(
 
 
 def test_the_shipped_network_is_compared_without_an_option() -> None:
-    assert OPTIONS.checkpoint == BUILTIN == bench.__defaults__[-2]  # type: ignore[index]
+    assert OPTIONS.checkpoint == BUILTIN == Measured(name="trade").checkpoint

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from infra.bench import harness
 from infra.bench.harness import Options
@@ -16,12 +15,12 @@ from infra.bench.trade.curves import judged
 from infra.bench.trade.knobs import knob_named
 from infra.bench.trade.saved import saved_curves
 from infra.bench.trade.workshop import Workshop
-from infra.cli.app import app
 from model.config import smoke
 from model.layer_errors import random_network
 from model.weights import encode_weights
 from pipeline.objects.generated import generate_objects
 from pipeline.objects.licences import DEFAULT_ALLOWED
+from tests.command_line import trilight
 from tests.infra.trade_kit import TINY
 
 pytestmark = pytest.mark.slow
@@ -39,9 +38,7 @@ def test_knobs_with_children_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_p
     torch.manual_seed(0)
     checkpoint.write_bytes(encode_weights(random_network(smoke())))
     words = [word for name in (*WITH_CHILDREN, "engines") for word in ("--knob", name)]
-    result = CliRunner().invoke(
-        app, ["bench", "trade", "--quick", "--checkpoint", str(checkpoint), *words]
-    )
+    result = trilight(["bench", "trade", "--quick", "--checkpoint", str(checkpoint), *words])
     assert result.exit_code == 0, result.exception
     (path,) = (tmp_path / "results").glob("trade-*.json")
     assert path.with_suffix(".png").stat().st_size > 10_000

@@ -5,15 +5,14 @@ import os
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from storage.errors import TrilightError
+from tests.command_line import trilight
 from tests.documents.dataset_by_hand import five_scenes, write_dataset
 
 
 def inspect(*arguments: str | Path) -> str:
-    result = CliRunner().invoke(app, ["inspect", *(str(argument) for argument in arguments)])
+    result = trilight(["inspect", *(str(argument) for argument in arguments)])
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -58,7 +57,7 @@ def test_json_holds_the_distributions(tmp_path: Path) -> None:
 
 def _refused(dataset: Path) -> str:
     """Return the one line that `inspect` ends with."""
-    result = CliRunner().invoke(app, ["inspect", str(dataset)])
+    result = trilight(["inspect", str(dataset)])
     assert isinstance(result.exception, TrilightError), result.exception
     return str(result.exception)
 

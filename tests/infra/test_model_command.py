@@ -6,18 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from model.open import open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
+from tests.command_line import trilight
 from tests.model.kit import awake, tiny_config
 from tests.model.test_published import publishable
 
 
 def printed(*arguments: str) -> str:
-    result = CliRunner().invoke(app, ["model", *arguments])
+    result = trilight(["model", *arguments])
     if result.exception:
         raise result.exception
     assert result.exit_code == 0

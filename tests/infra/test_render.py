@@ -12,9 +12,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from pipeline.flows import render_scene
 from pipeline.flows.scene_source import load_source, scene_source
 from storage.conventions import preview_srgb8
@@ -26,6 +24,7 @@ from storage.sample import Sample, encode_sample
 from storage.scene import Scene
 from storage.scene_file import encode_scene, scene_digest
 from storage.shard_writer import write_shard
+from tests.command_line import trilight
 from tests.infra.render_kit import SMALL, mistake, render
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
@@ -148,7 +147,7 @@ def test_the_picture_says_how_it_was_made(tmp_path: Path) -> None:
 def test_a_person_is_told_where_to_look(tmp_path: Path) -> None:
     (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
     words = ["render", str(tmp_path / "tiny.safetensors"), "--out", str(tmp_path / "x.exr"), *SMALL]
-    printed = CliRunner().invoke(app, words).output
+    printed = trilight(words).output
     for text in ("x.png", "psnr_log_db", "the cap came before", "in the PNG a pixel is 16 x 16"):
         assert text in printed.replace("\n", "")
 

@@ -8,9 +8,7 @@ import flip_evaluator
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from infra.excursion_plots import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
@@ -21,6 +19,7 @@ from storage.metrics import psnr_log_db
 from storage.scene import Scene
 from storage.seeds import rng_for
 from storage.training_data import open_training_data
+from tests.command_line import trilight
 from tests.train.kit import tiny_run
 from tests.train.test_loss_lpips import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
@@ -274,7 +273,7 @@ def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) 
     weights.write_bytes(encode_weights(new_state(tiny_run()).model))
     data = ["--data", str(dataset.folder.root)]
     command = ["evaluate", str(weights), *data, "--split", "validation", "--out", str(out)]
-    done = CliRunner().invoke(app, [*command, "--json", "--resolution", "16"])
+    done = trilight([*command, "--json", "--resolution", "16"])
     assert done.exit_code == 0, done.output
     found = json.loads((out / "evaluation.json").read_text())
     assert found["contestants"] == json.loads(done.output[done.output.index("{") :])["contestants"]
@@ -283,11 +282,11 @@ def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) 
     for name in ("worst.png", "median.png"):
         with Image.open(out / name) as sheet:
             assert min(sheet.size) > 200
-    shown = CliRunner().invoke(app, command, env={"COLUMNS": "160"}).output.splitlines()
+    shown = trilight(command, env={"COLUMNS": "160"}).output.splitlines()
     (scores,) = [line.split() for line in shown if line.split()[:1] == ["psnr_log_db"]]
     assert len(scores) == 1 + len(found["contestants"])  # a column for each
-    missing = CliRunner().invoke(app, ["evaluate", str(tmp_path / "no"), *data])
+    missing = trilight(["evaluate", str(tmp_path / "no"), *data])
     assert isinstance(missing.exception, TrilightError)
     assert "no such file or folder" in str(missing.exception)
-    empty = CliRunner().invoke(app, ["evaluate", str(weights), *data])
+    empty = trilight(["evaluate", str(weights), *data])
     assert "the test split holds no scene" in str(empty.exception)

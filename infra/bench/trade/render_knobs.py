@@ -143,7 +143,7 @@ KNOBS = (
             "build.renders.noise_floor_db",
             "build.renders.reject_at_cap",
             "order.noise_floor_db",
-            "render.noise_floor",
+            "render.noise_floor_db",
         ),
         cost=_CORE_S,
         error=_DB,
