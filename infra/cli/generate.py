@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
-from infra.cli.changes import SharedSettings
+from infra.cli.changes import Shared
 from infra.cli.console import first_words, note
 from infra.cli.dataset_changes import with_shared
 from infra.cli.generate_progress import watched
@@ -39,7 +39,7 @@ class Runner:
 
 
 @command("build")
-def generate(order: DatasetOrder, shared: SharedSettings, runner: Runner, shown: Shown) -> None:
+def generate(order: DatasetOrder, shared: Shared, runner: Runner, shown: Shown) -> None:
     order = with_shared(order, shared)
     folder, started = dataset_folder(order.place), time.monotonic()
     first_words(f"Making {folder.shown} with the build {order.build}", silent=shown.json)
