@@ -24,6 +24,12 @@ class Ended:
     """The mistake that ended it, of which the real command prints one line."""
 
     @property
+    def mistake(self) -> str:
+        """The one line that a mistake becomes, without the name of the command."""
+        assert self.exit_code in (1, 2) and self.stderr.count("\n") == 1, self.output
+        return self.stderr.strip().removeprefix("trilight: ")
+
+    @property
     def output(self) -> str:
         return self.stdout + self.stderr
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @checked()
-class SharedSettings:
+class Shared:
     """Settings from elsewhere, which other options and --set change further."""
 
     like: str | None = None
@@ -56,7 +56,7 @@ def json_or_word(text: str) -> Any:
 
 
 def all_changes(
-    settings: Any, shared: SharedSettings, liked: Mapping[str, Any], stated: Mapping[str, Any]
+    settings: Any, shared: Shared, liked: Mapping[str, Any], stated: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return by dotted name what differs from named settings, and check that all fits together.
 
@@ -106,7 +106,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str,
     return found
 
 
-def dataset_record(shared: SharedSettings) -> dict[str, Any]:
+def dataset_record(shared: Shared) -> dict[str, Any]:
     """Return the settings of the dataset that is to be followed, without the name of its build."""
     from storage.dataset import open_dataset
 
@@ -114,7 +114,7 @@ def dataset_record(shared: SharedSettings) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name not in ("build", "derived")}
 
 
-def run_record(shared: SharedSettings) -> dict[str, Any]:
+def run_record(shared: Shared) -> dict[str, Any]:
     """Return the settings of the run that is to be followed, without its name.
 
     Raises:

@@ -4,12 +4,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from infra.cli.changes import SharedSettings, all_changes, dataset_record
+from infra.cli.changes import Shared, all_changes, dataset_record
 from pipeline.flows.builds import named_build
 from pipeline.flows.order import DatasetOrder
 
 
-def with_shared(order: DatasetOrder, shared: SharedSettings) -> DatasetOrder:
+def with_shared(order: DatasetOrder, shared: Shared) -> DatasetOrder:
     """Return an order whose changes are all that differs from its build, checked.
 
     Raises:

@@ -2,7 +2,7 @@
 
 import time
 
-from infra.cli.changes import SharedSettings
+from infra.cli.changes import Shared
 from infra.cli.console import first_words, note
 from infra.cli.dataset_changes import with_shared
 from infra.cli.generate_progress import watched
@@ -20,16 +20,14 @@ class ExecutorChoice:
     """Who does the work."""
 
     runner: str = "threads"
-    """Who runs the tasks: threads of this process, the workers of a dask cluster, or an executor of your
+    """Threads of this process, the workers of a dask cluster, or an executor of your
     own (--extend)."""
     address: str | None = None
     """With --runner dask: the scheduler, such as tcp://host:8786; by default there is none."""
 
 
 @command("build")
-def generate(
-    order: DatasetOrder, shared: SharedSettings, runner: ExecutorChoice, shown: Shown
-) -> None:
+def generate(order: DatasetOrder, shared: Shared, runner: ExecutorChoice, shown: Shown) -> None:
     order = with_shared(order, shared)
     folder, started = dataset_folder(order.place), time.monotonic()
     first_words(f"Making {folder.shown} with the build {order.build}", silent=shown.json)

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Annotated
 
-from infra.cli.changes import SharedSettings
+from infra.cli.changes import Shared
 from infra.cli.console import (
     first_words,
     next_step,
@@ -37,7 +37,7 @@ class Prognosis:
 @command("build")
 def plan(
     order: DatasetOrder,
-    shared: SharedSettings,
+    shared: Shared,
     prognosis: Prognosis,
     core: CorePrice,
     shown: Shown,

@@ -12,7 +12,7 @@ from rich.progress import Progress as Bars
 from rich.progress import TaskID
 from rich.text import Text
 
-from infra.cli.changes import SharedSettings, all_changes, run_record
+from infra.cli.changes import Shared, all_changes, run_record
 from infra.cli.console import console, print_rows, progress_bars
 from infra.cli.options import Shown, command
 from infra.torch_library import require_torch
@@ -78,7 +78,7 @@ class _BarProgress:
 
 
 @command("run")
-def train(order: TrainOrder, shared: SharedSettings, shown: Shown) -> None:
+def train(order: TrainOrder, shared: Shared, shown: Shown) -> None:
     if shared.is_given:
         changes = all_changes(named_run(order.run), shared, run_record(shared), order.changes)
         order = dataclasses.replace(order, changes=changes)

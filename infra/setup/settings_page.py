@@ -18,6 +18,7 @@ from storage.ranges import declared_ranges, shown_number
 from storage.scene import Scene
 from storage.settings import described, field_sentences
 from train.evaluation.evaluate import Contest
+from train.evaluation.order import EvaluationOrder
 from train.settings import TrainSettings
 
 FILE = Path(__file__).parents[2] / "docs/reference/settings.md"
@@ -28,7 +29,7 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Render": (Asked,),
     "Plan": (CorePrice,),
     "Train": (TrainOrder, TrainSettings),
-    "Evaluate": (Contest,),
+    "Evaluate": (EvaluationOrder, Contest),
 }
 """What each command is told; the settings within settings are found from here."""
 

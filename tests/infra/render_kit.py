@@ -9,7 +9,6 @@ import torch
 from model.config import smoke
 from model.trained_range import TrainedRange
 from model.weights import encode_weights
-from storage.errors import TrilightError
 from tests.command_line import trilight
 from tests.model.kit import awake
 
@@ -26,10 +25,7 @@ def render(*arguments: str | Path) -> dict[str, Any]:
 
 def mistake(*arguments: str | Path) -> str:
     """Return the one line that a mistake becomes."""
-    result = trilight(["render", *(str(argument) for argument in arguments)])
-    assert isinstance(result.exception, TrilightError), result.output
-    assert "\n" not in str(result.exception)
-    return str(result.exception)
+    return trilight(["render", *(str(argument) for argument in arguments)]).mistake
 
 
 def write_network(path: Path, max_triangles: int | None = None, bias: float = 0.3) -> Path:

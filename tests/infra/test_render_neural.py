@@ -161,7 +161,7 @@ def test_mistakes_are_one_line(network: Path, scene: Path, tmp_path: Path) -> No
         (("--engine", "neural", "--checkpoint", network, "--resolution", "20"), "resolution is 20"),
         (
             ("--engine", "neural", "--checkpoint", network, "--precision", "half"),
-            "precision 'half'",
+            "--precision is 'half'; expected one of float32",
         ),
         (("--engine", "both", "--checkpoint", network, "--view", "2"), "--view is 2"),
     ):
