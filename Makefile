@@ -19,10 +19,10 @@ dataset: setup  ## 24 scenes of built-in objects, verified
 	trilight verify data/smoke
 
 test: setup-all  ## the tests that take minutes
-	python -m pytest -n 2
+	python -m pytest -n 2 --dist worksteal
 
 test-slow: setup-all  ## the others
-	python -m pytest -m slow -n 2
+	python -m pytest -m slow -n 2 --dist worksteal
 
 test-elsewhere: setup-all  ## the most telling ones, as other processors would run them
 	python -m tests.elsewhere

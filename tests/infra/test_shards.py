@@ -13,6 +13,9 @@ from storage.errors import TrilightError
 from tests.flows.derive_kit import finished, scenes
 
 
+pytestmark = pytest.mark.usefixtures("bare_reports")
+
+
 def shards(*arguments: str | Path) -> str:
     result = CliRunner().invoke(app, ["shards", *(str(argument) for argument in arguments)])
     if result.exception is not None:

@@ -18,7 +18,7 @@ from tests.scenes.small_pool import first_scene
 
 SCENES = 8
 TEMPLATES = {"plane", "wall", "corner", "open_box"}
-BUILDS = ("renderformer-v1-256", "renderformer-v1-512", "benchmark-v1")
+BUILDS = ("renderformer-v1-256", "benchmark-v1")
 
 
 @pytest.mark.parametrize("build", BUILDS)
