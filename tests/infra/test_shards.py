@@ -12,7 +12,6 @@ from storage.dataset import open_dataset
 from storage.errors import TrilightError
 from tests.flows.derive_kit import finished, scenes
 
-
 pytestmark = pytest.mark.usefixtures("bare_reports")
 
 
