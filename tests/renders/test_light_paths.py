@@ -157,9 +157,9 @@ def test_the_same_bits_for_any_number_of_threads() -> None:
 def _means(
     kind: type[VectorTracer], scene: Scene, *, max_depth: int = 10, first_seed: int = 0
 ) -> Estimate:
-    """Return the mean of the picture from 48 passes."""
+    """Return the mean of the picture from 32 passes."""
     tracer = kind(scene, max_depth=max_depth, rr_depth=2)
-    return render_blocks(scene, block=32, passes=48, first_seed=first_seed, tracer=tracer)
+    return render_blocks(scene, block=32, passes=32, first_seed=first_seed, tracer=tracer)
 
 
 def _less(a: Estimate, b: Estimate) -> Estimate:
