@@ -20,8 +20,8 @@ class ExecutorChoice:
     """Who does the work."""
 
     runner: str = "threads"
-    """Threads of this process, the workers of a dask cluster, or an executor of your
-    own (--extend)."""
+    """Threads of this process, the workers of a dask cluster, or an executor of your own
+    (--extend)."""
     address: str | None = None
     """With --runner dask: the scheduler, such as tcp://host:8786; by default there is none."""
 
