@@ -14,7 +14,7 @@
 set -eu
 
 OBJECTS=${OBJECTS:-builtin:40}        # a folder of .glb .obj .ply ..., or procedural objects
-SCENES=${SCENES:-8}                   # rounded up to whole shards, of four scenes here
+SCENES=${SCENES:-8}                   # eight are the fewest that have all three splits
 STEPS=${STEPS:-10}                    # of the network; a step sees four scenes
 RESOLUTION=${RESOLUTION:-64}          # pictures are square
 NOISE_FLOOR=${NOISE_FLOOR:-30}        # decibels at which sampling of a view stops
@@ -29,11 +29,11 @@ trilight doctor
 #    quality.html shows every mesh beside its source. Step 3 makes its own levels of detail.
 trilight assets "$OBJECTS" --epsilon 0.5% --out "$DATA/meshes"
 
-# 3. Meshes to scenes, scenes to path-traced pictures, pictures to shards. The built-in cycle of
-#    eight shards would give no validation split to eight scenes: in a cycle of two, every shard
-#    but one in two is training, so that there is something to judge by.
+# 3. Meshes to scenes, scenes to path-traced pictures, pictures to shards. In every cycle of eight
+#    shards the third is validation and the sixth is test; with one scene a shard, eight scenes
+#    have all three splits. Leave the --set away for more than a few scenes.
 trilight generate smoke --objects "$DATA/meshes" --scenes "$SCENES" --resolution "$RESOLUTION" \
-    --noise-floor "$NOISE_FLOOR" --set splits.shards_per_cycle=2 --out "$DATA/set"
+    --noise-floor "$NOISE_FLOOR" --set splits.scenes_per_shard=1 --out "$DATA/set"
 
 # 4. Every hash, member and law; then what a person looks at: report.html, contact_sheet.png.
 trilight verify "$DATA/set"
@@ -45,7 +45,7 @@ trilight train smoke --data "$DATA/set" --steps "$STEPS" --out "$RUN" $resume
 
 # 6. Judge: view by view beside each view's own noise floor, and beside two baselines that have
 #    learned nothing (the median picture, and the nearest training view).
-trilight evaluate "$RUN" --data "$DATA/set" --split validation
+trilight evaluate "$RUN" --data "$DATA/set" --split test --out "$RUN/evaluation"
 
 # 7. One scene by the path tracer and by the network, side by side with their difference; and the
 #    same scene as USD, for Blender and other programs.
@@ -54,4 +54,4 @@ trilight render "$scene" --engine both --checkpoint "$RUN" --resolution "$RESOLU
     --noise-floor "$NOISE_FLOOR" --out "$DATA/both.exr"
 trilight convert "$scene" "$DATA/scene.usdz"
 
-echo "Look at $DATA/meshes/quality.html, $DATA/set/report.html, $RUN and $DATA/both.png"
+echo "Look at $DATA/meshes/quality.html, $DATA/set/report.html, $DATA/both.png, $RUN/evaluation"

@@ -2,7 +2,7 @@
 # Writes requirements/*.txt from requirements/*.in: exact versions, no index, no local build tags.
 set -eu
 cd "$(dirname "$0")/../.."
-for name in dataset served all; do
+for name in dataset served all docs; do
     pip-compile --quiet --strip-extras --no-header --no-annotate --no-emit-options \
         --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
         --output-file "requirements/$name.txt" "requirements/$name.in"
