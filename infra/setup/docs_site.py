@@ -1,7 +1,7 @@
 """MkDocs hook: files of the checkout that a page links to become pages of the site.
 
-Pages of docs/ link to files beside that folder (`../../examples/template.py`), which a reader of the
-checkout can follow. A site holds only its own folder, so each of those files gets a page under
+Pages of docs/ link to files beside that folder (`../../examples/template.py`), which a reader of
+the checkout can follow. A site holds only its own folder, so each of those files gets a page under
 `source/`, outside the navigation, and the links lead there.
 """
 

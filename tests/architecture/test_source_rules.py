@@ -72,7 +72,7 @@ def test_the_top_level_holds_what_the_design_names() -> None:
     ).stdout
     allowed = {
         *PACKAGES, "tests", "docs", "requirements", "README.md", "LICENSE", "DECISIONS.md",
-        "LOG.md", "Makefile", "pyproject.toml", "prefect.yaml",
+        "CONTRIBUTING.md", "Makefile", "pyproject.toml", "prefect.yaml", "mkdocs.yml", "examples",
     }  # fmt: skip
     top = {line.split("/")[0] for line in tracked.splitlines()}
     assert {name for name in top if not name.startswith(".")} <= allowed
@@ -82,7 +82,7 @@ def test_no_file_names_this_machine() -> None:
     pattern = re.compile(r"/(?:work|root|home)/\w+|py" r"pi\.org|pythonhos" r"ted|npm" r"js\.org")
     found = [
         f"{path.relative_to(ROOT)}: {match[0]}"
-        for path in [*_sources(*PACKAGES, "tests"), *ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
+        for path in [*_sources(*PACKAGES, "tests"), *ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]
         if (match := pattern.search(path.read_text()))
     ]
     assert not found

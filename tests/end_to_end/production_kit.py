@@ -177,7 +177,7 @@ def served(
 
 
 def copy_of_the_project(folder: Path) -> None:
-    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (LOG.md)."""
+    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (docs/log)."""
     listed = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout

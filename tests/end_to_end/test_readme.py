@@ -1,4 +1,4 @@
-"""The commands of README and of the tutorials do what their pages say; every page's commands exist."""
+"""The commands of README and tutorials do what is said; those of all pages exist."""
 
 import os
 import re
@@ -134,7 +134,7 @@ def _run(command: str, folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(5400)
 def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
-    """README's and the tutorials', in order; only the user's own dataset and training are smaller."""
+    """README's and the tutorials', in order; only README's own dataset and training are smaller."""
     copy_of_the_project(tmp_path)
     for command in _shell_lines(README):
         if command in NOT_RUN_HERE:

@@ -11,10 +11,12 @@ import pytest
 
 from tests.conftest import ROOT
 
-pytest.importorskip("mkdocs", reason="the site needs requirements/docs.txt: make docs installs it")
-pytest.importorskip("material", reason="the site needs requirements/docs.txt: make docs installs it")
+for needed in ("mkdocs", "material", "mkdocstrings"):
+    pytest.importorskip(
+        needed, reason="the site needs requirements/docs.txt; `make docs` installs it"
+    )
 
-LOADED = re.compile(r"""<(?:script|img|link|iframe|source)\b[^>]*?(?:src|href)="(https?:)?//""")
+LOADED = re.compile(r'<(?:script|img|link|iframe|source)\b[^>]*?(?:src|href)="(?:https?:)?//')
 """What a browser would fetch from a server; links that a person may click are not among it."""
 
 
