@@ -8,13 +8,14 @@
 # The defaults end in minutes on two cores and show that everything works. A network that has seen
 # eight scenes for ten steps paints a mean grey, and its report says so. For a first real run:
 #
-#   SCENES=960 STEPS=2400 OBJECTS=/path/to/your/objects sh examples/whole_line.sh
+#   OBJECTS=FOLDER SCENES=960 SCENES_PER_SHARD=16 STEPS=2400 sh examples/whole_line.sh
 #
 # Every step may be interrupted. Run the script again, and it goes on where it was.
 set -eu
 
 OBJECTS=${OBJECTS:-builtin:40}        # a folder of .glb .obj .ply ..., or procedural objects
 SCENES=${SCENES:-8}                   # eight are the fewest that have all three splits
+SCENES_PER_SHARD=${SCENES_PER_SHARD:-1}
 STEPS=${STEPS:-10}                    # of the network; a step sees four scenes
 RESOLUTION=${RESOLUTION:-64}          # pictures are square
 NOISE_FLOOR=${NOISE_FLOOR:-30}        # decibels at which sampling of a view stops
@@ -30,10 +31,10 @@ trilight doctor
 trilight assets "$OBJECTS" --epsilon 0.5% --out "$DATA/meshes"
 
 # 3. Meshes to scenes, scenes to path-traced pictures, pictures to shards. In every cycle of eight
-#    shards the third is validation and the sixth is test; with one scene a shard, eight scenes
-#    have all three splits. Leave the --set away for more than a few scenes.
+#    shards the third is validation and the sixth is test, so that with one scene a shard eight
+#    scenes have all three splits.
 trilight generate smoke --objects "$DATA/meshes" --scenes "$SCENES" --resolution "$RESOLUTION" \
-    --noise-floor "$NOISE_FLOOR" --set splits.scenes_per_shard=1 --out "$DATA/set"
+    --noise-floor "$NOISE_FLOOR" --set splits.scenes_per_shard="$SCENES_PER_SHARD" --out "$DATA/set"
 
 # 4. Every hash, member and law; then what a person looks at: report.html, contact_sheet.png.
 trilight verify "$DATA/set"
