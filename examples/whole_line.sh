@@ -14,7 +14,7 @@
 set -eu
 
 OBJECTS=${OBJECTS:-builtin:40}        # a folder of .glb .obj .ply ..., or procedural objects
-SCENES=${SCENES:-8}                   # eight are the fewest that have all three splits
+SCENES=${SCENES:-8}                   # six or more have all three splits
 SCENES_PER_SHARD=${SCENES_PER_SHARD:-1}
 STEPS=${STEPS:-10}                    # of the network; a step sees four scenes
 RESOLUTION=${RESOLUTION:-64}          # pictures are square
