@@ -10,9 +10,8 @@ import pytest
 
 from tests.conftest import ROOT
 
-CODE = re.findall(
-    r"```python\n(.*?)```", (ROOT / "docs/reference/python.md").read_text(), re.DOTALL
-)
+PAGE = (ROOT / "docs/reference/python.md").read_text()
+CODE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
 def test_the_page_is_a_program() -> None:
