@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pipeline.flows.order_words import option_words
 from storage.errors import TrilightError
+from storage.extensions import function_name
 from storage.ranges import Within
 from storage.settings import checked
 from train.runs import changed_run
@@ -54,7 +55,7 @@ class TrainOrder:
     @property
     def place(self) -> str:
         """The folder of the run."""
-        return f"runs/{self.run}" if self.out is None else self.out
+        return f"runs/{function_name(self.run)}" if self.out is None else self.out
 
     def settings(self) -> TrainSettings:
         """Return the settings of the run.
@@ -75,7 +76,7 @@ class TrainOrder:
 
     def command(self) -> list[str]:
         """Return the command line that trains."""
-        launch = ["-m", "infra.cli.app"]
+        launch = ["-m", "trilight"]
         if self.processes > 1:
             several = f"--nproc-per-node={self.processes}"
             launch = ["-m", "torch.distributed.run", "--standalone", several, *launch]

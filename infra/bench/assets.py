@@ -20,8 +20,8 @@ from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.assets.stage import prepare_assets
 from pipeline.assets.store import AssetStore
 from pipeline.flows.children import ChildPool
-from pipeline.flows.prepare_isolated import asset_child
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, preload
+from pipeline.flows.prepare_isolated import asset_child, preload_mesh_libraries
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
 from pipeline.objects.sources import find_objects
 from storage.asset import decode_asset
@@ -60,7 +60,7 @@ QUICK = Effort(most_objects=4, sizes=SIZES[:2], repeats=1)
 
 def run(options: Options, round_done: Callable[[], None]) -> Comparison:
     """Measure on the objects of all sources together."""
-    preload(["pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters"])
+    preload_mesh_libraries()
     effort, records = _effort(options), object_records(options)
     with tempfile.TemporaryDirectory() as work, contextlib.closing(_child()) as child:
         sizes = clean_sizes(child, records)

@@ -182,7 +182,7 @@ def _errors(rows: Sequence[Mapping[str, Any]], price: float, recipe: str) -> lis
 
 
 def _generate(out: Path, arguments: Sequence[str]) -> None:
-    command = [sys.executable, "-m", "infra.cli.app", "generate", "smoke", "--out", str(out)]
+    command = [sys.executable, "-m", "trilight", "generate", "smoke", "--out", str(out)]
     command += ["--objects", "builtin:", "--scenes", str(_SCENES), *arguments]
     subprocess.run(command, check=True, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
 

@@ -151,7 +151,7 @@ def _wait(sleeping: Sleeping, sleep_s: float, workers: int) -> Mapping[str, floa
 
 def _render(options: Options, num_scenes: int, workers: int) -> Mapping[str, float]:
     with tempfile.TemporaryDirectory() as place:
-        words = [sys.executable, "-m", "infra.cli.app", "generate", "smoke", "--out", place]
+        words = [sys.executable, "-m", "trilight", "generate", "smoke", "--out", place]
         words += ["--objects", options.objects[0], "--scenes", str(num_scenes)]
         words += ["--resolution", "64", "--noise-floor", "20", "--workers", str(workers)]
         subprocess.run(

@@ -9,6 +9,7 @@ from types import FrameType
 from cyclopts import CycloptsError
 
 from infra.cli.commands import app, complaint
+from infra.cli.extending import extended
 from infra.cli.leaving import leave
 from storage.errors import TrilightError
 
@@ -20,7 +21,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     signal.signal(signal.SIGINT, _interrupted)
     try:
-        app(sys.argv[1:])
+        app(extended(sys.argv[1:]))
     except CycloptsError as mistake:
         leave(f"trilight: {complaint(mistake)}", 2)
     except TrilightError as mistake:

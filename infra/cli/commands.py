@@ -33,7 +33,7 @@ COMMANDS = {
     "model": "Print parameters, FLOPs and memory by precision of a named size or of a checkpoint.",
     "status": "Say how far a dataset is, when it will be done, and what failed; needs no server.",
     "train": "Train a model; writes checkpoints, metrics.jsonl, TensorBoard curves and a sheet."
-    "\n\nFor processes on several machines: torchrun -m infra.cli.app train ...",
+    "\n\nFor processes on several machines: torchrun -m trilight train ...",
     "evaluate": "Judge a network; writes evaluation.json, evaluation.md and sheets of pictures.",
     "bench": "Run a benchmark; writes a dated JSON line and a figure under docs/bench.",
     "shards": "Make new datasets of finished ones.",
@@ -47,8 +47,8 @@ GROUPS = ("shards",)
 app = App(
     name="trilight",
     help="Triangles in, light out: make data for, train and judge RenderFormer-style renderers.",
-    help_epilogue="Before any command: --extend FILE.py takes in templates, builds, runs, formats "
-    "and more of your own.",
+    help_epilogue="--extend FILE.py, anywhere on the line, adds what a file of your own registers: "
+    "docs/how-to.",
     help_format="plaintext",
     help_formatter=Sections(),
     version=lambda: f"trilight {metadata.version('trilight')}",
@@ -63,7 +63,7 @@ app = App(
 for _place, (_name, _help) in enumerate(COMMANDS.items()):
     _found = "app" if _name in GROUPS else _name
     _own: Any = {} if _name in GROUPS else {"help_epilogue": ""}  # groups state their own
-    app.command(f"infra.cli.{_name}:{_found}", name=_name, help=_help, sort_key=_place, **_own)
+    app.command(f"{__package__}.{_name}:{_found}", name=_name, help=_help, sort_key=_place, **_own)
 app.register_install_completion_command(
     help="Let the tab key complete commands and options: --shell bash, zsh or fish."
 )

@@ -16,7 +16,7 @@ from infra.cli.console import (
 )
 from infra.cli.options import Shown, command
 from storage.dataset import Dataset, open_dataset
-from storage.dataset_files import RemoteFiles
+from storage.dataset_files import RemoteDatasetFiles
 from storage.errors import TrilightError
 from storage.failures import count_by_reason
 from storage.layout import DatasetFolder
@@ -91,7 +91,7 @@ def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | N
     """Return where report and sheet go; None where nobody said and it cannot be there."""
     if out is not None:
         return DatasetFolder(out)
-    if isinstance(opened.files, RemoteFiles) or not os.access(
+    if isinstance(opened.files, RemoteDatasetFiles) or not os.access(
         opened.folder.root, os.W_OK | os.X_OK
     ):
         return None

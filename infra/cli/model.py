@@ -83,11 +83,12 @@ def model(counted: Counted, written: Written, shown: Shown) -> None:
 
 
 def _open(name: str) -> "RenderFormer":
-    from model.checkpoints import open_checkpoint
     from model.config import SIZES
+    from model.open import open_network
+    from train.networks import network_of_run
 
     try:
-        return open_checkpoint(name)
+        return open_network(name, network_of_run)
     except TrilightError as error:
         if Path(name).exists() or "/" in name:
             raise
@@ -118,7 +119,7 @@ def _errors(network: "RenderFormer | None", config: "ModelConfig") -> "dict[str,
 
 
 def _publish(name: str, network: "RenderFormer | None", folder: Path) -> None:
-    from model.checkpoints import save_published
+    from model.open import save_published
 
     if network is None:
         raise TrilightError(

@@ -13,6 +13,7 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.dataset_changes import with_shared
+from infra.cli.extending import extend_words
 from infra.cli.leaving import temporary_folder
 from infra.cli.options import Shown, command
 from pipeline.flows.order import DatasetOrder
@@ -74,4 +75,4 @@ def plan(
     )
     for text in found.notes:
         note(text)
-    next_step((*generate_words(order), "--out", order.place))
+    next_step((*generate_words(order), *extend_words(), "--out", order.place))

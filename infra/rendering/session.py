@@ -8,17 +8,22 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from infra.rendering.asked import Asked
-from infra.rendering.cameras import Camera, Shot, camera_path, orbit, own_camera, shots
+from infra.rendering.cameras import Shot, ShotCamera, camera_path, orbit, own_camera, shots
 from infra.rendering.engines import Engine, MitsubaEngine, NeuralEngine
 from infra.rendering.look import Look
-from infra.rendering.places import Place, place
+from infra.rendering.places import PicturePlaces, place
 from infra.rendering.run import FinishedShot, ShotRun
 from infra.rendering.sources import scene_sources
 from infra.rendering.tone_maps import require_tone_map
 from infra.rendering.video import write_video
+from infra.torch_library import require_torch
 from pipeline.flows.read_scenes import SceneReader
 from pipeline.flows.scene_source import SceneSource, scene_source
-from pipeline.renders.settings import PASS_SPP, RenderSettings
+from pipeline.renders.settings import (
+    FIRST_SPP,
+    RenderSettings,
+    one_picture,
+)
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
 
@@ -30,17 +35,14 @@ ENGINES = {"mitsuba": ("mitsuba",), "neural": ("neural",), "both": ("mitsuba", "
 
 _RESOLUTION = 512
 
-FIRST_SPP = 2 * PASS_SPP[1]
-"""Fewer samples, and the noise floor may flatter (pipeline.renders.noise_floor)."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Outcome:
+class RenderOutcome:
     """What came of it."""
 
     asked: Asked
     """With network and width, where none was named."""
-    place: Place
+    place: PicturePlaces
     """Where the files are."""
     shots: tuple[FinishedShot, ...]
     """Picture by picture."""
@@ -50,7 +52,7 @@ class Outcome:
     """What a person should know."""
 
 
-class Watcher(Protocol):
+class RenderWatcher(Protocol):
     """Is told how far a render is."""
 
     def pictures(self, done: int, total: int) -> None:
@@ -60,7 +62,7 @@ class Watcher(Protocol):
         """The path tracer has finished a pass."""
 
 
-def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
+def render_asked(asked: Asked, watcher: RenderWatcher) -> RenderOutcome:
     """Render what was asked for and write its files.
 
     Raises:
@@ -82,7 +84,7 @@ def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
         finished = run.run(wanted, reader, lambda now: watcher.pictures(now, len(wanted)))
     if where.video is not None:
         write_video(where.video, [shot.png for shot in finished], asked.fps)
-    return Outcome(
+    return RenderOutcome(
         asked=asked,
         place=where,
         shots=tuple(finished),
@@ -95,39 +97,28 @@ def _completed(asked: Asked) -> Asked:
     """Return it with the network and the width that are taken where none is named."""
     checkpoint, resolution = asked.checkpoint, asked.resolution
     if asked.engine != "mitsuba":
-        _require_torch()
-        from model.checkpoints import BUILTIN
-        from train.networks import trained_resolution
+        require_torch("--engine neural")
+        from model.open import BUILTIN, find_network
+        from train.networks import network_of_run
 
         checkpoint = checkpoint or BUILTIN
         if resolution is None:
-            resolution = trained_resolution(checkpoint)
+            resolution = find_network(checkpoint, network_of_run).trained.resolution
     if resolution is None:
         resolution = _RESOLUTION
     return dataclasses.replace(asked, checkpoint=checkpoint, resolution=resolution)
 
 
-def _require_torch() -> None:
-    try:
-        import torch  # noqa: F401
-    except ImportError as error:
-        raise TrilightError(
-            "--engine neural needs PyTorch, which is not installed; expected it: make setup-all."
-        ) from error
-
-
 def _settings(asked: Asked) -> RenderSettings:
     assert asked.resolution is not None
-    return RenderSettings(
+    return one_picture(
         resolution=asked.resolution,
         noise_floor_db=asked.noise_floor_db,
-        min_spp=min(FIRST_SPP, asked.max_spp),
         max_spp=asked.max_spp,
-        min_mean_radiance=0.0,  # who asks for a dark picture gets it
     )
 
 
-def _shots(asked: Asked, where: Place, reader: SceneReader) -> list[Shot]:
+def _shots(asked: Asked, where: PicturePlaces, reader: SceneReader) -> list[Shot]:
     if where.is_sequence:
         sources = scene_sources(asked.source, reader)
         return shots(sources, _cameras(asked, sources[0], reader))
@@ -136,7 +127,7 @@ def _shots(asked: Asked, where: Place, reader: SceneReader) -> list[Shot]:
     return shots([scene_source(asked.source)], None)
 
 
-def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[Camera] | None:
+def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[ShotCamera] | None:
     if asked.cameras is not None:
         return camera_path(asked.cameras, reader, asked.view)
     if asked.orbit is None:
@@ -146,7 +137,7 @@ def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[Came
 
 
 def _engine(
-    name: str, asked: Asked, settings: RenderSettings, watcher: Watcher, stack: ExitStack
+    name: str, asked: Asked, settings: RenderSettings, watcher: RenderWatcher, stack: ExitStack
 ) -> Engine:
     make: Callable[..., Engine] = _mitsuba if name == "mitsuba" else _neural
     engine = make(asked, settings, watcher)
@@ -154,7 +145,7 @@ def _engine(
     return engine
 
 
-def _mitsuba(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
+def _mitsuba(asked: Asked, settings: RenderSettings, watcher: RenderWatcher) -> Engine:
     from pipeline.flows.render_scene import PathTracer
 
     tracer = PathTracer(
@@ -167,16 +158,17 @@ def _mitsuba(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine
     return MitsubaEngine(tracer)
 
 
-def _neural(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
+def _neural(asked: Asked, settings: RenderSettings, watcher: RenderWatcher) -> Engine:
     import torch
 
     from model.neural_renderer import NeuralRenderer
+    from train.networks import network_of_run
 
     if asked.threads is not None:
         torch.set_num_threads(asked.threads)
     assert asked.checkpoint is not None
     return NeuralEngine(
-        NeuralRenderer.load(asked.checkpoint, precision=asked.precision),
+        NeuralRenderer.load(asked.checkpoint, precision=asked.precision, finders=[network_of_run]),
         checkpoint=asked.checkpoint,
         precision=asked.precision,
         resolution=settings.resolution,

@@ -10,7 +10,6 @@ from typing import Any, get_args
 
 from infra.rendering.asked import Asked
 from infra.serving.train_model import TrainOrder
-from model.config import ModelConfig
 from pipeline.documents.markdown import table
 from pipeline.flows.price import CorePrice
 from pipeline.flows.served.orders import DatasetInRuns
@@ -94,8 +93,8 @@ def _rows(kind: type) -> Iterator[tuple[str, ...]]:
             yield f"`{declared.name}`{part}", sentence, str(declared.within), ""
         return
     for field in described(kind) if hasattr(kind, "__pydantic_fields__") else ():
-        groups = [found.__name__ for found in _kinds(field.hint) if hasattr(found, "PRESETS")]
-        presets = f", or one of {', '.join(ModelConfig.PRESETS)}" if groups else ""
+        named = [name for kind in _kinds(field.hint) for name in getattr(kind, "PRESETS", ())]
+        presets = f", or one of {', '.join(named)}" if named else ""
         yield (
             f"`{field.name}`",
             _first_sentence(field.sentence).replace("|", "\\|"),

@@ -10,10 +10,10 @@ from pipeline.renders.settings import NoiseFloor, Resolution
 from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.dataset_settings import MOST_SCENES
 from storage.errors import TrilightError
+from storage.extensions import function_name
 from storage.output import dataset_folder
 from storage.ranges import Seed, Share, Within
 from storage.settings import checked
-from storage.suggestion import expected_one_of
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
@@ -67,9 +67,7 @@ class DatasetOrder:
     are JSON); by default none differ."""
 
     def __post_init__(self) -> None:
-        if self.build not in BUILDS:
-            expected = expected_one_of(self.build, BUILDS)
-            raise TrilightError(f"build {self.build!r} is unknown; {expected}.")
+        BUILDS.find(self.build)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(
                 f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "
@@ -83,7 +81,7 @@ class DatasetOrder:
     @property
     def place(self) -> str:
         """Where the dataset is made."""
-        return f"data/{self.build}" if self.out is None else self.out
+        return f"data/{function_name(self.build)}" if self.out is None else self.out
 
     def shard_range(self) -> range | None:
         """Return the shards that are asked for, or None for all.

@@ -191,7 +191,7 @@ def test_only_bad_objects_make_a_folder_too(source: Path, tmp_path: Path) -> Non
 
 def trilight(*arguments: str, cache: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "infra.cli.app", *arguments],
+        [sys.executable, "-m", "trilight", *arguments],
         cwd=ROOT,
         env=os.environ | {"TRILIGHT_CACHE": str(cache)},
         capture_output=True,

@@ -118,7 +118,7 @@ def test_one_view_is_not_the_other() -> None:
 def test_scenes_have_the_size_that_is_asked_for(triangles: int) -> None:
     scene = scene_of(Workload(triangles=triangles, views=3, resolution=32))
     assert scene.num_triangles == triangles and scene.num_views == 3
-    assert scene.material_T10[:, -3:].max() > 0, "a light is among them"
+    assert scene.material_TM[:, -3:].max() > 0, "a light is among them"
     assert len(scene.c2w_V44.unique(dim=0)) == 3
 
 

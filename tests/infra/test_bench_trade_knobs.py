@@ -19,9 +19,9 @@ from infra.bench.trade.knobs import knob_named
 from infra.bench.trade.mesh_knobs import EPSILONS, SCENE_BUDGETS, Fit, scene_fits
 from infra.bench.trade.workshop import Workshop
 from infra.cli.bench import Measured
-from model.checkpoints import BUILTIN
 from model.config import smoke
 from model.layer_errors import random_network
+from model.open import BUILTIN
 from model.weights import encode_weights
 from pipeline.flows.training_builds import smoke as smoke_build
 from pipeline.isolation import ChildFailed

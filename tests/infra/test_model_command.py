@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from model.checkpoints import open_checkpoint
+from model.open import open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
 from tests.command_line import trilight
@@ -46,7 +46,7 @@ def test_a_checkpoint_is_described_measured_and_published(tmp_path: Path) -> Non
     errors = json.loads(text)["errors"]
     assert set(errors) == {"float32", "bfloat16"}
     assert errors["bfloat16"][-1]["layer"] == "decoder.head"
-    again = open_checkpoint(str(target))
+    again = open_network(str(target))
     for (name, a), b in zip(again.named_parameters(), model.parameters(), strict=True):
         assert torch.equal(a, b), name
 

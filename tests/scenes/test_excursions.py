@@ -14,7 +14,7 @@ from pipeline.flows.settings import differences
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.families.out_of_range import median_settings
 from scene_templates.plans import scene_plan
-from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.scene import Scene
 from tests.scenes.scene_facts import planes_of, points_of, rows_of, triangles_of
 from tests.scenes.small_pool import first_scene

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
 
-from model.checkpoints import save_published
 from model.config import SIZES
 from model.layers import Norm
 from model.neural_renderer import NeuralRenderer
+from model.open import save_published
 from model.renderformer import RenderFormer
 from storage.training_data import open_training_data
 from tests.command_line import trilight
@@ -21,7 +21,7 @@ from tests.train.toy import toy_sample, toy_scene
 from train.data.buckets import make_batch
 from train.data.scenes import training_scene
 from train.evaluation.evaluate import Contest, judged_views
-from train.loop.checkpoint import save_checkpoint
+from train.loop.checkpoints import save_checkpoint
 from train.loop.crew import Crew
 from train.loop.state import new_state
 from train.loop.step import predicted

@@ -12,9 +12,9 @@ from PIL import Image
 from infra.excursion_plots import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
-from storage.conventions import ROUGHNESS
 from storage.dataset import Dataset
 from storage.errors import TrilightError
+from storage.material import ROUGHNESS
 from storage.metrics import psnr_log_db
 from storage.scene import Scene
 from storage.seeds import rng_for
@@ -35,7 +35,7 @@ from train.evaluation.grouped_lights import GROUPED, grouped_pictures
 from train.evaluation.groups import by_group, summary
 from train.evaluation.judge import judged_scene, median_picture, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
-from train.evaluation.picture_scores import MEANING, hdr_flip, picture_scores
+from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals
 from train.loop.state import new_state
@@ -74,7 +74,7 @@ def test_what_cannot_be_measured_is_not_a_number() -> None:
     picture = rng_for(0, "picture").uniform(0, 2, (16, 16, 3))
     hits = np.ones((16, 16), bool)
     without = picture_scores(picture, picture, hits, None)
-    assert list(without) == list(MEANING)
+    assert list(without) == list(METRICS)
     assert without["lpips"] is None
     assert (without["psnr_log_db"], without["ssim"], without["log_l1"]) == (100.0, 1.0, 0.0)
     with_weights = picture_scores(picture * 0.5, picture, hits, Lpips(*small_weights()))
@@ -111,7 +111,7 @@ def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
         judged_views(dataclasses.replace(contest(dataset), resolution=24), lambda: None)
 
 
-SCORES = dict.fromkeys(MEANING, 31.0) | {"lpips": None, "log_l1": 0.1}
+SCORES = dict.fromkeys(METRICS, 31.0) | {"lpips": None, "log_l1": 0.1}
 
 
 def with_lights(scene: Scene, lights: int) -> Scene:
@@ -136,7 +136,7 @@ def with_lights(scene: Scene, lights: int) -> Scene:
 
 
 def row(number: int, **changes: object) -> JudgedView:
-    scores = {name: 30.0 + number for name in MEANING} | {"lpips": None, "log_l1": 0.1}
+    scores = {name: 30.0 + number for name in METRICS} | {"lpips": None, "log_l1": 0.1}
     base = JudgedView(
         key=f"{number:09d}",
         view=0,

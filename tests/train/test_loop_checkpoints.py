@@ -11,16 +11,23 @@ from pathlib import Path
 import pytest
 import torch
 
+from model.neural_renderer import NeuralRenderer
+from model.open import find_network, open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
 from tests.conftest import ROOT
 from tests.train.kit import tiny_run
 from train.folder import RunFolder
-from train.loop.checkpoint import resumed_state
-from train.loop.checkpoints import checkpoint_path, keep_checkpoint, resumed_checkpoint, saved_steps
+from train.loop.checkpoints import (
+    keep_checkpoint,
+    path_of_step,
+    resumed_checkpoint,
+    resumed_state,
+    saved_steps,
+)
 from train.loop.crew import Crew
 from train.loop.state import new_state
-from train.networks import open_network
+from train.networks import network_of_run
 
 ALONE = Crew(device=torch.device("cpu"))
 
@@ -109,25 +116,25 @@ def test_a_damaged_newest_one_is_named_and_the_one_before_it_is_used(
     damage: Callable[[Path], None], tmp_path: Path
 ) -> None:
     keep(tmp_path, 4, 8, 12)
-    damage(checkpoint_path(tmp_path, 12))
+    damage(path_of_step(tmp_path, 12))
     notes: list[str] = []
     assert resumed_checkpoint(tmp_path, ALONE, notes.append).header["step"] == 8
     (note,) = notes
-    assert f"checkpoint {checkpoint_path(tmp_path, 12)} is not readable: " in note
+    assert f"checkpoint {path_of_step(tmp_path, 12)} is not readable: " in note
     assert note.endswith("The run goes on from that of step 8")
     for step in (8, 4):
-        damage(checkpoint_path(tmp_path, step))
+        damage(path_of_step(tmp_path, step))
     with pytest.raises(
         TrilightError, match="none of its checkpoints can be resumed from"
     ) as caught:
         resumed_checkpoint(tmp_path, ALONE, pytest.fail)
     for step in (4, 8, 12):
-        assert f"{checkpoint_path(tmp_path, step)} is not readable" in str(caught.value)
+        assert f"{path_of_step(tmp_path, step)} is not readable" in str(caught.value)
 
 
 def test_a_damaged_later_one_takes_nobodys_place(tmp_path: Path) -> None:
     keep(tmp_path, 4, 12)
-    flip(checkpoint_path(tmp_path, 12))
+    flip(path_of_step(tmp_path, 12))
     keep(tmp_path, 8, kept=1)
     assert resumed_checkpoint(tmp_path, ALONE, lambda _: None).header["step"] == 8
 
@@ -173,10 +180,16 @@ def test_a_network_is_found_in_folder_checkpoint_and_file(tmp_path: Path) -> Non
     with torch.no_grad():
         state.mean_model.decoder.token_W.fill_(0.25)
     with pytest.raises(TrilightError, match="no checkpoint here"):
-        open_network(tmp_path)
+        open_network(tmp_path, network_of_run)
     keep_checkpoint(folder.checkpoints, state, settings, data_digest="d", world_size=1)
-    for place in (tmp_path, checkpoint_path(folder.checkpoints, 0)):
-        assert (open_network(place).decoder.token_W == 0.25).all(), "the mean is what is shown"
+    for place in (tmp_path, path_of_step(folder.checkpoints, 0)):
+        found = find_network(place, network_of_run)
+        assert found.trained.resolution == settings.resolution
+        assert (found.open().decoder.token_W == 0.25).all(), "the mean is what is shown"
+        renderer = NeuralRenderer.load(place, device="cpu", finders=[network_of_run])
+        assert renderer.trained == found.trained
     folder.weights.write_bytes(encode_weights(state.model))
     for place in (tmp_path, folder.weights):
-        assert torch.equal(open_network(place).decoder.token_W, state.model.decoder.token_W)
+        assert torch.equal(
+            open_network(place, network_of_run).decoder.token_W, state.model.decoder.token_W
+        )

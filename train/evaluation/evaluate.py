@@ -22,9 +22,9 @@ from train.data.unusable import Unusable
 from train.evaluation.grouped_lights import GROUPED, grouped_pictures
 from train.evaluation.judge import JudgedScene, judged_scene, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
+from train.evaluation.metrics import picture_scores
 from train.evaluation.noise_floors import noise_floors
 from train.evaluation.order import SceneCount, Width
-from train.evaluation.picture_scores import picture_scores
 from train.evaluation.rivals import Rivals
 from train.evaluation.sheet import SheetView
 from train.evaluation.swapped_scene import swapped_pictures

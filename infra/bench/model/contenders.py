@@ -7,7 +7,6 @@ the weights happen to be.
 """
 
 import copy
-import dataclasses
 from collections.abc import Callable
 
 import torch
@@ -23,7 +22,7 @@ from model.precision import set_precision
 from model.published.config import PublishedConfig
 from model.published.convert import from_published, to_published
 from model.renderformer import ELU_ALPHA, RenderFormer
-from model.scene_tensors import Cameras, SceneTensors, batch_scenes
+from model.scene_tensors import Cameras, SceneTensors, batch_scenes, converted
 
 PUBLISHED, EQUAL, DEFAULT = "published", "float32", "bfloat16"
 SIDES = (PUBLISHED, EQUAL, DEFAULT)
@@ -108,6 +107,4 @@ def _view(cameras: Cameras, view: int) -> Cameras:
 
 
 def _moved(scene: SceneTensors, device: torch.device) -> SceneTensors:
-    return SceneTensors(
-        **{field.name: getattr(scene, field.name).to(device) for field in dataclasses.fields(scene)}
-    )
+    return converted(scene, lambda tensor: tensor.to(device))

@@ -33,7 +33,7 @@ from infra.bench.model.precision_report import (
 )
 from infra.bench.model.rounded_parts import Part, parts_of, rounded
 from infra.cli.console import console, progress_bars
-from model.checkpoints import BUILTIN
+from model.open import BUILTIN, open_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer
 from model.scene_tensors import batch_scenes
@@ -42,7 +42,7 @@ from storage.training_data import open_training_data
 from train.data.scenes import TrainingScene, training_scene
 from train.data.splits import first_samples
 from train.data.unusable import Unusable
-from train.networks import open_network
+from train.networks import network_of_run
 
 NARROW = torch.bfloat16
 SPLIT = "test"
@@ -63,7 +63,7 @@ def main(
     opened = open_training_data([data])
     samples = first_samples(opened.split(SPLIT), scenes, Unusable(0))
     judged = [training_scene(sample, resolution) for sample in samples]
-    model = open_network(checkpoint)
+    model = open_network(checkpoint, network_of_run)
     with progress_bars() as bars:
         task = bars.add_task("networks", total=num_rounds(model), note="")
         result = measure(

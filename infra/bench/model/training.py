@@ -63,7 +63,7 @@ def _batch(workload: Workload, scenes: int, on: torch.device) -> SceneBatch:
     return SceneBatch(
         triangles_BT33=one.triangles_BT33.to(on),
         normals_BT33=one.normals_BT33.to(on),
-        material_BT10=one.material_BT10.to(on),
+        material_BTM=one.material_BTM.to(on),
         c2w_BV44=one.c2w_BV44.to(on),
         fov_deg_BV=one.fov_deg_BV.to(on),
         is_triangle_BT=None,

@@ -11,8 +11,8 @@ from infra.bench.shard_pictures import codecs, picture_side
 from infra.bench.trade.curves import Curve, Knob, Point
 from infra.bench.trade.rendered import shots
 from infra.bench.trade.workshop import Workshop
-from storage.conventions import DIFFUSE, SPECULAR
 from storage.dataset_settings import StorageSettings
+from storage.material import DIFFUSE, SPECULAR
 from storage.metrics import psnr_log_db
 from storage.profiles import LAW_DB, pack_arrays
 from storage.scene import ARRAY_FIELDS, Scene

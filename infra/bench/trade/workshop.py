@@ -20,7 +20,8 @@ from infra.bench.harness import Options
 from infra.bench.render_child import smoke_child
 from infra.bench.renders.named_set import named_set
 from infra.bench.renders.references import make_reference
-from pipeline.isolation import ChildLimits, IsolatedChild, preload
+from pipeline.flows.prepare_isolated import preload_mesh_libraries
+from pipeline.isolation import ChildLimits, IsolatedChild
 from storage.errors import TrilightError
 from storage.safe_url import safe_url
 from storage.scene import Scene
@@ -118,7 +119,7 @@ class Workshop:
 
     def __init__(self, effort: Effort, options: Options) -> None:
         # before any child: pymeshlab takes a second to import, and would be counted as work
-        preload(["pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters"])
+        preload_mesh_libraries()
         self.effort, self.options = effort, options
         self._stack = contextlib.ExitStack()
         self._network_s: dict[int, float] = {}
