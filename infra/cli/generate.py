@@ -20,7 +20,8 @@ class Execution:
     """Who does the work."""
 
     runner: str = "threads"
-    """Whose work it is: threads of this process, the workers of a dask cluster, or an executor of your own."""
+    """Whose work it is: threads of this process, the workers of a dask cluster, or an executor of
+    your own."""
     address: str | None = None
     """With --runner dask: the scheduler, such as tcp://host:8786; by default there is none."""
 
