@@ -68,12 +68,8 @@ def test_a_preset_takes_the_place_of_single_settings(tmp_path: Path) -> None:
 
 def test_a_file_says_what_set_would() -> None:
     """Plain words are JSON or words, and quoted ones texts: YAML's own rules read 1e-3 as one."""
-    found = {
-        name: value
-        for name, (value, _) in read_settings_file(
-            str(Path(__file__).parent / "shared.yaml")
-        ).items()
-    }
+    stated = read_settings_file(str(Path(__file__).parent / "shared.yaml"))
+    found = {name: value for name, (value, _) in stated.items()}
     assert found == {
         "learning_rate": 1e-3,
         "loss.perceptual": "none",

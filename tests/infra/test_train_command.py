@@ -8,7 +8,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NoReturn
 
+import pytest
+
+from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
@@ -144,3 +148,22 @@ def test_a_wait_policy_of_the_users_own_stays() -> None:
             [sys.executable, "-c", code], cwd=ROOT, env=unset | own, capture_output=True, text=True
         )
         assert done.stdout.splitlines()[-1] == expected
+
+
+def test_several_processes_are_launched_by_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one command line, with what a file says in it; under torchrun it would be twice as many."""
+    seen: list[list[str]] = []
+
+    def replaced(program: str, words: list[str]) -> NoReturn:
+        seen.append(words)
+        sys.exit(0)
+
+    monkeypatch.setattr(os, "execv", replaced)
+    asked = ["train", "smoke", "--processes", "2", "--set", "seed=3", "--skip-unusable", "1"]
+    assert trilight([*asked, "--json"]).exit_code == 0
+    (words,) = seen
+    assert words[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m"]
+    assert " ".join(words[6:]) == "trilight train smoke --most-unusable 1 --changes seed=3 --json"
+    monkeypatch.setenv("RANK", "0")
+    assert trilight(asked).mistake.startswith("--processes is 2 under torchrun")
+    assert len(seen) == 1
