@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
+from cyclopts import Parameter, run
 
 from infra.bench.economy_counts import SceneCosts, scene_costs
 from infra.bench.economy_line import Line, base_flops
@@ -32,8 +32,8 @@ _HDF5_SCENES = 24
 
 
 def main(
-    dataset: Annotated[str, typer.Argument(help="root of a finished dataset")],
-    write: Annotated[bool, typer.Option(help="write docs/economy.md")] = False,
+    dataset: Annotated[str, Parameter(help="root of a finished dataset")],
+    write: Annotated[bool, Parameter(help="write docs/economy.md")] = False,
 ) -> None:
     """Count and print."""
     opened = open_dataset(dataset)
@@ -202,6 +202,6 @@ def _published_bytes(dataset: Dataset, found: Sequence[SceneCosts]) -> tuple[flo
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except TrilightError as mistake:
         raise SystemExit(f"economy: {mistake}") from mistake

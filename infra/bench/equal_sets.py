@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
+from cyclopts import Parameter, run
 
 from infra.bench.equal_set_plot import plot
 from infra.bench.equal_set_recipes import JUDGE, JUDGE_ARGUMENTS, RECIPES, USUAL, Recipe
@@ -51,13 +51,13 @@ class BoughtSet:
 
 
 def main(
-    work: Annotated[Path, typer.Option(help="folder of sets and runs")] = Path("runs/equal"),
-    core_seconds: Annotated[float, typer.Option(help="price of every set")] = 500.0,
-    only: Annotated[str, typer.Option(help="this recipe alone")] = "",
-    size: Annotated[str, typer.Option(help="network: small or large")] = "small",
-    sets_only: Annotated[bool, typer.Option(help="make the sets, train nothing")] = False,
-    table: Annotated[Path, typer.Option(help="file of the results")] = TABLE,
-    report: Annotated[bool, typer.Option(help="only print what the file says")] = False,
+    work: Annotated[Path, Parameter(help="folder of sets and runs")] = Path("runs/equal"),
+    core_seconds: Annotated[float, Parameter(help="price of every set")] = 500.0,
+    only: Annotated[str, Parameter(help="this recipe alone")] = "",
+    size: Annotated[str, Parameter(help="network: small or large")] = "small",
+    sets_only: Annotated[bool, Parameter(help="make the sets, train nothing")] = False,
+    table: Annotated[Path, Parameter(help="file of the results")] = TABLE,
+    report: Annotated[bool, Parameter(help="only print what the file says")] = False,
 ) -> None:
     """Make the sets, train on them, append a row for each training, print the table."""
     if only and only not in RECIPES:
@@ -189,6 +189,6 @@ def _generate(out: Path, arguments: Sequence[str]) -> None:
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except TrilightError as mistake:
         raise SystemExit(f"equal sets: {mistake}") from mistake

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from cyclopts import Parameter, run
 
 from infra.bench.harness import RESULTS, machine
 from infra.bench.training_jobs import Job, all_jobs
@@ -34,14 +34,14 @@ TABLE = RESULTS / "training_table.jsonl"
 
 
 def main(
-    data: Annotated[str, typer.Option(help="root of the dataset")] = "",
-    minutes: Annotated[float, typer.Option(help="begin no job after so many")] = 60.0,
-    plan: Annotated[str, typer.Option(help="cpu or gpu")] = "cpu",
-    only: Annotated[str, typer.Option(help="jobs whose name holds this")] = "",
-    work: Annotated[Path, typer.Option(help="folder of the runs")] = Path("runs/table"),
-    table: Annotated[Path, typer.Option(help="file of the results")] = TABLE,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda")] = None,
-    report: Annotated[bool, typer.Option(help="only print what the file says")] = False,
+    data: Annotated[str, Parameter(help="root of the dataset")] = "",
+    minutes: Annotated[float, Parameter(help="begin no job after so many")] = 60.0,
+    plan: Annotated[str, Parameter(help="cpu or gpu")] = "cpu",
+    only: Annotated[str, Parameter(help="jobs whose name holds this")] = "",
+    work: Annotated[Path, Parameter(help="folder of the runs")] = Path("runs/table"),
+    table: Annotated[Path, Parameter(help="file of the results")] = TABLE,
+    device: Annotated[str | None, Parameter(help="cpu or cuda")] = None,
+    report: Annotated[bool, Parameter(help="only print what the file says")] = False,
 ) -> None:
     """Run the jobs that are missing, within a budget."""
     jobs = [job for job in all_jobs(plan) if only in job.name]
@@ -151,6 +151,6 @@ def _shards(dataset: Dataset, scenes: int) -> tuple[list[str], int]:
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except TrilightError as mistake:
         raise SystemExit(f"training table: {mistake}") from mistake

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
+from cyclopts import Parameter, run
 from rich.table import Table
 
 from infra.bench import harness
@@ -25,19 +25,19 @@ from storage.errors import TrilightError
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="JSON file to write")],
+    out: Annotated[Path, Parameter(help="JSON file to write")],
     scenes: Annotated[
-        Path | None, typer.Option(help="folder of RenderFormer scene files [none]")
+        Path | None, Parameter(help="folder of RenderFormer scene files [none]")
     ] = None,
     scene: Annotated[
-        list[str] | None, typer.Option(help="name in that folder; may be repeated [all]")
+        list[str] | None, Parameter(help="name in that folder; may be repeated [all]")
     ] = None,
-    sampled: Annotated[int, typer.Option(help="scenes composed of built-in objects")] = 3,
-    resolution: Annotated[int, typer.Option(help="pixels each way")] = 128,
-    cycles_spp: Annotated[str, typer.Option(help="samples of Cycles")] = "128,1024",
-    our_spp: Annotated[str, typer.Option(help="our samples, multiples of 128")] = "128,1024",
-    reference_spp: Annotated[int, typer.Option(help="our samples of the reference")] = 8192,
-    threads: Annotated[int, typer.Option(help="of either renderer")] = os.cpu_count() or 1,
+    sampled: Annotated[int, Parameter(help="scenes composed of built-in objects")] = 3,
+    resolution: Annotated[int, Parameter(help="pixels each way")] = 128,
+    cycles_spp: Annotated[str, Parameter(help="samples of Cycles")] = "128,1024",
+    our_spp: Annotated[str, Parameter(help="our samples, multiples of 128")] = "128,1024",
+    reference_spp: Annotated[int, Parameter(help="our samples of the reference")] = 8192,
+    threads: Annotated[int, Parameter(help="of either renderer")] = os.cpu_count() or 1,
 ) -> None:
     """Render the same views with both, and print seconds and errors."""
     chosen = _chosen(scenes, scene or [], sampled)
@@ -139,6 +139,6 @@ def _summary(plan: Plan, results: list[SceneResult]) -> str:
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except TrilightError as mistake:
         sys.exit(f"infra.bench.cycles: {mistake}")

@@ -15,7 +15,7 @@ from typing import Annotated
 
 import matplotlib
 import numpy as np
-import typer
+from cyclopts import Parameter, run
 from numpy.typing import NDArray
 from rich.table import Table
 
@@ -154,16 +154,18 @@ def _by_cycles(scene: Scene, resolution: int, spp: int, threads: int) -> Pair:
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="PNG file")] = RESULTS / "cycles-residual.png",
+    out: Annotated[Path, Parameter(help="PNG file")] = RESULTS / "cycles-residual.png",
     scenes: Annotated[
-        Path | None, typer.Option(help="folder of RenderFormer scene files: figures only [none]")
+        Path | None,
+        Parameter(help="folder of RenderFormer scene files: figures only [none]"),
     ] = None,
-    scene: Annotated[list[str] | None, typer.Option(help="name in it; may be repeated")] = None,
+    scene: Annotated[list[str] | None, Parameter(help="name in it; may be repeated")] = None,
     sampled_scene: Annotated[
-        list[int] | None, typer.Option(help="scene of built-in objects; may be repeated [0, 4, 12]")
+        list[int] | None,
+        Parameter(help="scene of built-in objects; may be repeated [0, 4, 12]"),
     ] = None,
-    resolution: Annotated[int, typer.Option(help="pixels each way")] = 256,
-    spp: Annotated[int, typer.Option(help="samples of every picture")] = 1024,
+    resolution: Annotated[int, Parameter(help="pixels each way")] = 256,
+    spp: Annotated[int, Parameter(help="samples of every picture")] = 1024,
 ) -> None:
     """Render every view four times, and say where the difference comes from."""
     chosen = [described(scenes.resolve(), f"{name}.json") for name in scene or ()] if scenes else []
@@ -251,6 +253,6 @@ def draw(made: list[Pictures], out: Path) -> None:
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except TrilightError as mistake:
         sys.exit(f"infra.bench.cycles.residual: {mistake}")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated
 
 import torch
-import typer
+from cyclopts import Parameter, run
 from torch import Tensor
 
 from infra.bench.harness import ROOT, save
@@ -52,11 +52,11 @@ Pictures = list[Tensor]
 
 
 def main(
-    checkpoint: Annotated[str, typer.Argument(help="builtin:, or any trained network")],
-    data: Annotated[str, typer.Option(help="dataset; its test split is used")],
-    scenes: Annotated[int, typer.Option(help="the first so many of the split")] = 16,
-    resolution: Annotated[int, typer.Option(help="pixels across")] = 64,
-    write: Annotated[bool, typer.Option(help="write docs/bench and docs/tradeoffs.md")] = False,
+    checkpoint: Annotated[str, Parameter(help="builtin:, or any trained network")],
+    data: Annotated[str, Parameter(help="dataset; its test split is used")],
+    scenes: Annotated[int, Parameter(help="the first so many of the split")] = 16,
+    resolution: Annotated[int, Parameter(help="pixels across")] = 64,
+    write: Annotated[bool, Parameter(help="write docs/bench and docs/tradeoffs.md")] = False,
 ) -> None:
     """Measure and print."""
     torch.set_num_threads(1)  # a small network: threads would wait for each other
@@ -205,6 +205,6 @@ def _digest(model: RenderFormer) -> str:
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except TrilightError as mistake:
         raise SystemExit(f"precision_parts: {mistake}") from mistake

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
+from cyclopts import Parameter, run
 from rich.table import Table
 
 from infra.bench import harness
@@ -108,12 +108,12 @@ def with_firm_truth(found: list[Promise]) -> list[Promise]:
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="JSON file to write")],
-    first: Annotated[int, typer.Option(help="number of the first scene")] = NUM_SAMPLED,
-    scenes: Annotated[int, typer.Option(help="how many")] = 40,
-    resolution: Annotated[int, typer.Option(help="pixels each way")] = 96,
-    max_spp: Annotated[int, typer.Option(help="cap of what is judged")] = 1024,
-    reference_spp: Annotated[int, typer.Option(help="cap of the references")] = 4096,
+    out: Annotated[Path, Parameter(help="JSON file to write")],
+    first: Annotated[int, Parameter(help="number of the first scene")] = NUM_SAMPLED,
+    scenes: Annotated[int, Parameter(help="how many")] = 40,
+    resolution: Annotated[int, Parameter(help="pixels each way")] = 96,
+    max_spp: Annotated[int, Parameter(help="cap of what is judged")] = 1024,
+    reference_spp: Annotated[int, Parameter(help="cap of the references")] = 4096,
 ) -> None:
     """Render held-out scenes to several targets, and count broken promises."""
     found: list[Promise] = []
@@ -165,6 +165,6 @@ def _cells(chosen: list[Promise]) -> list[str]:
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except TrilightError as mistake:
         sys.exit(f"infra.bench.renders.calibration: {mistake}")

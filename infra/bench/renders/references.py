@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
+from cyclopts import Parameter, run
 from numpy.typing import NDArray
 
 from infra.bench.cycles.comparison import NamedScene
@@ -119,7 +119,7 @@ def _cached() -> Path:
 
 def main(
     scenes: Annotated[
-        Path | None, typer.Option(help="folder of RenderFormer scene files [none]")
+        Path | None, Parameter(help="folder of RenderFormer scene files [none]")
     ] = None,
 ) -> None:
     """Render what is missing of the named set's references."""
@@ -141,6 +141,6 @@ def main(
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except TrilightError as mistake:
         sys.exit(f"infra.bench.renders.references: {mistake}")

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import matplotlib
 import numpy as np
-import typer
+from cyclopts import Parameter, run
 from numpy.typing import NDArray
 
 from infra.bench.cycles.comparison import sampled
@@ -61,10 +61,10 @@ def _render(scene: Scene, settings: RenderSettings, seed: int) -> _Rendered:
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="PNG file")] = RESULTS / "rising-floors.png",
-    scene: Annotated[int, typer.Option(help="which of the sampled scenes")] = 12,
-    resolution: Annotated[int, typer.Option(help="pixels each way")] = 256,
-    max_spp: Annotated[int, typer.Option(help="cap, and samples of the reference")] = 2048,
+    out: Annotated[Path, Parameter(help="PNG file")] = RESULTS / "rising-floors.png",
+    scene: Annotated[int, Parameter(help="which of the sampled scenes")] = 12,
+    resolution: Annotated[int, Parameter(help="pixels each way")] = 256,
+    max_spp: Annotated[int, Parameter(help="cap, and samples of the reference")] = 2048,
 ) -> None:
     """Draw one scene at rising noise floors, with its cost under each."""
     settings = RenderSettings(
@@ -114,6 +114,6 @@ def _draw(made: list[_Rendered], reference: NDArray[np.float32], out: Path) -> N
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        run(main)
     except TrilightError as mistake:
         sys.exit(f"infra.bench.renders.rising_floors: {mistake}")
