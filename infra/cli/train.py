@@ -16,8 +16,8 @@ from infra.cli.changes import Shared, all_changes, run_record
 from infra.cli.console import console, print_rows, progress_bars
 from infra.cli.options import Shown, command
 from infra.train_order import TrainOrder
-from pipeline.flows.order_words import option_words
 from storage.errors import TrilightError
+from storage.option_words import option_words
 from train.runs import in_proportion, named_run
 from train.settings import TrainSettings
 

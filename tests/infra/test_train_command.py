@@ -151,7 +151,7 @@ def test_a_wait_policy_of_the_users_own_stays() -> None:
 
 
 def test_several_processes_are_launched_by_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As one command line, with what a file says in it; under torchrun it would be twice as many."""
+    """As one command line; under torchrun it would be twice as many."""
     seen: list[list[str]] = []
 
     def replaced(program: str, words: list[str]) -> NoReturn:
