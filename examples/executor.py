@@ -29,7 +29,7 @@ TRILIGHT = (sys.executable, "-m", "trilight")
 def by_commands(order: DatasetOrder, address: str | None) -> Outcome:
     """Make every missing shard in a process of its own, then finish what is left here."""
     missing = prepare_dataset(order).publication.missing_shards()
-    words = (*TRILIGHT, *generate_words(order), "--out", order.out)
+    words = (*TRILIGHT, *generate_words(order), "--out", order.place)
 
     def make(shard: int) -> None:
         command = [*words, "--shards", f"{shard}:{shard + 1}"]

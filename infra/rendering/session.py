@@ -19,11 +19,7 @@ from infra.rendering.video import write_video
 from infra.torch_library import require_torch
 from pipeline.flows.read_scenes import SceneReader
 from pipeline.flows.scene_source import SceneSource, scene_source
-from pipeline.renders.settings import (
-    FIRST_SPP,
-    RenderSettings,
-    one_picture,
-)
+from pipeline.renders.settings import FIRST_SPP, RenderSettings, one_picture
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
 

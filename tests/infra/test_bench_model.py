@@ -30,6 +30,7 @@ def measured() -> Comparison:
     return result
 
 
+@pytest.mark.slow
 def test_the_sides_are_one_network(measured: Comparison) -> None:
     for case in ("full", "plane-only"):
         # float32 rounds sums of size 1 to 1e-7, over a dozen layers
@@ -41,6 +42,7 @@ def test_the_sides_are_one_network(measured: Comparison) -> None:
             assert measured.sides[cases.side_name(case, side)]["memory_bytes"].median > 0
 
 
+@pytest.mark.slow
 def test_the_published_side_pays_for_textures(measured: Comparison) -> None:
     """It needs its own input at least, of which ours is a thousandth."""
     published, equal = (
@@ -51,6 +53,7 @@ def test_the_published_side_pays_for_textures(measured: Comparison) -> None:
     assert equal < published
 
 
+@pytest.mark.slow
 def test_the_cases_are_told_and_drawn(measured: Comparison, tmp_path: Path) -> None:
     lines = cases_report.rows(measured)
     assert [name for name, _ in lines if not name.startswith(" ")] == [
@@ -63,6 +66,7 @@ def test_the_cases_are_told_and_drawn(measured: Comparison, tmp_path: Path) -> N
     assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_ratios_are_of_the_right_sides(measured: Comparison) -> None:
     def with_costs(**seconds: float) -> Comparison:
         sides = {}
@@ -91,7 +95,9 @@ def test_ratios_are_of_the_right_sides(measured: Comparison) -> None:
     }
 
 
-def test_growth_is_told_and_drawn(tmp_path: Path) -> None:
+def test_growth_is_told_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory is measured in the cases above, in a process for each side."""
+    monkeypatch.setattr(growth, "peaks_of", lambda side, config, cases, on: [1 << 20] * len(cases))
     plan = growth.Plan(
         config=CONFIG,
         middle=PLANE,
@@ -122,6 +128,7 @@ def test_scenes_have_the_size_that_is_asked_for(triangles: int) -> None:
     assert len(scene.c2w_V44.unique(dim=0)) == 3
 
 
+@pytest.mark.slow
 def test_on_a_graphics_card_the_share_of_its_peak_is_told(
     measured: Comparison, monkeypatch: pytest.MonkeyPatch
 ) -> None:

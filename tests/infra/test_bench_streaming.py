@@ -23,6 +23,7 @@ def _samples(build: object, options: Options, count: int, done: Callable[[], Non
     return [dataclasses.replace(made, key=str(index)) for index in range(count)]
 
 
+@pytest.mark.slow
 def test_a_small_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(streaming, "rendered_samples", _samples)
     monkeypatch.setattr(streaming, "MANIFESTS", (20, 3000))

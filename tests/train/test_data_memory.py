@@ -14,7 +14,7 @@ from storage.shard_writer import write_shard
 from tests.conftest import ROOT
 from tests.train.toy import toy_sample
 
-SHARDS, PER_SHARD, RESOLUTION = 48, 8, 128
+SHARDS, PER_SHARD, RESOLUTION = 30, 8, 128
 
 CHILD = """
 import itertools, json, resource, sys
@@ -69,7 +69,7 @@ def peak_bytes(folder: Path, num_shards: int) -> int:
 
 
 def test_the_reader_holds_as_much_of_a_large_set_as_of_a_small_one(shards: Path) -> None:
-    """6 shards of 1.4 MB and 48: what is read grows by 58 MB, more when it is unpacked."""
+    """6 shards of 1.4 MB and 30: what is read grows by 33 MB, more when it is unpacked."""
     more = sum(path.stat().st_size for path in shards.iterdir()) * (SHARDS - 6) // SHARDS
     grown = peak_bytes(shards, SHARDS) - peak_bytes(shards, 6)
     # a tenth of what was read leaves room for what the allocator keeps; measured: 0.5 MB

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -31,6 +30,8 @@ from train.networks import network_of_run
 
 ALONE = Crew(device=torch.device("cpu"))
 
+CASES = [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")]
+
 CHILD = """
 import os, signal, sys
 from pathlib import Path
@@ -38,24 +39,40 @@ from tests.train.kit import tiny_run
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.state import new_state
 
-settings, state, folder = tiny_run(), new_state(tiny_run()), Path(sys.argv[1])
+settings, state = tiny_run(), new_state(tiny_run())
 
-def keep(step):
+def keep(folder, step):
     state.step = state.skipped_steps = step
     keep_checkpoint(folder, state, settings, data_digest="d", world_size=1)
 
-keep(1)
-name = sys.argv[2]
-original = getattr(os, name)
+def killed(folder, name, when):
+    keep(folder, 1)
+    original = getattr(os, name)
 
-def die(*arguments, **options):
-    if sys.argv[3] == "after":
-        original(*arguments, **options)
-    os.kill(os.getpid(), signal.SIGKILL)
+    def die(*arguments, **options):
+        if when == "after":
+            original(*arguments, **options)
+        os.kill(os.getpid(), signal.SIGKILL)
 
-setattr(os, name, die)
-keep(2)
+    setattr(os, name, die)
+    keep(folder, 2)
+
+for case in sys.argv[2:]:
+    child = os.fork()
+    if child == 0:
+        killed(Path(sys.argv[1]) / case, *case.split())
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
 """
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with one of each case, which a killed process has left."""
+    folder, cases = tmp_path_factory.mktemp("killed"), [" ".join(case) for case in CASES]
+    subprocess.run([sys.executable, "-c", CHILD, str(folder), *cases], cwd=ROOT, check=True)
+    return folder
 
 
 def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
@@ -70,22 +87,16 @@ def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
     assert saved_steps(tmp_path) == [10, 20, 24]
 
 
-@pytest.mark.parametrize(
-    ("call", "when"),
-    [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")],
-)
-def test_killed_while_saving_leaves_a_whole_one(tmp_path: Path, call: str, when: str) -> None:
-    killed = subprocess.run(
-        [sys.executable, "-c", CHILD, str(tmp_path), call, when], cwd=ROOT, check=False
-    )
-    assert killed.returncode == -signal.SIGKILL
-    newest = resumed_checkpoint(tmp_path, ALONE, pytest.fail)
+@pytest.mark.parametrize(("call", "when"), CASES)
+def test_killed_while_saving_leaves_a_whole_one(killed: Path, call: str, when: str) -> None:
+    folder = killed / f"{call} {when}"
+    newest = resumed_checkpoint(folder, ALONE, pytest.fail)
     step = resumed_state(newest, tiny_run(), "d").step
     assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
     state = new_state(tiny_run())
     state.step = state.skipped_steps = 3
-    keep_checkpoint(tmp_path, state, tiny_run(), data_digest="d", world_size=1)
-    assert not list(tmp_path.glob("*.part")), "what the killed one left is cleared away"
+    keep_checkpoint(folder, state, tiny_run(), data_digest="d", world_size=1)
+    assert not list(folder.glob("*.part")), "what the killed one left is cleared away"
 
 
 def keep(folder: Path, *steps: int, kept: int = 3) -> None:

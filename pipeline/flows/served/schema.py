@@ -73,7 +73,8 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
 def changed_values(form: BaseModel | None) -> dict[str, Any]:
     """Return what was filled in, by dotted name, as `storage.changes` takes it."""
     values: dict[str, Any] = {}
-    for name in form.model_fields_set if form else ():
+    fields = type(form).model_fields if form else {}  # in order, which the set of those given lacks
+    for name in fields:
         value = getattr(form, name)
         if isinstance(value, BaseModel):
             values |= {f"{name}.{below}": entry for below, entry in changed_values(value).items()}
