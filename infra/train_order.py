@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated, Any, Literal
 
-from pipeline.flows.order_words import option_words
 from storage.errors import TrilightError
 from storage.extensions import function_name
+from storage.option_words import option_words
 from storage.ranges import Within
 from storage.settings import checked
 from train.runs import changed_run

@@ -125,6 +125,7 @@ INTERNAL = {
     "OrderSettings": "made of StreamSettings",
     "PublishedConfig": "a ModelConfig, and one number that the published code fixes",
     "StorageSettings": "has no number",
+    "StatusOrder": "has no number",
 }
 """Settings that nobody writes, or without numbers."""
 

@@ -1,0 +1,36 @@
+"""What a shell offers where a name is expected; asked at every press of the tab key."""
+
+from collections.abc import Callable
+
+
+def _builds() -> list[str]:
+    from pipeline.flows.builds import BUILDS
+
+    return list(BUILDS)
+
+
+def _runs() -> list[str]:
+    from train.runs import RUNS
+
+    return list(RUNS)
+
+
+def _sizes() -> list[str]:
+    from model.config import SIZES
+
+    return list(SIZES)
+
+
+def _runners() -> list[str]:
+    from pipeline.flows.executors import EXECUTORS
+
+    return list(EXECUTORS)
+
+
+NAMES: dict[str, Callable[[], list[str]]] = {
+    "build": _builds,
+    "run": _runs,
+    "network": _sizes,
+    "runner": _runners,
+}
+"""Names that are known by the field that takes one, or something of the user's own."""
