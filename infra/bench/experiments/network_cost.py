@@ -44,7 +44,8 @@ def _workload(size: tuple[int, int, int]) -> "Workload":
 
 def _cases(effort: Effort) -> list[Point]:
     """Return every side of every case: scene, views and width of the picture."""
-    widths = sorted({effort.network_px, 2 * effort.network_px if effort.name == "careful" else 256})
+    px = effort.network_px
+    widths = (px, 2 * px) if effort.name == "careful" else (px,)
     chosen = {px: CASES.get(px, {"full": effort.network_triangles}) for px in widths}
     return [
         Point(
