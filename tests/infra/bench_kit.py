@@ -31,7 +31,9 @@ FIGURES = {"cheap": (1.0, 30.0), "default": (2.0, 40.0), "waste": (3.0, 35.0)}
 """Cost and error in decibels by point."""
 
 
-def measure(workshop: Workshop, points: Sequence[Point], turn: str) -> Iterable[tuple[str, Figures]]:
+def measure(
+    workshop: Workshop, points: Sequence[Point], turn: str
+) -> Iterable[tuple[str, Figures]]:
     """Return made-up figures; the turn `bad` cannot be used, and the turn `killed` ends the run."""
     for point in points:
         if turn == "bad" and point.name == "default":

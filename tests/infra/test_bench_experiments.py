@@ -1,6 +1,7 @@
 """Every experiment's declaration is whole, its points can be listed, and its results told."""
 
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -75,22 +76,17 @@ def test_what_is_advised_is_measured_and_on_the_front_or_says_why() -> None:
     assert len(list(choices(RESULTS))) == 2 + len(CHOICES)
 
 
-def test_the_blocks_of_the_pages_are_those_of_the_results(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    """Written anew from the results that are kept, a page stays as it is."""
-    page = ROOT / "docs" / "tradeoffs.md"
-    copy = tmp_path / page.name
-    copy.write_text(page.read_text())
-    before = read_block(copy, "bench noise-floor")
-    assert "| **46 dB** |" in before
-    copy.write_text(copy.read_text().replace("| **46 dB** |", "| 46 dB |"))
-    (tmp_path / "results").mkdir()
-    for name in ("noise-floor", *(choice.experiment for choice in CHOICES)):
-        found = newest_run(RESULTS, name)
-        assert found is not None
-        store = found[1].path
-        (tmp_path / "results" / store.name).write_bytes(store.read_bytes())
-    assert write_pages(tmp_path / "results", (copy,)) == [copy]
-    assert read_block(copy, "bench noise-floor") == before
-    copy.write_text("<!-- bench nothing:begin -->\n<!-- bench nothing:end -->\n")
+def test_the_block_of_a_page_is_that_of_the_result(tmp_path: Path) -> None:
+    """Written anew from the results that are kept, it is what the page holds."""
+    of_today = read_block(ROOT / "docs" / "tradeoffs.md", "bench guides")
+    found = newest_run(RESULTS, "guides")
+    assert found is not None and "| **64** |" in of_today
+    (tmp_path / found[1].path.name).write_bytes(found[1].path.read_bytes())
+    page = tmp_path / "page.md"
+    page.write_text("<!-- bench guides:begin -->\nold\n<!-- bench guides:end -->\nafter\n")
+    assert write_pages(tmp_path, (page,)) == [page]
+    assert read_block(page, "bench guides") == of_today
+    assert page.read_text().endswith("after\n")
+    page.write_text("<!-- bench nothing:begin -->\n<!-- bench nothing:end -->\n")
     with pytest.raises(TrilightError, match="no such experiment"):
-        write_pages(tmp_path / "results", (copy,))
+        write_pages(tmp_path, (page,))

@@ -10,6 +10,8 @@ from infra.bench.sides.plain_mitsuba import render_levels
 from infra.bench.sides.shots import SEED, fixed_samples, shots
 from pipeline.renders.renderer import SceneRenderer
 from storage.metrics import psnr_log_db
+from storage.seeds import rng_for
+from tests.renders.scene_kit import sampled_like_scene
 from tests.scenes_by_hand import tiny_scene
 
 
@@ -29,6 +31,7 @@ def test_shared_passes_are_the_pictures_that_each_setting_gives_alone() -> None:
     assert together["easy"].view.spp < together["hard"].view.spp == 512
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("llvm")
 def test_plain_mitsuba_comes_to_the_same_picture() -> None:
     """With other samples of another sampler: its error falls with samples, towards our picture."""
@@ -44,7 +47,7 @@ def test_plain_mitsuba_comes_to_the_same_picture() -> None:
 
 
 def test_bare_pictures_come_nearer_with_samples() -> None:
-    scene = tiny_scene()
+    scene = sampled_like_scene(rng_for(0, "trade"), num_views=1)
     reference = shots(scene, {"ours": fixed_samples(32, 2048)})["ours"].view.radiance_rgb
     sampled, denoised = (one.levels for one in bare_pictures(scene, 32, (1, 8, 128)))
     assert [one.spp for one in sampled] == [one.spp for one in denoised] == [1, 8, 128]
