@@ -18,11 +18,11 @@ dataset: setup  ## 24 scenes of built-in objects, verified
 	trilight generate smoke --objects builtin: --out data/smoke --scenes 24
 	trilight verify data/smoke
 
-test: setup-all  ## the tests that take minutes
-	python -m pytest -n 2
+test: setup-all  ## the tests that take minutes; a worker has a core, and no use for a second thread
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python -m pytest -n 2 --dist worksteal
 
 test-slow: setup-all  ## the others
-	python -m pytest -m slow -n 2
+	python -m pytest -m slow -n 2 --dist worksteal
 
 test-elsewhere: setup-all  ## the most telling ones, as other processors would run them
 	python -m tests.elsewhere
@@ -48,8 +48,9 @@ lock: setup-all  ## write the lock files anew from requirements/*.in
 third-party: setup-all  ## write docs/third_party.md anew
 	python -m infra.setup.third_party
 
-settings: setup-all  ## write docs/reference/settings.md anew
+settings: setup-all  ## write docs/reference/settings.md and command-line.md anew
 	python -m infra.setup.settings_page
+	python -m infra.setup.command_line_page
 
 clean:  ## everything that make has made, except data/ and runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache *.egg-info

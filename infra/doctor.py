@@ -16,6 +16,7 @@ from typing import Literal
 from pipeline.renders.facts import render_facts
 from pipeline.renders.variant import choose_variant
 from storage.cache import cache_folder
+from storage.installation import IMPORT_ROOT, module_name
 
 State = Literal["ok", "slower", "missing"]
 
@@ -141,7 +142,8 @@ def _mesh_filters() -> Finding:
             mend="pip install -r requirements/dataset.txt",
         )
     code = (
-        "from pipeline.assets.environment import missing_filters; m = missing_filters(); "
+        f"from {module_name('pipeline.assets.environment')} import missing_filters; "
+        "m = missing_filters(); "
         "raise SystemExit(', '.join(m) if m else 0)"
     )
     return _probe(
@@ -215,7 +217,7 @@ def _probe(name: str, code: str, *, found: str, consequence: str, mend: str) -> 
     try:
         result = subprocess.run(
             [sys.executable, "-c", code],
-            cwd=Path(__file__).parents[1],
+            cwd=IMPORT_ROOT,
             capture_output=True,
             text=True,
             timeout=_PROBE_S,

@@ -21,6 +21,7 @@ from pipeline.flows.make_task import ShardJob, close_children, make_task
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.pieces import MOST_TASKS, TASK_S, Piece
 from pipeline.flows.settings import BuildSettings
+from storage.extensions import recorded
 from storage.layout import DatasetFolder
 from storage.manifest import index_shard
 from storage.sample import sample_key
@@ -119,6 +120,7 @@ def measure_scenes(
         folder=run.publication.folder,
         settings=run.settings,
         environment={},
+        extensions=recorded("data"),
         accepted=run.accepted,
         lock_sha256=run.publication.manifest.objects_lock_sha256,
         num_at_once=1,

@@ -14,6 +14,7 @@ from storage.asked import read_asked, value_of
 from storage.dataset import Dataset, open_dataset
 from storage.derived import derivation_of
 from storage.errors import TrilightError
+from storage.extensions import recorded, require_same_extensions
 from storage.manifest import Manifest
 from storage.remote.url import parse_url
 
@@ -53,6 +54,7 @@ def repair(
     opened = open_dataset(str(root))
     manifest = opened.manifest
     _require_generated(manifest, scenes_from)
+    require_same_extensions(str(root), manifest.extensions, recorded("data"))
     changes, licence = _changes(manifest), _stated_licence(opened)
     asked = read_asked(opened) or ()
     for name in bad_shards:
@@ -103,6 +105,8 @@ def _changes(manifest: Manifest) -> dict[str, object]:
     """Return in what the settings of a dataset differ from those of its build's name."""
     build = named_build(manifest.build).as_json()
     changed = {name: now for name, _, now in differences(build, manifest.settings)}
+    if isinstance(families := changed.get("scenes.families"), list):
+        changed["scenes.families"] = [family["name"] for family in families]  # compared in full
     if manifest.settings["splits"].get("listed_scenes") is not None:
         return {name: now for name, now in changed.items() if name not in _OF_SCENE_FILES}
     return changed

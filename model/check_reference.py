@@ -17,6 +17,7 @@ from torch.nn.functional import elu
 
 from model.published.config import decode_published
 from model.published.convert import from_published
+from model.published.texture import NORMAL
 from model.renderformer import ELU_ALPHA, RenderFormer
 from model.scene_tensors import SceneBatch
 from model.weights import read_tensors
@@ -108,11 +109,13 @@ def _batch(
     """Return the batch; padding is zeroed, the tangent normal left out, emission encoded."""
     exists = mask.bool()
     material = material13.float()
-    ten = torch.cat([material[..., :7], torch.log10(1 + material[..., 10:])], dim=-1)
+    ten = torch.cat(
+        [material[..., : NORMAL.start], torch.log10(1 + material[..., NORMAL.stop :])], dim=-1
+    )
     return SceneBatch(
         triangles_BT33=triangles.float().where(exists[..., None, None], 0),
         normals_BT33=normals.float().where(exists[..., None, None], 0),
-        material_BT10=ten.where(exists[..., None], 0),
+        material_BTM=ten.where(exists[..., None], 0),
         c2w_BV44=c2w.float(),
         fov_deg_BV=fov.float()[..., 0],
         is_triangle_BT=exists,
@@ -125,7 +128,7 @@ def _scene_alone(batch: SceneBatch, scene: int) -> SceneBatch:
     return SceneBatch(
         triangles_BT33=batch.triangles_BT33[[scene]][:, exists],
         normals_BT33=batch.normals_BT33[[scene]][:, exists],
-        material_BT10=batch.material_BT10[[scene]][:, exists],
+        material_BTM=batch.material_BTM[[scene]][:, exists],
         c2w_BV44=batch.c2w_BV44[[scene]],
         fov_deg_BV=batch.fov_deg_BV[[scene]],
         is_triangle_BT=None,

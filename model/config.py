@@ -4,11 +4,13 @@ The architecture is written once; a size is only numbers. `SIZES` names those th
 size cannot change: two stages, QK-norm over the full width, SwiGLU, RMSNorm before each block.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, ClassVar, Literal
 
 from storage.errors import TrilightError
+from storage.material import PUBLISHED_COLUMNS, material_columns
 from storage.ranges import Within
+from storage.registry import Registry
 from storage.settings import checked
 
 Head = Literal["dpt", "linear"]
@@ -27,7 +29,7 @@ LAYERS = 256
 class ModelConfig:
     """All numbers of one network."""
 
-    PRESETS: ClassVar[dict[str, Callable[[], "ModelConfig"]]] = {}
+    PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
     """The named sizes, by which a setting of this kind may be given (storage.changes)."""
     width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)]
     """Width of every token."""
@@ -61,6 +63,8 @@ class ModelConfig:
     """Widths of the DPT's four grids, finest first; empty with a linear head."""
     dpt_taps: Annotated[tuple[int, ...], Within(0, LAYERS - 1)] = ()
     """Decoder layers that feed those grids, in the same order; empty with a linear head."""
+    material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
+    """Columns of a material that the network reads, in the order of its input."""
 
     def __post_init__(self) -> None:
         if self.width % self.num_heads or self.head_width % 2:
@@ -70,6 +74,7 @@ class ModelConfig:
             _wrong(f"rope_num_freqs {self.rope_num_freqs}", f"at most {most} for this head width")
         if self.window_bundles % 2:
             _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
+        _check_columns(self.material_columns)
         if self.head == "dpt":
             self._check_dpt()
         elif self.dpt_features or self.dpt_channels or self.dpt_taps:
@@ -184,10 +189,27 @@ def large() -> ModelConfig:
     )
 
 
-SIZES = ModelConfig.PRESETS
-"""Every named size, smallest first."""
+SIZES: Registry[Callable[[], ModelConfig]] = Registry(
+    "size",
+    Callable,
+    {"smoke": smoke, "tiny": tiny, "small": small, "base": base, "large": large},
+    decides=("weights",),
+)
+"""Every named size, ours first and smallest first. A checkpoint holds all numbers of its network,
+and no name, so that it opens where its size is not registered."""
 
-SIZES.update(smoke=smoke, tiny=tiny, small=small, base=base, large=large)
+ModelConfig.PRESETS = SIZES
+
+
+def _check_columns(names: tuple[str, ...]) -> None:
+    declared = [column.name for column in material_columns()]
+    known = isinstance(names, tuple) and all(name in declared for name in names)
+    if not names or not known or len(set(names)) != len(names):
+        _wrong(
+            f"material_columns {names!r}",
+            f"some of {', '.join(declared)}, each once; a column that is not among them has to be "
+            "declared first (docs/how-to/material_column.md)",
+        )
 
 
 def _wrong(got: str, expected: str) -> None:

@@ -7,6 +7,7 @@ rotations and activations are left out (1 % of the time at 205 M parameters).
     d width   f hidden width   n registers + triangles   q ray bundles of a view
 """
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -17,10 +18,14 @@ from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
 from model.renderformer import RenderFormer, count_parameters
 from model.windows import cut_windows
-from storage.conventions import MATERIAL_WIDTH
+from storage.material import material_width
 
 TRAINING_BYTES = 16
 """Per parameter while training in float32: weight, gradient, and AdamW's two memories."""
+
+
+TRAINING_PASSES = 3
+"""Forward, and twice as much backward: one product for each operand."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +85,9 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
     n = config.num_registers + workload.triangles
     per_side = workload.resolution // config.patch_px
     q, views = per_side**2, workload.views
-    token_inputs = MATERIAL_WIDTH + encoded_normal_width(config.normal_octaves)
+    token_inputs = material_width(config.material_columns) + encoded_normal_width(
+        config.normal_octaves
+    )
     layers = {
         "cross-attention": 4 * q * d * d + 4 * q * n * d,
         "bundle self-attention": 8 * q * d * d + 4 * d * _pairs(config, per_side),
@@ -97,6 +104,13 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
     }
 
 
+@functools.lru_cache(maxsize=4096)
+def training_flops(config: ModelConfig, workload: Workload) -> int:
+    """Return the FLOPs of a forward and backward pass: each product has two more backward."""
+    return TRAINING_PASSES * sum(flops(config, workload).values())
+
+
+@functools.lru_cache
 def _pairs(config: ModelConfig, per_side: int) -> int:
     """Return how many (query, key) pairs of bundles there are, as the mean over the layers."""
     if not config.window_bundles:

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from model.config import ModelConfig
 from model.precision import set_precision
 from model.renderformer import RenderFormer
-from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes
+from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, converted
+from storage.material import material_columns, material_width
 
 PROBE_TRIANGLES, PROBE_RESOLUTION = 256, 64
 """Of the random scene that stands for all where none is given."""
@@ -45,14 +46,7 @@ def layer_errors(
     """
     rounded = set_precision(copy.deepcopy(model), precision)
     precise = copy.deepcopy(model).double()
-    as_float64 = SceneBatch(
-        **{
-            name: value.double()
-            if isinstance(value, Tensor) and name != "is_triangle_BT"
-            else value
-            for name, value in vars(batch).items()
-        }
-    )
+    as_float64 = converted(batch, lambda x: x.double() if x.is_floating_point() else x)
     expected = _outputs(precise, as_float64, resolution)
     got = _outputs(rounded, batch, resolution)
     return [_compare(name, got[name], twin) for name, twin in expected.items()]
@@ -74,10 +68,12 @@ def probe_batch() -> SceneBatch:
     normals = torch.randn(PROBE_TRIANGLES, 3, 3, generator=generator)
     c2w_V44 = torch.eye(4)[None].clone()
     c2w_V44[0, 2, 3] = 2.0
+    columns = tuple(column.name for column in material_columns())
     scene = SceneTensors(
         triangles_T33=centre + 0.1 * torch.randn(PROBE_TRIANGLES, 3, 3, generator=generator),
         normals_T33=normals / normals.norm(dim=-1, keepdim=True),
-        material_T10=torch.rand(PROBE_TRIANGLES, 10, generator=generator),
+        material_TM=torch.rand(PROBE_TRIANGLES, material_width(), generator=generator),
+        columns=columns,
         c2w_V44=c2w_V44,
         fov_deg_V=torch.tensor([40.0]),
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import EMISSION
+from storage.material import EMISSION
 from storage.scene import Scene
 
 

@@ -9,6 +9,7 @@ All of the network that is used here is in `_encode` and `_decode`.
 import dataclasses
 import functools
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,16 +18,16 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from model.checkpoints import WEIGHTS_NAME, checkpoint_path, open_checkpoint
 from model.encoded_scene import EncodedScene
 from model.light_groups import light_groups
+from model.open import Finder, find_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import Cameras, batch_scenes, scene_tensors
-from model.trained_range import MAX_LIGHTS, PUBLISHED, TrainedRange, trained_range
-from model.weights import CONFIG_KEY, network_digest
+from model.trained_range import MAX_LIGHTS, TrainedRange
+from model.weights import network_digest
 from storage.errors import TrilightError
-from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
+from storage.material import unread_columns
 from storage.scene import Scene
 
 _FLOAT_BYTES = 4
@@ -62,21 +63,22 @@ class NeuralRenderer:
         *,
         device: str | None = None,
         precision: str = "float32",
+        finders: Sequence[Finder] = (),
     ) -> "NeuralRenderer":
         """Read a checkpoint.
 
         Args:
-            checkpoint: as `model.checkpoints.open_checkpoint`.
+            checkpoint: as `model.open.find_network`.
             device: of torch; by default the graphics card where there is one.
             precision: a name of model.precision.PRECISIONS.
+            finders: as `model.open.find_network`.
 
         Raises:
             TrilightError: no such file, or no network.
         """
-        source = str(checkpoint)
-        model = open_checkpoint(source)
+        found = find_network(checkpoint, *finders)
         place = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        return cls(set_precision(model.to(place), precision), _trained_range(source))
+        return cls(set_precision(found.open().to(place), precision), found.trained)
 
     @property
     def trained(self) -> TrainedRange:
@@ -93,21 +95,29 @@ class NeuralRenderer:
         """The sha256 of configuration and weights, whatever file they came from."""
         return network_digest(self._model)
 
-    def render(self, scene: Scene, resolution: int) -> NDArray[np.float32]:
+    def render(self, scene: Scene, resolution: int | None = None) -> NDArray[np.float32]:
         """Return the pictures of all cameras of a scene.
 
         Warns where `prepare` has notes.
 
         Args:
             scene: passes `Scene.check`; `scene.with_cameras` gives it others.
-            resolution: width and height in pixels, a multiple of the network's ray bundles.
+            resolution: width and height in pixels, a multiple of the network's ray bundles; what
+                the network was trained at by default, where that is known.
 
         Returns:
             Linear radiance [V, R, R, 3] of at least 0.
 
         Raises:
-            TrilightError: as `prepare` and `view`.
+            TrilightError: as `prepare` and `view`, or no width is known.
         """
+        if resolution is None:
+            resolution = self.trained.resolution
+        if resolution is None:
+            raise TrilightError(
+                "resolution is None, and the network does not say what it was trained at; expected "
+                "a number of pixels."
+            )
         self.require_resolution(resolution)
         prepared = self.prepare(scene)
         for note in (*prepared.notes, *self.resolution_notes(resolution)):
@@ -196,6 +206,10 @@ class NeuralRenderer:
                 f"the {int(scene.triangle_emits.sum())} emitting triangles are rendered in "
                 f"{num_groups} groups, whose pictures are added"
             )
+        if unread := unread_columns(scene.materials, self._model.config.material_columns):
+            notes.append(
+                f"the network does not read {', '.join(unread)}, which materials of the scene have"
+            )
         most = self._trained.max_triangles
         if most is not None and scene.num_triangles > most:
             notes.append(
@@ -219,12 +233,12 @@ class NeuralRenderer:
 
 def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> EncodedScene:
     """Return one scene after the view-independent stage."""
-    batch = batch_scenes([scene_tensors(scene)])
+    batch = batch_scenes([scene_tensors(scene, model.config.material_columns)])
     moved = dataclasses.replace(
         batch,
         triangles_BT33=batch.triangles_BT33.to(device),
         normals_BT33=batch.normals_BT33.to(device),
-        material_BT10=batch.material_BT10.to(device),
+        material_BTM=batch.material_BTM.to(device),
     )
     return model.encode(moved)
 
@@ -240,22 +254,6 @@ def _decode(
     """Return log10(1 + radiance) [R, R, 3] from one camera."""
     camera = Cameras(c2w_BV44=c2w_44[None, None], fov_deg_BV=fov_deg[None, None])
     return model.decode(encoded, camera, resolution, skip_empty_bundles=skip_empty_bundles)[0, 0]
-
-
-def _trained_range(source: str) -> TrainedRange | None:
-    """Return what the network of a readable checkpoint was trained on, if that is known."""
-    path = _weights_file(source)
-    if not path.is_file():
-        return PUBLISHED  # a name on the hub
-    with path.open("rb") as file:
-        header = safetensors_header(file.read(8 + MAX_HEADER_BYTES), name=str(path))
-    metadata = header.get("__metadata__", {})
-    return trained_range(metadata) if CONFIG_KEY in metadata else PUBLISHED
-
-
-def _weights_file(source: str) -> Path:
-    path = checkpoint_path(source)
-    return path / WEIGHTS_NAME if path.is_dir() else path
 
 
 def _free_bytes(device: torch.device) -> int | None:

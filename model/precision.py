@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Precision:
+class PrecisionChoice:
     """One choice."""
 
     dtype: torch.dtype
@@ -39,10 +39,10 @@ class Precision:
 
 
 PRECISIONS = {
-    "float32": Precision(dtype=torch.float32),
-    "bfloat16": Precision(dtype=torch.bfloat16),
-    "tf32": Precision(dtype=torch.float32, tf32=True, needs_cuda=True),
-    "float16": Precision(dtype=torch.float16, needs_cuda=True),
+    "float32": PrecisionChoice(dtype=torch.float32),
+    "bfloat16": PrecisionChoice(dtype=torch.bfloat16),
+    "tf32": PrecisionChoice(dtype=torch.float32, tf32=True, needs_cuda=True),
+    "float16": PrecisionChoice(dtype=torch.float16, needs_cuda=True),
 }
 """Every choice by name. docs/tradeoffs.md has speeds and errors of bfloat16, and the errors that
 float16's numbers make; how fast float16 is, and all of tf32, was not measured."""

@@ -4,21 +4,25 @@ Shape suffixes here and in all of `model`:
     B scenes of a batch      V views of a scene      T triangles (padded to the longest of a batch)
     N tokens of a scene = registers + T              Q ray bundles of a picture
     W token width   H heads   D width of a head      R pixels across a picture, P across a bundle
-    A rotary angles of a position                    3 x, y, z or r, g, b      10 a material row
+    A rotary angles of a position                    3 x, y, z or r, g, b
+    M numbers of a material, of the columns that the network reads: 10 of the published ones
 
 A batch holds scenes of about one length and is padded to the longest of them, never to a constant;
 the padding is zero, because a mask hides finite garbage but not NaN (0 * NaN is NaN).
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from storage.conventions import EMISSION, MATERIAL_WIDTH, log10_radiance
+from storage.conventions import log10_radiance
 from storage.errors import TrilightError
+from storage.material import PUBLISHED_COLUMNS, chosen_columns, laid_out, material_columns
 from storage.scene import MAX_POSITION_M, Scene
 
 
@@ -30,12 +34,14 @@ class SceneTensors:
     """Vertices of each triangle, world space, metres."""
     normals_T33: Tensor
     """Unit shading normals at those vertices, world space."""
-    material_T10: Tensor
-    """Columns of storage.conventions, with emission as log10(1 + emission)."""
+    material_TM: Tensor
+    """What the columns hold; of those that are log-encoded, log10(1 + x)."""
     c2w_V44: Tensor
     """Camera to world."""
     fov_deg_V: Tensor
     """Full field of view in degrees."""
+    columns: tuple[str, ...] = PUBLISHED_COLUMNS
+    """Names of the columns of `material_TM`, in order (storage.material)."""
 
     @property
     def num_triangles(self) -> int:
@@ -68,7 +74,7 @@ class SceneBatch:
     """As in SceneTensors."""
     normals_BT33: Tensor
     """As in SceneTensors."""
-    material_BT10: Tensor
+    material_BTM: Tensor
     """As in SceneTensors."""
     c2w_BV44: Tensor
     """As in SceneTensors."""
@@ -76,17 +82,44 @@ class SceneBatch:
     """As in SceneTensors."""
     is_triangle_BT: Tensor | None
     """bool, False in the padding; None where nothing is padded, which spares the mask."""
+    columns: tuple[str, ...] = PUBLISHED_COLUMNS
+    """As in SceneTensors."""
 
     @property
     def cameras(self) -> Cameras:
         return Cameras(c2w_BV44=self.c2w_BV44, fov_deg_BV=self.fov_deg_BV)
 
+    def material_of(self, columns: tuple[str, ...]) -> Tensor:
+        """Return [B, T, M] of these columns alone, in this order.
 
-def scene_tensors(scene: Scene) -> SceneTensors:
+        Raises:
+            TrilightError: the batch has no such column.
+        """
+        if columns == self.columns:
+            return self.material_BTM
+        places = {column.name: part for column, part in laid_out(self.columns)}
+        if missing := [name for name in columns if name not in places]:
+            raise TrilightError(
+                f"scene: the network reads the material columns {', '.join(missing)}; the scene "
+                f"has only {', '.join(self.columns)}."
+            )
+        return torch.cat([self.material_BTM[..., places[name]] for name in columns], dim=-1)
+
+
+Scenes = TypeVar("Scenes", SceneTensors, SceneBatch)
+
+
+def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> SceneTensors:
     """Return the tensors of a scene that passes `Scene.check`; its arrays stay unchanged.
 
+    Args:
+        scene: what to show.
+        columns: of the material, such as those that one network reads
+            (`ModelConfig.material_columns`); None: all that are declared, for any network.
+
     Raises:
-        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis.
+        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis, or a
+            column is not declared.
     """
     farthest = np.abs(scene.vertex_positions).max()
     if not farthest <= MAX_POSITION_M:  # not a number is no place either
@@ -95,32 +128,47 @@ def scene_tensors(scene: Scene) -> SceneTensors:
             f"{MAX_POSITION_M:g} m. Move the scene, with its cameras, towards the origin."
         )
     faces = scene.faces.astype(np.int64)
-    material = scene.materials[scene.material_index]
-    encoded = np.concatenate(
-        [material[:, : EMISSION.start], log10_radiance(material[:, EMISSION])], axis=1
-    )
-    assert encoded.shape[1] == MATERIAL_WIDTH
+    if columns is None:
+        columns = tuple(column.name for column in material_columns())
+    material = chosen_columns(scene.materials, columns)
+    for column, part in laid_out(columns):
+        if column.is_log_encoded:
+            material[:, part] = log10_radiance(material[:, part])
     return SceneTensors(
         triangles_T33=torch.from_numpy(scene.vertex_positions[faces]),
         normals_T33=torch.from_numpy(scene.vertex_normals[faces]),
-        material_T10=torch.from_numpy(encoded.astype(np.float32)),
+        material_TM=torch.from_numpy(material[scene.material_index]),
         c2w_V44=torch.from_numpy(scene.c2w.copy()),
         fov_deg_V=torch.from_numpy(scene.fov_deg.copy()),
+        columns=columns,
     )
 
 
+def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
+    """Return the fields that are tensors, by name."""
+    return {name: value for name, value in vars(scenes).items() if isinstance(value, Tensor)}
+
+
+def converted(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
+    """Return the same scenes with each tensor converted, such as moved to a device."""
+    tensors: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
+    return dataclasses.replace(scenes, **tensors)
+
+
 def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
-    """Stack scenes of equal view count; the picture of a scene does not depend on its company."""
+    """Stack scenes of equal view count and columns; a scene's picture depends on no other scene."""
+    assert all(scene.columns == scenes[0].columns for scene in scenes)
     lengths = [scene.num_triangles for scene in scenes]
     longest = max(lengths)
     padded = min(lengths) < longest
     return SceneBatch(
         triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
         normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
-        material_BT10=_stack_padded([scene.material_T10 for scene in scenes], longest),
+        material_BTM=_stack_padded([scene.material_TM for scene in scenes], longest),
         c2w_BV44=torch.stack([scene.c2w_V44 for scene in scenes]),
         fov_deg_BV=torch.stack([scene.fov_deg_V for scene in scenes]),
         is_triangle_BT=torch.arange(longest) < torch.tensor(lengths)[:, None] if padded else None,
+        columns=scenes[0].columns,
     )
 
 

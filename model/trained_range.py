@@ -27,7 +27,7 @@ class TrainedRange:
         return {RANGE_KEY: json.dumps(asdict(self), sort_keys=True)}
 
 
-PUBLISHED = TrainedRange(max_triangles=4096, resolution=512)
+PUBLISHED_RANGE = TrainedRange(max_triangles=4096, resolution=512)
 """Of the published checkpoints: their second stage (Zeng et al. 2025)."""
 
 

@@ -19,29 +19,29 @@ from model.positions import (
 )
 from model.precision import as_given
 from model.scene_tensors import SceneBatch
-from storage.conventions import MATERIAL_WIDTH
+from storage.material import material_width
 
 
 class TriangleTokens(nn.Module):
     """Material and normals -> token.
 
     The published network reads a 13 x 32 x 32 texture whose cells are all equal; that is a linear
-    map of these ten numbers (its tangent-space normal is constant), at a thousandth of the input.
+    map of the ten numbers (its tangent-space normal is constant), at a thousandth of the input.
     """
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.octaves = config.normal_octaves
         self.token_W = nn.Parameter(torch.zeros(config.width))
-        self.material = nn.Linear(MATERIAL_WIDTH, config.width)
+        self.material = nn.Linear(material_width(config.material_columns), config.width)
         self.material_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
         self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
         self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
 
-    def forward(self, material_BT10: Tensor, normals_BT33: Tensor) -> Tensor:
+    def forward(self, material_BTM: Tensor, normals_BT33: Tensor) -> Tensor:
         """Return tokens [B, T, W], float32 under autocast too."""
-        with as_given(material_BT10.device):
-            material_BTW = self.material_norm(self.material(material_BT10))
+        with as_given(material_BTM.device):
+            material_BTW = self.material_norm(self.material(material_BTM))
             normal_BTW = self.normal_norm(self.normal(encode_normals(normals_BT33, self.octaves)))
             return self.token_W + material_BTW + normal_BTW
 
@@ -54,6 +54,7 @@ class TriangleEncoder(nn.Module):
         self.rotary = rotary
         self.register_eps = config.register_eps
         self.recompute = False
+        self.columns = config.material_columns
         self.tokens = TriangleTokens(config)
         self.registers_NW = nn.Parameter(torch.zeros(config.num_registers, config.width))
         self.layers = nn.ModuleList(
@@ -63,7 +64,7 @@ class TriangleEncoder(nn.Module):
 
     def forward(self, batch: SceneBatch, places: TokenPlaces) -> Tensor:
         """Return the context [B, N, W] with N = registers + triangles."""
-        tokens_BTW = self.tokens(batch.material_BT10, batch.normals_BT33)
+        tokens_BTW = self.tokens(batch.material_of(self.columns), batch.normals_BT33)
         registers_BNW = self.registers_NW.expand(len(tokens_BTW), -1, -1)
         x_BNW = torch.cat([registers_BNW, tokens_BTW], dim=1).to(dtype_of(self.layers))
         rotation = world_rotation(self.rotary, places)

@@ -3,8 +3,10 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -15,6 +17,7 @@ from model.config import ModelConfig
 from model.renderformer import RenderFormer
 from model.trained_range import TrainedRange
 from storage.errors import TrilightError
+from storage.material import PUBLISHED_COLUMNS
 from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
 
 CONFIG_KEY = "trilight_model"
@@ -57,7 +60,7 @@ def decode_weights(data: bytes) -> RenderFormer:
 
     Raises:
         TrilightError: not such a file, or its tensors are not those of its configuration; the
-            names are listed. `model.checkpoints` reads published checkpoints too.
+            names are listed. `model.open` reads published checkpoints too.
     """
     header = safetensors_header(data)
     try:
@@ -83,13 +86,25 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     Raises:
         TrilightError: the file cannot be read, is damaged, or is pickled code, which is never run.
     """
+    with _opened(path) as tensors:
+        arrays = {name: tensors.get_tensor(name) for name in tensors.keys()}
+        return arrays, tensors.metadata() or {}
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """Return the metadata of a safetensors file without its tensors; raises as `read_tensors`."""
+    with _opened(path) as tensors:
+        return tensors.metadata() or {}
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     try:
         with path.open("rb") as file:
             start = file.read(8)
         _require_safetensors(path, start)
         with safe_open(path, "pt") as tensors:
-            arrays = {name: tensors.get_tensor(name) for name in tensors.keys()}
-            return arrays, tensors.metadata() or {}
+            yield tensors
     except OSError as error:
         raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
     except (SafetensorError, KeyError) as error:
@@ -153,8 +168,15 @@ def require_tensors(got: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -
 
 
 def encode_config(config: ModelConfig) -> str:
-    """Return the JSON of a configuration."""
-    return json.dumps(dataclasses.asdict(config), sort_keys=True)
+    """Return the JSON of a configuration.
+
+    Material columns stand there where they are not the published ones, so that the bytes and the
+    digest of every other network stay what they were before there was a choice.
+    """
+    fields = dataclasses.asdict(config)
+    if config.material_columns == PUBLISHED_COLUMNS:
+        del fields["material_columns"]
+    return json.dumps(fields, sort_keys=True)
 
 
 def decode_config(text: str) -> ModelConfig:

@@ -14,7 +14,7 @@ RGB = tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surface:
+class SurfaceLook:
     """How a shell part or an object reflects, in linear colour."""
 
     diffuse_scale: float
@@ -42,7 +42,7 @@ class ShellPart:
     """[81, 3] world units."""
     faces: NDArray[np.uint32]
     """[128, 3], counter-clockwise seen from the room (but see SeparateSides.wall2_faces_out)."""
-    surface: Surface
+    surface: SurfaceLook
     """Its material."""
 
 
@@ -64,7 +64,7 @@ class ObjectPlacement:
 
     pose: Pose
     """Where it is."""
-    surface: Surface
+    surface: SurfaceLook
     """Its material."""
 
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from scene_templates.contents.lights import emitters_rand
 from scene_templates.contents.materials import surface_rand
-from scene_templates.contents.placement import ObjectSpace, Shape, poses_rand
+from scene_templates.contents.placement import ObjectSpace, PlaceableShape, poses_rand
 from scene_templates.families.family import Family
-from scene_templates.layout import Layout, ObjectPlacement, Surface
+from scene_templates.layout import Layout, ObjectPlacement, SurfaceLook
 from scene_templates.plans import ScenePlan
 from scene_templates.settings import SceneSettings
 from scene_templates.shell.patches import SIDES, patch
@@ -23,7 +23,7 @@ def layout_rand(
     rng: np.random.Generator,
     settings: SceneSettings,
     plan: ScenePlan,
-    shapes: Sequence[Shape],
+    shapes: Sequence[PlaceableShape],
 ) -> Layout:
     """Draw a layout of the planned kind.
 
@@ -77,5 +77,5 @@ def _surface_rand(
     settings: SceneSettings,
     family: Family,
     kind: Literal["shell", "object"],
-) -> Surface:
+) -> SurfaceLook:
     return surface_rand(rng, settings.materials, smooth_share=family.smooth_share, kind=kind)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from storage.atomic import write_atomically
 from storage.dataset import Dataset
+from storage.extensions import is_reference
 from storage.layout import DatasetFolder
 
 _NAME = "logs/asked.json"
@@ -22,7 +23,8 @@ def write_asked(folder: DatasetFolder, words: Sequence[str]) -> None:
 def read_asked(dataset: Dataset) -> list[str] | None:
     """Return what was written down; None where nothing is, or nothing that may be shown.
 
-    Whoever hands out a dataset may have written it: only words of `generate` that print come back.
+    Whoever hands out a dataset may have written it: only words of `generate` that print come back,
+    and none that would run a file when they are repeated.
     """
     try:
         words = json.loads(dataset.files.read(_NAME) or b"null")
@@ -30,7 +32,13 @@ def read_asked(dataset: Dataset) -> list[str] | None:
         return None
     if not isinstance(words, list) or words[:1] != ["generate"]:
         return None
-    return words if all(isinstance(word, str) and word.isprintable() for word in words) else None
+    harmless = all(
+        isinstance(word, str)
+        and word.isprintable()
+        and not (is_reference(word) or word.startswith("--extend"))
+        for word in words
+    )
+    return words if harmless else None
 
 
 def value_of(words: Sequence[str], option: str) -> str | None:

@@ -2,14 +2,14 @@
 
 A writer that names what it knows drops what it does not know. So each form states the members that
 it carries, and whatever a scene has besides, not at its default, is said to be lost. A member is a
-field of `Scene`, or a part of one: `materials.diffuse` (storage.conventions.MATERIAL_COLUMNS) and
-`objects.uid` (SceneObject). A form that carries `materials` carries all columns, also new ones.
+field of `Scene`, or a part of one: `materials.diffuse` (storage.material) and `objects.uid`
+(SceneObject). A form that carries `materials` carries all columns, also those that are added.
 """
 
 import dataclasses
 from collections.abc import Collection, Iterator
 
-from storage.conventions import MATERIAL_COLUMNS
+from storage.material import columns_in_use
 from storage.scene import Scene, SceneObject
 
 
@@ -24,23 +24,13 @@ def lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]:
 
 
 def _members_in_use(scene: Scene) -> Iterator[str]:
-    """Yield the members that are not at their defaults; those of a material are zero."""
+    """Yield the members that are not at their defaults."""
     for field in dataclasses.fields(Scene):
         if field.name == "materials":
-            yield from _columns_in_use(scene)
+            yield from (f"materials.{name}" for name in columns_in_use(scene.materials))
         elif field.name == "objects":
             for part in dataclasses.fields(SceneObject):
                 if any(getattr(entry, part.name) != part.default for entry in scene.objects):
                     yield f"objects.{part.name}"
         elif len(getattr(scene, field.name)):
             yield field.name
-
-
-def _columns_in_use(scene: Scene) -> Iterator[str]:
-    known = 0
-    for name, columns in MATERIAL_COLUMNS.items():
-        known = max(known, columns.stop)
-        if scene.materials[:, columns].any():
-            yield f"materials.{name}"
-    if scene.materials[:, known:].any():
-        yield f"materials.{known} to {scene.materials.shape[1] - 1}"

@@ -3,8 +3,8 @@
 A name leads through groups of settings, and through a list of them by the number of an entry, as in
 `families.0.weight`; without a number each entry is changed. Values come as JSON has them, lists and
 whole groups included. A group whose class has `PRESETS`, makers by name, may also be replaced by
-one of those, and single settings of it are then changes of the preset: model=large with
-model.window_bundles=0.
+the name of one, and a list of such groups by names; single settings of it are then changes of the
+preset: model=large with model.window_bundles=0.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from storage.errors import TrilightError
-from storage.settings import field_value
+from storage.settings import field_value, settings_record
 from storage.suggestion import expected_one_of
 
 Settings = TypeVar("Settings")
@@ -68,25 +68,30 @@ def _changed_field(group: Any, field: str, changes: Sequence[Change]) -> Any:
     value = getattr(group, field)
     for path, new, name in changes:
         if not path:
-            value = _whole(type(group), field, value, new, name)
+            value = field_value(type(group), field, _without_names(new, value, name), name)
     return _within(value, [change for change in changes if change[0]])
 
 
-def _whole(kind: type, field: str, old: Any, new: Any, name: str) -> Any:
-    presets: Mapping[str, Callable[[], Any]] = getattr(old, "PRESETS", {})
-    if presets and not isinstance(new, Mapping):
-        if not isinstance(new, str) or new not in presets:
+def _without_names(new: Any, old: Any, name: str) -> Any:
+    """Return a new value with the record of a preset wherever its name stands."""
+    many = isinstance(old, tuple) and bool(old)
+    first = old[0] if many else old
+    if not dataclasses.is_dataclass(first) or new == []:
+        return new
+    presets: Mapping[str, Callable[[], Any]] = getattr(first, "PRESETS", {})
+    entries = new if many and isinstance(new, list) else [new]
+    records = [
+        settings_record(presets[each]()) if isinstance(each, str) and each in presets else each
+        for each in entries
+    ]
+    for each in records:
+        if not isinstance(each, Mapping):
+            choices = f"{expected_one_of(str(each), presets)}, or" if presets else "expected"
             raise TrilightError(
-                f"setting {name!r} is {new!r}; {expected_one_of(str(new), presets)}, or one of its "
-                f"settings by name, such as {name}.{dataclasses.fields(old)[0].name}."
+                f"setting {name!r} is {new!r}; {choices} one of its settings by name, such as "
+                f"{name}.{dataclasses.fields(first)[0].name}, since it is a group."
             )
-        return presets[new]()
-    if dataclasses.is_dataclass(old) and not isinstance(new, Mapping):
-        raise TrilightError(
-            f"setting {name!r} is {new!r}, but it is a group; expected names with values, or one "
-            f"of its settings by name, such as {name}.{dataclasses.fields(old)[0].name}."
-        )
-    return field_value(kind, field, new, name)
+    return records if many else records[0]
 
 
 def _within(value: Any, changes: Sequence[Change]) -> Any:

@@ -20,22 +20,6 @@ READABLE_VERSIONS = (2, 3)
 
 SPLITS = ("train", "validation", "test")
 
-DIFFUSE = slice(0, 3)
-SPECULAR = slice(3, 6)
-ROUGHNESS = 6
-EMISSION = slice(7, 10)
-"""Columns of a material row: albedos in [0, 1], roughness in [0, 1], emission as radiance."""
-
-MATERIAL_COLUMNS = {
-    "diffuse": DIFFUSE,
-    "specular": SPECULAR,
-    "roughness": slice(ROUGHNESS, ROUGHNESS + 1),
-    "emission": EMISSION,
-}
-"""All of them by name; what a form of file says of a material, it says by these names."""
-
-MATERIAL_WIDTH = max(columns.stop for columns in MATERIAL_COLUMNS.values())
-
 HALF_FLOAT_MAX = 65504.0
 """The largest finite value of a stored picture."""
 

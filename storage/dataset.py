@@ -3,8 +3,9 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import BinaryIO
 
+from storage.conventions import SPLITS
 from storage.damage import reading
-from storage.dataset_files import DatasetFiles, RemoteFiles, dataset_files
+from storage.dataset_files import DatasetFiles, RemoteDatasetFiles, dataset_files
 from storage.errors import TrilightError
 from storage.failures import decode_failures
 from storage.layout import DatasetFolder
@@ -30,7 +31,7 @@ class Dataset:
     @property
     def folder(self) -> DatasetFolder:
         """The dataset's folder; raises TrilightError where it is on a server."""
-        if isinstance(self.files, RemoteFiles):
+        if isinstance(self.files, RemoteDatasetFiles):
             raise TrilightError(f"dataset {self.shown!r} is on a server; expected a local folder.")
         return DatasetFolder(self.files.root)
 
@@ -42,6 +43,27 @@ class Dataset:
     def shards_of(self, split: str) -> list[ShardEntry]:
         """Return the shards of one split, by name."""
         return [shard for shard in self.manifest.shards if shard.split == split]
+
+    def scenes(self, split: str | None = None) -> Iterator[SceneRecord]:
+        """Yield the scenes of a split, or of all, without their pictures; as `read_scenes`."""
+        for shard in self._shards(split):
+            yield from self.read_scenes(shard)
+
+    def samples(self, split: str | None = None) -> Iterator[Sample]:
+        """Yield the scenes of a split, or of all, with their pictures, as `read_shard` does.
+
+        `sample.radiance_rgb` is [V, R, R, 3] float32 linear radiance of the cameras of
+        `sample.scene`, and `sample.views` says of each how it was rendered, and its error.
+        """
+        for shard in self._shards(split):
+            yield from self.read_shard(shard)
+
+    def _shards(self, split: str | None) -> list[ShardEntry]:
+        if split is None:
+            return list(self.manifest.shards)
+        if split not in SPLITS:
+            raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")
+        return self.shards_of(split)
 
     def read_shard(self, shard: ShardEntry) -> Iterator[Sample]:
         """Yield the samples of a shard in the order of the file, after checking its digest.

@@ -98,7 +98,7 @@ class LocalFiles(_Files):
         self._checked[shard.name] = seen
 
 
-class RemoteFiles(_Files):
+class RemoteDatasetFiles(_Files):
     """A folder on a server. Its shards come whole to the cache of this machine."""
 
     def __init__(self, url: RemoteUrl) -> None:
@@ -140,10 +140,10 @@ class RemoteFiles(_Files):
         return shard_cache().open(url, num_bytes=shard.num_bytes, sha256=shard.sha256)
 
 
-DatasetFiles = LocalFiles | RemoteFiles
+DatasetFiles = LocalFiles | RemoteDatasetFiles
 
 
 def dataset_files(url: str) -> DatasetFiles:
     """Return where the files of a dataset are; raises TrilightError for a URL that is refused."""
     place = parse_url(url, what="dataset")
-    return LocalFiles(place) if isinstance(place, Path) else RemoteFiles(place)
+    return LocalFiles(place) if isinstance(place, Path) else RemoteDatasetFiles(place)

@@ -81,6 +81,9 @@ class Manifest:
     """The finished shards, by name."""
     schema_version: int = SCHEMA_VERSION
     """Version of the formats."""
+    extensions: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """The sha256 of each file of the makers' own that had part in it, by its name; nothing that is
+    read from here is ever imported (storage.extensions)."""
 
     @property
     def num_samples(self) -> int:
@@ -135,6 +138,8 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
     record["shards"] = [shard_row(shard) for shard in manifest.shards]
     record["totals"] = {"samples": manifest.num_samples, "bytes": manifest.num_bytes}
     record["dataset_digest"] = manifest.dataset_digest
+    if not manifest.extensions:  # as manifests are that were written before there were any
+        del record["extensions"]
     with atomic_writer(path) as stream:  # bit by bit: the whole text has many small ones
         for text in json.JSONEncoder(indent=1, sort_keys=True).iterencode(record):
             stream.write(text.encode())
@@ -196,6 +201,8 @@ def decode_manifest(
             record[name] = value
         require_readable(record.get("schema_version"), place)
         del record["totals"], record["dataset_digest"]
+        if not all(isinstance(sha256, str) for sha256 in record.get("extensions", {}).values()):
+            raise ValueError("extensions without digests")
         return Manifest(shards=tuple(shards), **record)
     except TrilightError:
         raise

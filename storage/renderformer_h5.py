@@ -33,20 +33,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.atomic import write_atomically
-from storage.conventions import DIFFUSE, EMISSION, HALF_FLOAT_MAX, ROUGHNESS, SPECULAR
+from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
+from storage.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, REFLECTING, SPECULAR
 from storage.scene import Scene
 
 CARRIED = frozenset(
     {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg"}
-    | {f"materials.{name}" for name in ("diffuse", "specular", "roughness", "emission")}
+    | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
 )
 """Of a scene (storage.carried)."""
 
 CHANNELS, CELLS = 13, 32
 """Of a texture; it has CELLS x CELLS cells."""
 TEXTURE_EMISSION = slice(10, 13)
-"""Channels of a texture row; those before ROUGHNESS + 1 are as in storage.conventions."""
+TEXTURE_NORMAL = slice(7, 10)
+"""Channels of a texture row; those before them are REFLECTING (storage.material)."""
 FLAT_NORMAL = (0.5, 0.5, 1.0)
 NEAR, FAR = 0.05, 5.0
 """Of `mvp`, in metres."""
@@ -103,9 +105,9 @@ def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating
     """
     emits = np.any(scene.materials[:, EMISSION] > 0, axis=1)
     rows = np.zeros((len(scene.materials), CHANNELS), np.float32)
-    rows[:, : ROUGHNESS + 1] = scene.materials[:, : ROUGHNESS + 1]
-    rows[emits, : ROUGHNESS + 1] = [1, 1, 1, 0, 0, 0, 1]
-    rows[:, 7:10] = FLAT_NORMAL
+    rows[:, REFLECTING] = scene.materials[:, REFLECTING]
+    rows[emits, REFLECTING] = [1, 1, 1, 0, 0, 0, 1]
+    rows[:, TEXTURE_NORMAL] = FLAT_NORMAL
     rows[:, TEXTURE_EMISSION] = scene.materials[:, EMISSION]
     if texture_type == "float32":
         return rows[scene.material_index]
@@ -120,8 +122,10 @@ def texture_rows(scene: Scene, texture_type: TextureType) -> NDArray[np.floating
         )
     total = half[:, DIFFUSE].astype(np.float32) + half[:, SPECULAR]
     over = np.tile(total > 1, (1, 2))
-    lower = np.nextafter(half[:, :6], np.float16(0))
-    half[:, :6] = np.where(over & (half[:, :6] > rows[:, :6]), lower, half[:, :6])
+    albedos = slice(DIFFUSE.start, SPECULAR.stop)
+    lower = np.nextafter(half[:, albedos], np.float16(0))
+    rises = half[:, albedos] > rows[:, albedos]
+    half[:, albedos] = np.where(over & rises, lower, half[:, albedos])
     return half[scene.material_index]
 
 

@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, ROUGHNESS, SPECULAR
 from storage.errors import TrilightError
 from storage.exr import MAX_RESOLUTION
+from storage.material import DIFFUSE, EMISSION, REFLECTING, SPECULAR, default_rows
 from storage.renderformer_h5 import (
     CELLS,
     CHANNELS,
     FLAT_NORMAL,
     TEXTURE_EMISSION,
+    TEXTURE_NORMAL,
     filled_cells,
 )
 from storage.rows import distinct_rows
@@ -117,7 +118,7 @@ def _texture_rows(file: Any, count: int, lost: list[str]) -> NDArray[np.float32]
     varies = (low != high).any(axis=1)
     if varies.any():
         lost.append(f"textures that vary, of {varies.sum()} triangles: their mean was taken")
-    bumpy = (low[:, 7:10] != np.array(FLAT_NORMAL, np.float32)).any(axis=1)
+    bumpy = (low[:, TEXTURE_NORMAL] != np.array(FLAT_NORMAL, np.float32)).any(axis=1)
     if bumpy.any():
         lost.append(f"normal textures of {bumpy.sum()} triangles")
     mean = (total / filled.sum()).astype(np.float32)
@@ -164,12 +165,12 @@ def _indexed(
 
 def _palette(rows: NDArray[np.float32], lost: list[str]) -> dict[str, Any]:
     emits = (rows[:, TEXTURE_EMISSION] > 0).any(axis=1)
-    materials = np.zeros((len(rows), MATERIAL_WIDTH), np.float32)
-    materials[:, : ROUGHNESS + 1] = rows[:, : ROUGHNESS + 1]
+    materials = default_rows(len(rows))
+    materials[:, REFLECTING] = rows[:, REFLECTING]
     materials[:, EMISSION] = rows[:, TEXTURE_EMISSION]
-    if (materials[emits, : ROUGHNESS + 1] != _PUBLISHED_EMITTER).any():
+    if (materials[emits, REFLECTING] != _PUBLISHED_EMITTER).any():
         lost.append("what emitters reflect: ours reflect nothing")
-    materials[emits, : ROUGHNESS + 1] = [0, 0, 0, 0, 0, 0, 1]
+    materials[emits, REFLECTING] = [0, 0, 0, 0, 0, 0, 1]
     _within_one(materials, lost)
     order = np.where(emits, np.cumsum(emits), 0)  # emitters stay apart, even of equal radiance
     first, index = distinct_rows(np.column_stack([materials, order.astype(np.float32)]))

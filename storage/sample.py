@@ -25,9 +25,14 @@ from storage.errors import TrilightError
 from storage.exr import decode_exr
 from storage.lights import decode_lights_exr, encode_lights_exr, num_lights
 from storage.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
-from storage.safe_read import read_safetensors
-from storage.scene import ARRAY_FIELDS, Scene
-from storage.scene_file import encode_arrays, scene_objects, scene_provenance, scene_record
+from storage.scene import Scene
+from storage.scene_file import (
+    decode_arrays,
+    encode_arrays,
+    scene_objects,
+    scene_provenance,
+    scene_record,
+)
 
 _FAR = 1000.0
 """Beyond any noise floor in dB and any share."""
@@ -193,8 +198,7 @@ def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
     try:
         views = tuple(_view(view, row) for row, view in enumerate(record["views"]))
         objects = scene_objects(record["objects"])
-        arrays, _ = read_safetensors(unpack_arrays(members))
-        fields = {name: arrays[name] for name in ARRAY_FIELDS}
+        fields = decode_arrays(unpack_arrays(members))
         provenance = scene_provenance(record["provenance"])
         scene = Scene(objects=objects, provenance=provenance, **fields)
     except KeyError as error:

@@ -12,8 +12,16 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, ROUGHNESS, SPECULAR
 from storage.errors import TrilightError
+from storage.material import (
+    DIFFUSE,
+    EMISSION,
+    PUBLISHED_COLUMNS,
+    SPECULAR,
+    laid_out,
+    material_columns,
+    material_width,
+)
 from storage.ranges import FLOAT32_MAX, Columns, Within, declared_ranges
 
 ObjectKind = Literal["object", "shell", "emitter"]
@@ -75,12 +83,10 @@ class Scene:
     """[T] row of `materials`."""
     materials: Annotated[
         NDArray[np.float32],
-        Columns("diffuse", DIFFUSE, Within(0, 1)),
-        Columns("specular", SPECULAR, Within(0, 1)),
-        Columns("roughness", slice(ROUGHNESS, ROUGHNESS + 1), Within(0, 1)),
-        Columns("emission", EMISSION, Within(0, FLOAT32_MAX)),
+        *(Columns(each.name, part, each.within) for each, part in laid_out(PUBLISHED_COLUMNS)),
     ]
-    """[M, 10] diffuse rgb, specular rgb, roughness, emission rgb (storage.conventions)."""
+    """[M, 10 or more] the declared columns: diffuse rgb, specular rgb, roughness, emission rgb, and
+    those that were added (storage.material)."""
     object_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
     """[T] row of `objects`."""
     c2w: Annotated[NDArray[np.float32], FINITE]
@@ -166,12 +172,12 @@ ARRAY_FIELDS: Mapping[str, tuple[type, tuple[int | None, ...]]] = {
     "vertex_normals": (np.float32, (None, 3)),
     "faces": (np.uint32, (None, 3)),
     "material_index": (np.uint16, (None,)),
-    "materials": (np.float32, (None, MATERIAL_WIDTH)),
+    "materials": (np.float32, (None, None)),
     "object_index": (np.uint16, (None,)),
     "c2w": (np.float32, (None, 4, 4)),
     "fov_deg": (np.float32, (None,)),
 }
-"""dtype and shape of every array field; None is any length."""
+"""dtype and shape of every array field; None is any length, or as many as columns are declared."""
 
 
 def _check_arrays(scene: Scene) -> None:
@@ -186,6 +192,7 @@ def _check_arrays(scene: Scene) -> None:
             _broken(f"{name} has shape {array.shape}", f"{shape} with None for any length")
         if np.issubdtype(dtype, np.floating):
             _require(np.isfinite(array), name, array, "finite values")
+    _check_columns(scene)
     for field in declared_ranges(Scene):
         values = getattr(scene, field.name)
         part = "" if field.part is None else f"{field.part.name} "
@@ -194,6 +201,19 @@ def _check_arrays(scene: Scene) -> None:
         _same_length(scene, name, other)
     for name in ("material_index", "object_index"):
         _same_length(scene, name, "faces")
+
+
+def _check_columns(scene: Scene) -> None:
+    """Check the width of a material row, and the ranges of the columns that were added to four."""
+    got, wanted = scene.materials.shape, material_width()
+    if got[1] != wanted:
+        names = ", ".join(column.name for column in material_columns())
+        _broken(f"materials has shape {got}", f"(None, {wanted}), since its columns are {names}")
+    for column, part in laid_out():
+        if column.name not in PUBLISHED_COLUMNS:
+            holds = np.ones(got, np.bool_)
+            holds[:, part] = column.within.holds(scene.materials[:, part])
+            _require(holds, "materials", scene.materials, f"{column.name} {column.within}")
 
 
 def _check_geometry(scene: Scene) -> None:

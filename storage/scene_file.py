@@ -24,6 +24,7 @@ from safetensors.numpy import save
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.material import chosen_columns, completed_rows, stored_columns, stored_names
 from storage.safe_read import read_safetensors, safetensors_header
 from storage.scene import ARRAY_FIELDS, OBJECT_KINDS, Scene, SceneObject
 
@@ -36,13 +37,31 @@ MAX_HEADER_BYTES = 8 << 20
 CARRIED = frozenset({*ARRAY_FIELDS, "objects", "provenance"})
 """Of a scene (storage.carried): all, whatever a material or an object may come to hold."""
 
-_METADATA = "trilight_scene"
+_METADATA, _COLUMNS = "trilight_scene", "material_columns"
 _DTYPE_NAMES: Mapping[type, str] = {np.float32: "F32", np.uint32: "U32", np.uint16: "U16"}
 
 
 def encode_arrays(scene: Scene) -> bytes:
-    """Return the arrays of a scene alone, as the member `scene.safetensors` of a sample."""
-    return save(_arrays(scene))
+    """Return the arrays of a scene alone, as the member `scene.safetensors` of a sample.
+
+    Material columns beyond the published ones stand there where they are not at their default; then
+    the metadata name all of them.
+    """
+    stated = stored_names(stored_columns(scene.materials))
+    return save(_arrays(scene), None if stated is None else {_COLUMNS: stated})
+
+
+def decode_arrays(data: bytes) -> dict[str, NDArray]:
+    """Return the array fields of a scene from the bytes of `encode_arrays`.
+
+    Raises:
+        TrilightError: damaged, an array is missing, or a material column is not declared here.
+    """
+    arrays, metadata = read_safetensors(data)
+    if missing := set(ARRAY_FIELDS) - set(arrays):
+        raise TrilightError(f"scene: the array {min(missing)} is missing.")
+    arrays["materials"] = completed_rows(arrays["materials"], metadata.get(_COLUMNS))
+    return {name: arrays[name] for name in ARRAY_FIELDS}
 
 
 def scene_digest(scene: Scene) -> str:
@@ -58,6 +77,8 @@ def encode_scene(scene: Scene) -> bytes:
     """
     scene.check()
     record = {"schema_version": SCHEMA_VERSION, **scene_record(scene)}
+    if stated := stored_names(stored_columns(scene.materials)):
+        record[_COLUMNS] = stated
     data = save(_arrays(scene), {_METADATA: canonical_json(record).decode()})
     header_bytes = int.from_bytes(data[:8], "little")
     if len(data) > MAX_FILE_BYTES or header_bytes > MAX_HEADER_BYTES:
@@ -104,6 +125,7 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
         _check_header(safetensors_header(data, MAX_HEADER_BYTES))
         arrays, metadata = read_safetensors(data, MAX_HEADER_BYTES)
         record = _metadata_record(metadata)
+        arrays["materials"] = completed_rows(arrays["materials"], record.get(_COLUMNS))
         scene = Scene(
             objects=scene_objects(record.get("objects")),
             provenance=scene_provenance(record.get("provenance")),
@@ -154,7 +176,9 @@ def _object(value: Any, row: int) -> SceneObject:
 
 
 def _arrays(scene: Scene) -> dict[str, NDArray]:
-    return {name: np.ascontiguousarray(getattr(scene, name)) for name in ARRAY_FIELDS}
+    arrays = {name: np.ascontiguousarray(getattr(scene, name)) for name in ARRAY_FIELDS}
+    columns = stored_columns(scene.materials)
+    return arrays | {"materials": chosen_columns(scene.materials, columns)}
 
 
 def _check_header(header: Mapping[str, Any]) -> None:

@@ -134,6 +134,11 @@ def field_sentences(kind: type) -> dict[str, str]:
     return sentences
 
 
+def option_of(field: str) -> str:
+    """Return the option of the command line that fills a field."""
+    return "--" + field.replace("_", "-")
+
+
 def expected_of(hint: Any) -> str:
     """Return what a value of a type without a range looks like, for a person."""
     origin, args = get_origin(hint), get_args(hint)

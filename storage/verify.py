@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 from storage.check_sample import check_sample
 from storage.dataset import Dataset, open_dataset
-from storage.dataset_files import LocalFiles, RemoteFiles
+from storage.dataset_files import LocalFiles, RemoteDatasetFiles
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.layout import DatasetFolder
@@ -123,7 +123,7 @@ def _num_planned(manifest: Manifest) -> int:
 
 def _strangers(dataset: Dataset) -> list[str]:
     """Return shards in the folder that nobody lists; a server's folder is not listed."""
-    if isinstance(dataset.files, RemoteFiles):
+    if isinstance(dataset.files, RemoteDatasetFiles):
         return []
     listed = {shard.name for shard in dataset.manifest.shards}
     root = dataset.files.root
@@ -157,7 +157,7 @@ def _check_shard(
     found = _Found()
     try:
         found.faults += _check_size(dataset, shard)
-        if found.faults or (fast and isinstance(dataset.files, RemoteFiles)):
+        if found.faults or (fast and isinstance(dataset.files, RemoteDatasetFiles)):
             return found
         with _opened(dataset, shard) as stream:
             if fast:

@@ -103,7 +103,8 @@ def main() -> int:
     """Run tests as each processor, or as the one that is named; return the exit status."""
     named, tests = sys.argv[1:2], sys.argv[2:] or CHOSEN
     for name in named or PROCESSORS:
-        command = [sys.executable, "-m", "pytest", "-n", "2", "-p", "tests.elsewhere", *tests]
+        options = ("-n", "2", "--dist", "worksteal", "-p", "tests.elsewhere")
+        command = [sys.executable, "-m", "pytest", *options, *tests]
         status = subprocess.call(
             command, cwd=ROOT, env=os.environ | PROCESSORS[name] | {ASKED: name}
         )

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from storage.conventions import look_at_c2w
+from storage.material import completed_rows
 from storage.sample import Sample, ViewRecord
 from storage.scene import Scene, SceneObject
 
@@ -35,7 +36,7 @@ def tiny_scene(**changes: Any) -> Scene:
         "vertex_normals": normals,
         "faces": np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]], np.uint32),
         "material_index": np.array([FLOOR, FLOOR, LIGHT], np.uint16),
-        "materials": materials,
+        "materials": completed_rows(materials, None),
         "object_index": np.array([FLOOR, FLOOR, LIGHT], np.uint16),
         "c2w": np.stack(poses).astype(np.float32),
         "fov_deg": np.array([45, 40], np.float32),

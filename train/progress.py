@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 
-class Progress(Protocol):
+class TrainProgress(Protocol):
     """Receives the course of a run: noted, then begin, then advance and validated, in turns."""
 
     def noted(self, text: str) -> None:

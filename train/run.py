@@ -9,11 +9,13 @@ from pathlib import Path
 
 import torch
 
+from model.open import open_network
 from model.renderformer import count_parameters
 from model.weights import decode_config, encode_weights
 from storage.atomic import write_atomically
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.extensions import recorded
 from storage.settings import settings_record
 from storage.training_data import TrainingData, open_training_data
 from train.data.scenes import training_scene
@@ -22,16 +24,15 @@ from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable
 from train.evaluation.judge import Judge, median_picture
 from train.folder import RunFolder
-from train.loop.checkpoint import Checkpoint, resumed_state
-from train.loop.checkpoints import resumed_checkpoint, saved_steps
+from train.loop.checkpoints import Checkpoint, resumed_checkpoint, resumed_state, saved_steps
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState, new_state
 from train.loop.trainer import Trainer
 from train.loss.lpips_weights import load_lpips
 from train.loss.objective import Objective
-from train.networks import open_network
-from train.progress import Progress, Silent
+from train.networks import network_of_run
+from train.progress import Silent, TrainProgress
 from train.result import TrainResult, finished, pretty_json
 from train.settings import TrainSettings
 from train.start import Start
@@ -56,7 +57,7 @@ def train_run(
     start: Start | None = None,
     crew: Crew | None = None,
     workers: int = 1,
-    progress: Progress | None = None,
+    progress: TrainProgress | None = None,
 ) -> TrainResult | None:
     """Train a network and judge it.
 
@@ -150,7 +151,7 @@ def _begin(
     data: TrainingData,
     start: Start,
     crew: Crew,
-    progress: Progress,
+    progress: TrainProgress,
 ) -> tuple[TrainSettings, TrainState]:
     """Return the state that the run begins or goes on with, and the settings with its network."""
     if start.resume:
@@ -166,7 +167,7 @@ def _begin(
             "another --out."
         )
     start.check(settings)
-    network = None if start.begin_with is None else open_network(start.begin_with)
+    network = None if start.begin_with is None else open_network(start.begin_with, network_of_run)
     if network is not None:
         settings = dataclasses.replace(settings, model=network.config)
     if crew.is_first:
@@ -174,6 +175,7 @@ def _begin(
             "settings": settings_record(settings),
             "begun_with_sha256": sha256_hex(encode_weights(network)) if network else None,
             "data_digest": data.digest,
+            **({"extensions": found} if (found := recorded("weights")) else {}),
             "versions": {"torch": torch.__version__, "python": platform.python_version()},
             "threads": torch.get_num_threads(),
             "processes": crew.world_size,
@@ -182,7 +184,7 @@ def _begin(
     return settings, new_state(settings, crew.device, network)
 
 
-def _note_other_crew(checkpoint: Checkpoint, crew: Crew, progress: Progress) -> None:
+def _note_other_crew(checkpoint: Checkpoint, crew: Crew, progress: TrainProgress) -> None:
     before = checkpoint.header["world_size"]
     if before != crew.world_size:
         progress.noted(
@@ -208,7 +210,7 @@ def _recorder(
     settings: TrainSettings,
     folder: RunFolder,
     judge: Judge | None,
-    progress: Progress,
+    progress: TrainProgress,
 ) -> Recorder:
     progress.begin(
         step=state.step,

@@ -17,6 +17,7 @@ from model.config import large as large_model
 from model.config import smoke as smoke_model
 from storage.changes import changed
 from storage.errors import TrilightError
+from storage.registry import Registry
 from storage.suggestion import expected_one_of
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
@@ -176,27 +177,63 @@ def finetune() -> TrainSettings:
     )
 
 
-RUNS: dict[str, Callable[[], TrainSettings]] = {
-    "smoke": smoke,
-    "builtin": builtin,
-    "pretrain": pretrain,
-    "finetune": finetune,
-    "paper-pretrain": paper_pretrain,
-    "paper-finetune": paper_finetune,
-    "paper-pretrain-large": paper_pretrain_large,
-    "paper-finetune-large": paper_finetune_large,
-}
+RUNS: Registry[Callable[[], TrainSettings]] = Registry(
+    "run",
+    Callable,
+    {
+        "smoke": smoke,
+        "builtin": builtin,
+        "pretrain": pretrain,
+        "finetune": finetune,
+        "paper-pretrain": paper_pretrain,
+        "paper-finetune": paper_finetune,
+        "paper-pretrain-large": paper_pretrain_large,
+        "paper-finetune-large": paper_finetune_large,
+    },
+    decides=("weights",),
+)
 """Every named run."""
 
 _INTERVALS = ("log_every", "validate_every", "checkpoint_every", "keep_every")
 """Settings that say after how many steps something happens again."""
 
 
+def typed_run(typed: str) -> str:
+    """Return the name of a run as a person typed it on a command line.
+
+    Of FILE.py:FUNCTION, a file of their own, it registers the TrainSettings that the function
+    returns. Names that come from elsewhere must not be brought here, since the file is run.
+
+    Raises:
+        TrilightError: as `Registry.typed`, or the function returns something else.
+    """
+    return RUNS.typed(typed, _as_run)
+
+
+def _as_run(found: Any) -> Callable[[], TrainSettings]:
+    if not isinstance(found, TrainSettings):
+        raise TrilightError(f"it returned a {type(found).__name__}; expected TrainSettings.")
+    return lambda: found
+
+
 def named_run(name: str) -> TrainSettings:
-    """Return the settings of a run; raises TrilightError for an unknown name."""
+    """Return the settings of a run.
+
+    Args:
+        name: one of RUNS.
+
+    Raises:
+        TrilightError: an unknown name, or one from outside that passes for one of ours.
+    """
     if name not in RUNS:
         raise TrilightError(f"run {name!r}: no such run; {expected_one_of(name, sorted(RUNS))}.")
-    return RUNS[name]()
+    run = RUNS[name]()
+    if not RUNS.is_ours(name) and RUNS.is_ours(run.run):
+        raise TrilightError(
+            f"run {name!r}: its settings say run={run.run!r}, which is one of Trilight's own; "
+            f"expected another name, such as dataclasses.replace(..., run='my-{run.run}')."
+        )
+    return run
 
 
 def changed_run(

@@ -20,12 +20,8 @@ class Start:
     lpips: str | None = None
     """Where LPIPS' weights are (loss.lpips_weights)."""
 
-    def check(self, settings: TrainSettings, named: str = "--from") -> None:
+    def check(self, settings: TrainSettings) -> None:
         """Refuse a start that is not the run's; one that goes on has begun and is not asked.
-
-        Args:
-            settings: the run.
-            named: what `begin_with` is called where it was written.
 
         Raises:
             TrilightError: the run begins with given weights and none are named, or the reverse.
@@ -34,11 +30,11 @@ class Start:
             return
         if settings.from_weights and self.begin_with is None:
             raise TrilightError(
-                f"run {settings.run}: begins with a trained network; name one with {named}, or "
-                f"begin with random weights: {_HOW}=false."
+                f"run {settings.run}: begins with a trained network; name one with --begin-with, "
+                f"or begin with random weights: {_HOW}=false."
             )
         if self.begin_with is not None and not settings.from_weights:
             raise TrilightError(
-                f"run {settings.run}: begins with random weights, but {named} names "
+                f"run {settings.run}: begins with random weights, but --begin-with names "
                 f"{self.begin_with}; to begin with those: {_HOW}=true."
             )

@@ -91,13 +91,13 @@ def _plan(experiment: Experiment, effort: Effort, asked: Asked) -> dict[str, obj
         from infra.bench.sides.blender_environment import blender_python
 
         blender_python()  # before anything is measured
-    wanted = dataclasses.asdict(asked)
+    wanted = {**dataclasses.asdict(asked), "scenes": asked.scenes.name if asked.scenes else None}
     folder = described(asked.scenes) if experiment.takes_scenes else []
     return {
         "experiment": experiment.name,
         "date": time.strftime("%Y-%m-%d"),
         "effort": dataclasses.asdict(effort),
-        "asked": {**wanted, "scenes": asked.scenes.name if asked.scenes else None},
+        "asked": wanted,
         "machine": machine(),
         "points": [point.name for point in experiment.points(effort)],
         "turns": [*(named.name for named in folder), *experiment.turns(effort)],

@@ -20,7 +20,8 @@ from infra.bench.effort import Effort
 from infra.bench.subjects.named_scenes import described, first_sample, sampled
 from infra.bench.subjects.references import make_reference
 from infra.bench.subjects.render_child import asked_child, smoke_child
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, preload
+from pipeline.flows.prepare_isolated import preload_mesh_libraries
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.errors import Rejected, TrilightError
 from storage.scene import Scene
 
@@ -53,7 +54,7 @@ class Workshop:
 
     def __init__(self, effort: Effort, asked: Asked) -> None:
         # before any child: pymeshlab takes a second to import, and would be counted as work
-        preload(["pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters"])
+        preload_mesh_libraries()
         self.effort, self.asked = effort, asked
         self.notes: list[str] = []
         """What was found out on the way and belongs to the result."""

@@ -6,7 +6,10 @@ import signal
 import sys
 from types import FrameType
 
-from infra.cli.commands import app
+from cyclopts import CycloptsError
+
+from infra.cli.commands import app, complaint
+from infra.cli.extending import extended
 from infra.cli.leaving import leave
 from storage.errors import TrilightError
 
@@ -18,7 +21,9 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     signal.signal(signal.SIGINT, _interrupted)
     try:
-        app(prog_name="trilight")  # in usage lines and in completion, also under `python -m`
+        app(extended(sys.argv[1:]))
+    except CycloptsError as mistake:
+        leave(f"trilight: {complaint(mistake)}", 2)
     except TrilightError as mistake:
         leave(f"trilight: {mistake}", 1)
 

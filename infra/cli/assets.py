@@ -2,9 +2,8 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.table import Table
 from rich.text import Text
 
@@ -18,11 +17,14 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
+from infra.cli.options import Shown, command
 from pipeline.assets.settings import AssetSettings, Profile
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
 from storage.failures import count_by_reason
+from storage.ranges import Within
 from storage.safe_url import safe_url
+from storage.settings import checked, described
 
 if TYPE_CHECKING:
     from pipeline.flows.make_assets import AssetReport
@@ -32,49 +34,55 @@ _BUDGET = 1400
 _EPSILON_BUDGET = 4096
 """What the largest published scene may hold in all."""
 _SHOWN = 12
+_LEVELS = next(field.within for field in described(AssetSettings) if field.name == "budgets")
 
 
-def assets(
-    source: Annotated[str, typer.Argument(help="folder, URL, builtin: or objaverse:")],
-    out: Annotated[Path, typer.Option(help="folder to write")],
-    budget: Annotated[
-        int | None, typer.Option(help=f"most triangles of an object [{_BUDGET}]")
-    ] = None,
-    epsilon: Annotated[
-        str | None,
-        typer.Option(help="fewest triangles within this distance, such as 0.5% of the diagonal"),
-    ] = None,
-    profile: Annotated[str, typer.Option(help="faithful or uniform")] = "faithful",
-    licence: Annotated[
-        str | None, typer.Option(help="licence of files that state none [yours to use]")
-    ] = None,
-    allow_licence: Annotated[
-        list[str] | None, typer.Option(help="allow this licence too; may be repeated")
-    ] = None,
-    workers: Annotated[int | None, typer.Option(help="objects at a time [all cores]")] = None,
-    json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
-) -> None:
-    """Turn objects into clean meshes within a budget or an error; writes quality.html."""
-    settings = _settings(budget, epsilon, profile)
-    first_words(f"Meshes of {safe_url(source)} to {out}", silent=json)
+@checked()
+class Meshes:
+    """Which objects become meshes, and how."""
+
+    source: str
+    """Source of 3D objects: a folder here or on a server, builtin:, or objaverse:."""
+    out: Path
+    """Folder of the meshes."""
+    budget: Annotated[int | None, _LEVELS] = None
+    """Most triangles of an object; by default 1400, or 4096 with --epsilon."""
+    epsilon: str | None = None
+    """As few triangles as lie within this distance, such as 0.5% of the diagonal; by default as
+    many as the budget."""
+    profile: Profile = "faithful"
+    """Whether triangles go where the shape needs them, or are of one size."""
+    licence: str | None = None
+    """Licence of object files that come without any statement; by default they count as yours."""
+    allow_licences: tuple[str, ...] = ()
+    """Licences allowed in addition to the usual ones, which are the default."""
+    workers: Annotated[int | None, Within(1, 1024, unit="objects")] = None
+    """How many objects are worked on at a time; by default as many as there are cores."""
+
+
+@command("source")
+def assets(asked: Meshes, shown: Shown) -> None:
+    settings = _settings(asked)
+    source, out = asked.source, asked.out
+    first_words(f"Meshes of {safe_url(source)} to {out}", silent=shown.json)
     from pipeline.flows.make_assets import AssetFolder, make_assets
 
     folder = AssetFolder(out)
     with progress_bars() as bars:
-        fetched = bars.add_task("download", total=None, note="", visible=not json)
-        task = bars.add_task("objects", total=None, note="", visible=not json)
+        fetched = bars.add_task("download", total=None, note="", visible=not shown.json)
+        task = bars.add_task("objects", total=None, note="", visible=not shown.json)
         report = make_assets(
             source,
             folder,
             settings,
-            allowed_licences=(*DEFAULT_ALLOWED, *(allow_licence or ())),
-            licence=licence,
-            workers=os.cpu_count() or 1 if workers is None else workers,
+            allowed_licences=(*DEFAULT_ALLOWED, *asked.allow_licences),
+            licence=asked.licence,
+            workers=asked.workers or os.cpu_count() or 1,
             downloaded=lambda done, total: bars.update(fetched, completed=done, total=total),
             planned=lambda total: bars.update(task, total=total),
             done=lambda: bars.advance(task),
         )
-    if json:
+    if shown.json:
         print_json(report.as_json())
         return
     _print_table(report)
@@ -90,8 +98,7 @@ def assets(
     print_rows("Assets finished", rows)
     look_at(f"Look at {folder.page}")
     if report.rows:
-        allowed = allow_licence or ()
-        next_step(generate_from_meshes(report.geometry_sha256, out, allowed))
+        next_step(generate_from_meshes(report.geometry_sha256, out, asked.allow_licences))
 
 
 def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:
@@ -106,13 +113,12 @@ def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[
     ]
 
 
-def _settings(budget: int | None, epsilon: str | None, profile: str) -> AssetSettings:
-    usual = _EPSILON_BUDGET if epsilon else _BUDGET
-    most = usual if budget is None else budget
+def _settings(asked: Meshes) -> AssetSettings:
+    usual = _EPSILON_BUDGET if asked.epsilon else _BUDGET
     return AssetSettings(
-        profile=cast(Profile, profile),  # checked by the settings
-        budgets=(most,),
-        epsilon=_share(epsilon) if epsilon else None,
+        profile=asked.profile,
+        budgets=(usual if asked.budget is None else asked.budget,),
+        epsilon=_share(asked.epsilon) if asked.epsilon else None,
     )
 
 

@@ -1,10 +1,32 @@
-"""`--set NAME=VALUE` of the command line: settings by their names in a manifest."""
+"""Settings that differ from the named ones: as a dataset or run has them, of a file, by `--set`."""
 
 import json
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from storage.changes import changed
 from storage.errors import TrilightError
+from storage.settings import checked, settings_record
+
+if TYPE_CHECKING:
+    from infra.cli.settings_file import Stated
+
+
+@checked()
+class Shared:
+    """Settings from elsewhere, which other options and --set change further."""
+
+    like: str | None = None
+    """The settings of this dataset (a folder or a URL), or for train of this run (its folder),
+    instead of the named ones, which are the default."""
+    settings: str | None = None
+    """YAML file of settings that differ, nested or by dotted names; by default none do."""
+
+    @property
+    def is_given(self) -> bool:
+        """Whether there are any."""
+        return (self.like, self.settings) != (None, None)
 
 
 def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
@@ -21,8 +43,90 @@ def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
                 f"--set {text!r}: expected NAME=VALUE with each name once, such as "
                 "scenes.lights.coloured_share=0.5."
             )
-        try:
-            changes[name] = json.loads(value)
-        except json.JSONDecodeError:
-            changes[name] = value
+        changes[name] = json_or_word(value)
     return changes
+
+
+def json_or_word(text: str) -> Any:
+    """Return the JSON value that a text is, or the text."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def all_changes(
+    settings: Any, shared: Shared, liked: Mapping[str, Any], stated: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return by dotted name what differs from named settings, and check that all fits together.
+
+    Args:
+        settings: the named ones.
+        shared: names a file, which counts more than `liked`.
+        liked: the record of other settings that was asked for, or none.
+        stated: values that other options and `--set` state, by dotted name; they count most.
+
+    Raises:
+        TrilightError: a file that cannot be read, or a value that is refused; where it is one of
+            the file, its line is named.
+    """
+    filed = {} if shared.settings is None else _read(shared.settings)
+    values = {name: value for name, (value, _) in filed.items()}
+    found: dict[str, Any] = {}
+    for layer in (_differences(settings_record(settings), liked), values, stated):
+        for name, value in layer.items():  # a whole group takes the place of what was in it
+            kept = [old for old in found if not f"{old}.".startswith(f"{name}.")]
+            found = {old: found[old] for old in kept} | {name: value}
+    try:
+        changed(settings, found)
+    except TrilightError as error:
+        lines = [line for name, (_, line) in filed.items() if f"'{name}'" in str(error)]
+        if not lines:
+            raise
+        raise TrilightError(f"{shared.settings}, line {lines[0]}: {error}") from error
+    return found
+
+
+def _read(file: str) -> "Stated":
+    from infra.cli.settings_file import read_settings_file  # YAML takes time to import
+
+    return read_settings_file(file)
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    """Return by dotted name what differs in a record; groups of another kind are whole."""
+    found: dict[str, Any] = {}
+    for name, value in now.items():
+        old = before.get(name)
+        if isinstance(old, Mapping) and isinstance(value, Mapping) and old.keys() == value.keys():
+            inner = _differences(old, value)
+            found |= {f"{name}.{below}": entry for below, entry in inner.items()}
+        elif old != value:
+            found[name] = value
+    return found
+
+
+def dataset_record(shared: Shared) -> dict[str, Any]:
+    """Return the settings of the dataset that is to be followed, without the name of its build."""
+    from storage.dataset import open_dataset
+
+    settings = {} if shared.like is None else open_dataset(shared.like).manifest.settings
+    return {name: value for name, value in settings.items() if name not in ("build", "derived")}
+
+
+def run_record(shared: Shared) -> dict[str, Any]:
+    """Return the settings of the run that is to be followed, without its name.
+
+    Raises:
+        TrilightError: the folder is not that of a run.
+    """
+    if shared.like is None:
+        return {}
+    path = Path(shared.like) / "settings.json"
+    try:
+        settings = dict(json.loads(path.read_bytes())["settings"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise TrilightError(
+            f"--like {shared.like}: {path} cannot be read; expected the folder of a run."
+        ) from error
+    return {name: value for name, value in settings.items() if name != "run"}

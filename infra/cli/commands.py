@@ -1,95 +1,106 @@
 """Which commands there are; the file of each is loaded when it is asked for."""
 
-from importlib import import_module, metadata
-from typing import Annotated, Any
+from difflib import get_close_matches
+from importlib import metadata
+from typing import Any
 
-import typer
-from rich.markup import escape
-from typer.core import TyperGroup
-
-_NAMES = (
-    "doctor",
-    "assets",
-    "generate",
-    "plan",
-    "render",
-    "convert",
-    "verify",
-    "inspect",
-    "model",
-    "status",
-    "train",
-    "evaluate",
-    "bench",
-    "shards",
+from cyclopts import App, CycloptsError, Group
+from cyclopts.exceptions import (
+    CoercionError,
+    MissingArgumentError,
+    RepeatArgumentError,
+    UnknownCommandError,
+    UnknownOptionError,
+    UnusedCliTokensError,
 )
-"""Each is the function of its name, or for a group of commands `app`, in the file of its name."""
 
+from infra.cli.help import Sections
+from storage.suggestion import expected_one_of
 
-class _Commands(TyperGroup):
-    """Loads a command when it is first named: one needs other libraries than the others."""
+COMMANDS = {
+    "doctor": "Say what this machine has, what it lacks, what is then slower, and what mends it.",
+    "assets": "Turn objects into clean meshes within a budget or an error; writes quality.html.",
+    "generate": "Turn objects into a verified, resumable dataset; run it again to go on after any "
+    "stop.",
+    "plan": "Measure a few scenes and predict time, cores, bytes and cost, each with an interval.",
+    "render": "Render scenes: path traced to a measured noise floor, or by a trained network.",
+    "convert": "Convert by extension, and say what could not be carried over.",
+    "verify": "Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."
+    "\n\nA dataset that is not finished is checked as far as it is, and the exit status is 1 too.",
+    "inspect": "Write report, gallery and contact sheet anew, and print what the dataset holds."
+    "\n\nA dataset that is read-only, or on a server, is only summed up, unless there is an --out. "
+    "Of one scene the summary is printed, with what of its file could not be carried over.",
+    "model": "Print parameters, FLOPs and memory by precision of a named size or of a checkpoint.",
+    "status": "Say how far a dataset is, when it will be done, and what failed; needs no server.",
+    "train": "Train a model; writes checkpoints, metrics.jsonl, TensorBoard curves and a sheet."
+    "\n\nFor processes on several machines: torchrun -m trilight train ...",
+    "evaluate": "Judge a network; writes evaluation.json, evaluation.md and sheets of pictures.",
+    "bench": "Measure cost against error; an interrupted run goes on. Without a name, list all.",
+    "shards": "Make new datasets of finished ones.",
+}
+"""What each does. It is the function of its name, or for a group of commands `app`, in the file of
+its name."""
 
-    def list_commands(self, ctx: Any) -> list[str]:
-        return list(_NAMES)
+GROUPS = ("shards",)
+"""Commands that have commands."""
 
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        if cmd_name in _NAMES and cmd_name not in self.commands:
-            self.commands[cmd_name] = _loaded(cmd_name)
-        return self.commands.get(cmd_name)
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if self.get_command(ctx, args[0]) is None:
-            for name in _NAMES:  # whichever may have been meant
-                self.get_command(ctx, name)
-        return super().resolve_command(ctx, args)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"trilight {metadata.version('trilight')}")
-        raise typer.Exit
-
-
-def _before_a_command(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", is_eager=True, callback=_print_version, help="print the version and end"
-        ),
-    ] = False,
-) -> None:
-    pass
-
-
-def _loaded(name: str) -> Any:
-    """Return a command, or a group of them, from the file of its name."""
-    module = import_module(f"infra.cli.{name}")
-    found = getattr(module, "app", None)
-    if found is None:
-        found = typer.Typer(add_completion=False)
-        found.command(name)(getattr(module, name))
-    command = typer.main.get_command(found)
-    command.name = name
-    _keep_brackets(command)
-    return command
-
-
-def _keep_brackets(command: Any) -> None:
-    """Let help texts say `[builtin:]`: Rich takes what stands in brackets for a style."""
-    for parameter in command.params:
-        parameter.help = escape(parameter.help or "")
-    command.help = escape(command.help or "")
-    for each in getattr(command, "commands", {}).values():
-        _keep_brackets(each)
-
-
-app = typer.Typer(
+app = App(
     name="trilight",
-    cls=_Commands,
     help="Triangles in, light out: make data for, train and judge RenderFormer-style renderers.",
-    no_args_is_help=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
-    pretty_exceptions_enable=False,
+    help_epilogue="Anywhere on the line: --extend FILE.py, a file of your own that adds templates, "
+    "builds, runs, formats and more (docs/how-to).",
+    help_format="plaintext",
+    help_formatter=Sections(),
+    version=lambda: f"trilight {metadata.version('trilight')}",
+    version_format="plaintext",
+    group_parameters=Group("Options"),
+    suppress_keyboard_interrupt=False,
+    result_action="return_value",
+    exit_on_error=False,
+    print_error=False,
 )
 """The whole command line."""
-app.callback()(_before_a_command)
+for _place, (_name, _help) in enumerate(COMMANDS.items()):
+    _found = "app" if _name in GROUPS else _name
+    _own: Any = {} if _name in GROUPS else {"help_epilogue": ""}  # groups state their own
+    app.command(f"{__package__}.{_name}:{_found}", name=_name, help=_help, sort_key=_place, **_own)
+app.register_install_completion_command(
+    help="Let the tab key complete commands and options: --shell bash, zsh or fish."
+)
+
+
+def complaint(mistake: CycloptsError) -> str:
+    """Return what is wrong with the words of a command line: one line, with what was expected."""
+    chain = list(mistake.command_chain or ())
+    see = f"See trilight {' '.join([*chain, '--help'])}."
+    where = f"{' '.join(chain)}: " if chain else ""
+    if isinstance(mistake, UnusedCliTokensError) and mistake.unused_tokens:
+        return (
+            f"{where}{mistake.unused_tokens[0]!r} is one word too many; expected an option. {see}"
+        )
+    if isinstance(mistake, UnknownCommandError) and mistake.unused_tokens:
+        known = [name for name in mistake.app or app if not name.startswith("-")]
+        typed = mistake.unused_tokens[0]
+        return f"{where}command {typed!r} is unknown; {expected_one_of(typed, known)}. {see}"
+    if isinstance(mistake, UnknownOptionError):
+        typed = mistake.token.keyword or mistake.token.value
+        known = [name for each in mistake.argument_collection for name in each.names]
+        near = "".join(f"; did you mean {name}?" for name in get_close_matches(typed, known, n=1))
+        return f"{where}option {typed!r} is unknown{near or '.'} {see}"
+    if isinstance(mistake, RepeatArgumentError):
+        return f"{where}{mistake.token.keyword} is there twice; expected it once. {see}"
+    argument: Any = mistake.argument
+    if isinstance(mistake, MissingArgumentError) and argument:
+        thing = mistake.keyword or _called(argument)
+        lacks = "has no value" if mistake.keyword else "is missing"
+        return f"{where}{thing} {lacks}; expected: {argument.parameter.help} {see}"
+    if isinstance(mistake, CoercionError) and argument and mistake.token:
+        choices = argument.get_choices(force=True) or ()
+        expected = expected_one_of(mistake.token.value, choices) if choices else "expected no value"
+        return f"{where}{_called(argument)} is {mistake.token.value!r}; {expected}. {see}"
+    return f"{where}{' '.join(str(mistake).split())} {see}"
+
+
+def _called(argument: Any) -> str:
+    name: str = argument.name
+    return name if name.startswith("--") else name.upper()

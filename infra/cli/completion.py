@@ -1,8 +1,25 @@
-"""What a shell offers where a name is expected; called at every press of the tab key."""
+"""What a shell offers where a name is expected; asked at every press of the tab key."""
 
-from pipeline.flows.builds import BUILDS
+from collections.abc import Callable
 
 
-def builds(incomplete: str) -> list[str]:
-    """Return the named builds that begin so."""
-    return [name for name in BUILDS if name.startswith(incomplete)]
+def _builds() -> list[str]:
+    from pipeline.flows.builds import BUILDS
+
+    return list(BUILDS)
+
+
+def _runs() -> list[str]:
+    from train.runs import RUNS
+
+    return list(RUNS)
+
+
+def _sizes() -> list[str]:
+    from model.config import SIZES
+
+    return list(SIZES)
+
+
+NAMES: dict[str, Callable[[], list[str]]] = {"build": _builds, "run": _runs, "network": _sizes}
+"""Names that are known by the field that takes one, or something of the user's own."""

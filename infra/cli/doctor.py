@@ -1,13 +1,14 @@
 """`trilight doctor`: what this machine has and lacks."""
 
+import sys
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
 from rich.table import Table
 from rich.text import Text
 
 from infra.cli.console import console, first_words, print_json
+from infra.cli.options import Shown, command
 
 if TYPE_CHECKING:
     from infra.doctor import Finding
@@ -17,23 +18,21 @@ _WIDTHS = (7, 16)
 """Of the columns state and name: rows are printed one by one, as they are found."""
 
 
-def doctor(
-    json: Annotated[bool, typer.Option(help="print the findings as JSON")] = False,
-) -> None:
-    """Say what this machine has, what it lacks, what is then slower, and what mends it."""
-    first_words("Looking at this machine", silent=json)
+@command()
+def doctor(shown: Shown) -> None:
+    first_words("Looking at this machine", silent=shown.json)
     from infra.doctor import examine
 
     findings = []
     with console.status("") as status:
         for finding in examine(lambda name: status.update(f"looking at: {name}")):
             findings.append(finding)
-            if not json:
+            if not shown.json:
                 console.print(_row(finding))
-    if json:
+    if shown.json:
         print_json([asdict(finding) for finding in findings])
     if any(finding.state == "missing" for finding in findings):
-        raise typer.Exit(1)
+        sys.exit(1)
 
 
 def _row(finding: "Finding") -> Table:

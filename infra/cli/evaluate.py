@@ -1,171 +1,47 @@
 """`trilight evaluate`: a trained network against the pictures of a dataset."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
-import typer
 from rich.table import Table
 from rich.text import Text
 
 from infra.cli.console import console, first_words, look_at, print_json, progress_bars
-from storage.atomic import write_atomically
-from storage.errors import TrilightError
-
-if TYPE_CHECKING:
-    from storage.training_data import TrainingData
-    from train.evaluation.evaluate import Contest
-    from train.evaluation.judged_view import JudgedView
+from infra.cli.options import Shown, command
+from infra.torch_library import require_torch
+from train.evaluation.order import EvaluationOrder
 
 
-def evaluate(
-    checkpoint: Annotated[str, typer.Argument(help="run folder, model.safetensors or checkpoint")],
-    data: Annotated[
-        list[str], typer.Option(help="root of a dataset, or shards by name or pattern; repeatable")
-    ],
-    split: Annotated[str, typer.Option(help="train, validation or test")] = "test",
-    train_data: Annotated[
-        list[str] | None,
-        typer.Option(help="data of the rivals' training pictures [the same, if it has any]"),
-    ] = None,
-    resolution: Annotated[
-        int | None,
-        typer.Option(help="pixels across [the run's if known, else the data's]"),
-    ] = None,
-    most_scenes: Annotated[int, typer.Option(min=1, help="judge the first so many scenes")] = 10**6,
-    lpips: Annotated[
-        str | None,
-        typer.Option(help="folder of LPIPS' weights, or hub [$TRILIGHT_LPIPS; else LPIPS is n/a]"),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option(help="cpu or cuda [cuda where there is one]")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="folder of the report")] = Path("evaluation"),
-    json: Annotated[bool, typer.Option(help="print the summary as JSON")] = False,
-) -> None:
-    """Judge a network; writes evaluation.json, evaluation.md and sheets of pictures."""
-    first_words(f"Judging {checkpoint} on the split {split}", silent=json)
-    try:
-        from storage.training_data import open_training_data
-        from train.evaluation.evaluate import judged_views
-        from train.evaluation.report import markdown, record
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise TrilightError("evaluate: torch is not installed; run `make setup-all`.") from error
-    opened = open_training_data(data)
-    rivals = opened if train_data is None else open_training_data(train_data)
-    contest = _contest(
-        checkpoint,
-        opened,
-        rivals,
-        split=split,
-        resolution=resolution,
-        most_scenes=most_scenes,
-        lpips=lpips,
-        device=device,
-    )
+@command("checkpoint")
+def evaluate(order: EvaluationOrder, shown: Shown) -> None:
+    first_words(f"Judging {order.checkpoint} on the split {order.split}", silent=shown.json)
+    require_torch("evaluate")
+    from infra.judging import judge_network, write_judgement
+
     with progress_bars() as bars:
-        total = _num_scenes(contest)
-        task = bars.add_task("scenes", total=total, note="", visible=not json)
-        views = judged_views(contest, lambda: bars.advance(task))
-    first_words(f"Drawing the sheets of {out}", silent=json)
-    found = record(views, _about(checkpoint, opened, contest, split, views))
-    write_atomically(out / "evaluation.json", _encoded(found))
-    write_atomically(out / "evaluation.md", markdown(found).encode())
-    _write_pictures(out, contest, views)
-    if json:
+        task = bars.add_task("scenes", total=None, note="", visible=not shown.json)
+        judgement = judge_network(
+            order.checkpoint,
+            order.data,
+            split=order.split,
+            train_data=order.train_data or None,
+            resolution=order.resolution,
+            most_scenes=order.most_scenes,
+            lpips=order.lpips,
+            device=order.device,
+            done=lambda now, total: bars.update(task, completed=now, total=total),
+        )
+    first_words(f"Drawing the sheets of {order.out}", silent=shown.json)
+    found = judgement.record
+    write_judgement(judgement, order.out)
+    if shown.json:
         print_json({name: found[name] for name in ("about", "contestants")})
     else:
-        _report(found, out)
-
-
-def _about(
-    checkpoint: str,
-    opened: "TrainingData",
-    contest: "Contest",
-    split: str,
-    views: "Sequence[JudgedView]",
-) -> dict[str, str | int]:
-    """Return what the report says of itself; no path of this machine."""
-    from model.weights import network_digest
-
-    return {
-        "network": Path(checkpoint).name,
-        "network sha256": network_digest(contest.network),
-        "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],
-        "build": opened.build or "unknown",
-        "data digest": opened.digest,
-        "split": split,
-        "resolution": contest.resolution,
-        "scenes": len({view.key for view in views}),
-    }
-
-
-def _contest(
-    checkpoint: str,
-    opened: "TrainingData",
-    rivals: "TrainingData",
-    *,
-    split: str,
-    resolution: int | None,
-    most_scenes: int,
-    lpips: str | None,
-    device: str | None,
-) -> "Contest":
-    from train.evaluation.evaluate import Contest, make_rivals, stored_resolution
-    from train.loop.crew import choose_device
-    from train.loss.lpips_weights import load_lpips
-    from train.networks import open_network, trained_resolution
-
-    network = open_network(checkpoint)
-    shards = opened.split(split)
-    if resolution is None:
-        resolution = trained_resolution(checkpoint) or stored_resolution(shards)
-    place, distance = choose_device(device), load_lpips(lpips)
-    return Contest(
-        network=network.to(place),
-        shards=shards,
-        resolution=resolution,
-        rivals=make_rivals(rivals.split("train"), resolution) if "train" in rivals.splits else None,
-        lpips=None if distance is None else distance.to(place),
-        most_scenes=most_scenes,
-    )
-
-
-def _write_pictures(out: Path, contest: "Contest", views: "list[JudgedView]") -> None:
-    from infra.excursion_plots import plot_excursions
-    from train.evaluation.evaluate import sheet_views, worst_and_median, worst_of_each_excursion
-    from train.evaluation.sheet import drawn_sheet, write_picture
-
-    chosen = worst_and_median(views)
-    if excursions := worst_of_each_excursion(views):
-        chosen["worst of each axis"] = excursions
-        plot_excursions(out / "excursions.png", views)
-    shown = iter(sheet_views(contest, [row for rows in chosen.values() for row in rows]))
-    for name, rows in chosen.items():
-        title = (f"{name}, of {len(views)} views at {contest.resolution} pixels, by psnr_log_db",)
-        sheet = drawn_sheet([next(shown) for _ in rows], title)
-        write_picture(out / f"{name.replace(' ', '_')}.png", sheet)
-
-
-def _encoded(found: dict[str, Any]) -> bytes:
-    from train.result import pretty_json
-
-    return pretty_json(found)
-
-
-def _num_scenes(contest: "Contest") -> int:
-    """Return how many scenes will be judged; opens no shard that is not judged anyway."""
-    count = 0
-    for number in range(len(contest.shards.names)):
-        if count < contest.most_scenes:
-            count += contest.shards.num_samples(number)
-    return min(count, contest.most_scenes)
+        _report(found, order.out)
 
 
 def _report(found: dict[str, Any], out: Path) -> None:
-    from train.evaluation.picture_scores import DECIMALS
+    from train.evaluation.metrics import METRICS
 
     contestants = found["contestants"]
     table = Table(box=None, title_justify="left", header_style="dim")
@@ -173,10 +49,10 @@ def _report(found: dict[str, Any], out: Path) -> None:
     table.add_column("", style="dim", no_wrap=True)
     for name in contestants:
         table.add_column(Text(name), justify="right")
-    for metric, places in DECIMALS.items():
-        medians = [scores[metric]["median"] for scores in contestants.values()]
-        shown = ["n/a" if value is None else f"{value:.{places}f}" for value in medians]
-        table.add_row(metric, *shown)
+    for name, metric in METRICS.items():
+        medians = [scores[name]["median"] for scores in contestants.values()]
+        shown = ["n/a" if value is None else f"{value:.{metric.decimals}f}" for value in medians]
+        table.add_row(name, *shown)
     near = [scores.get("near_floor") for scores in contestants.values()]
     table.add_row(
         "within 3 dB of the noise", *("" if share is None else f"{share:.1%}" for share in near)

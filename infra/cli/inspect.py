@@ -6,8 +6,6 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from infra.cli.console import (
     first_words,
     look_at,
@@ -16,12 +14,15 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
+from infra.cli.options import Shown, command
 from storage.dataset import Dataset, open_dataset
-from storage.dataset_files import RemoteFiles
+from storage.dataset_files import RemoteDatasetFiles
 from storage.errors import TrilightError
 from storage.failures import count_by_reason
 from storage.layout import DatasetFolder
+from storage.ranges import Within
 from storage.safe_url import safe_url
+from storage.settings import checked
 from storage.statistics import Statistics, dataset_statistics
 
 if TYPE_CHECKING:
@@ -31,52 +32,47 @@ if TYPE_CHECKING:
 _READ_ONLY = "It cannot be written there: choose a folder for report and sheet with --out."
 
 
-def inspect(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="SRC",
-            help="a dataset (folder or URL), or one scene in any form that render reads",
-        ),
-    ],
-    scenes: Annotated[int, typer.Option(help="scenes on the contact sheet")] = 16,
-    by_template: Annotated[
-        int | None, typer.Option(help="write templates.png too: so many scenes of each layout")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="write the report and the sheet here [the dataset]")
-    ] = None,
-    turntable: Annotated[
-        Path | None, typer.Option(help="of one scene: write views from all sides here, X.png")
-    ] = None,
-    json: Annotated[bool, typer.Option(help="print the summary as JSON")] = False,
-) -> None:
-    """Write report, gallery and contact sheet anew, and print what the dataset holds.
+@checked()
+class Inspected:
+    """What is looked at, and what is drawn of it."""
 
-    A dataset that is read-only, or on a server, is only summed up, unless there is an --out. Of one
-    scene the summary is printed, with what of its file could not be carried over.
+    source: str
+    """A dataset (folder or URL), or one scene in any form that render reads."""
+    scenes: Annotated[int, Within(1, 10_000, unit="scenes")] = 16
+    """How many scenes are on the contact sheet."""
+    by_template: Annotated[int | None, Within(1, 1000, unit="scenes")] = None
+    """Write templates.png too, with so many scenes of each layout; by default it is not written."""
+    out: Path | None = None
+    """Folder for the report and the sheet; by default the dataset's own."""
+    turntable: Path | None = None
+    """Of one scene: write its views from all sides into this X.png; by default they are not drawn.
     """
+
+
+@command("source")
+def inspect(asked: Inspected, shown: Shown) -> None:
+    source = asked.source
     if not ("://" in source or Path(source).is_dir()):
-        _inspect_scene(source, turntable, json=json)
+        _inspect_scene(source, asked.turntable, json=shown.json)
         return
-    if turntable is not None:
+    if asked.turntable is not None:
         raise TrilightError(f"--turntable: {source} is a dataset; expected one scene.")
-    first_words(f"Reading {safe_url(source)}", silent=json)
+    first_words(f"Reading {safe_url(source)}", silent=shown.json)
     opened = open_dataset(source)
     _require_shards(opened)
     from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
 
     with progress_bars() as bars:
         total = len(opened.manifest.shards)
-        task = bars.add_task("shards", total=total, note="", visible=not json)
+        task = bars.add_task("shards", total=total, note="", visible=not shown.json)
         statistics = dataset_statistics(opened)
         found = dataset_distributions(opened, shard_done=lambda _: bars.advance(task))
-    folder = _folder_of_documents(opened, out)
+    folder = _folder_of_documents(opened, asked.out)
     if folder is not None:
-        _write(opened, statistics, found, folder, max_scenes=scenes)
-        if by_template is not None:
-            _write_templates(opened, folder, per_template=by_template)
-    if json:
+        _write(opened, statistics, found, folder, max_scenes=asked.scenes)
+        if asked.by_template is not None:
+            _write_templates(opened, folder, per_template=asked.by_template)
+    if shown.json:
         print_json(_as_json(opened, statistics, found))
         return
     _print_summary(opened.shown, opened, statistics, found)
@@ -95,7 +91,7 @@ def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | N
     """Return where report and sheet go; None where nobody said and it cannot be there."""
     if out is not None:
         return DatasetFolder(out)
-    if isinstance(opened.files, RemoteFiles) or not os.access(
+    if isinstance(opened.files, RemoteDatasetFiles) or not os.access(
         opened.folder.root, os.W_OK | os.X_OK
     ):
         return None
@@ -138,8 +134,6 @@ def _write(
 def _write_templates(opened: Dataset, folder: DatasetFolder, *, per_template: int) -> None:
     from pipeline.documents.template_sheet import write_template_sheet
 
-    if per_template < 1:
-        raise TrilightError(f"--by-template is {per_template}; expected at least 1.")
     write_template_sheet(opened, per_template=per_template, out=folder)
 
 

@@ -4,12 +4,14 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich.table import Table
 
 from infra.cli.console import console, first_words, print_json, print_rows
 from infra.cli.layer_plot import plot_layer_errors
+from infra.cli.options import Shown, command
 from storage.errors import TrilightError
+from storage.ranges import Within
+from storage.settings import checked
 from storage.suggestion import expected_one_of
 
 if TYPE_CHECKING:
@@ -19,26 +21,37 @@ if TYPE_CHECKING:
     from model.renderformer import RenderFormer
 
 
-def model(
-    name: Annotated[
-        str, typer.Argument(help="a size (smoke, tiny, small, base, large) or a checkpoint")
-    ],
-    triangles: Annotated[int, typer.Option(min=1, help="of the scene that is counted")] = 1536,
-    resolution: Annotated[int, typer.Option(min=8, help="pixels across a view")] = 256,
-    views: Annotated[int, typer.Option(min=1, help="of that scene")] = 1,
-    errors: Annotated[
-        bool, typer.Option(help="also measure each precision against float64, layer by layer")
-    ] = False,
-    plot: Annotated[
-        Path | None, typer.Option(help="draw those errors into this picture; implies --errors")
-    ] = None,
-    publish: Annotated[
-        Path | None, typer.Option(help="also write the checkpoint here under published names")
-    ] = None,
-    json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
-) -> None:
-    """Print parameters, FLOPs and memory by precision of a named size or of a checkpoint."""
-    first_words(f"Looking at {name}", silent=json)
+@checked()
+class Counted:
+    """Which network, and what it renders."""
+
+    network: str
+    """A size (smoke, tiny, small, base, large) or a checkpoint."""
+    triangles: Annotated[int, Within(1, 2**31 - 1, unit="triangles")] = 1536
+    """Triangles of the scene that is counted."""
+    resolution: Annotated[int, Within(8, 8192, unit="pixels")] = 256
+    """Pixels across a view."""
+    views: Annotated[int, Within(1, 100_000, unit="views")] = 1
+    """Views of that scene."""
+
+
+@checked()
+class Written:
+    """What else is measured or written."""
+
+    errors: bool = False
+    """Measure each precision against float64 too, layer by layer."""
+    plot: Path | None = None
+    """Draw those errors into this picture, which implies --errors; by default they are not drawn.
+    """
+    publish: Path | None = None
+    """Write the checkpoint here too, under the published names; by default it is not written."""
+
+
+@command("network")
+def model(counted: Counted, written: Written, shown: Shown) -> None:
+    name = counted.network
+    first_words(f"Looking at {name}", silent=shown.json)
     try:
         from model.config import SIZES
         from model.costs import Workload, costs
@@ -48,31 +61,34 @@ def model(
         raise TrilightError("model: torch is not installed; run `make setup-all`.") from error
     network = None if name in SIZES else _open(name)
     config = network.config if network else SIZES[name]()
-    _require_pictures(config, resolution)
-    workload = Workload(triangles=triangles, views=views, resolution=resolution)
-    counted = costs(config, workload)
-    measured = _errors(network, config) if errors or plot else {}
-    if plot:
-        plot_layer_errors(measured, f"{name}, random scene", plot)
-    if publish:
-        _publish(name, network, publish)
-    if json:
-        found = {
+    _require_pictures(config, counted.resolution)
+    workload = Workload(
+        triangles=counted.triangles, views=counted.views, resolution=counted.resolution
+    )
+    found = costs(config, workload)
+    measured = _errors(network, config) if written.errors or written.plot else {}
+    if written.plot:
+        plot_layer_errors(measured, f"{name}, random scene", written.plot)
+    if written.publish:
+        _publish(name, network, written.publish)
+    if shown.json:
+        errors = {
             precision: list(map(dataclasses.asdict, rows)) for precision, rows in measured.items()
         }
-        print_json(_as_json(name, config, workload, counted) | ({"errors": found} if found else {}))
+        print_json(_as_json(name, config, workload, found) | ({"errors": errors} if errors else {}))
         return
-    _report(name, workload, counted)
+    _report(name, workload, found)
     for precision, rows in measured.items():
         _report_errors(precision, rows)
 
 
 def _open(name: str) -> "RenderFormer":
-    from model.checkpoints import open_checkpoint
     from model.config import SIZES
+    from model.open import open_network
+    from train.networks import network_of_run
 
     try:
-        return open_checkpoint(name)
+        return open_network(name, network_of_run)
     except TrilightError as error:
         if Path(name).exists() or "/" in name:
             raise
@@ -103,7 +119,7 @@ def _errors(network: "RenderFormer | None", config: "ModelConfig") -> "dict[str,
 
 
 def _publish(name: str, network: "RenderFormer | None", folder: Path) -> None:
-    from model.checkpoints import save_published
+    from model.open import save_published
 
     if network is None:
         raise TrilightError(

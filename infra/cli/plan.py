@@ -3,10 +3,7 @@
 import dataclasses
 from typing import Annotated
 
-import typer
-
-from infra.cli.changes import parse_changes
-from infra.cli.completion import builds
+from infra.cli.changes import Shared
 from infra.cli.console import (
     first_words,
     next_step,
@@ -15,58 +12,51 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
+from infra.cli.dataset_changes import with_shared
+from infra.cli.extending import extend_words
 from infra.cli.leaving import temporary_folder
+from infra.cli.options import Shown, command
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.order_words import generate_words
-from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
+from pipeline.flows.price import CorePrice
+from storage.errors import TrilightError
+from storage.ranges import Within
+from storage.settings import checked
 
 
+@checked()
+class Prognosis:
+    """What is predicted from what."""
+
+    samples: Annotated[int, Within(4, 10_000, unit="scenes")] = 12
+    """How many scenes are measured."""
+    cores: Annotated[int, Within(1, 10**7, unit="cores")] = 64
+    """Cores of the fleet, all of them."""
+
+
+@command("build")
 def plan(
-    build: Annotated[
-        str, typer.Argument(help="named settings, such as pretrain-256", autocompletion=builds)
-    ],
-    scenes: Annotated[int | None, typer.Option(help="scenes of the dataset [the build's]")] = None,
-    objects: Annotated[str | None, typer.Option(help="as for generate [builtin:]")] = None,
-    samples: Annotated[int, typer.Option(min=4, help="scenes to measure")] = 12,
-    cores: Annotated[int, typer.Option(min=1, help="cores of the fleet, all of them")] = 64,
-    price: Annotated[float, typer.Option(help="USD per core-hour")] = USD_PER_CORE_HOUR,
-    resolution: Annotated[int | None, typer.Option(help="picture width in pixels")] = None,
-    noise_floor: Annotated[
-        float | None, typer.Option("--noise-floor", help="target in dB (psnr_log_db)")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="seed of every draw")] = None,
-    allow_licence: Annotated[
-        list[str] | None, typer.Option(help="allow this licence too; may be repeated")
-    ] = None,
-    licence: Annotated[
-        str | None, typer.Option(help="licence of files that state none [yours to use]")
-    ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="any other setting, as for generate")
-    ] = None,
-    json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
+    order: DatasetOrder,
+    shared: Shared,
+    prognosis: Prognosis,
+    core: CorePrice,
+    shown: Shown,
 ) -> None:
-    """Measure a few scenes and predict time, cores, bytes and cost, each with an interval."""
-    core_price = CorePrice(price=price)
-    order = DatasetOrder(
-        build=build,
-        objects=objects,
-        scenes=scenes,
-        seed=seed,
-        resolution=resolution,
-        noise_floor_db=noise_floor,
-        allow_licences=tuple(allow_licence or ()),
-        licence=licence,
-        changes=parse_changes(set_ or ()),
-    )
-    first_words(f"Measuring {samples} scenes of {build}", silent=json)
+    if order.scenes_from is not None or order.shards is not None:
+        raise TrilightError(
+            "plan: --scenes-from or --shards was given; expected neither, since a whole dataset of "
+            "new scenes is predicted."
+        )
+    order = with_shared(order, shared)
+    build, samples, cores = order.build, prognosis.samples, prognosis.cores
+    first_words(f"Measuring {samples} scenes of {build}", silent=shown.json)
     from infra.planning import measure_scenes, predict  # slow: every stage
 
     with progress_bars() as bars, temporary_folder("trilight-plan-") as place:
-        task = bars.add_task("scenes", total=samples, note="", visible=not json)
+        task = bars.add_task("scenes", total=samples, note="", visible=not shown.json)
         measured = measure_scenes(order, samples, place, lambda: bars.advance(task))
-    found = predict(measured, order, cores=cores, usd_per_core_hour=core_price.price)
-    if json:
+    found = predict(measured, order, cores=cores, usd_per_core_hour=core.price)
+    if shown.json:
         print_json(dataclasses.asdict(found))
         return
     print_rows(
@@ -85,4 +75,4 @@ def plan(
     )
     for text in found.notes:
         note(text)
-    next_step((*generate_words(order), "--out", f"data/{build}"))
+    next_step((*generate_words(order), *extend_words(), "--out", order.place))

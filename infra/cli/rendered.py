@@ -9,15 +9,16 @@ import numpy as np
 from rich.text import Text
 
 from infra.cli.console import console, print_json, print_rows
+from infra.rendering.asked import Asked
 from infra.rendering.look import enlargement
 from infra.rendering.picture_file import PictureFile
 from infra.rendering.run import FinishedShot, Flicker
-from infra.rendering.session import Asked, Outcome
+from infra.rendering.session import RenderOutcome
 
 Rows = list[tuple[str, str]]
 
 
-def print_outcome(outcome: Outcome, seconds: float, *, as_json: bool) -> None:
+def print_outcome(outcome: RenderOutcome, seconds: float, *, as_json: bool) -> None:
     """Print files and figures: of the only picture, or summed up over all."""
     asked = outcome.asked
     if as_json:
@@ -69,7 +70,7 @@ def _shot_json(shot: FinishedShot) -> dict[str, Any]:
     }
 
 
-def _print_one(asked: Asked, outcome: Outcome, seconds: float) -> None:
+def _print_one(asked: Asked, outcome: RenderOutcome, seconds: float) -> None:
     (shot,) = outcome.shots
     scene = shot.scene
     rows: Rows = [
@@ -96,7 +97,7 @@ def _enlarged(asked: Asked) -> str:
     return "" if factor == 1 else f"; in the PNG a pixel is {factor} x {factor}"
 
 
-def _traced(picture: PictureFile, outcome: Outcome) -> Rows:
+def _traced(picture: PictureFile, outcome: RenderOutcome) -> Rows:
     facts, target = picture.facts, outcome.settings.noise_floor_db
     reached = "the cap came before" if facts["at_cap"] else "reached"
     return [
@@ -111,7 +112,7 @@ def _neural(asked: Asked, picture: PictureFile) -> Rows:
     return [("network", f"{asked.checkpoint}; passes: {picture.facts['passes']}")]
 
 
-def _print_sequence(asked: Asked, outcome: Outcome, seconds: float) -> None:
+def _print_sequence(asked: Asked, outcome: RenderOutcome, seconds: float) -> None:
     pictures = [picture for shot in outcome.shots for picture in shot.pictures.values()]
     kept = Counter(picture.was_kept for picture in pictures)[True]
     rows: Rows = [

@@ -1,67 +1,94 @@
 """`trilight shards`: new datasets made of finished ones."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-import typer
+from cyclopts import App
 
 from infra.cli.console import first_words, next_step, print_json, print_rows, progress_bars
+from infra.cli.options import Shown, command
 from pipeline.shards.derive import Derive
 from pipeline.shards.plans import Selection
 from storage.errors import TrilightError
+from storage.ranges import Within
+from storage.settings import checked
 
-app = typer.Typer(
-    add_completion=False, no_args_is_help=True, help="Make new datasets of finished ones."
+app = App(name="shards", help_epilogue="")
+
+
+@checked()
+class NewDataset:
+    """The new dataset."""
+
+    out: Path
+    """Folder of the new dataset, which must not exist."""
+
+
+@checked()
+class Datasets:
+    """What it is made of."""
+
+    datasets: tuple[Path, ...]
+    """Folders of finished datasets."""
+
+
+@checked()
+class Selected:
+    """Which scenes are kept."""
+
+    dataset: Path
+    """Folder of a finished dataset."""
+    split: Literal["train", "validation", "test"] | None = None
+    """Scenes of this split only; by default all."""
+    template: str | None = None
+    """Scenes of this layout only, such as plane; by default all."""
+    min_noise_floor_db: Annotated[float | None, Within(-100, 200, unit="dB")] = None
+    """Scenes whose every view has at least this noise floor (psnr_log_db); by default all."""
+
+
+@checked()
+class Resharded:
+    """What is divided anew."""
+
+    dataset: Path
+    """Folder of a finished dataset."""
+    scenes_per_shard: Annotated[int, Within(1, 10**9, unit="scenes")]
+    """Scenes of each new shard."""
+
+
+@app.command(
+    help="Put datasets together, shard by shard; later ones get keys beyond those of earlier ones."
 )
-
-Source = Annotated[Path, typer.Argument(help="folder of a finished dataset")]
-Out = Annotated[Path, typer.Option(help="folder of the new dataset; must not exist")]
-Json = Annotated[bool, typer.Option(help="print the outcome as JSON")]
-
-
-@app.command("merge")
-def merge(
-    datasets: Annotated[list[Path], typer.Argument(help="folders of finished datasets")],
-    out: Out,
-    json: Json = False,
-) -> None:
-    """Put datasets together, shard by shard; later ones get keys beyond those of earlier ones."""
-    if len(datasets) < 2:
-        raise TrilightError(f"merge: {len(datasets)} dataset; expected at least 2.")
-    _run(datasets, Derive(operation="merge"), out, as_json=json)
+@command("datasets")
+def merge(sources: Datasets, new: NewDataset, shown: Shown) -> None:
+    if len(sources.datasets) < 2:
+        raise TrilightError(f"merge: {len(sources.datasets)} dataset; expected at least 2.")
+    _run(sources.datasets, Derive(operation="merge"), new.out, as_json=shown.json)
 
 
-@app.command("select")
-def select(
-    dataset: Source,
-    out: Out,
-    split: Annotated[str | None, typer.Option(help="train, validation or test")] = None,
-    template: Annotated[str | None, typer.Option(help="layout, such as plane")] = None,
-    min_noise_floor: Annotated[
-        float | None, typer.Option(help="least noise floor of every view of a scene, dB")
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Keep the scenes that meet every condition, under their keys."""
-    selection = Selection(split=split, template=template, min_noise_floor_db=min_noise_floor)
+@app.command(help="Keep the scenes that meet every condition, under their keys.")
+@command("dataset")
+def select(chosen: Selected, new: NewDataset, shown: Shown) -> None:
+    selection = Selection(
+        split=chosen.split,
+        template=chosen.template,
+        min_noise_floor_db=chosen.min_noise_floor_db,
+    )
     if selection == Selection():
-        raise TrilightError("select: expected --split, --template or --min-noise-floor.")
-    _run([dataset], Derive(operation="select", selection=selection), out, as_json=json)
+        raise TrilightError("select: expected --split, --template or --min-noise-floor-db.")
+    derive = Derive(operation="select", selection=selection)
+    _run([chosen.dataset], derive, new.out, as_json=shown.json)
 
 
-@app.command("reshard")
-def reshard(
-    dataset: Source,
-    out: Out,
-    scenes_per_shard: Annotated[int, typer.Option(help="scenes of each new shard")],
-    json: Json = False,
-) -> None:
-    """Divide the scenes of every split into shards of another size, under their keys."""
-    derive = Derive(operation="reshard", scenes_per_shard=scenes_per_shard)
-    _run([dataset], derive, out, as_json=json)
+@app.command(help="Divide the scenes of every split into shards of another size, under their keys.")
+@command("dataset")
+def reshard(asked: Resharded, new: NewDataset, shown: Shown) -> None:
+    derive = Derive(operation="reshard", scenes_per_shard=asked.scenes_per_shard)
+    _run([asked.dataset], derive, new.out, as_json=shown.json)
 
 
-def _run(datasets: list[Path], derive: Derive, out: Path, *, as_json: bool) -> None:
+def _run(datasets: Sequence[Path], derive: Derive, out: Path, *, as_json: bool) -> None:
     first_words(f"Making {out}", silent=as_json)
     from pipeline.flows.derive_dataset import derive_dataset  # slow: matplotlib
 

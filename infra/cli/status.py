@@ -3,25 +3,27 @@
 import dataclasses
 import shlex
 import time
-from typing import Annotated
-
-import typer
 
 from infra.cli.console import look_at, next_step, print_json, print_rows
-from pipeline.flows.price import USD_PER_CORE_HOUR, CorePrice
+from infra.cli.options import Shown, command
+from pipeline.flows.price import CorePrice
 from storage.dataset_status import DatasetStatus, read_status
+from storage.settings import checked
 
 
-def status(
-    dataset: Annotated[str, typer.Argument(help="the dataset, a folder or a URL")],
-    price: Annotated[float, typer.Option(help="USD per core-hour")] = USD_PER_CORE_HOUR,
-    json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
-) -> None:
-    """Say how far a dataset is, when it will be done, and what failed; needs no server."""
-    core_price = CorePrice(price=price)
-    found = read_status(dataset)
-    cost = None if found.core_hours is None else found.core_hours * core_price.price
-    if json:
+@checked()
+class StatusOrder:
+    """What is looked at."""
+
+    dataset: str
+    """The dataset, a folder or a URL."""
+
+
+@command("dataset")
+def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
+    found = read_status(watched.dataset)
+    cost = None if found.core_hours is None else found.core_hours * core.price
+    if shown.json:
         row = {**dataclasses.asdict(found), "next": _next(found), "cost_usd": cost}
         print_json(row)
         return

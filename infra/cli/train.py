@@ -1,24 +1,29 @@
 """`trilight train`: a named run on the shards of a dataset, alone or under torchrun."""
 
+import dataclasses
 import os
 import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, NoReturn
 
-import typer
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
 from rich.text import Text
 
-from infra.cli.changes import parse_changes
+from infra.cli.changes import Shared, all_changes, run_record
 from infra.cli.console import console, print_rows, progress_bars
+from infra.cli.options import Shown, command
+from infra.torch_library import require_torch
+from infra.train_order import TrainOrder
+from pipeline.flows.order_words import option_words
 from storage.errors import TrilightError
+from train.runs import in_proportion, named_run
+from train.settings import TrainSettings
 
 if TYPE_CHECKING:
     from train.result import TrainResult
-    from train.settings import TrainSettings
 
 
 class _BarProgress:
@@ -72,97 +77,54 @@ class _BarProgress:
         os._exit(130)
 
 
-def train(
-    run: Annotated[str, typer.Argument(help="named run, such as smoke")],
-    data: Annotated[
-        list[str],
-        typer.Option(
-            help="root of a dataset, a folder or a URL; or shards, by name or pattern such as "
-            "s3://b/{train,validation}-{000000..000007}.tar, and may be repeated"
-        ),
-    ],
-    out: Annotated[Path | None, typer.Option(help="folder of the run [runs/RUN]")] = None,
-    resume: Annotated[bool, typer.Option(help="go on from the newest checkpoint")] = False,
-    from_: Annotated[
-        str | None,
-        typer.Option("--from", help="finetune runs: run folder or checkpoint to begin with"),
-    ] = None,
-    lpips: Annotated[
-        str | None,
-        typer.Option(
-            help="folder with vgg16-397923af.pth and vgg.pth, or hub to download them "
-            "[$TRILIGHT_LPIPS]"
-        ),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option(help="cpu or cuda [cuda where there is one]")
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            help="replace the run's number of steps; fewer shorten its warm-up and intervals"
-        ),
-    ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="threads that decode samples")] = 1,
-    skip_unusable: Annotated[
-        int | None, typer.Option(min=0, help="replace up to so many damaged samples [stop at one]")
-    ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            help="any other setting by its name in settings.json, with its value in JSON, such as "
-            "loss.perceptual=none or model.width=256; may be repeated",
-        ),
-    ] = None,
-    json: Annotated[bool, typer.Option(help="print the outcome as JSON")] = False,
-) -> None:
-    """Train a model; writes checkpoints, metrics.jsonl, TensorBoard curves and a sheet.
-
-    For several processes, on one machine or many: torchrun -m infra.cli.app train ...
-    """
-    from train.runs import changed_run  # without torch, so that mistakes are named at once
-    from train.start import Start
-
-    changes = parse_changes(set_ or ())
-    settings = changed_run(run, changes, steps=steps, most_unusable=skip_unusable)
-    start = Start(resume=resume, begin_with=from_, lpips=lpips)
-    start.check(settings)
-    if os.environ.get("RANK", "0") == "0" and not json:
-        _announce(settings, steps, changes)
-    result = _trained(
-        settings,
-        data=data,
-        out=out or Path("runs") / run,
-        start=start,
-        device=device,
-        workers=workers,
-        quiet=json,
-    )
+@command("run")
+def train(order: TrainOrder, shared: Shared, shown: Shown) -> None:
+    if shared.is_given:
+        changes = all_changes(named_run(order.run), shared, run_record(shared), order.changes)
+        order = dataclasses.replace(order, changes=changes)
+    settings = order.settings()  # without torch, so that mistakes are named at once
+    if order.processes > 1:
+        _launch(order, shown)
+    if os.environ.get("RANK", "0") == "0" and not shown.json:
+        _announce(order, settings)
+    result = _trained(order, settings, quiet=shown.json)
     if result is None:
         return
-    if json:
+    if shown.json:
         sys.stdout.write(result.folder.summary.read_text())
     else:
         _report(result)
 
 
-def _trained(
-    settings: "TrainSettings", *, device: str | None, quiet: bool, **rest: Any
-) -> "TrainResult | None":
+def _launch(order: TrainOrder, shown: Shown) -> NoReturn:
+    """Become torchrun, which starts this command once for each process."""
+    if "RANK" in os.environ:
+        raise TrilightError(
+            f"--processes is {order.processes} under torchrun; expected one of the two: omit it."
+        )
+    words = [*order.command(), *option_words(shown)]
+    os.execv(words[0], words)
+
+
+def _trained(order: TrainOrder, settings: TrainSettings, *, quiet: bool) -> "TrainResult | None":
     """Train as train.run.train_run does; torch is imported here, which takes seconds."""
-    try:
-        from train.loop.crew import join_crew
-        from train.loop.interrupts import Stopped
-        from train.run import train_run
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise TrilightError("train: torch is not installed; run `make setup-all`.") from error
-    with join_crew(device) as crew, progress_bars() as bars:
+    require_torch("train")
+    from train.loop.crew import join_crew
+    from train.loop.interrupts import Stopped
+    from train.run import train_run
+
+    with join_crew(order.device) as crew, progress_bars() as bars:
         progress = None if quiet else _BarProgress(bars)
         try:
-            return train_run(settings, crew=crew, progress=progress, **rest)
+            return train_run(
+                settings,
+                data=list(order.data),
+                out=Path(order.place),
+                start=order.start(),
+                workers=order.workers,
+                crew=crew,
+                progress=progress,
+            )
         except Stopped as stopped:
             if crew.world_size > 1:  # torchrun's own arguments are not known here
                 raise
@@ -173,12 +135,10 @@ def _trained(
             ) from stopped
 
 
-def _announce(settings: "TrainSettings", steps: int | None, changes: Mapping[str, Any]) -> None:
+def _announce(order: TrainOrder, settings: TrainSettings) -> None:
     """Say what begins, before torch is imported."""
-    from train.runs import in_proportion, named_run
-
-    if steps is not None:
-        shorter = in_proportion(named_run(settings.run), steps, changes)
+    if (steps := order.steps) is not None:
+        shorter = in_proportion(named_run(order.run), steps, order.changes)
         if shorter:
             shown = ", ".join(f"{name}={value}" for name, value in shorter.items())
             console.print(f"In proportion to {steps} steps: {shown}")

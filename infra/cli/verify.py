@@ -1,8 +1,6 @@
 """`trilight verify`: is a dataset what its manifest says?"""
 
-from typing import Annotated
-
-import typer
+import sys
 
 from infra.cli.console import (
     first_words,
@@ -12,49 +10,54 @@ from infra.cli.console import (
     print_rows,
     progress_bars,
 )
+from infra.cli.options import Shown, command
 from storage.asked import read_asked, value_of
 from storage.dataset import open_dataset
 from storage.derived import derivation_of
 from storage.remote.url import RemoteUrl, parse_url
 from storage.safe_url import safe_url
+from storage.settings import checked
 from storage.verify import Verification, verify_dataset
 
 
-def verify(
-    dataset: Annotated[str, typer.Argument(help="the dataset, a folder or a URL")],
-    fast: Annotated[bool, typer.Option(help="compare sizes and counts only")] = False,
-    repair: Annotated[
-        bool, typer.Option(help="make the shards that are missing or bad anew, and check again")
-    ] = False,
-    objects: Annotated[
-        str | None, typer.Option(help="with --repair: the source of objects, as for generate")
-    ] = None,
-    scenes_from: Annotated[
-        str | None, typer.Option(help="with --repair: the folder of scenes, as for generate")
-    ] = None,
-    json: Annotated[bool, typer.Option(help="print the result as JSON")] = False,
-) -> None:
-    """Check every hash, member and law of a dataset; exit 1 with a list of what is wrong.
+@checked()
+class Checked:
+    """What is checked, and how far."""
 
-    A dataset that is not finished is checked as far as it is, and the exit status is 1 too.
+    dataset: str
+    """The dataset, a folder or a URL."""
+    fast: bool = False
+    """Compare sizes and counts only."""
+    repair: bool = False
+    """Make the shards that are missing or bad anew, and check again."""
+    objects: str | None = None
+    """With --repair: the source of objects, by default that of generate."""
+    scenes_from: str | None = None
+    """With --repair: the folder of scene files, where the dataset was made of one; by default none.
     """
-    first_words(f"Verifying {safe_url(dataset)}", silent=json)
-    found = _verified(dataset, fast=fast, silent=json)
-    if repair and found.bad_shards and found.is_finished:
+
+
+@command("dataset")
+def verify(asked: Checked, shown: Shown) -> None:
+    first_words(f"Verifying {safe_url(asked.dataset)}", silent=shown.json)
+    found = _verified(asked.dataset, fast=asked.fast, silent=shown.json)
+    if asked.repair and found.bad_shards and found.is_finished:
         from infra.repair import repair as make_anew  # slow: the whole pipeline
 
-        if not json:
-            _report(found, fast=fast)
+        if not shown.json:
+            _report(found, fast=asked.fast)
             first_words("Making the named shards anew")
-        make_anew(dataset, found.bad_shards, objects=objects, scenes_from=scenes_from)
-        found = _verified(dataset, fast=fast, silent=json)
-    if json:
+        make_anew(
+            asked.dataset, found.bad_shards, objects=asked.objects, scenes_from=asked.scenes_from
+        )
+        found = _verified(asked.dataset, fast=asked.fast, silent=shown.json)
+    if shown.json:
         print_json(_as_json(found))
     else:
-        _report(found, fast=fast)
-        _say_what_mends(found, dataset)
+        _report(found, fast=asked.fast)
+        _say_what_mends(found, asked.dataset)
     if found.problems or not found.is_finished:
-        raise typer.Exit(1)
+        sys.exit(1)
 
 
 def _verified(dataset: str, *, fast: bool, silent: bool) -> Verification:

@@ -13,7 +13,7 @@ from storage.scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Camera:
+class ShotCamera:
     """One camera."""
 
     c2w: NDArray[np.float32]
@@ -28,11 +28,11 @@ class Shot:
 
     source: SceneSource
     """The scene."""
-    camera: Camera | None
+    camera: ShotCamera | None
     """From where; None for the camera of the scene that `--view` names."""
 
 
-def shots(sources: Sequence[SceneSource], cameras: Sequence[Camera] | None) -> list[Shot]:
+def shots(sources: Sequence[SceneSource], cameras: Sequence[ShotCamera] | None) -> list[Shot]:
     """Return the pictures of scenes by cameras, in order.
 
     One scene is seen by all cameras, many scenes each by its own camera or by the only one that is
@@ -55,17 +55,17 @@ def shots(sources: Sequence[SceneSource], cameras: Sequence[Camera] | None) -> l
     ]
 
 
-def own_camera(scene: Scene, view: int) -> Camera:
-    """Return a camera of a scene; raises TrilightError where it has no such view."""
+def own_camera(scene: Scene, view: int, named: str = "--view") -> ShotCamera:
+    """Return a camera of a scene; raises TrilightError, with `named`, where it has no such view."""
     if not 0 <= view < scene.num_views:
         raise TrilightError(
-            f"--view is {view}; expected 0 to {scene.num_views - 1}: the scene has "
+            f"{named} is {view}; expected 0 to {scene.num_views - 1}: the scene has "
             f"{scene.num_views} cameras."
         )
-    return Camera(c2w=scene.c2w[view], fov_deg=float(scene.fov_deg[view]))
+    return ShotCamera(c2w=scene.c2w[view], fov_deg=float(scene.fov_deg[view]))
 
 
-def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camera]:
+def orbit(scene: Scene, start: ShotCamera, count: int, arc_deg: float) -> list[ShotCamera]:
     """Return `count` cameras on a circle around what `start` looks at, about the vertical.
 
     The middle of the circle is the point on the camera's axis that is nearest to the middle of all
@@ -85,7 +85,7 @@ def orbit(scene: Scene, start: Camera, count: int, arc_deg: float) -> list[Camer
     return [_turned(start, target, float(np.radians(turn))) for turn in turns_deg]
 
 
-def camera_path(text: str, reader: SceneReader, view: int) -> list[Camera]:
+def camera_path(text: str, reader: SceneReader, view: int) -> list[ShotCamera]:
     """Return the cameras of a file: all of one scene, or one of each frame of a stage that moves.
 
     Args:
@@ -102,15 +102,15 @@ def camera_path(text: str, reader: SceneReader, view: int) -> list[Camera]:
         return [own_camera(reader.load(frame).scene, view) for frame in frames]
     c2w, fov_deg = reader.cameras(frames[0])
     return [
-        Camera(c2w=pose, fov_deg=float(angle)) for pose, angle in zip(c2w, fov_deg, strict=True)
+        ShotCamera(c2w=pose, fov_deg=float(angle)) for pose, angle in zip(c2w, fov_deg, strict=True)
     ]
 
 
-def _turned(start: Camera, target: NDArray[np.float64], turn: float) -> Camera:
+def _turned(start: ShotCamera, target: NDArray[np.float64], turn: float) -> ShotCamera:
     """Return a camera that went around the vertical through `target`, as a rigid body."""
     cos, sin = np.cos(turn), np.sin(turn)
     rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
     pose = start.c2w.astype(np.float64)
     pose[:3, :3] = np.einsum("ij,jk->ik", rotation, pose[:3, :3])
     pose[:3, 3] = np.einsum("ij,j->i", rotation, pose[:3, 3] - target) + target
-    return Camera(c2w=pose.astype(np.float32), fov_deg=start.fov_deg)
+    return ShotCamera(c2w=pose.astype(np.float32), fov_deg=start.fov_deg)

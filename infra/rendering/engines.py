@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import HALF_FLOAT_MAX
+from storage.material import PUBLISHED_COLUMNS, unread_columns
 from storage.scene import Scene
 
 if TYPE_CHECKING:
@@ -57,7 +58,8 @@ class MitsubaEngine:
 
     def open(self, scene: Scene, name: str) -> tuple[str, ...]:
         self._tracer.open(scene, name)
-        return ()
+        unread = unread_columns(scene.materials, PUBLISHED_COLUMNS)
+        return (f"{name}: the path tracer does not read {', '.join(unread)}",) if unread else ()
 
     def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> Rendered:
         view = self._tracer.render(c2w, fov_deg, name)

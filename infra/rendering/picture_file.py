@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from infra.rendering.cameras import Camera
+from infra.rendering.cameras import ShotCamera
 from infra.rendering.engines import Engine, Fact, Rendered
 from storage.atomic import write_atomically
 from storage.digests import canonical_json, sha256_hex
@@ -72,7 +72,7 @@ class PictureFile:
 
 
 def request(
-    engine: Engine, *, source: str, scene_sha256: str, camera: Camera, view: int | None
+    engine: Engine, *, source: str, scene_sha256: str, camera: ShotCamera, view: int | None
 ) -> Request:
     """Return what is asked of an engine; `view` is the row of the scene's own camera, or None."""
     pose: dict[str, Any] = {"c2w": camera.c2w.tolist(), "fov_deg": camera.fov_deg}

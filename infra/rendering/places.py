@@ -10,7 +10,7 @@ from storage.errors import TrilightError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
+class PicturePlaces:
     """Where pictures go."""
 
     stem: Path | None
@@ -30,7 +30,7 @@ class Place:
         return self.stem or self.folder / f"{index:06d}"
 
 
-def place(out: Path) -> Place:
+def place(out: Path) -> PicturePlaces:
     """Return what is written for `--out`.
 
     Raises:
@@ -39,16 +39,18 @@ def place(out: Path) -> Place:
     """
     suffix = out.suffix.lower()
     if out.is_dir() or not suffix:
-        return Place(stem=None, folder=_writable(out, out), video=None)
+        return PicturePlaces(stem=None, folder=_writable(out, out), video=None)
     if suffix == ".exr":
-        return Place(stem=out.with_suffix(""), folder=_writable(out.parent, out), video=None)
+        return PicturePlaces(
+            stem=out.with_suffix(""), folder=_writable(out.parent, out), video=None
+        )
     if suffix not in SUFFIXES:
         raise TrilightError(
             f"--out is {out}; expected picture.exr, or for many pictures a folder, or X.mp4 or "
             "X.webp, beside which they are kept in a folder X."
         )
     require_encoder(out)
-    return Place(stem=None, folder=_writable(out.with_suffix(""), out), video=out)
+    return PicturePlaces(stem=None, folder=_writable(out.with_suffix(""), out), video=out)
 
 
 def _writable(folder: Path, out: Path) -> Path:

@@ -18,10 +18,10 @@ from infra.rendering.picture_file import (
     request,
     write_picture,
 )
-from infra.rendering.places import Place
+from infra.rendering.places import PicturePlaces
 from pipeline.documents.png import encode_png
 from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_source import LoadedScene, SceneSource
+from pipeline.flows.scene_formats import FORMATS, LoadedScene, SceneSource
 from storage.atomic import write_atomically
 from storage.lights import num_lights
 from storage.metrics import psnr_log_db
@@ -29,7 +29,7 @@ from storage.scene_file import scene_digest
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneFacts:
+class SceneIdentity:
     """What there is to say of a scene."""
 
     name: str
@@ -66,7 +66,7 @@ class _Frame:
 class FinishedShot:
     """What came of one shot."""
 
-    scene: SceneFacts
+    scene: SceneIdentity
     """The scene."""
     pictures: Mapping[str, PictureFile]
     """By engine."""
@@ -83,20 +83,22 @@ class _OpenScene:
     """The scene of the shots at hand."""
 
     loaded: LoadedScene
-    facts: SceneFacts
+    facts: SceneIdentity
     opened_by: set[str]
     """Engines that have taken it."""
 
 
 def _is_next_frame(source: SceneSource, before: SceneSource) -> bool:
     """Return whether two sources are moments of one stage; a shard's scenes are strangers."""
-    return source.path == before.path and source.path.suffix != ".tar"
+    return source.path == before.path and not FORMATS[source.path.suffix.lower()].always_many
 
 
 class ShotRun:
     """Renders shots one after the other; scenes are read once for shots in a row."""
 
-    def __init__(self, engines: Sequence[Engine], place: Place, *, view: int, look: Look) -> None:
+    def __init__(
+        self, engines: Sequence[Engine], place: PicturePlaces, *, view: int, look: Look
+    ) -> None:
         """Remember how.
 
         Args:
@@ -128,7 +130,7 @@ class ShotRun:
     def _read(self, shot: Shot, reader: SceneReader) -> _OpenScene:
         loaded = reader.load(shot.source)
         self.notes |= dict.fromkeys(loaded.notes)
-        facts = SceneFacts(
+        facts = SceneIdentity(
             name=shot.source.name,
             digest=scene_digest(loaded.scene),
             num_triangles=loaded.scene.num_triangles,

@@ -2,100 +2,43 @@
 
 import dataclasses
 import os
-import re
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from infra.rendering.cameras import Camera, Shot, camera_path, orbit, own_camera, shots
+from infra.rendering.asked import Asked
+from infra.rendering.cameras import Shot, ShotCamera, camera_path, orbit, own_camera, shots
 from infra.rendering.engines import Engine, MitsubaEngine, NeuralEngine
 from infra.rendering.look import Look
-from infra.rendering.places import Place, place
+from infra.rendering.places import PicturePlaces, place
 from infra.rendering.run import FinishedShot, ShotRun
 from infra.rendering.sources import scene_sources
 from infra.rendering.tone_maps import require_tone_map
 from infra.rendering.video import write_video
+from infra.torch_library import require_torch
 from pipeline.flows.read_scenes import SceneReader
 from pipeline.flows.scene_source import SceneSource, scene_source
-from pipeline.renders.settings import PASS_SPP, NoiseFloor, RenderSettings, Resolution, Samples
+from pipeline.renders.settings import FIRST_SPP, RenderSettings, one_picture
 from pipeline.renders.variant import choose_variant
-from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.errors import TrilightError
-from storage.ranges import Seed, Within
-from storage.settings import checked
 
 if TYPE_CHECKING:
     from pipeline.renders.renderer import Sampling
 
 ENGINES = {"mitsuba": ("mitsuba",), "neural": ("neural",), "both": ("mitsuba", "neural")}
-"""What `--engine` may be."""
+"""Who renders, by what `--engine` may be."""
 
 _RESOLUTION = 512
 
-FIRST_SPP = 2 * PASS_SPP[1]
-"""Fewer samples, and the noise floor may flatter (pipeline.renders.noise_floor)."""
-
-
-def _option(name: str) -> str:
-    """Return the option that a field stands for."""
-    return "--" + re.sub("_(db|deg|ev)$", "", name).replace("_", "-")
-
-
-@checked(option=_option)
-class Asked:
-    """What the user asked for; names are those of the options."""
-
-    source: str
-    """SRC."""
-    out: Path
-    """See infra.rendering.places."""
-    engine: str
-    """A key of ENGINES."""
-    checkpoint: str | None
-    """Of the network; None for the one that is shipped."""
-    resolution: Resolution | None
-    """Width of pictures; None for what the network was trained on, or 512."""
-    noise_floor_db: NoiseFloor
-    """Target of the path tracer."""
-    max_spp: Samples
-    """Its cap."""
-    view: Annotated[int, Within(0, 999)]
-    """Row of a scene's own cameras."""
-    orbit: Annotated[int | None, Within(1, 100_000, unit="pictures")]
-    """Number of pictures of a turn."""
-    arc_deg: Annotated[float, Within(0, 360, low_open=True, unit="degrees")]
-    """Its angle."""
-    cameras: str | None
-    """File of a camera path."""
-    fps: Annotated[int, Within(1, 240, unit="pictures a second")]
-    """Pictures a second of a video."""
-    tone_map: str
-    """A name of infra.rendering.tone_maps."""
-    exposure_ev: Annotated[float, Within(-32, 32, unit="stops")]
-    """Brightness of PNG and video."""
-    precision: str
-    """A name of model.precision."""
-    lights_per_pass: Annotated[int, Within(1, 65_535, unit="triangles")]
-    """Most emitting triangles of a group (model.light_groups)."""
-    skip_empty_bundles: bool
-    """Whether the network leaves what no triangle reaches black (model.empty_bundles)."""
-    seed: Seed
-    """Of samples."""
-    threads: Annotated[int | None, Within(1, 1024, unit="threads")]
-    """Of the processor; None for all cores."""
-    albedo_over_one: AlbedoOverOne = "scale"
-    """Of RenderFormer's JSON, where diffuse and specular albedos add up to more than 1."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Outcome:
+class RenderOutcome:
     """What came of it."""
 
     asked: Asked
     """With network and width, where none was named."""
-    place: Place
+    place: PicturePlaces
     """Where the files are."""
     shots: tuple[FinishedShot, ...]
     """Picture by picture."""
@@ -105,7 +48,7 @@ class Outcome:
     """What a person should know."""
 
 
-class Watcher(Protocol):
+class RenderWatcher(Protocol):
     """Is told how far a render is."""
 
     def pictures(self, done: int, total: int) -> None:
@@ -115,14 +58,13 @@ class Watcher(Protocol):
         """The path tracer has finished a pass."""
 
 
-def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
+def render_asked(asked: Asked, watcher: RenderWatcher) -> RenderOutcome:
     """Render what was asked for and write its files.
 
     Raises:
         TrilightError: an option that means nothing, a source, camera or checkpoint that is
             unusable, a scene that cannot be rendered, or files that cannot be written.
     """
-    _check(asked)
     asked = _completed(asked)
     settings = _settings(asked)
     look = Look(tone_map=require_tone_map(asked.tone_map), exposure_ev=asked.exposure_ev)
@@ -138,7 +80,7 @@ def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
         finished = run.run(wanted, reader, lambda now: watcher.pictures(now, len(wanted)))
     if where.video is not None:
         write_video(where.video, [shot.png for shot in finished], asked.fps)
-    return Outcome(
+    return RenderOutcome(
         asked=asked,
         place=where,
         shots=tuple(finished),
@@ -147,64 +89,32 @@ def render_asked(asked: Asked, watcher: Watcher) -> Outcome:
     )
 
 
-def _check(asked: Asked) -> None:
-    neural = asked.engine in ("neural", "both")
-    for law, option, got, expected in (
-        (asked.engine in ENGINES, "--engine", asked.engine, "mitsuba, neural or both"),
-        (
-            asked.orbit is None or asked.cameras is None,
-            "--cameras",
-            asked.cameras,
-            "no --orbit beside it",
-        ),
-        (
-            neural or asked.checkpoint is None,
-            "--checkpoint",
-            asked.checkpoint,
-            "--engine neural or both beside it",
-        ),
-    ):
-        if not law:
-            raise TrilightError(f"{option} is {got}; expected {expected}.")
-
-
 def _completed(asked: Asked) -> Asked:
     """Return it with the network and the width that are taken where none is named."""
     checkpoint, resolution = asked.checkpoint, asked.resolution
     if asked.engine != "mitsuba":
-        _require_torch()
-        from model.checkpoints import BUILTIN
-        from train.networks import trained_resolution
+        require_torch("--engine neural")
+        from model.open import BUILTIN, find_network
+        from train.networks import network_of_run
 
         checkpoint = checkpoint or BUILTIN
         if resolution is None:
-            resolution = trained_resolution(checkpoint)
+            resolution = find_network(checkpoint, network_of_run).trained.resolution
     if resolution is None:
         resolution = _RESOLUTION
     return dataclasses.replace(asked, checkpoint=checkpoint, resolution=resolution)
 
 
-def _require_torch() -> None:
-    try:
-        import torch  # noqa: F401
-    except ImportError as error:
-        raise TrilightError(
-            "--engine neural needs PyTorch, which is not installed; expected it: make setup-all."
-        ) from error
-
-
 def _settings(asked: Asked) -> RenderSettings:
     assert asked.resolution is not None
-    return RenderSettings(
+    return one_picture(
         resolution=asked.resolution,
         noise_floor_db=asked.noise_floor_db,
-        min_spp=min(FIRST_SPP, asked.max_spp),
         max_spp=asked.max_spp,
-        min_mean_radiance=0.0,  # who asks for a dark picture gets it
     )
 
 
-def _shots(asked: Asked, where: Place, reader: SceneReader) -> list[Shot]:
+def _shots(asked: Asked, where: PicturePlaces, reader: SceneReader) -> list[Shot]:
     if where.is_sequence:
         sources = scene_sources(asked.source, reader)
         return shots(sources, _cameras(asked, sources[0], reader))
@@ -213,7 +123,7 @@ def _shots(asked: Asked, where: Place, reader: SceneReader) -> list[Shot]:
     return shots([scene_source(asked.source)], None)
 
 
-def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[Camera] | None:
+def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[ShotCamera] | None:
     if asked.cameras is not None:
         return camera_path(asked.cameras, reader, asked.view)
     if asked.orbit is None:
@@ -223,7 +133,7 @@ def _cameras(asked: Asked, first: SceneSource, reader: SceneReader) -> list[Came
 
 
 def _engine(
-    name: str, asked: Asked, settings: RenderSettings, watcher: Watcher, stack: ExitStack
+    name: str, asked: Asked, settings: RenderSettings, watcher: RenderWatcher, stack: ExitStack
 ) -> Engine:
     make: Callable[..., Engine] = _mitsuba if name == "mitsuba" else _neural
     engine = make(asked, settings, watcher)
@@ -231,7 +141,7 @@ def _engine(
     return engine
 
 
-def _mitsuba(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
+def _mitsuba(asked: Asked, settings: RenderSettings, watcher: RenderWatcher) -> Engine:
     from pipeline.flows.render_scene import PathTracer
 
     tracer = PathTracer(
@@ -244,16 +154,17 @@ def _mitsuba(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine
     return MitsubaEngine(tracer)
 
 
-def _neural(asked: Asked, settings: RenderSettings, watcher: Watcher) -> Engine:
+def _neural(asked: Asked, settings: RenderSettings, watcher: RenderWatcher) -> Engine:
     import torch
 
     from model.neural_renderer import NeuralRenderer
+    from train.networks import network_of_run
 
     if asked.threads is not None:
         torch.set_num_threads(asked.threads)
     assert asked.checkpoint is not None
     return NeuralEngine(
-        NeuralRenderer.load(asked.checkpoint, precision=asked.precision),
+        NeuralRenderer.load(asked.checkpoint, precision=asked.precision, finders=[network_of_run]),
         checkpoint=asked.checkpoint,
         precision=asked.precision,
         resolution=settings.resolution,

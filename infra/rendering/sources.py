@@ -4,7 +4,8 @@ import re
 from pathlib import Path
 
 from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_source import SUFFIXES, SceneSource, scene_source
+from pipeline.flows.scene_formats import SceneSource, readable
+from pipeline.flows.scene_source import scene_source
 from storage.errors import TrilightError
 from storage.shard_places import expanded
 
@@ -29,10 +30,10 @@ def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
 
 
 def _scene_files(folder: Path) -> list[Path]:
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in readable()]
     if not paths:
         raise TrilightError(
-            f"{folder}: holds no scene file; expected files that end in {' '.join(SUFFIXES)}."
+            f"{folder}: holds no scene file; expected files that end in {' '.join(readable())}."
         )
     return sorted(paths, key=lambda path: _by_number(path.name))
 

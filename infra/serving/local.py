@@ -163,7 +163,7 @@ def _prepare(environment: Mapping[str, str]) -> None:
     """Make pool, limits and deployments; what is there already is replaced."""
     prefect = [str(shutil.which("prefect")), "--no-prompt"]
     pool = ["work-pool", "create", POOL, "--type", "process", "--overwrite", *_TEMPLATE]
-    limits = [sys.executable, "-m", "infra.serving.limits"]
+    limits = [sys.executable, "-m", f"{__package__}.limits"]
     deployments = ["deploy", "--name", f"*/{POOL}"]
     steps = {
         f"the pool `{POOL}`": [*prefect, *pool],

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from model.checkpoints import BUILTIN, checkpoint_path
+from model.open import BUILTIN, BUILTIN_WEIGHTS
 from model.weights import decode_weights, network_digest
 from storage.atomic import write_atomically
 from storage.dataset import Dataset, open_dataset
@@ -50,7 +50,7 @@ def main(
     about = json.loads(folder.settings.read_text())
     judged = json.loads((evaluation / "evaluation.json").read_text())
     _check(dataset, weights, about, judged["about"])
-    place = checkpoint_path(BUILTIN)
+    place = BUILTIN_WEIGHTS
     write_atomically(place, weights)
     card = _card(dataset, about, judged, json.loads(folder.summary.read_text()), weights, command)
     write_atomically(place.with_name("README.md"), card.encode())

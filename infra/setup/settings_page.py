@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
-from infra.rendering.session import Asked
+from infra.rendering.asked import Asked
 from infra.serving.train_model import TrainOrder
-from model.config import ModelConfig
 from pipeline.documents.markdown import table
 from pipeline.flows.price import CorePrice
 from pipeline.flows.served.orders import DatasetInRuns
@@ -19,6 +18,7 @@ from storage.ranges import declared_ranges, shown_number
 from storage.scene import Scene
 from storage.settings import described, field_sentences
 from train.evaluation.evaluate import Contest
+from train.evaluation.order import EvaluationOrder
 from train.settings import TrainSettings
 
 FILE = Path(__file__).parents[2] / "docs/reference/settings.md"
@@ -29,7 +29,7 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Render": (Asked,),
     "Plan": (CorePrice,),
     "Train": (TrainOrder, TrainSettings),
-    "Evaluate": (Contest,),
+    "Evaluate": (EvaluationOrder, Contest),
 }
 """What each command is told; the settings within settings are found from here."""
 
@@ -93,8 +93,8 @@ def _rows(kind: type) -> Iterator[tuple[str, ...]]:
             yield f"`{declared.name}`{part}", sentence, str(declared.within), ""
         return
     for field in described(kind) if hasattr(kind, "__pydantic_fields__") else ():
-        groups = [found.__name__ for found in _kinds(field.hint) if hasattr(found, "PRESETS")]
-        presets = f", or one of {', '.join(ModelConfig.PRESETS)}" if groups else ""
+        named = [name for kind in _kinds(field.hint) for name in getattr(kind, "PRESETS", ())]
+        presets = f", or one of {', '.join(named)}" if named else ""
         yield (
             f"`{field.name}`",
             _first_sentence(field.sentence).replace("|", "\\|"),

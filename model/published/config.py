@@ -10,6 +10,7 @@ from typing import Any
 
 from model.config import NUM_TAPS, ModelConfig
 from storage.errors import TrilightError
+from storage.material import PUBLISHED_COLUMNS
 
 REGISTER_EPS = 1e-5
 """In the published registers' mean position."""
@@ -117,13 +118,15 @@ def encode_published(config: PublishedConfig) -> dict[str, Any]:
     """Return the config.json of a network, with every field spelled out.
 
     Raises:
-        TrilightError: the network is none of the two families: a linear head, windows of another
-            width, or rotary frequencies that their code does not build.
+        TrilightError: the network is none of the two families: a linear head, other material
+            columns, windows of another width, or rotary frequencies that their code does not build.
     """
     model = config.model
     doubled = model.rope_max_freq == _max_freq(model.rope_num_freqs, doubled=True)
     if model.head != "dpt":
         _unpublished("head linear", "dpt")
+    if model.material_columns != PUBLISHED_COLUMNS:
+        _unpublished(f"material_columns {model.material_columns}", f"{PUBLISHED_COLUMNS}")
     if model.window_bundles not in (0, WINDOW_BUNDLES):
         _unpublished(f"window_bundles {model.window_bundles}", f"0 or {WINDOW_BUNDLES}")
     if not doubled and model.rope_max_freq != _max_freq(model.rope_num_freqs, doubled=False):

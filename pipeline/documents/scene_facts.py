@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.sample import SceneRecord
 from storage.scene import Scene
 
@@ -14,7 +14,7 @@ Values = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surface:
+class SurfaceFacts:
     """One row of `Scene.objects` that reflects: an object, the floor or a wall."""
 
     row: int
@@ -57,7 +57,7 @@ class Light:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera:
+class CameraFacts:
     """Where one camera stands, seen from the origin."""
 
     position: tuple[float, float, float]
@@ -72,7 +72,7 @@ class Camera:
     """Full angle."""
 
 
-def surfaces(scene: Scene) -> list[Surface]:
+def surfaces(scene: Scene) -> list[SurfaceFacts]:
     """Return the objects and shell parts of a lawful scene that have triangles."""
     found = []
     for row, entry in enumerate(scene.objects):
@@ -84,7 +84,7 @@ def surfaces(scene: Scene) -> list[Surface]:
         diffuse, specular = materials[:, DIFFUSE], materials[:, SPECULAR]
         faces = scene.faces[mine]
         found.append(
-            Surface(
+            SurfaceFacts(
                 row=row,
                 kind=entry.kind,
                 num_triangles=len(rows),
@@ -123,13 +123,13 @@ def lights(scene: Scene) -> list[Light]:
     return found
 
 
-def cameras(scene: Scene) -> list[Camera]:
+def cameras(scene: Scene) -> list[CameraFacts]:
     """Return where the cameras of a scene stand; at the origin itself all angles are 0."""
     found = []
     for c2w, fov_deg in zip(scene.c2w, scene.fov_deg, strict=True):
         x, y, z = (float(value) for value in c2w[:3, 3])
         found.append(
-            Camera(
+            CameraFacts(
                 position=(x, y, z),
                 distance=float(np.sqrt(x * x + y * y + z * z)),
                 elevation_deg=float(np.degrees(np.arctan2(z, np.hypot(x, y)))),

@@ -20,7 +20,8 @@ from pipeline.documents.html import (
     table,
 )
 from pipeline.documents.scene_facts import cameras, lights, surfaces
-from storage.conventions import DIFFUSE, preview_srgb8, srgb8
+from storage.conventions import preview_srgb8, srgb8
+from storage.material import DIFFUSE
 from storage.records import Failure
 from storage.sample import Sample
 from storage.scene import Scene

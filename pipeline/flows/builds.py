@@ -12,12 +12,42 @@ from pipeline.objects.generated import BENCHMARK
 from pipeline.objects.generated import PREFIX as BUILTIN
 from storage.changes import changed
 from storage.errors import TrilightError
+from storage.registry import Registry
 from storage.safe_url import safe_url
 from storage.statistics import Statistics
-from storage.suggestion import expected_one_of
 
-BUILDS: Mapping[str, NamedBuild] = {**TRAINING_BUILDS, **RENDERFORMER_BUILDS, **JUDGING_BUILDS}
+BUILDS: Registry[NamedBuild] = Registry(
+    "build",
+    NamedBuild,
+    {**TRAINING_BUILDS, **RENDERFORMER_BUILDS, **JUDGING_BUILDS},
+    decides=("data",),
+)
 """By the name that the command line takes."""
+
+
+def typed_build(typed: str) -> str:
+    """Return the name of a build as a person typed it on a command line.
+
+    Of FILE.py:FUNCTION, a file of their own, it registers what the function returns: BuildSettings,
+    of which a cycle of shards is made unless said otherwise, or a NamedBuild. Names that come from
+    elsewhere, a dataset or a form, must not be brought here, since the file is run.
+
+    Raises:
+        TrilightError: as `Registry.typed`, or the function returns something else.
+    """
+    return BUILDS.typed(typed, _as_build)
+
+
+def _as_build(found: Any) -> NamedBuild:
+    if isinstance(found, BuildSettings):
+        splits = found.splits
+        num_scenes = splits.shards_per_cycle * splits.scenes_per_shard
+        return NamedBuild(settings=lambda: found, num_scenes=num_scenes)
+    if isinstance(found, NamedBuild):
+        return found
+    raise TrilightError(
+        f"it returned a {type(found).__name__}; expected BuildSettings or a NamedBuild."
+    )
 
 
 def named_build(
@@ -40,9 +70,13 @@ def named_build(
     Raises:
         TrilightError: an unknown name, or values that contradict each other.
     """
-    if name not in BUILDS:
-        raise TrilightError(f"build {name!r} is unknown; {expected_one_of(name, BUILDS)}.")
-    build = BUILDS[name].settings()
+    build = BUILDS.find(name).settings()
+    if not BUILDS.is_ours(name) and BUILDS.is_ours(build.build):
+        raise TrilightError(
+            f"build {name!r}: its settings say build={build.build!r}, which is one of Trilight's "
+            f"own; expected another name, such as dataclasses.replace(..., "
+            f"build='my-{build.build}')."
+        )
     named = {
         "seed": seed,
         "renders.resolution": resolution,

@@ -1,10 +1,10 @@
 """One scene, or all that a file holds, from one form to another; in a child process with limits.
 
-USD holds many scenes in one file. The other forms hold one: many become `NAME.KEY.SUFFIX`.
+USD holds many scenes in one file. Forms that hold one: many become `NAME.KEY.SUFFIX`.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,29 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.flows.file_child import file_child
-from pipeline.flows.scene_source import LoadedScene, SceneSource, load_source, source_keys
+from pipeline.flows.scene_formats import FORMATS, LoadedScene, SceneFormat, SceneSource, writable
+from pipeline.flows.scene_source import load_source, source_keys
 from pipeline.isolation import ChildFailed, call_with_retries
-from pipeline.scenes import renderformer_json_write
-from pipeline.scenes.renderformer_json_write import described_files
-from storage import renderformer_h5, scene_file
-from storage.atomic import write_atomically
 from storage.carried import lost_members
 from storage.errors import TrilightError
-from storage.renderformer_h5 import reflecting_emitters, write_renderformer_h5
 from storage.scene import Scene
-from storage.scene_file import encode_scene
-from storage.usd import export as usd
-from storage.usd.export import SUFFIXES, write_usd, write_usd_shard
-
-_CARRIED = {
-    **dict.fromkeys(SUFFIXES, usd.CARRIED),
-    ".json": renderformer_json_write.CARRIED,
-    ".h5": renderformer_h5.CARRIED,
-    ".safetensors": scene_file.CARRIED,
-}
-"""What each form holds of a scene, by the suffix that chooses it."""
-
-_EXPECTED = "expected the name of a file: .usda .usdc .usdz, .json, .h5 or .safetensors"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,16 +47,14 @@ def convert_scene(
         TrilightError: the source is unusable, the target's form cannot hold it, or it cannot be
             written.
     """
-    suffix = target.suffix.lower()
-    if suffix not in _CARRIED or target.is_dir():
-        raise TrilightError(f"{target}: cannot be written as a scene; {_EXPECTED}.")
+    form = _form_of(target)
     child = file_child()
     try:
         keys = call_with_retries(child, source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
-        if suffix in SUFFIXES and len(keys) > 1:
-            found = [call_with_retries(child, _many_to_usd, source, keys, target, budget)]
+        if form.write_many and len(keys) > 1:
+            found = [call_with_retries(child, _many, source, keys, target, budget)]
             done(1, 1)
         else:
             found = []
@@ -106,22 +87,23 @@ def write_scene(
     Raises:
         TrilightError: the form cannot hold it, or it cannot be written.
     """
-    suffix = target.suffix.lower()
-    lost = lost_members(scene, _CARRIED[suffix])
-    if suffix in SUFFIXES:
-        write_usd(target, scene)
-    elif suffix == ".json":
-        return (*lost, *_write_json(target, scene))
-    elif suffix == ".h5":
-        write_renderformer_h5(target, scene, radiance_rgb)
-        return (*lost, *reflecting_emitters(scene))
-    else:
-        write_atomically(target, encode_scene(scene))
-    return lost
+    form = _form_of(target)
+    assert form.write is not None
+    return (*lost_members(scene, form.carried), *form.write(target, scene, radiance_rgb))
+
+
+def _form_of(target: Path) -> SceneFormat:
+    form = FORMATS.get(target.suffix.lower())
+    if form is None or form.write is None or target.is_dir():
+        raise TrilightError(
+            f"{target}: cannot be written as a scene; expected the name of a file: "
+            f"{' '.join(writable())}."
+        )
+    return form
 
 
 def _one(source: SceneSource, target: Path, budget: int | None) -> Converted:
-    loaded = _loaded(source, budget, pictures=target.suffix.lower() == ".h5")
+    loaded = _loaded(source, budget, pictures=_form_of(target).holds_pictures)
     lost = write_scene(target, loaded.scene, loaded.radiance_rgb)
     notes = (*loaded.notes, *_said(target, lost))
     return Converted(files=(target,), triangles=loaded.scene.num_triangles, notes=notes)
@@ -131,9 +113,11 @@ def _said(target: Path, lost: Iterable[str]) -> Iterator[str]:
     return (f"{target.name}: cannot hold {text}" for text in lost)
 
 
-def _many_to_usd(
-    source: SceneSource, keys: list[str | None], target: Path, budget: int | None
+def _many(
+    source: SceneSource, keys: Sequence[str | None], target: Path, budget: int | None
 ) -> Converted:
+    form = _form_of(target)
+    assert form.write_many is not None
     triangles, notes = 0, list[str]()
 
     def scenes() -> Iterator[tuple[str, Scene]]:
@@ -141,17 +125,12 @@ def _many_to_usd(
         for key in keys:
             loaded = _loaded(dataclasses.replace(source, key=key), budget)
             triangles += loaded.scene.num_triangles
-            lost = lost_members(loaded.scene, usd.CARRIED)
+            lost = lost_members(loaded.scene, form.carried)
             notes.extend((*loaded.notes, *_said(target, lost)))
-            yield _variant_name(str(key)), loaded.scene
+            yield str(key), loaded.scene
 
-    write_usd_shard(target, scenes())
+    form.write_many(target, scenes())
     return Converted(files=(target,), triangles=triangles, notes=tuple(notes))
-
-
-def _variant_name(key: str) -> str:
-    """Return a key as a variant of USD may be called: a time code has a point, or a minus."""
-    return key.replace(".", "_").replace("-", "m")
 
 
 def _loaded(source: SceneSource, budget: int | None, *, pictures: bool = False) -> LoadedScene:
@@ -164,11 +143,3 @@ def _loaded(source: SceneSource, budget: int | None, *, pictures: bool = False) 
     if loaded.radiance_rgb is not None:
         notes = (*notes, "pictures left out: they show the scene before that")
     return LoadedScene(scene=scene, notes=(*loaded.notes, *notes))
-
-
-def _write_json(target: Path, scene: Scene) -> tuple[str, ...]:
-    described = described_files(scene, target.stem)
-    for path, data in described.meshes.items():
-        write_atomically(target.parent / path, data)
-    write_atomically(target, described.json)  # last: what it names is there
-    return described.lost

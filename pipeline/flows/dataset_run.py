@@ -114,7 +114,7 @@ def prepare_dataset(order: DatasetOrder) -> Run:
 
 
 def _folder(order: DatasetOrder) -> DatasetFolder:
-    folder = dataset_folder(order.out)
+    folder = dataset_folder(order.place)
     return replace(folder, root=folder.root.resolve())
 
 
@@ -184,6 +184,7 @@ def _make_missing(run: Run, runner: Runner, watch: Watcher) -> None:
         accepted=run.accepted,
         lock_sha256=publication.manifest.objects_lock_sha256,
         num_at_once=num_at_once,
+        extensions=publication.manifest.extensions,
     )
     while missing := [
         index for index in publication.missing_shards() if wanted is None or index in wanted

@@ -16,9 +16,10 @@ from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.atomic import write_atomically
-from storage.conventions import EMISSION, look_at_c2w, preview_srgb8
+from storage.conventions import look_at_c2w, preview_srgb8
 from storage.errors import Rejected, TrilightError
 from storage.lights import num_lights
+from storage.material import EMISSION, PUBLISHED_COLUMNS, unread_columns
 from storage.scene import Scene
 from storage.scene_file import scene_digest
 
@@ -70,11 +71,13 @@ def _facts(source: SceneSource) -> InspectedScene:
     low, high = scene.vertex_positions.min(axis=0), scene.vertex_positions.max(axis=0)
     kinds = Counter(entry.kind for entry in scene.objects)
     licences = Counter(entry.licence for entry in scene.objects)
+    added = unread_columns(scene.materials, PUBLISHED_COLUMNS)
     facts = {
         "triangles": scene.num_triangles,
         "vertices": len(scene.vertex_positions),
         "objects": ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
         "materials": len(scene.materials),
+        **({"added_columns": ", ".join(added)} if added else {}),
         "lights": num_lights(scene),
         "cameras": ", ".join(f"{angle:.1f} deg" for angle in scene.fov_deg[:8]),
         "views": scene.num_views,

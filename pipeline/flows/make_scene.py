@@ -30,7 +30,7 @@ MAX_ATTEMPTS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneSource:
+class SceneRecipe:
     """What a render child needs to know once."""
 
     settings: BuildSettings
@@ -62,14 +62,14 @@ class SceneAttempt:
 class _ChildState:
     """The assets of a render child by split, read once."""
 
-    source: SceneSource
+    source: SceneRecipe
     pool: dict[str, Sequence[PooledAsset]]
 
 
 _state = _ChildState()
 
 
-def set_up_child(source: SceneSource) -> None:
+def set_up_child(source: SceneRecipe) -> None:
     """Prepare a render child: its graphics card, Mitsuba's variant, its threads, and the assets."""
     if source.gpu is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = source.gpu

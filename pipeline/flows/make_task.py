@@ -11,13 +11,14 @@ from pipeline.flows.accept_objects import AcceptedObjects
 from pipeline.flows.children import ChildPool
 from pipeline.flows.environment import environment
 from pipeline.flows.machine import cores_owned, visible_gpus
-from pipeline.flows.make_scene import SceneSource, set_up_child
+from pipeline.flows.make_scene import SceneRecipe, set_up_child
 from pipeline.flows.make_shard import make_piece
 from pipeline.flows.pieces import Piece
 from pipeline.flows.settings import BuildSettings, differences
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
+from storage.extensions import recorded, require_same_extensions
 from storage.layout import DatasetFolder
 from storage.manifest import ShardEntry
 from storage.records import Failure
@@ -46,6 +47,8 @@ class ShardJob:
     """Digest of the frozen objects."""
     num_at_once: int
     """Tasks at a time in one process; they share its cores."""
+    extensions: Mapping[str, str]
+    """What the dataset was begun with, which every maker must have loaded (storage.extensions)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +135,7 @@ def _child_of(job: ShardJob) -> Iterator[IsolatedChild]:
 
 
 def _new_pool(job: ShardJob) -> ChildPool:
+    require_same_extensions("this worker: the dataset", job.extensions, recorded("data"))
     variant = choose_variant()
     if job.environment:
         require_environment(job.environment, environment(variant))
@@ -139,7 +143,7 @@ def _new_pool(job: ShardJob) -> ChildPool:
     cards = visible_gpus() if on_card else ()
 
     def render_child(number: int) -> IsolatedChild:
-        source = SceneSource(
+        source = SceneRecipe(
             settings=job.settings,
             variant=variant,
             threads=cores_of_child(job),

@@ -10,10 +10,10 @@ from pipeline.renders.settings import NoiseFloor, Resolution
 from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.dataset_settings import MOST_SCENES
 from storage.errors import TrilightError
+from storage.extensions import function_name
 from storage.output import dataset_folder
 from storage.ranges import Seed, Share, Within
 from storage.settings import checked
-from storage.suggestion import expected_one_of
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 
@@ -28,21 +28,22 @@ class DatasetOrder:
     """Source of 3D objects: a folder here or on a server, builtin:, objaverse:, or
     env:TRILIGHT_SOURCE_NAME for what that environment variable of the worker says. By default what
     the build demands, or else builtin:."""
-    out: str = "data/smoke"
-    """Folder of the dataset, as the worker sees it, or a bucket such as s3://bucket/folder. With a
-    bucket, machines that work at the same time should make different shards, or they waste work."""
+    out: str | None = None
+    """Folder of the dataset, as the worker sees it, or a bucket such as s3://bucket/folder; by
+    default data/BUILD. With a bucket, machines that work at the same time should make different
+    shards, or they waste work."""
     scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
     """How many scenes, rounded up to whole shards; by default the build's number."""
     seed: Seed | None = None
-    """Replaces the build's seed of every draw."""
+    """Seed of every draw; by default the build's."""
     resolution: Resolution | None = None
-    """Replaces the build's picture width in pixels."""
+    """Width of a picture in pixels; by default the build's."""
     noise_floor_db: NoiseFloor | None = None
-    """Replaces the build's target (psnr_log_db)."""
+    """Noise floor in dB (psnr_log_db) down to which is rendered; by default the build's."""
     allow_licences: tuple[str, ...] = ()
-    """Licences allowed in addition to the build's."""
+    """Licences allowed in addition to the build's, which are the default."""
     licence: str | None = None
-    """Licence of object files that come without any statement; otherwise they count as yours."""
+    """Licence of object files that come without any statement; by default they count as yours."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
     """Render processes that share the cores; by default one, or one for each graphics card."""
     failure_budget: Share = 0.1
@@ -50,23 +51,23 @@ class DatasetOrder:
     accept_environment: bool = False
     """Go on with a dataset that was begun with other library versions."""
     scenes_from: str | None = None
-    """Folder of scene files (RenderFormer JSON) to render instead of new scenes: scene k is the
-    k-th *.json, all are of the split test, and the build's limits on scenes do not apply."""
+    """Folder of scene files (RenderFormer JSON) to render instead of new scenes, which are the
+    default: scene k is the k-th *.json, all are of the split test, and the build's limits on scenes
+    do not apply."""
     views: Annotated[int | None, Within(1, 1000, unit="cameras")] = None
     """First cameras of each scene file; by default as many as every file has."""
     albedo_over_one: AlbedoOverOne = "scale"
     """What to do with a material of a scene file whose diffuse and specular albedos add up to more
     than 1: scale multiplies both by one number, refuse leaves the file out."""
     shards: str | None = None
-    """A range of shards A:B, from A up to but not B: make these only. Whoever makes the last
-    missing shard of a dataset finishes it."""
+    """A range of shards A:B, from A up to but not B: make these only, by default all. Whoever makes
+    the last missing shard of a dataset finishes it."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Other settings of the build by dotted name, such as scenes.lights.count."""
+    """Other settings of the build by dotted name, such as scenes.lights.coloured_share=0.5 (values
+    are JSON); by default none differ."""
 
     def __post_init__(self) -> None:
-        if self.build not in BUILDS:
-            expected = expected_one_of(self.build, BUILDS)
-            raise TrilightError(f"build {self.build!r} is unknown; {expected}.")
+        BUILDS.find(self.build)
         if self.scenes_from is not None and (self.objects, self.scenes) != (None, None):
             raise TrilightError(
                 f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "
@@ -74,8 +75,13 @@ class DatasetOrder:
             )
         if self.scenes_from is None and self.views is not None:
             raise TrilightError(f"--views is {self.views}; expected it only with --scenes-from.")
-        dataset_folder(self.out)
+        dataset_folder(self.place)
         self.shard_range()
+
+    @property
+    def place(self) -> str:
+        """Where the dataset is made."""
+        return f"data/{function_name(self.build)}" if self.out is None else self.out
 
     def shard_range(self) -> range | None:
         """Return the shards that are asked for, or None for all.

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from storage.cache import cache_folder, open_private, private_folder
 from storage.errors import TrilightError
+from storage.installation import IMPORT_ROOT
 
 TOLD_BY_ITS_STARTER = "TRILIGHT_TOLD_BY_ITS_STARTER"
 """In the environment of processes that get SIGTERM from who started them, and from nobody else."""
@@ -30,7 +31,7 @@ CLIENT_PASSWORD = "PREFECT_API_AUTH_STRING"
 """Variable of who sends requests, with the same."""
 _START_UP_S = 120.0
 _LOG_NAME = "server.log"
-SERVER = (sys.executable, "-m", "pipeline.flows.guarded_server")
+SERVER = (sys.executable, "-m", f"{__package__}.guarded_server")
 """Program of every server that we start; --host and --port follow."""
 
 
@@ -72,7 +73,7 @@ def prefect_server() -> Iterator[str]:
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
-            cwd=Path(__file__).parents[2],
+            cwd=IMPORT_ROOT,
         )
         url = f"http://127.0.0.1:{port}/api"
         try:

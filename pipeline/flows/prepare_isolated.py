@@ -9,6 +9,7 @@ from pipeline.flows.children import ChildPool
 from pipeline.isolation import ChildLimits, IsolatedChild, preload
 from storage.cache import cache_folder
 from storage.errors import TrilightError
+from storage.installation import module_name
 from storage.records import Failure, ObjectRecord
 
 _LIMITS = ChildLimits(memory_bytes=5 << 30, wall_s=300, cpu_s=60, calls_per_child=50)
@@ -23,8 +24,14 @@ def asset_store() -> AssetStore:
 
 def asset_child() -> IsolatedChild:
     """Return a child for mesh work."""
-    preload(["pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters"])
+    preload_mesh_libraries()
     return IsolatedChild(limits=_LIMITS, setup=require_filters)
+
+
+def preload_mesh_libraries() -> None:
+    """Have every new child begin with the mesh libraries; call before the first one starts."""
+    names = ("pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters")
+    preload([module_name(name) for name in names])
 
 
 def prepare_isolated(

@@ -11,9 +11,9 @@ PRICES = Within(0, 1000, unit="USD per core-hour")
 """Ten thousand times what a core is rented for."""
 
 
-@checked(option="--{}".format)
+@checked()
 class CorePrice:
-    """What `--price` says, of `plan`, `status` and `bench`."""
+    """What computing costs."""
 
     price: Annotated[float, PRICES] = USD_PER_CORE_HOUR
-    """An hour of one core."""
+    """USD for an hour of one core."""

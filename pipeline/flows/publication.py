@@ -14,6 +14,7 @@ from storage.dataset_settings import SplitSettings
 from storage.derived import derivation_of
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.extensions import recorded, require_same_extensions
 from storage.failures import read_failures, write_failures
 from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry, read_manifest, write_manifest
@@ -213,6 +214,7 @@ def begin(
                 num_views=settings.scenes.num_views,
                 objects_lock_sha256="",
                 shards=(),
+                extensions=recorded("data"),
             )
         manifest = dataclasses.replace(manifest, num_scenes=whole)
         write_manifest(folder.manifest, manifest)
@@ -227,6 +229,7 @@ def _require_same_dataset(
     accept_environment: bool,
 ) -> None:
     _require_generated(folder, manifest)
+    require_same_extensions(folder.shown, manifest.extensions, recorded("data"))
     begun = settings_record(from_record(BuildSettings, manifest.settings))  # fields may come later
     _require_same(folder, "setting", begun, settings.as_json(), "choose another --out")
     if not accept_environment:

@@ -2,22 +2,20 @@
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pipeline.assets.settings import AssetSettings
 from pipeline.flows.file_child import file_child
-from pipeline.flows.scene_source import (
-    LoadedScene,
-    SceneSource,
-    load_cameras,
-    load_source,
-    source_keys,
-)
+from pipeline.flows.scene_files import load_mesh_file
+from pipeline.flows.scene_formats import Cameras, LoadedScene, SceneSource
+from pipeline.flows.scene_source import load_cameras, load_source, source_keys
 from pipeline.isolation import ChildFailed, Result, call_with_retries
 from pipeline.scenes.described_albedos import AlbedoOverOne
+from pipeline.scenes.from_description import LoadedMesh
 from storage.errors import TrilightError
+from storage.scene import Scene
 
 
 class SceneReader:
@@ -38,7 +36,7 @@ class SceneReader:
         Raises:
             TrilightError: the file is unusable, or holds no scene.
         """
-        keys = self._call(source_keys, source)
+        keys = self._call(source.name, source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
         return [dataclasses.replace(source, key=key) for key in keys]
@@ -46,11 +44,20 @@ class SceneReader:
     def load(self, source: SceneSource) -> LoadedScene:
         """Read one scene; raises TrilightError as `scene_source.load_source`."""
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
-        return self._call(load_source, source)
+        return self._call(source.name, load_source, source)
 
-    def cameras(self, source: SceneSource) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def cameras(self, source: SceneSource) -> Cameras:
         """Return poses and angles; raises TrilightError as `scene_source.load_cameras`."""
-        return self._call(load_cameras, source)
+        return self._call(source.name, load_cameras, source)
+
+    def mesh(self, path: Path, licence: str) -> LoadedMesh:
+        """Read a file of an object, as it is; raises TrilightError as `load_mesh_file`."""
+        wanted = (path, path.name, path.name, AssetSettings(), licence)
+        return self._call(path.name, load_mesh_file, *wanted)[0]
+
+    def within_budget(self, scene: Scene, max_triangles: int) -> LoadedScene:
+        """Return a scene of fewer triangles; raises TrilightError as `within_budget`."""
+        return self._call("scene", _within_budget, scene, max_triangles)
 
     def __enter__(self) -> "SceneReader":
         return self
@@ -63,8 +70,15 @@ class SceneReader:
     ) -> None:
         self._child.close()
 
-    def _call(self, function: Callable[[SceneSource], Result], source: SceneSource) -> Result:
+    def _call(self, name: str, function: Callable[..., Result], *args: Any) -> Result:
         try:
-            return call_with_retries(self._child, function, source)
+            return call_with_retries(self._child, function, *args)
         except ChildFailed as failure:
-            raise TrilightError(f"{source.name}: could not be read ({failure}).") from failure
+            raise TrilightError(f"{name}: could not be read ({failure}).") from failure
+
+
+def _within_budget(scene: Scene, max_triangles: int) -> LoadedScene:
+    from pipeline.flows.scene_budget import within_budget  # loads mesh libraries
+
+    reduced, notes = within_budget(scene, max_triangles)
+    return LoadedScene(scene=reduced, notes=notes)

@@ -11,7 +11,7 @@ from pipeline.assets.cleaning.clean import clean, normalise
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.recipe import methods_of
-from pipeline.scenes.pieces import Piece, joined
+from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, face_normals, flat_shaded, smooth_shaded
 from storage.errors import Rejected, TrilightError
@@ -59,12 +59,12 @@ def within_budget(scene: Scene, budget: int) -> tuple[Scene, tuple[str, ...]]:
     return reduced, (f"{scene.num_triangles} triangles reduced to {total}",)
 
 
-def _piece_of(scene: Scene, row: int) -> Piece:
+def _piece_of(scene: Scene, row: int) -> ScenePiece:
     own = scene.object_index == row
     rows, corners = np.unique(scene.faces[own], return_inverse=True)
     palette, index = np.unique(scene.material_index[own], return_inverse=True)
     faces = corners.reshape(-1, 3).astype(np.uint32)
-    return Piece(
+    return ScenePiece(
         entry=scene.objects[row],
         mesh=ShadedMesh(
             positions=scene.vertex_positions[rows],
@@ -77,7 +77,7 @@ def _piece_of(scene: Scene, row: int) -> Piece:
     )
 
 
-def _reduced(piece: Piece, count: int) -> Piece:
+def _reduced(piece: ScenePiece, count: int) -> ScenePiece:
     from scipy.spatial import cKDTree
 
     old = piece.mesh
@@ -94,7 +94,7 @@ def _reduced(piece: Piece, count: int) -> Piece:
     )
     centres = old.positions[old.faces].mean(axis=1)
     _, nearest = cKDTree(centres).query(mesh.positions[mesh.faces].mean(axis=1))
-    return Piece(
+    return ScenePiece(
         entry=piece.entry,
         mesh=mesh,
         materials=piece.materials,
@@ -102,7 +102,7 @@ def _reduced(piece: Piece, count: int) -> Piece:
     )
 
 
-def _simpler(piece: Piece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+def _simpler(piece: ScenePiece, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     raw = TriangleMesh(
         positions=piece.mesh.positions.astype(np.float64), faces=piece.mesh.faces.astype(np.int64)
     )

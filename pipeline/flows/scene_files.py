@@ -162,22 +162,47 @@ def _load(
     root: Path, described: DescribedObject, name: str, settings: AssetSettings, licence: str
 ) -> tuple[LoadedMesh, str]:
     """Return the mesh of an object, and the digest of its file."""
-    from pipeline.assets.scene_mesh import load_scene_mesh  # mesh libraries: in children only
-
     where = f"{name}: objects.{described.name}.mesh_path"
     path = _below(root, described.mesh_path, where)
+    uid = path.relative_to(root).as_posix()
+    shown = f"{where} is {described.mesh_path}"
+    return load_mesh_file(path, uid, shown, settings, licence, described.remesh_faces)
+
+
+def load_mesh_file(
+    path: Path,
+    uid: str,
+    shown: str,
+    settings: AssetSettings,
+    licence: str,
+    remesh_faces: int | None = None,
+) -> tuple[LoadedMesh, str]:
+    """Read the mesh of a scene; only children come here.
+
+    Args:
+        path: the file.
+        uid: what the scene calls it.
+        shown: what the user named, for messages.
+        settings: limits on meshes.
+        licence: of the object.
+        remesh_faces: most triangles of a remeshed mesh, or None for the mesh as it is.
+
+    Returns:
+        The mesh, and the sha256 of its file.
+
+    Raises:
+        TrilightError: the file is no usable mesh, or cannot be read.
+    """
+    from pipeline.assets.scene_mesh import load_scene_mesh  # mesh libraries: in children only
+
     try:
-        loaded = load_scene_mesh(path, settings, described.remesh_faces)
+        loaded = load_scene_mesh(path, settings, remesh_faces)
     except Rejected as rejection:
-        raise TrilightError(
-            f"{where} is {described.mesh_path}: {rejection}; expected a usable mesh."
-        ) from rejection
+        raise TrilightError(f"{shown}: {rejection}; expected a usable mesh.") from rejection
     except OSError as error:
-        raise TrilightError(
-            f"{where} is {described.mesh_path}: cannot be read ({error.strerror})."
-        ) from error
+        raise TrilightError(f"{shown}: cannot be read ({error.strerror}).") from error
     mesh = LoadedMesh(
-        uid=path.relative_to(root).as_posix(),
+        uid=uid,
         licence=licence,
         positions=loaded.mesh.positions,
         faces=loaded.mesh.faces,

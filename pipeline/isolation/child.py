@@ -6,23 +6,30 @@ parent decides), and dies with its owner even if that is killed with SIGKILL whi
 the child: the kernel itself watches the pipe between the two, no thread of Python is needed.
 """
 
+import contextlib
 import multiprocessing
 import signal
-from collections.abc import Callable
+import sys
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from types import ModuleType
 from typing import Any
 
 from pipeline.isolation.deaths import ChildFailed, Result, with_retries
 from pipeline.isolation.inside import serve
 from pipeline.isolation.waiting import wait_for_answer
 from storage.errors import EnvironmentFailure, Rejected, TrilightError
+from storage.extensions import load_same, loaded_files
 
 _START_UP_S = 180.0
 _LAUNCHES = 3
 _CRASHES = (signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV, signal.SIGTRAP)
 """Signals by which native code ends itself. Every other one comes from somebody else, also SIGBUS:
 a file that cannot be read or a disk that is full behind a memory map."""
+_one_start = threading.Lock()
+"""Threads start children one after another: `__main__` is hidden meanwhile."""
 
 
 class ChildClosed(Exception):
@@ -113,6 +120,8 @@ class IsolatedChild:
         self._stop()
         self._process, self._connection = _launched(self._limits)
         try:
+            if files := loaded_files():  # first: what follows may be made of what they define
+                self._exchange((load_same, (files,)), _START_UP_S)
             self._exchange(self._setup, _START_UP_S)
         except ChildFailed as failure:
             if self._closed:
@@ -171,7 +180,8 @@ def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
             target=serve, args=(theirs, limits.memory_bytes, limits.cpu_s), daemon=True
         )
         try:
-            process.start()
+            with _without_main():
+                process.start()
         except (EOFError, OSError) as error:
             ours.close()
             if not tries_left:
@@ -183,6 +193,24 @@ def _launched(limits: ChildLimits) -> tuple[Any, Connection]:
         finally:
             theirs.close()
     raise AssertionError("unreachable: the last try returns or raises")
+
+
+@contextlib.contextmanager
+def _without_main() -> Iterator[None]:
+    """Hide a program that runs from a file: multiprocessing would run it again in the child.
+
+    Children import by name what they are asked to call, and need none of it. A program of a user's
+    that does not guard its last lines by `if __name__ == "__main__"` would start children there.
+    What runs by `python -m` is a module, and may be asked for functions of its own.
+    """
+    with _one_start:
+        program = sys.modules["__main__"]
+        if program.__spec__ is None:
+            sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = program
 
 
 def preload(modules: list[str]) -> None:

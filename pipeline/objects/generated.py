@@ -10,12 +10,14 @@ stages after this one read files and nothing else, and a damaged file is mended.
 from pathlib import Path
 
 from pipeline.objects.builtin.families import FAMILIES
+from pipeline.objects.builtin.grids import Mesh
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 from storage.layout import numbered
 from storage.ply import encode_ply
 from storage.records import ObjectRecord
 from storage.seeds import rng_for
+from storage.suggestion import expected_one_of
 
 PREFIX = "builtin:"
 BENCHMARK = "builtin:benchmark-v1"
@@ -40,7 +42,7 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
     for index in range(num_builtin(source)):
         family, number = names[index % len(names)], index // len(names)
         path = work_dir / group / numbered(index, f"{family}-{number:05d}.ply")
-        data = encode_ply(*FAMILIES[family](rng_for(0, f"{group}/{family}", number)))
+        data = encode_ply(*builtin_mesh(family, number, group))
         if not path.is_file() or path.read_bytes() != data:
             write_atomically(path, data)
         records.append(
@@ -55,6 +57,19 @@ def generate_objects(source: str, work_dir: Path) -> list[ObjectRecord]:
             )
         )
     return records
+
+
+def builtin_mesh(family: str, number: int, group: str = "builtin") -> Mesh:
+    """Return a built-in object, vertices [V, 3] and faces [F, 3]: the same one in every dataset.
+
+    Raises:
+        TrilightError: there is no such family.
+    """
+    if family not in FAMILIES:
+        raise TrilightError(
+            f"built-in family {family!r} is unknown; {expected_one_of(family, FAMILIES)}."
+        )
+    return FAMILIES[family](rng_for(0, f"{group}/{family}", number))
 
 
 def num_builtin(source: str) -> int:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from storage.records import Failure, ObjectRecord
 
 Fetched = tuple[list[ObjectRecord], list[Failure]]
-Progress = Callable[[int, int], None]
+CountDone = Callable[[int, int], None]
 
 
-def _here_already(records: list[ObjectRecord], downloaded: Progress) -> Fetched:
+def _here_already(records: list[ObjectRecord], downloaded: CountDone) -> Fetched:
     return records, []
 
 
@@ -21,7 +21,7 @@ class Listing:
     """In any order. The path of an object that must be fetched means nothing yet."""
     failures: list[Failure]
     """Objects that cannot be used, whatever their licence."""
-    fetch: Callable[[list[ObjectRecord], Progress], Fetched] = _here_already
+    fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _here_already
     """Brings objects to this machine; returns them with their paths, and a failure for each that
     could not be had. Files of this machine are left where they are."""
 

@@ -12,22 +12,12 @@ from operator import attrgetter
 from pathlib import Path
 
 from pipeline.objects.generated import PREFIX as BUILTIN
-from pipeline.objects.generated import generate_objects, num_builtin
-from pipeline.objects.licences import (
-    check_allowed,
-    refuse_licences,
-    require_unstated,
-    stated_licence,
-)
+from pipeline.objects.licences import check_allowed, refuse_licences, stated_licence
 from pipeline.objects.listing import Listing
-from pipeline.objects.local.source import list_folder
-from pipeline.objects.objaverse.source import PREFIX as OBJAVERSE
-from pipeline.objects.objaverse.source import list_objaverse
-from pipeline.objects.remote.source import list_remote
+from pipeline.objects.registry import SourceQuery, source_of
 from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
 from storage.records import Failure, ObjectRecord
-from storage.remote.url import parse_url
 from storage.safe_url import printable, safe_url
 
 ENVIRONMENT = "env:"
@@ -105,11 +95,7 @@ def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str
         TrilightError: as `find_objects`, as far as listing the source tells.
     """
     with _said_by(source) as value:
-        if value.startswith(BUILTIN):
-            require_unstated(licence, BUILTIN)
-            num_builtin(value)
-        else:
-            _listed(value, Path(), licence, allowed_licences)
+        _listed(value, Path(), licence, allowed_licences, only_look=True)
 
 
 def _find(
@@ -120,6 +106,7 @@ def _find(
     downloaded: Callable[[int, int], None],
 ) -> FoundObjects:
     listing = _listed(source, work_dir, licence, allowed_licences)
+    assert listing is not None
     allowed, refused = refuse_licences(listing.records, allowed_licences)
     here, lost = listing.fetch(allowed, downloaded)
     failures = [*listing.failures, *refused, *lost]
@@ -174,34 +161,31 @@ def _without_value(message: str, source: str, value: str) -> str:
 
 
 def _listed(
-    source: str, work_dir: Path, licence: str | None, allowed_licences: Sequence[str]
-) -> Listing:
-    """Return what a source says that it holds; raises TrilightError where that is nothing."""
+    source: str,
+    work_dir: Path,
+    licence: str | None,
+    allowed_licences: Sequence[str],
+    *,
+    only_look: bool = False,
+) -> Listing | None:
+    """Return what a source says that it holds, where a look does not do.
+
+    Raises:
+        TrilightError: it holds nothing.
+    """
     check_allowed(allowed_licences)
     stated_licence(licence)
-    listing = _list(source, work_dir, licence, allowed_licences)
-    if not listing.records and not listing.failures:
+    asked = SourceQuery(
+        source=source, work_dir=work_dir, licence=licence, allowed_licences=allowed_licences
+    )
+    listing = source_of(source).asked(asked, only_look=only_look)
+    if listing and not listing.records and not listing.failures:
         raise TrilightError(
             f"objects {printable(safe_url(source))!r} holds no object; expected "
             f"{' '.join(SUFFIXES)} files, or a catalogue (objects.jsonl or objects.csv) that lists "
             f"some. Name {BUILTIN} for built-in objects."
         )
     return listing
-
-
-def _list(
-    source: str, work_dir: Path, licence: str | None, allowed_licences: Sequence[str]
-) -> Listing:
-    if source.startswith(BUILTIN):
-        require_unstated(licence, BUILTIN)
-        return Listing(records=generate_objects(source, work_dir), failures=[])
-    if source.startswith(OBJAVERSE):
-        require_unstated(licence, OBJAVERSE)
-        return list_objaverse(source, allowed_licences)
-    place = parse_url(source, what="objects")
-    if isinstance(place, Path):
-        return list_folder(place, licence)
-    return list_remote(place, licence)
 
 
 def _require_some(shown: str, here: list[ObjectRecord], failures: list[Failure]) -> None:

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 
-from pipeline.objects.listing import Fetched, Progress, failure
+from pipeline.objects.listing import CountDone, Fetched, failure
 from storage.records import Failure, ObjectRecord
 from storage.remote.tries import TransferFailed
 
@@ -12,7 +12,7 @@ from storage.remote.tries import TransferFailed
 def fetch_all(
     records: list[ObjectRecord],
     fetch: Callable[[ObjectRecord], ObjectRecord],
-    downloaded: Progress,
+    downloaded: CountDone,
     *,
     threads: int,
     stop: threading.Event,

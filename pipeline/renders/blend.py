@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import DIFFUSE, ROUGHNESS, SPECULAR, alpha_ggx
+from storage.conventions import alpha_ggx
+from storage.material import DIFFUSE, ROUGHNESS, SPECULAR
 
 MIN_ALPHA = 1e-4
 """Floor of the GGX width: a roughness of 0.01, the smoothest that scenes draw.
@@ -34,7 +35,7 @@ class Lobes:
 
 
 def lobes_of(materials: NDArray[np.float32]) -> Lobes:
-    """Return the lobes of material rows [T, 10]."""
+    """Return the lobes of material rows [T, 10 or more]; other columns are not read."""
     rows = materials.astype(np.float64)
     diffuse, specular = rows[:, DIFFUSE], rows[:, SPECULAR]
     d, s = diffuse.max(axis=1), specular.max(axis=1)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import own_floats
-from storage.conventions import EMISSION
 from storage.errors import Rejected
+from storage.material import EMISSION
 from storage.scene import Scene
 
 _ONE_MINUS_EPSILON = 0.99999994

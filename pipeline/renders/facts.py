@@ -7,25 +7,11 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-from pipeline.renders.variant import Variant
-
-_ROOT = Path(__file__).parents[2]
-_ASK_S = 120
-
-_QUESTION = """
-import json, sys
 from pipeline.renders.denoiser import open_device
 from pipeline.renders.variant import Variant, activate
-variant = Variant(**json.loads(sys.argv[1]))
-activate(variant)
-import drjit
-version = open_device(variant.denoiser).get_int("version")
-print(json.dumps({
-    "threads": str(drjit.thread_count()),
-    "denoiser": f"{version // 10000}.{version // 100 % 100}.{version % 100}",
-    "denoiser_device": variant.denoiser,
-}))
-"""
+from storage.installation import IMPORT_ROOT
+
+_ASK_S = 120
 
 
 def render_facts(variant: Variant) -> dict[str, str]:
@@ -33,8 +19,8 @@ def render_facts(variant: Variant) -> dict[str, str]:
     facts = {name: metadata.version(name) for name in ("mitsuba", "drjit", "pyoidn")}
     facts |= {"variant": variant.name, "llvm": Path(variant.libllvm).name}
     result = subprocess.run(
-        [sys.executable, "-c", _QUESTION, json.dumps(vars(variant))],
-        cwd=_ROOT,
+        [sys.executable, "-m", f"{__package__}.facts", json.dumps(vars(variant))],
+        cwd=IMPORT_ROOT,
         env=dict(os.environ),
         capture_output=True,
         text=True,
@@ -42,3 +28,19 @@ def render_facts(variant: Variant) -> dict[str, str]:
         check=False,
     )
     return facts | json.loads(result.stdout) if result.returncode == 0 else facts
+
+
+def _answer(variant: Variant) -> dict[str, str]:
+    activate(variant)
+    import drjit
+
+    version = open_device(variant.denoiser).get_int("version")
+    return {
+        "threads": str(drjit.thread_count()),
+        "denoiser": f"{version // 10000}.{version // 100 % 100}.{version % 100}",
+        "denoiser_device": variant.denoiser,
+    }
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(_answer(Variant(**json.loads(sys.argv[1])))))

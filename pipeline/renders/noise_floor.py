@@ -44,7 +44,7 @@ _MAX_GROWTH = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoiseFloor:
+class MeasuredFloor:
     """The measured error of one picture, in dB."""
 
     log_db: float
@@ -65,7 +65,7 @@ class Half:
     """[R, R, 3] the same, denoised."""
 
 
-def measure_floor(a: Half, b: Half, hits: NDArray[np.bool_], spp: int) -> NoiseFloor:
+def measure_floor(a: Half, b: Half, hits: NDArray[np.bool_], spp: int) -> MeasuredFloor:
     """Return the floor of the picture made from both halves.
 
     It cannot see light that no sample has found: a view whose only caustic was never hit looks
@@ -79,7 +79,7 @@ def measure_floor(a: Half, b: Half, hits: NDArray[np.bool_], spp: int) -> NoiseF
     """
     common_db = common_error_db(outlying_share(a, b), spp)
     first, second = a.denoised_rgb, b.denoised_rgb
-    return NoiseFloor(
+    return MeasuredFloor(
         log_db=psnr_log_db(first, second) - common_db,
         linear_db=psnr_linear_db(first, second) - common_db,
         object_log_db=object_psnr_log_db(first, second, hits) - common_db,

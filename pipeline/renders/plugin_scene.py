@@ -16,8 +16,8 @@ from pipeline.renders.blend import lobes_of, scaled_albedos
 from pipeline.renders.compensated_texture import PLUGIN, register_plugin
 from pipeline.renders.multiscatter import scattered_again
 from pipeline.renders.tracer import split_triangles
-from storage.conventions import EMISSION
 from storage.errors import Rejected
+from storage.material import EMISSION
 from storage.scene import Scene
 
 _TWIN_OFFSET = 1e-4

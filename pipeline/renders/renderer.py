@@ -20,7 +20,7 @@ from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import (
     Goal,
     Half,
-    NoiseFloor,
+    MeasuredFloor,
     expected_spp,
     measure_floor,
     next_spp,
@@ -158,14 +158,14 @@ class SceneRenderer:
         if mean < bound:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
 
-    def _refuse_noisy(self, floor: NoiseFloor) -> None:
+    def _refuse_noisy(self, floor: MeasuredFloor) -> None:
         target_db = self._settings.noise_floor_db
         if self._settings.reject_at_cap and floor.log_db < target_db:
             raise Rejected("floor_not_reached", f"{floor.log_db:.1f} dB; expected {target_db:g}")
 
     def _sample_to_target(
         self, samples: HalfSamples, features: Features, hits: NDArray[np.bool_]
-    ) -> Generator[Sampling, None, NoiseFloor]:
+    ) -> Generator[Sampling, None, MeasuredFloor]:
         settings = self._settings
         measured: list[tuple[int, float]] = []
         while True:

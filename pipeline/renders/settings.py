@@ -15,6 +15,9 @@ A pass of 64 is stratified finer than four of 16: 0.1 to 0.3 dB less error on sa
 to 2 dB in the median pixel of the easy ones (LOG.md). The small ones are for quick previews.
 """
 
+FIRST_SPP = 2 * PASS_SPP[1]
+"""Samples of a picture before its floor is measured; of fewer, the noise floor may flatter."""
+
 MAX_RESOLUTION = 2048
 """Largest picture: one pass of 64 samples takes 3.3 GB there, and that grows with the area."""
 
@@ -82,6 +85,26 @@ class RenderSettings:
             f"and a cap of a multiple of {2 * PASS_SPP[0]} for the best sampling",
         )
         _require(self.aux_spp in PASS_SPP, f"aux_spp is {self.aux_spp}; expected one of {PASS_SPP}")
+
+
+def one_picture(*, resolution: int, noise_floor_db: float, max_spp: int) -> RenderSettings:
+    """Return the settings of a picture that a person asks for, who gets it even where it is dark.
+
+    Args:
+        resolution: width and height in pixels, a multiple of 8.
+        noise_floor_db: target of the measured error (psnr_log_db).
+        max_spp: most samples per pixel.
+
+    Raises:
+        TrilightError: a value that is refused; the message names it.
+    """
+    return RenderSettings(
+        resolution=resolution,
+        noise_floor_db=noise_floor_db,
+        min_spp=min(FIRST_SPP, max_spp),
+        max_spp=max_spp,
+        min_mean_radiance=0.0,
+    )
 
 
 def _require(law: bool, complaint: str) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from storage.conventions import EMISSION
+from storage.material import EMISSION
 from storage.scene import Scene
 
 _STEPS = 34

@@ -31,8 +31,8 @@ from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.installation import IMPORT_ROOT
 
-_ROOT = Path(__file__).parents[2]
 _PROBE_S = 180
 _REMEMBERED_TRIES = 32
 
@@ -180,8 +180,8 @@ def _probe(variant: Variant) -> _Probed:
             environment["DRJIT_LIBLLVM_PATH"] = variant.libllvm
         try:
             result = subprocess.run(
-                [sys.executable, "-m", "pipeline.renders.variant_probe", variant.name],
-                cwd=_ROOT,
+                [sys.executable, "-m", f"{__package__}.variant_probe", variant.name],
+                cwd=IMPORT_ROOT,
                 env=environment,
                 capture_output=True,
                 text=True,

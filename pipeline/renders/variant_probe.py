@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.denoiser import DenoiserDevice, card_is_supported, set_denoiser_device
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from storage.conventions import look_at_c2w
+from storage.material import completed_rows
 from storage.scene import ObjectKind, Scene, SceneObject
 
 BLOCK = 4
@@ -124,7 +125,7 @@ def probe_scene() -> Scene:
         vertex_normals=np.repeat(normals, 3, axis=0).astype(np.float32),
         faces=np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3),
         material_index=rows,
-        materials=np.array(materials, np.float32),
+        materials=completed_rows(np.array(materials, np.float32), None),
         object_index=rows,
         c2w=look_at_c2w(eye=[0, -3, 1.6], target=[0.1, 0, 0.4], up=[0, 0, 1])[None].astype(
             np.float32

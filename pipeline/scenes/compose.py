@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
+from pipeline.scenes.drawn_columns import with_drawn_columns
 from pipeline.scenes.laws import require_laws
-from pipeline.scenes.pieces import Piece, emitter_piece, joined, object_piece, shell_piece
+from pipeline.scenes.pieces import ScenePiece, emitter_piece, joined, object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.posing import posed
 from pipeline.scenes.shapes import MeshShape
@@ -67,8 +68,12 @@ def compose_scene(
     ]
     layout = layout_rand(rng, settings, plan, shapes)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng)
+    arrays = joined(pieces)
+    arrays["materials"] = with_drawn_columns(
+        arrays["materials"], seed=seed, scene_index=scene_index, attempt=attempt
+    )
     scene = Scene(
-        **joined(pieces),
+        **arrays,
         c2w=np.zeros((0, 4, 4), np.float32),
         fov_deg=np.zeros(0, np.float32),
         objects=tuple(piece.entry for piece in pieces),
@@ -117,7 +122,7 @@ def scene_pieces(
     shapes: Sequence[MeshShape],
     settings: SceneSettings,
     rng: np.random.Generator,
-) -> list[Piece]:
+) -> list[ScenePiece]:
     """Return floor and walls, objects and emitters of a layout, the objects as `shapes`.
 
     Raises:

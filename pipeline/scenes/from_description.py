@@ -27,19 +27,13 @@ from pipeline.scenes.description import (
     DescribedObject,
     SceneDescription,
 )
-from pipeline.scenes.pieces import Piece, joined
+from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
 from scene_templates.contents.rotations import rotated, rotation_xyz
-from storage.conventions import (
-    DIFFUSE,
-    EMISSION,
-    MATERIAL_WIDTH,
-    ROUGHNESS,
-    SPECULAR,
-    look_at_c2w,
-)
+from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
+from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.scene import ObjectKind, Scene, SceneObject
 
 SHELL_FOLDER = "templates/backgrounds/"
@@ -96,7 +90,7 @@ def scene_from_description(
     Raises:
         TrilightError: an object or a camera that means nothing, named; or too much of something.
     """
-    pieces: list[Piece] = []
+    pieces: list[ScenePiece] = []
     scales: dict[str, float] = {}
     for described, mesh in zip(description.objects, meshes, strict=True):
         try:
@@ -144,7 +138,7 @@ def scaled_albedo_notes(scene: Scene) -> tuple[str, ...]:
 
 def _pieces(
     described: DescribedObject, mesh: LoadedMesh, over_one: AlbedoOverOne
-) -> tuple[list[Piece], float]:
+) -> tuple[list[ScenePiece], float]:
     """Return the pieces of an object, and by what the darkest of its materials was multiplied."""
     positions = placed(mesh, described)
     mirrored = np.prod(described.transform.scale) < 0
@@ -168,7 +162,7 @@ def _pieces(
 
 def _surface(
     described: DescribedObject, mesh: LoadedMesh, shaded: ShadedMesh, over_one: AlbedoOverOne
-) -> tuple[Piece, float]:
+) -> tuple[ScenePiece, float]:
     material = described.material
     rows = np.zeros(len(shaded.faces), np.int64)
     diffuse = np.array([material.diffuse])
@@ -179,15 +173,15 @@ def _surface(
     materials, scale = _reflecting(diffuse, material, over_one)
     kind: ObjectKind = "shell" if mesh.uid.startswith(SHELL_FOLDER) else "object"
     entry = _entry(described.name, kind, mesh)
-    return Piece(entry=entry, mesh=shaded, materials=materials, material_index=rows), scale
+    return ScenePiece(entry=entry, mesh=shaded, materials=materials, material_index=rows), scale
 
 
 def _reflecting(
     diffuse: NDArray[np.float64], material: DescribedMaterial, over_one: AlbedoOverOne
 ) -> tuple[NDArray[np.float32], float]:
-    """Return rows [M, 10] that do not emit, for diffuse albedos [M, 3], and the least factor."""
+    """Return rows that do not emit, for diffuse albedos [M, 3], and the least factor."""
     diffuse, specular, scale = lawful_albedos(diffuse, np.array(material.specular), over_one)
-    materials = np.zeros((len(diffuse), MATERIAL_WIDTH), np.float32)
+    materials = default_rows(len(diffuse))
     materials[:, DIFFUSE] = diffuse
     materials[:, SPECULAR] = specular
     materials[:, ROUGHNESS] = material.roughness
@@ -200,7 +194,7 @@ def _emitters(
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
     over_one: AlbedoOverOne,
-) -> tuple[list[Piece], float]:
+) -> tuple[list[ScenePiece], float]:
     if len(faces) > MAX_EMITTERS:
         _too_many("emitting triangles", len(faces), MAX_EMITTERS)
     diffuse = np.array([described.material.diffuse])
@@ -208,7 +202,7 @@ def _emitters(
     materials[:, EMISSION] = described.material.emissive
     single = len(faces) == 1
     pieces = [
-        Piece(
+        ScenePiece(
             entry=_entry(described.name if single else f"{described.name}.{row}", "emitter", mesh),
             mesh=flat_shaded(positions, faces[row : row + 1]),
             materials=materials,
@@ -244,7 +238,7 @@ def _pose(camera: DescribedCamera, row: int) -> NDArray[np.float64]:
     return c2w
 
 
-def _check_counts(pieces: Sequence[Piece]) -> None:
+def _check_counts(pieces: Sequence[ScenePiece]) -> None:
     emitters = sum(piece.entry.kind == "emitter" for piece in pieces)
     for what, count, most in (
         ("triangles", sum(len(piece.mesh.faces) for piece in pieces), MAX_TRIANGLES),

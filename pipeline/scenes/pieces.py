@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
-from scene_templates.layout import Emitter, ShellPart, Surface
-from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, ROUGHNESS, SPECULAR
+from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.errors import Rejected
+from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.scene import SceneObject
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Piece:
+class ScenePiece:
     """One row of `Scene.objects` with its triangles and materials."""
 
     entry: SceneObject
@@ -23,12 +23,12 @@ class Piece:
     mesh: ShadedMesh
     """In world space."""
     materials: NDArray[np.float32]
-    """[M, 10]."""
+    """[M, 10 or more], every declared column (storage.material)."""
     material_index: NDArray[np.int64]
     """[T] row of `materials`."""
 
 
-def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: float) -> Piece:
+def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: float) -> ScenePiece:
     """Return a floor or wall; where it has many colours, one per triangle drawn from `rng`."""
     positions = part.positions.astype(np.float32)
     mesh = _shaded(positions, part.faces, part.surface, smooth_angle_deg)
@@ -39,10 +39,10 @@ def object_piece(
     entry: SceneObject,
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
-    surface: Surface,
+    surface: SurfaceLook,
     rng: np.random.Generator,
     smooth_angle_deg: float,
-) -> Piece:
+) -> ScenePiece:
     """Return an object in its place: vertices [V, 3] in world space, and faces [F, 3].
 
     Raises:
@@ -54,21 +54,23 @@ def object_piece(
     return _surfaced(entry, _shaded(positions, faces, surface, smooth_angle_deg), surface, rng)
 
 
-def emitter_piece(emitter: Emitter, row: int) -> Piece:
+def emitter_piece(emitter: Emitter, row: int) -> ScenePiece:
     """Return an emitter: one triangle with a material row of its own."""
     mesh = flat_shaded(emitter.triangle.astype(np.float32), np.array([[0, 1, 2]], np.uint32))
-    materials = np.zeros((1, MATERIAL_WIDTH), np.float32)
+    materials = default_rows(1)
     materials[:, DIFFUSE] = emitter.reflectance
     materials[:, ROUGHNESS] = 1.0
     materials[:, EMISSION] = emitter.radiance_rgb
     entry = SceneObject(name=f"emitter{row}", kind="emitter")
-    return Piece(entry=entry, mesh=mesh, materials=materials, material_index=np.zeros(1, np.int64))
+    return ScenePiece(
+        entry=entry, mesh=mesh, materials=materials, material_index=np.zeros(1, np.int64)
+    )
 
 
 def _shaded(
     positions: NDArray[np.float32],
     faces: NDArray[np.uint32],
-    surface: Surface,
+    surface: SurfaceLook,
     smooth_angle_deg: float,
 ) -> ShadedMesh:
     if surface.smooth:
@@ -77,8 +79,8 @@ def _shaded(
 
 
 def _surfaced(
-    entry: SceneObject, mesh: ShadedMesh, surface: Surface, rng: np.random.Generator
-) -> Piece:
+    entry: SceneObject, mesh: ShadedMesh, surface: SurfaceLook, rng: np.random.Generator
+) -> ScenePiece:
     """Give a mesh its materials: one row, or one per shading group or triangle."""
     rows = {
         "one": np.zeros(len(mesh.faces), np.int64),
@@ -88,14 +90,14 @@ def _surfaced(
     diffuse = np.array([surface.diffuse_rgb])
     if surface.colours != "one":
         diffuse = surface.diffuse_scale * rng.random((int(rows.max()) + 1, 3))
-    materials = np.zeros((len(diffuse), MATERIAL_WIDTH), np.float32)
+    materials = default_rows(len(diffuse))
     materials[:, DIFFUSE] = diffuse
     materials[:, SPECULAR] = surface.specular_rgb
     materials[:, ROUGHNESS] = surface.roughness
-    return Piece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
+    return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
 
 
-def joined(pieces: Sequence[Piece]) -> dict[str, NDArray]:
+def joined(pieces: Sequence[ScenePiece]) -> dict[str, NDArray]:
     """Return the geometry and material arrays of a Scene, in the order of the pieces."""
     vertex_start = _starts([len(piece.mesh.positions) for piece in pieces])
     material_start = _starts([len(piece.materials) for piece in pieces])

@@ -24,13 +24,14 @@ from pipeline.scenes.renderformer_json import (
     read_description,
 )
 from pipeline.scenes.shading import face_normals, smooth_shaded
-from storage.conventions import DIFFUSE, EMISSION, HALF_FLOAT_MAX, ROUGHNESS, SPECULAR
+from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
+from storage.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
 from storage.scene import ARRAY_FIELDS, Scene
 
 CARRIED = frozenset(
     {*ARRAY_FIELDS, "objects.name", "objects.kind"} - {"materials"}
-    | {f"materials.{name}" for name in ("diffuse", "specular", "roughness", "emission")}
+    | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
 )
 """Of a scene (storage.carried)."""
 

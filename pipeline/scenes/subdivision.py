@@ -11,13 +11,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from pipeline.scenes.pieces import Piece
+from pipeline.scenes.pieces import ScenePiece
 from pipeline.scenes.shading import ShadedMesh
 
 Edge = tuple[int, int]
 
 
-def filled(pieces: Sequence[Piece], fill_to: int) -> list[Piece]:
+def filled(pieces: Sequence[ScenePiece], fill_to: int) -> list[ScenePiece]:
     """Return the pieces with the objects subdivided until all have `fill_to` triangles together.
 
     Each object gets its share by what it has. The sum falls short of `fill_to` by a few; pieces
@@ -33,7 +33,7 @@ def filled(pieces: Sequence[Piece], fill_to: int) -> list[Piece]:
     ]
 
 
-def subdivided(piece: Piece, num_faces: int) -> Piece:
+def subdivided(piece: ScenePiece, num_faces: int) -> ScenePiece:
     """Return a piece with at most `num_faces` faces, short of it by less than one edge's faces.
 
     The longest edge is halved in every face that has it, so that no gap opens. A piece that has as

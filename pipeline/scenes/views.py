@@ -20,7 +20,7 @@ from storage.seeds import rng_for
 CAMERA_ATTEMPTS = 16
 """Proposals per view."""
 
-Camera = tuple[NDArray[np.float32], np.float32]
+PoseAndAngle = tuple[NDArray[np.float32], np.float32]
 
 
 def with_first_cameras(scene: Scene, settings: SceneSettings) -> Scene:
@@ -46,7 +46,7 @@ def next_camera(scene: Scene, settings: SceneSettings, *, view: int) -> Scene:
     settings = settings.of_scene(scene.provenance["scene_index"])
     attempts = list(scene.provenance["camera_attempts"])
     camera, attempt = _first_camera(scene, Sight(scene), settings, view, attempts[view] + 1)
-    cameras: list[Camera] = list(zip(scene.c2w, scene.fov_deg, strict=True))
+    cameras: list[PoseAndAngle] = list(zip(scene.c2w, scene.fov_deg, strict=True))
     cameras[view], attempts[view] = camera, attempt
     return _with_cameras(scene, cameras, attempts)
 
@@ -66,7 +66,7 @@ def complaint(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str
 
 def _first_camera(
     scene: Scene, sight: Sight, settings: SceneSettings, view: int, first: int
-) -> tuple[Camera, int]:
+) -> tuple[PoseAndAngle, int]:
     has_objects = any(entry.kind == "object" for entry in scene.objects)
     complaints: list[str] = []
     for attempt in range(first, CAMERA_ATTEMPTS):
@@ -82,14 +82,14 @@ def _first_camera(
     )
 
 
-def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> Camera:
+def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> PoseAndAngle:
     origin = scene.provenance
     rng = rng_for(origin["seed"], "camera", origin["scene_index"], origin["attempt"], view, attempt)
     pose = TEMPLATES[origin["template"]].camera_rand(rng, settings.cameras)
     return pose.c2w.astype(np.float32), np.float32(pose.fov_deg)
 
 
-def _with_cameras(scene: Scene, cameras: list[Camera], attempts: list[int]) -> Scene:
+def _with_cameras(scene: Scene, cameras: list[PoseAndAngle], attempts: list[int]) -> Scene:
     posed = scene.with_cameras(
         np.stack([c2w for c2w, _ in cameras]), np.array([fov_deg for _, fov_deg in cameras])
     )

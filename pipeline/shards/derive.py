@@ -142,6 +142,7 @@ def _manifest(
         build=builds.pop() if len(builds) == 1 else "merged",
         settings=derived_settings(derivation, scenes_per_shard=scenes_per_shard),
         environment=_environment(manifests),
+        extensions=_extensions(manifests),
         num_scenes=sum(shard.num_samples for shard in shards),
         objects_lock_sha256=sha256_hex(encode_objects_lock(objects)),
         shards=shards,
@@ -154,6 +155,15 @@ def _environment(manifests: Sequence[Manifest]) -> Mapping[str, Any]:
     if all(environment == environments[0] for environment in environments):
         return environments[0]
     return {**common(environments), "of_sources": environments}
+
+
+def _extensions(manifests: Sequence[Manifest]) -> Mapping[str, str]:
+    """Return every file that had part in a source; one name may stand for several files."""
+    found: dict[str, set[str]] = {}
+    for manifest in manifests:
+        for name, sha256 in manifest.extensions.items():
+            found.setdefault(name, set()).update(sha256.split(" "))
+    return {name: " ".join(sorted(several)) for name, several in sorted(found.items())}
 
 
 def _failures(sources: Sequence[FinishedDataset], taken: Sequence[Taken]) -> list[Failure]:

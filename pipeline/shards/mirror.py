@@ -21,7 +21,7 @@ from pipeline.shards.pack import rejections_of_shard
 from storage.atomic import write_atomically
 from storage.claims import claimed
 from storage.dataset import Dataset
-from storage.dataset_files import RemoteFiles
+from storage.dataset_files import RemoteDatasetFiles
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.failures import decode_failures, read_failures, write_failures
@@ -53,7 +53,7 @@ class Mirror:
         assert isinstance(url, RemoteUrl)
         self._folder = folder
         self._bucket = Bucket(url)
-        self._files = RemoteFiles(url)
+        self._files = RemoteDatasetFiles(url)
 
     def names(self) -> set[str]:
         """Return the names of all files of the dataset."""
@@ -252,7 +252,12 @@ def _identity(manifest: Manifest | None) -> object:
     """Return what scenes that are not in a shard yet depend on."""
     if manifest is None:
         return None
-    return (manifest.settings, manifest.environment, manifest.objects_lock_sha256)
+    return (
+        manifest.settings,
+        manifest.environment,
+        manifest.objects_lock_sha256,
+        manifest.extensions,
+    )
 
 
 def _clear(folder: DatasetFolder) -> None:

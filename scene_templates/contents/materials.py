@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from scene_templates.checks import Range, require
-from scene_templates.layout import Surface
+from scene_templates.layout import SurfaceLook
 from storage.ranges import Share, Within
 from storage.settings import checked
 
@@ -53,7 +53,7 @@ def surface_rand(
     *,
     smooth_share: float,
     kind: Literal["shell", "object"],
-) -> Surface:
+) -> SurfaceLook:
     """Draw a surface: mostly white energy split between a coloured diffuse and a specular.
 
     Args:
@@ -73,7 +73,7 @@ def surface_rand(
     by_triangle = kind == "shell" or rng.random() < settings.triangle_colours_share
     tint = rng.random(3) if rng.random() < settings.coloured_specular_share else np.ones(3)
     specular_red, specular_green, specular_blue = specular * tint
-    return Surface(
+    return SurfaceLook(
         diffuse_scale=diffuse_scale,
         diffuse_rgb=(red, green, blue),
         specular_rgb=(specular_red, specular_green, specular_blue),

@@ -3,7 +3,8 @@
 Sizes and rotations are drawn first, then places, the largest object first and each several times
 over, before sizes are given up and drawn anew. Drawing whole arrangements until one fits would be
 exactly uniform, but takes ten times as long and prefers small objects; here sizes stay near their
-stated range. What an object looks like is asked of its `Shape`; a template knows no meshes.
+stated range. What an object looks like is asked of its `PlaceableShape`; a template knows no
+meshes.
 """
 
 from collections.abc import Sequence
@@ -48,7 +49,7 @@ class PlacementSettings:
     centres are uniform in the cube [-0.5, 0.5]^3 and they may stick through."""
 
 
-class Shape(Protocol):
+class PlaceableShape(Protocol):
     """An object's mesh, scaled into the unit sphere around the origin."""
 
     @property
@@ -103,7 +104,7 @@ def poses_rand(
     rng: np.random.Generator,
     settings: PlacementSettings,
     space: ObjectSpace,
-    shapes: Sequence[Shape],
+    shapes: Sequence[PlaceableShape],
     *,
     object_scale: Range,
     overlaps: bool,
@@ -140,9 +141,9 @@ def _pose_rand(
     rng: np.random.Generator,
     settings: PlacementSettings,
     space: ObjectSpace,
-    shape: Shape,
+    shape: PlaceableShape,
     radius: float,
-    others: Sequence[tuple[Shape, Pose]],
+    others: Sequence[tuple[PlaceableShape, Pose]],
 ) -> Pose | None:
     """Draw a place for an object clear of others, or None where none was found."""
     rotation = rotation_rand(rng, settings.orientation)

@@ -1,6 +1,7 @@
 """A family: one layout with how many objects of which size it holds, and how often it is drawn."""
 
-from typing import Annotated
+from collections.abc import Callable, Mapping
+from typing import Annotated, ClassVar
 
 from scene_templates.checks import SIZE, Counts, Range, require
 from scene_templates.shell.rooms import SharedRoom
@@ -14,6 +15,8 @@ from storage.settings import checked
 class Family:
     """One row of the table that scenes are drawn from."""
 
+    PRESETS: ClassVar[Mapping[str, Callable[[], "Family"]]] = {}
+    """Functions by name that return one (families.default_families), for `storage.changes`."""
     name: str
     """Unique, such as `corner-multi`."""
     template: str

@@ -17,7 +17,7 @@ from scene_templates.layout import (
     Layout,
     ObjectPlacement,
     ShellPart,
-    Surface,
+    SurfaceLook,
 )
 from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
 from scene_templates.templates.sectors import Sector
@@ -29,7 +29,7 @@ class LayoutParams:
 
     patches: tuple[PatchPlacement, ...]
     """Where each shell part stands."""
-    surfaces: tuple[Surface, ...]
+    surfaces: tuple[SurfaceLook, ...]
     """What each shell part is made of."""
     objects: tuple[ObjectPlacement, ...]
     """Where the objects are, and what they are made of."""

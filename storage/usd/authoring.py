@@ -102,6 +102,7 @@ def _converter(kind: str) -> Callable[[Any], Any]:
     known: dict[str, Callable[[Any], Any]] = {
         "token[]": Vt.TokenArray,
         "int[]": Vt.IntArray.FromNumpy,
+        "float[]": Vt.FloatArray.FromNumpy,
         "color3f": Gf.Vec3f,
         "float2": Gf.Vec2f,
         "matrix4d": Gf.Matrix4d,

@@ -13,8 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import MATERIAL_COLUMNS, MATERIAL_WIDTH, require_readable
+from storage.conventions import require_readable
 from storage.errors import TrilightError
+from storage.material import (
+    PUBLISHED_COLUMNS,
+    UndeclaredColumn,
+    declared_column,
+    default_rows,
+    laid_out,
+)
 from storage.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.scene_file import scene_digest, scene_provenance
 from storage.usd import names
@@ -63,8 +70,8 @@ def read_exact(layer: Any, key: str | None = None) -> Scene | None:
     """Return the scene of a layer, or that under `key` of a shard; None where it is not as written.
 
     Raises:
-        TrilightError: it was written by a Trilight that this one cannot read, or the scene breaks a
-            law.
+        TrilightError: it was written by a Trilight that this one cannot read, has a material column
+            that is not declared here, or the scene breaks a law.
     """
     root = _root_of(layer, key)
     if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
@@ -73,6 +80,8 @@ def read_exact(layer: Any, key: str | None = None) -> Scene | None:
     require_readable(root.attributes[names.VERSION].default, name)
     try:
         scene = _scene(root)
+    except UndeclaredColumn as error:
+        raise TrilightError(f"{name}: {error}") from error
     except (_Changed, LookupError, TypeError, ValueError, AttributeError):
         return None
     if scene_digest(scene) != root.attributes[names.DIGEST].default:
@@ -128,12 +137,14 @@ def _scene(root: Any) -> Scene:
 
 def _materials(folder: Any) -> NDArray[np.float32]:
     prims = _numbered(folder, names.material_name)
-    rows = np.zeros((len(prims), MATERIAL_WIDTH), np.float32)
+    rows = default_rows(len(prims))
+    columns = _columns(prims[0])
     for row, prim in enumerate(prims):
-        for column, name in names.MATERIAL_ATTRIBUTES.items():
-            rows[row, MATERIAL_COLUMNS[column]] = prim.attributes[name].default
+        for column, part in laid_out():
+            if column.name in columns:
+                rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
         _children(prim, {PREVIEW, OPENPBR})
-        for place, table in material_tables(rows[row]).items():
+        for place, table in material_tables(rows[row], columns).items():
             part = prim.nameChildren[place.removeprefix("/")] if place else prim
             _require(as_expected(part, table))
             outputs = _OUTPUTS[place]
@@ -143,6 +154,13 @@ def _materials(folder: Any) -> NDArray[np.float32]:
                 own = prim.path.StripAllVariantSelections()
                 _require(found == ([] if source is None else [f"{own}/{source}"]))
     return rows
+
+
+def _columns(prim: Any) -> tuple[str, ...]:
+    """Return the columns that a material has; raises UndeclaredColumn."""
+    found = (names.added_column(attribute.name) for attribute in prim.attributes)
+    added = [name for name in found if name is not None]
+    return (*PUBLISHED_COLUMNS, *(declared_column(name).name for name in added))
 
 
 def _object(prim: Any) -> SceneObject:

@@ -23,7 +23,6 @@ from storage.usd.materials import add_materials
 from storage.usd.meshes import add_objects
 from storage.usd.names import (
     DIGEST,
-    MATERIAL_ATTRIBUTES,
     OBJECT_TEXTS,
     PROVENANCE,
     ROOT,
@@ -38,11 +37,7 @@ from storage.usd.package import packaged
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
 
-CARRIED = frozenset(
-    {*ARRAY_FIELDS, "provenance"} - {"materials"}
-    | {f"objects.{field}" for field in OBJECT_TEXTS}
-    | {f"materials.{column}" for column in MATERIAL_ATTRIBUTES}
-)
+CARRIED = frozenset({*ARRAY_FIELDS, "provenance"} | {f"objects.{field}" for field in OBJECT_TEXTS})
 """Of a scene (storage.carried)."""
 
 

@@ -10,18 +10,28 @@ OpenPBR counts emission in nits and UsdPreviewSurface as a plain colour: both ge
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.material import (
+    DIFFUSE,
+    EMISSION,
+    PUBLISHED_COLUMNS,
+    ROUGHNESS,
+    SPECULAR,
+    laid_out,
+    stored_columns,
+)
 from storage.usd.authoring import Attributes, add_attributes, add_output, add_prim, usd_value
 from storage.usd.names import (
     DIFFUSE_ALBEDO,
     EMITTED_RADIANCE,
     ROUGHNESS_VALUE,
     SPECULAR_ALBEDO,
+    column_attribute,
     material_name,
 )
 
@@ -33,7 +43,7 @@ _MOST_REFLECTING = 0.98
 
 
 def add_materials(layer: Any, folder: str, materials: NDArray[np.float32]) -> None:
-    """Write a prim for each material row [M, 10] below `folder`.
+    """Write a prim for each material row below `folder`.
 
     Copies of the first prim get their values: that takes half the time of writing each anew.
     """
@@ -41,21 +51,27 @@ def add_materials(layer: Any, folder: str, materials: NDArray[np.float32]) -> No
 
     add_prim(layer, folder, "Scope")
     first = f"{folder}/{material_name(0)}"
+    names = stored_columns(materials)
     for row, values in enumerate(materials):
         path = f"{folder}/{material_name(row)}"
         if row == 0:
-            _add_material(layer, path, values)
+            _add_material(layer, path, material_tables(values, names))
             continue
         Sdf.CopySpec(layer, first, layer, path)
-        for place, attributes in material_tables(values).items():
+        for place, attributes in material_tables(values, names).items():
             prim = layer.GetPrimAtPath(path + place)
             for name, (kind, value) in attributes.items():
-                if kind in ("color3f", "float"):
+                if kind in ("color3f", "float", "float[]"):
                     prim.attributes[name].default = usd_value(kind, value)
 
 
-def material_tables(values: NDArray[np.float32]) -> dict[str, Attributes]:
-    """Return the attributes of the prims of a material row [10], by their place below it."""
+def material_tables(values: NDArray[np.float32], columns: Sequence[str]) -> dict[str, Attributes]:
+    """Return the attributes of the prims of a material row, by their place below it.
+
+    Args:
+        values: the row, with all declared columns.
+        columns: names of those that the file holds (storage.material.stored_columns).
+    """
     diffuse, specular, emission = (_rgb(values[part]) for part in (DIFFUSE, SPECULAR, EMISSION))
     roughness = float(values[ROUGHNESS])
     head_on, luminance = max(specular), max(emission)
@@ -66,6 +82,7 @@ def material_tables(values: NDArray[np.float32]) -> dict[str, Attributes]:
             SPECULAR_ALBEDO: ("color3f", specular),
             ROUGHNESS_VALUE: ("float", roughness),
             EMITTED_RADIANCE: ("color3f", emission),
+            **_added_columns(values, columns),
         },
         f"/{PREVIEW}": {
             "info:id": ("uniform token", "UsdPreviewSurface"),
@@ -90,8 +107,22 @@ def material_tables(values: NDArray[np.float32]) -> dict[str, Attributes]:
     }
 
 
-def _add_material(layer: Any, path: str, values: NDArray[np.float32]) -> None:
-    for place, attributes in material_tables(values).items():
+def _added_columns(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
+    """Return the exact attributes of the columns beyond the published ones."""
+    found: dict[str, tuple[str, Any]] = {}
+    for column, part in laid_out():
+        if column.name in columns and column.name not in PUBLISHED_COLUMNS:
+            kind = "color3f" if column.is_colour else "float" if column.width == 1 else "float[]"
+            value = _rgb(values[part]) if column.is_colour else values[part]
+            found[column_attribute(column.name)] = (
+                kind,
+                float(value[0]) if kind == "float" else value,
+            )
+    return found
+
+
+def _add_material(layer: Any, path: str, tables: Mapping[str, Attributes]) -> None:
+    for place, attributes in tables.items():
         prim = add_prim(layer, path + place, "Shader" if place else "Material")
         add_attributes(prim, attributes)
         if place:

@@ -47,10 +47,24 @@ MATERIAL_ATTRIBUTES = {
     "roughness": ROUGHNESS_VALUE,
     "emission": EMITTED_RADIANCE,
 }
-"""On a material, by the names of its columns (storage.conventions)."""
+"""On a material, by the names of its columns (storage.material)."""
+
+_ADDED_COLUMN = NAMESPACE + "column:"
+"""Begins the attribute of a column that was added to the published ones."""
 
 FOV_DEG = NAMESPACE + "fovDeg"
 """On a camera; its pose is the transform, in doubles that hold single precision exactly."""
+
+
+def column_attribute(column: str) -> str:
+    """Return the attribute of a material column; of an added one it ends in the column's name."""
+    return MATERIAL_ATTRIBUTES.get(column, _ADDED_COLUMN + column)
+
+
+def added_column(attribute: str) -> str | None:
+    """Return the column beyond the published ones whose attribute this is; None for any other."""
+    column = attribute.removeprefix(_ADDED_COLUMN)
+    return None if column == attribute else column
 
 
 def material_name(row: int) -> str:

@@ -39,6 +39,16 @@ def test_what_streams_shards_needs_no_checker_of_settings(statement: str) -> Non
     assert not _loaded_by(statement) & {"pydantic", "prefect", "mitsuba", "pxr"}
 
 
+def test_the_face_is_light_until_it_is_used() -> None:
+    loaded = _loaded_by("import trilight")
+    assert not {name for name in loaded if name.startswith(("numpy", "storage", "pipeline"))}
+    every_module = (
+        "import trilight.compose, trilight.datasets, trilight.extend, trilight.learning, "
+        "trilight.pictures, trilight.scenes"
+    )
+    assert not _loaded_by(every_module) & set(HEAVY)
+
+
 def test_settings_are_light() -> None:
     assert not _loaded_by("import pipeline.flows.builds") & set(HEAVY)
 

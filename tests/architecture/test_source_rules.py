@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.conftest import ROOT
 
-PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra")
+PACKAGES = ("trilight", "storage", "scene_templates", "pipeline", "model", "train", "infra")
 MAX_FILE_LINES, MAX_FUNCTION_LINES = 300, 40
 
 
@@ -71,8 +71,9 @@ def test_the_top_level_holds_what_the_design_names() -> None:
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
     ).stdout
     allowed = {
-        *PACKAGES, "tests", "docs", "requirements", "README.md", "LICENSE", "DECISIONS.md",
-        "LOG.md", "Makefile", "pyproject.toml", "prefect.yaml",
+        *PACKAGES, "tests", "docs", "examples", "requirements", "README.md", "LICENSE",
+        "CONTRIBUTING.md", "DECISIONS.md", "LOG.md", "MANIFEST.in", "Makefile", "pyproject.toml",
+        "prefect.yaml",
     }  # fmt: skip
     top = {line.split("/")[0] for line in tracked.splitlines()}
     assert {name for name in top if not name.startswith(".")} <= allowed
@@ -82,7 +83,11 @@ def test_no_file_names_this_machine() -> None:
     pattern = re.compile(r"/(?:work|root|home)/\w+|py" r"pi\.org|pythonhos" r"ted|npm" r"js\.org")
     found = [
         f"{path.relative_to(ROOT)}: {match[0]}"
-        for path in [*_sources(*PACKAGES, "tests"), *ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
+        for path in [
+            *_sources(*PACKAGES, "tests", "examples"),
+            *ROOT.glob("*.md"),
+            *ROOT.glob("docs/**/*.md"),
+        ]
         if (match := pattern.search(path.read_text()))
     ]
     assert not found

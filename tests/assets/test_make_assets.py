@@ -191,7 +191,7 @@ def test_only_bad_objects_make_a_folder_too(source: Path, tmp_path: Path) -> Non
 
 def trilight(*arguments: str, cache: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "infra.cli.app", *arguments],
+        [sys.executable, "-m", "trilight", *arguments],
         cwd=ROOT,
         env=os.environ | {"TRILIGHT_CACHE": str(cache)},
         capture_output=True,
@@ -249,15 +249,19 @@ def test_a_mistake_is_one_line(tmp_path: Path, cache: Path, option: tuple[str, s
     assert not (out / "objects.jsonl").exists()
 
 
+def _asked(epsilon: str) -> assets.Meshes:
+    return assets.Meshes(source="builtin:", out=Path("meshes"), epsilon=epsilon)
+
+
 @pytest.mark.parametrize("epsilon", ["half", "9", "-1%", "nan", "inf", "0", "%", "1%%", "5 %."])
 def test_epsilons_without_meaning_are_refused(epsilon: str) -> None:
     with pytest.raises(TrilightError, match="epsilon is"):
-        assets._settings(None, epsilon, "faithful")
+        assets._settings(_asked(epsilon))
 
 
 @pytest.mark.parametrize(("text", "share"), [("0.5%", 0.005), ("0.005", 0.005), (" 1 %", 0.01)])
 def test_epsilons_are_shares_or_percent(text: str, share: float) -> None:
-    settings = assets._settings(None, text, "faithful")
+    settings = assets._settings(_asked(text))
     # One division in double precision.
     assert settings.epsilon == pytest.approx(share, rel=1e-15)
     assert settings.budgets == (4096,)

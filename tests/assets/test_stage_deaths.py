@@ -32,8 +32,8 @@ def hurried(bench: Bench) -> Iterator[Hurried]:
 
 @pytest.fixture(autouse=True)
 def source(bench: Bench) -> Path:
-    """3840 faces: every level needs a method."""
-    return write_obj(bench.root / "knot.obj", knot())
+    """1440 faces: every level needs a method."""
+    return write_obj(bench.root / "knot.obj", knot(segments=60))
 
 
 ENDS = [
@@ -51,7 +51,7 @@ ENDS = [
     ["die", "eat", "leave", "fail", "crash", pytest.param("sleep", marks=pytest.mark.slow)],
 )
 def test_a_child_that_dies_once_changes_no_byte(hurried: Hurried, action: str) -> None:
-    """A mesh of 3840 faces takes a second, and far below 15 on a busy machine."""
+    """A mesh of 1440 faces takes less than a second, and far below 15 on a busy machine."""
     bench = hurried(wall_s=15.0)
     (undisturbed,), _ = run(bench, "knot.obj", store="undisturbed")
     bench.set(**{FIRST: f"{action} once"})

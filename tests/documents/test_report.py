@@ -7,6 +7,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from pipeline.documents.distributions import dataset_distributions
+from pipeline.documents.gallery import write_gallery
 from pipeline.documents.report import write_report
 from storage.dataset import Dataset
 from storage.errors import TrilightError
@@ -49,10 +50,17 @@ def hostile(root: Path) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def five(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Tags]:
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Five scenes with their report."""
+    dataset = five_scenes(tmp_path_factory.mktemp("five"))
+    report_of(dataset)
+    return dataset
+
+
+@pytest.fixture(scope="module")
+def five(dataset: Dataset) -> dict[str, Tags]:
     """The pages of five scenes, by file name without suffix."""
-    report = report_of(five_scenes(tmp_path_factory.mktemp("five")))
-    return {path.stem: tags for path, tags in pages(report).items()}
+    return {path.stem: tags for path, tags in pages(dataset.folder.report).items()}
 
 
 def test_text_from_outside_stays_text(tmp_path: Path) -> None:
@@ -80,8 +88,8 @@ def test_only_source_addresses_lead_elsewhere(tmp_path: Path) -> None:
     assert "somebody" in text_of(page)
 
 
-def test_links_lead_somewhere(tmp_path: Path) -> None:
-    shown = pages(report_of(five_scenes(tmp_path)))
+def test_links_lead_somewhere(dataset: Dataset) -> None:
+    shown = pages(dataset.folder.report)
     followed = 0
     for path, tags in shown.items():
         for link in tags.links:
@@ -140,25 +148,13 @@ def test_swatches_show_the_albedo(five: dict[str, Tags]) -> None:
     assert "background: #cb0000" in five["000000000"].styles
 
 
-def test_writing_twice_gives_the_same_bytes(tmp_path: Path) -> None:
-    dataset = write_dataset(tmp_path, {"train-000000.tar": [sample(0, furnished(["a"]))]})
-    first = {path: path.read_bytes() for path in pages(report_of(dataset))}
-    assert {path: path.read_bytes() for path in pages(report_of(dataset))} == first
-    assert not any(str(tmp_path).encode() in data for data in first.values())
-
-
-def test_no_rejections(tmp_path: Path) -> None:
-    dataset = write_dataset(tmp_path, {"train-000000.tar": [sample(0, furnished(["a"]))]})
-    text = text_of(pages(report_of(dataset))[tmp_path / "report.html"])
-    assert "Nothing was rejected" in text
-
-
-def test_one_scene_has_no_neighbours(tmp_path: Path) -> None:
+def test_one_scene_has_neither_neighbours_nor_rejections(tmp_path: Path) -> None:
     dataset = write_dataset(tmp_path, {"validation-000002.tar": [sample(9, furnished([]))]})
     shown = pages(report_of(dataset))
     assert shown[tmp_path / "report" / "000000009.html"].links[0] == "../report.html#gallery"
     assert "before" not in text_of(shown[tmp_path / "report" / "000000009.html"])
     assert "1 of 1 scenes" in text_of(shown[tmp_path / "report.html"])
+    assert "Nothing was rejected" in text_of(shown[tmp_path / "report.html"])
 
 
 def test_no_scenes_at_all(tmp_path: Path) -> None:
@@ -168,7 +164,7 @@ def test_no_scenes_at_all(tmp_path: Path) -> None:
 
 def test_the_gallery_is_bounded_and_old_pages_go(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
-    report_of(dataset)
+    write_gallery(dataset, (), dataset.folder, 48)
     mine = tmp_path / "report" / "notes.html"
     mine.write_text("kept")
     report = report_of(dataset, max_scenes=2)
@@ -180,11 +176,17 @@ def test_the_gallery_is_bounded_and_old_pages_go(tmp_path: Path) -> None:
         report_of(dataset, max_scenes=1001)
 
 
-def test_another_folder_leaves_the_dataset_alone(tmp_path: Path) -> None:
-    dataset = five_scenes(tmp_path / "set")
-    before = sorted((tmp_path / "set").iterdir())
+def test_writing_elsewhere_gives_the_same_bytes_and_leaves_the_dataset_alone(
+    tmp_path: Path, dataset: Dataset
+) -> None:
+    root = dataset.folder.root
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     found = dataset_distributions(dataset)
-    report = write_report(dataset, found, out=DatasetFolder(tmp_path / "out"))
-    assert report == tmp_path / "out" / "report.html"
-    assert len(list((tmp_path / "out" / "report").iterdir())) == 5
-    assert sorted((tmp_path / "set").iterdir()) == before
+    report = write_report(dataset, found, out=DatasetFolder(tmp_path))
+    assert report == tmp_path / "report.html"
+    written = {path.relative_to(tmp_path): path.read_bytes() for path in pages(report)}
+    assert written == {
+        path.relative_to(root): path.read_bytes() for path in pages(root / "report.html")
+    }
+    assert not any(str(root).encode() in data for data in written.values())
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before

@@ -74,12 +74,12 @@ def environment(driver: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def _generate(out: Path | str, *more: str) -> list[str]:
-    command = ["-m", "infra.cli.app", "generate", "smoke", *OPTIONS]
+    command = ["-m", "trilight", "generate", "smoke", *OPTIONS]
     return [*command, "--out", str(out), *more]
 
 
 def _read(name: str, place: Path | str, environment: dict[str, str], *more: str) -> str:
-    return call(["-m", "infra.cli.app", name, str(place), *more], environment, RUN_S)
+    return call(["-m", "trilight", name, str(place), *more], environment, RUN_S)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """From objects to shards to a training model with the commands of the README, small."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -28,14 +29,9 @@ def test_objects_to_shards_to_a_model(trilight: Trilight, tmp_path: Path) -> Non
     with Image.open(tmp_path / "set" / "contact_sheet.png") as sheet:
         assert min(sheet.size) > 400
         assert len(sheet.getcolors(1 << 24) or []) > 1000  # pictures, not an empty sheet
-    assert trilight("inspect", "set").returncode == 0
     assert outcome["dataset_digest"] in (tmp_path / "set" / "README.md").read_text()
     for name in ("LICENSE.md", "attribution.csv", "croissant.json", "report.html"):
         assert (tmp_path / "set" / name).stat().st_size > 100
-
-    resharded = trilight("shards", "reshard", "set", "--out", "three", "--scenes-per-shard", "3")
-    assert resharded.returncode == 0, resharded.stderr
-    assert trilight("verify", "three").returncode == 0
 
     trained = trilight("train", "smoke", "--data", "set", "--out", "run", "--steps", "60")
     assert trained.returncode == 1
@@ -75,13 +71,13 @@ BAD_INPUT = [
     (("train", "nonsense", "--data", "empty"), "'nonsense'"),
     (("shards", "merge", "empty", "empty", "--out", "c"), "no manifest.json"),
     (("shards", "select", "empty", "--out", "c", "--split", "no"), "--split is 'no'"),
-    (("bench", "nonsense"), "benchmark 'nonsense' is unknown"),
+    (("bench", "nonsense"), "experiment 'nonsense' is unknown"),
 ]
 
 
 @pytest.mark.parametrize(("arguments", "message"), BAD_INPUT)
 def test_bad_input_is_one_clear_line(
-    trilight: Trilight, tmp_path: Path, arguments: tuple[str, ...], message: str
+    refused: Callable[..., str], tmp_path: Path, arguments: tuple[str, ...], message: str
 ) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken").mkdir()
@@ -91,9 +87,4 @@ def test_bad_input_is_one_clear_line(
            "source_url": ""}  # fmt: skip
     (tmp_path / "twice" / "a.stl").write_bytes(b"solid nothing")
     (tmp_path / "twice" / "objects.jsonl").write_text(2 * (json.dumps(row) + "\n"))
-    result = trilight(*arguments)
-    assert result.returncode == 1, result.stdout
-    lines = [line for line in result.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, result.stderr
-    assert lines[0].startswith("trilight: ")
-    assert message in lines[0]
+    assert message in refused(*arguments)

@@ -42,7 +42,7 @@ RUN_S = 900
 
 def _generate(out: Path, scenes: int, *more: str) -> None:
     size = (*OPTIONS, "--scenes", str(scenes))
-    call(["-m", "infra.cli.app", "generate", "smoke", *size, "--out", str(out), *more],
+    call(["-m", "trilight", "generate", "smoke", *size, "--out", str(out), *more],
          dict(os.environ), RUN_S)  # fmt: skip
 
 
@@ -154,7 +154,7 @@ def test_the_lines_of_the_readme_need_nothing_exported(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_ranges_at_the_same_time_and_who_is_last_finishes(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "infra.cli.app", "generate", "smoke", *OPTIONS]
+    command = [sys.executable, "-m", "trilight", "generate", "smoke", *OPTIONS]
     command += ["--scenes", str(FEW)]
     runs = [
         subprocess.Popen([*command, "--out", str(tmp_path / "set"), "--shards", shards])

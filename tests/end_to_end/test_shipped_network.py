@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from model.checkpoints import BUILTIN
+from model.open import BUILTIN
 from tests.end_to_end.conftest import Trilight
 
 SCENES = (

@@ -7,7 +7,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from infra.rendering.session import Asked
+from infra.rendering.asked import Asked
 from infra.serving.train_model import TrainOrder
 from infra.setup.settings_page import ROOTS, reachable
 from model.config import ModelConfig, smoke, tiny
@@ -32,6 +32,7 @@ from storage.ranges import Declared, declared_ranges
 from storage.scene import Scene
 from train.data.augmentation import AugmentationSettings
 from train.evaluation.evaluate import Contest
+from train.evaluation.order import EvaluationOrder
 from train.loss.settings import LossSettings
 from train.runs import named_run
 from train.settings import TrainSettings
@@ -75,6 +76,7 @@ EXAMPLES: dict[type, Any] = {
     LossSettings: RUN.loss,
     AugmentationSettings: RUN.augmentation,
     Contest: CONTEST,
+    EvaluationOrder: EvaluationOrder(checkpoint="a", data=("b",)),
 }  # fmt: skip
 """A valid value of every class that declares a range, but for `Scene`."""
 

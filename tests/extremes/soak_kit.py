@@ -99,7 +99,7 @@ def _command(objects: str, out: Path, num_scenes: int) -> list[str]:
         "renders.max_spp": 8,
         "renders.min_mean_radiance": 0.0,
     }
-    words = [sys.executable, "-m", "infra.cli.app", "generate", "smoke", "--out", str(out)]
+    words = [sys.executable, "-m", "trilight", "generate", "smoke", "--out", str(out)]
     words += ["--objects", objects, "--scenes", str(num_scenes)]
     words += ["--resolution", "16", "--noise-floor", "10"]
     return words + [

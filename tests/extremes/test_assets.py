@@ -101,7 +101,9 @@ def test_one_triangle_is_an_object(tmp_path: Path) -> None:
     assert asset.source.open_edges == 3
 
 
-@pytest.mark.parametrize("method", ["pymeshlab_collapse", "meshoptimizer"])
+@pytest.mark.parametrize(
+    "method", [pytest.param("pymeshlab_collapse", marks=pytest.mark.slow), "meshoptimizer"]
+)
 def test_two_hundred_thousand_faces(tmp_path: Path, method: str) -> None:
     ball = sphere(rings=251, columns=400)
     assert len(ball.faces) == 200_000 + 800

@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from model.attention import attend
 from model.attention_reference import attend_reference
-from model.checkpoints import BUILTIN, open_checkpoint
 from model.config import SIZES
 from model.layer_errors import layer_errors, probe_batch, random_network
 from model.layers import LAYER_NORM_EPS, Norm
+from model.open import BUILTIN, open_network
 from model.positions import TriangleRotary
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneBatch, batch_scenes, scene_tensors
@@ -47,7 +47,7 @@ EMISSIONS = [0.0, 1e-6, 1.0, 1e6]
 
 NETWORKS = {
     "random": lambda: random_network(SIZES["tiny"]()),
-    "trained": lambda: open_checkpoint(BUILTIN),
+    "trained": lambda: open_network(BUILTIN),
 }
 """One with every part of the large ones, and the one that is shipped."""
 
@@ -60,9 +60,9 @@ def network(request: pytest.FixtureRequest) -> RenderFormer:
 def lit(emission: float) -> SceneBatch:
     """Return a scene all of whose triangles emit so much, and the brightest other materials."""
     scene = random_scene(20, num_views=1, dtype=torch.float32)
-    material = torch.ones_like(scene.material_T10)
+    material = torch.ones_like(scene.material_TM)
     material[:, 7:] = math.log10(1 + emission)
-    return batch_scenes([dataclasses.replace(scene, material_T10=material)])
+    return batch_scenes([dataclasses.replace(scene, material_TM=material)])
 
 
 def products(model: RenderFormer) -> dict[str, nn.Module]:
@@ -148,7 +148,7 @@ def test_no_gradient_is_too_small_for_bfloat16(backward: dict[str, Tensor]) -> N
 
 def test_float16_would_lose_the_gradients_of_a_trained_network() -> None:
     """The loss is a mean over pixels, which makes them so: training offers no float16."""
-    gradients = [output.grad for output in backward_of(open_checkpoint(BUILTIN)).values()]
+    gradients = [output.grad for output in backward_of(open_network(BUILTIN)).values()]
     every = torch.cat([grad.flatten() for grad in gradients if grad is not None])
     # measured: 99.7 and 32 %, and more with more scenes in the mean; another network is not far off
     assert share_below(every, HALF_NORMAL) > 0.9
@@ -179,7 +179,7 @@ def test_emission_is_read_from_darkness_to_a_million() -> None:
         materials = scene.materials.copy()
         materials[-1, 7:] = emission
         tensors = scene_tensors(dataclasses.replace(scene, materials=materials))
-        read = 10 ** tensors.material_T10[-1, 7].double().item() - 1
+        read = 10 ** tensors.material_TM[-1, 7].double().item() - 1
         # float32 of a logarithm up to 6: 3e-7 of it, times ln 10
         assert read == pytest.approx(emission, rel=2e-6, abs=1e-7)
 

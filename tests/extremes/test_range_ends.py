@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from model.config import ModelConfig
 from model.renderformer import RenderFormer
-from model.scene_tensors import batch_scenes
+from model.scene_tensors import batch_scenes, tensors_of
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from pipeline.scenes.compose import compose_scene
@@ -265,7 +265,7 @@ def test_the_strongest_augmentation_leaves_scenes_finite() -> None:
     for seed in range(20):
         shown = augmented(scene, STRONGEST, np.random.default_rng(seed))
         assert torch.isfinite(shown.target_VRR3).all()
-        for tensor in vars(shown.tensors).values():
+        for tensor in tensors_of(shown.tensors).values():
             assert torch.isfinite(tensor).all()
 
 

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from infra.setup.settings_page import FILE, ROOTS, reachable, settings_page
-from storage.conventions import EMISSION
 from storage.errors import TrilightError
+from storage.material import EMISSION
 from storage.ranges import Columns, Declared, Within, declared_ranges
 from storage.scene import Scene, SceneObject
 from storage.settings import checked

@@ -13,9 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.flows.builds import named_build
-from storage.conventions import EMISSION, HALF_FLOAT_MAX
+from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.exr import decode_exr, encode_exr
+from storage.material import EMISSION
 from storage.profiles import PROFILES, Profile, keeps_law, pack_picture
 from storage.renderformer_h5 import write_renderformer_h5
 from storage.renderformer_h5_read import read_renderformer_h5

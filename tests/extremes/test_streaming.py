@@ -19,7 +19,7 @@ from storage.training_data import open_training_data
 from storage.verify import verify_dataset
 from tests.flows.derive_kit import finished, scenes
 from tests.train.toy import write_toy_dataset
-from train.data.order import OrderSettings, Share, batches_from, windows_from
+from train.data.order import OrderSettings, RankShare, batches_from, windows_from
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable
 
@@ -31,13 +31,13 @@ def keys(
     settings = StreamSettings(
         seed=0, window=window, batch_size=batch_size, resolution=8, views_per_scene=1
     )
-    shares = [_keys(root, settings, first, count, Share(rank=r, world_size=ranks))
+    shares = [_keys(root, settings, first, count, RankShare(rank=r, world_size=ranks))
               for r in range(ranks)]  # fmt: skip
     return [sorted(itertools.chain(*parts)) for parts in zip(*shares, strict=True)]
 
 
 def _keys(
-    root: Path, settings: StreamSettings, first: int, count: int, share: Share
+    root: Path, settings: StreamSettings, first: int, count: int, share: RankShare
 ) -> list[list[str]]:
     batches = stream_batches(
         open_training_data([str(root)]).split("train"),
@@ -95,7 +95,7 @@ def test_pixels_that_do_not_divide_the_data_s_are_refused(tmp_path: Path) -> Non
     write_toy_dataset(tmp_path, train=1, validation=1, per_shard=1, resolution=8, views=1)
     settings = StreamSettings(seed=0, window=1, batch_size=1, resolution=3, views_per_scene=1)
     with pytest.raises(TrilightError, match="resolution 3: expected a divisor of 8"):
-        _keys(tmp_path, settings, 0, 1, Share())
+        _keys(tmp_path, settings, 0, 1, RankShare())
 
 
 @pytest.mark.parametrize("num_samples", [0, 1, SAMPLES_PER_SHARD + 1, 20_000])

@@ -10,6 +10,11 @@ from tests.flows.bucket_kit import Machines, empty_bucket
 from tests.s3_server import s3_server
 
 
+@pytest.fixture(autouse=True)
+def _bare(bare_reports: None) -> None:
+    """No test here looks at a figure."""
+
+
 @pytest.fixture(scope="module")
 def moto() -> Iterator[int]:
     with s3_server() as port:

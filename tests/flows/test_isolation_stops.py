@@ -73,21 +73,25 @@ def test_a_child_that_is_continued_in_time_answers_itself(
     assert len(caplog.records) == 1
 
 
-PROGRAM = """
-import os, sys, time
-sys.path.insert(0, {root!r})
-from pipeline.isolation import ChildLimits, IsolatedChild
+CALLED = """
+import os, time
 
 def wait_for(path):
     while not os.path.exists(path):
         time.sleep(0.02)
     return os.getpid()
+"""
 
-if __name__ == "__main__":
-    limits = ChildLimits(memory_bytes=2 << 30, wall_s=5, calls_per_child=9)
-    child = IsolatedChild(limits=limits, setup=int)
-    print(child.call(wait_for, __file__), flush=True)
-    print(child.call(wait_for, __file__ + ".go"), flush=True)
+PROGRAM = """
+import sys
+sys.path.insert(0, {root!r})
+from called import wait_for
+from pipeline.isolation import ChildLimits, IsolatedChild
+
+limits = ChildLimits(memory_bytes=2 << 30, wall_s=5, calls_per_child=9)
+child = IsolatedChild(limits=limits, setup=int)
+print(child.call(wait_for, __file__), flush=True)
+print(child.call(wait_for, __file__ + ".go"), flush=True)
 """
 
 
@@ -95,6 +99,7 @@ def test_a_command_that_is_stopped_as_a_whole_goes_on_where_it_was(tmp_path: Pat
     """As by Ctrl-Z and `fg`: the pause is longer than the child's wall time, and nobody is told."""
     program = tmp_path / "program.py"
     program.write_text(PROGRAM.format(root=str(ROOT)))
+    (tmp_path / "called.py").write_text(CALLED)
     with subprocess.Popen(
         [sys.executable, str(program)],
         stdout=subprocess.PIPE,

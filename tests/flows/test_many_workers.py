@@ -8,9 +8,9 @@ from typing import Any, cast
 
 import pytest
 
-from infra.cli.generate import _runner
 from pipeline.flows import make_task
 from pipeline.flows.children import ChildPool
+from pipeline.flows.executors import find_executor
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.served import build_dataset as building
 from pipeline.flows.served import on_dask, runner
@@ -131,7 +131,7 @@ def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_pat
 
 def test_what_cannot_be_told_to_dask_is_named() -> None:
     with pytest.raises(TrilightError, match="--workers is 2; expected it without --runner dask"):
-        _runner("dask", "tcp://127.0.0.1:1", 2)
+        find_executor("dask", "tcp://127.0.0.1:1", 2)
     pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
     with (
         pytest.raises(TrilightError, match="--address http://127.0.0.1:1: no Dask scheduler"),

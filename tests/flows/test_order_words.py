@@ -2,12 +2,10 @@
 
 import json
 
-from typer.testing import CliRunner
-
-from infra.cli.app import app
 from infra.cli.changes import parse_changes
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.order_words import generate_words
+from tests.command_line import trilight
 
 ASKED = DatasetOrder(
     build="pretrain-256",
@@ -35,16 +33,16 @@ def test_every_option_that_was_given_is_there() -> None:
         ("--scenes", "2000000"),
         ("--seed", "7"),
         ("--resolution", "64"),
-        ("--noise-floor", "25.5"),
-        ("--allow-licence", "CC-BY-NC-4.0"),
-        ("--allow-licence", "MIT"),
+        ("--noise-floor-db", "25.5"),
+        ("--allow-licences", "CC-BY-NC-4.0"),
+        ("--allow-licences", "MIT"),
         ("--licence", "CC0-1.0"),
         ("--failure-budget", "0.2"),
     ):
         at = [i for i, word in enumerate(words) if word == pair[0]]
         assert pair[1] in [words[i + 1] for i in at]
     assert "--accept-environment" in words
-    changes = [words[i + 1] for i, word in enumerate(words) if word == "--set"]
+    changes = [words[i + 1] for i, word in enumerate(words) if word == "--changes"]
     assert parse_changes(changes) == json.loads(json.dumps(dict(ASKED.changes)))
 
 
@@ -53,7 +51,7 @@ def test_what_nobody_asked_for_is_not_there() -> None:
 
 
 def test_every_option_of_an_order_is_one_of_the_command() -> None:
-    shown = CliRunner().invoke(app, ["generate", "--help"], env={"COLUMNS": "200"}).output
+    shown = trilight(["generate", "--help"], env={"COLUMNS": "200"}).output
     for word in generate_words(ASKED):
         assert not word.startswith("--") or word in shown
 

@@ -5,13 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from model.config import smoke
 from model.trained_range import TrainedRange
 from model.weights import encode_weights
-from storage.errors import TrilightError
+from tests.command_line import trilight
 from tests.model.kit import awake
 
 SMALL = ("--resolution", "16", "--max-spp", "8", "--noise-floor", "90")
@@ -20,17 +18,14 @@ SMALL = ("--resolution", "16", "--max-spp", "8", "--noise-floor", "90")
 def render(*arguments: str | Path) -> dict[str, Any]:
     """Return what `trilight render --json` prints."""
     words = ["render", *(str(argument) for argument in arguments), *SMALL, "--json"]
-    result = CliRunner().invoke(app, words)
+    result = trilight(words)
     assert result.exit_code == 0, result.exception
     return dict(json.loads(result.output))
 
 
 def mistake(*arguments: str | Path) -> str:
     """Return the one line that a mistake becomes."""
-    result = CliRunner().invoke(app, ["render", *(str(argument) for argument in arguments)])
-    assert isinstance(result.exception, TrilightError), result.output
-    assert "\n" not in str(result.exception)
-    return str(result.exception)
+    return trilight(["render", *(str(argument) for argument in arguments)]).mistake
 
 
 def write_network(path: Path, max_triangles: int | None = None, bias: float = 0.3) -> Path:

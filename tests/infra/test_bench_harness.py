@@ -29,7 +29,7 @@ def same_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running, "machine", lambda: here)
 
 
-def measured(folder: Path, one: Experiment, data: str = "") -> Run:
+def measured(folder: Path, one: Experiment, data: str | None = None) -> Run:
     store = run(one, TINY, Asked(data=data), folder=folder)
     found = store.newest()
     assert found is not None

@@ -56,7 +56,7 @@ def test_the_transcription_gives_the_published_outputs(shared: Path) -> None:
         scene = SceneTensors(
             triangles_T33=batch.triangles_BT33[number][exists],
             normals_T33=batch.normals_BT33[number][exists],
-            material_T10=batch.material_BT10[number][exists],
+            material_TM=batch.material_BTM[number][exists],
             c2w_V44=batch.c2w_BV44[number],
             fov_deg_V=batch.fov_deg_BV[number],
         )

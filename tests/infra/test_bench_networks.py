@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from infra.bench.experiments.network import trained_scores
+from infra.bench.experiments.network_size import trained_scores
 from infra.bench.sides.network_memory import peaks_of
 from infra.bench.sides.networks import (
     CPU,
@@ -53,7 +53,7 @@ def test_the_published_side_pays_for_textures() -> None:
 def test_scenes_have_the_size_that_is_asked_for(triangles: int) -> None:
     scene = scene_of(Workload(triangles=triangles, views=3, resolution=32))
     assert scene.num_triangles == triangles and scene.num_views == 3
-    assert scene.material_T10[:, -3:].max() > 0, "a light is among them"
+    assert scene.material_TM[:, -3:].max() > 0, "a light is among them"
     assert len(scene.c2w_V44.unique(dim=0)) == 3
 
 

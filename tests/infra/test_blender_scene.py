@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from pipeline.scenes.usd.read import UsdScene, read_usd
-from storage.conventions import EMISSION, preview_srgb8
+from storage.conventions import preview_srgb8
+from storage.material import EMISSION
 from storage.metrics import psnr_linear_db
 from tests.infra.blender_kit import ours, run_blender
 

@@ -1,64 +1,125 @@
 """What every command has in common: help that says all, completion, a version, near names."""
 
 import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-import typer
-from rich.text import Text
-from typer.testing import CliRunner
 
-from infra.cli.app import app
+from infra.cli.commands import COMMANDS
+from infra.cli.options import ALIASES
+from infra.setup.command_line_page import FILE, Command, command_line_page, every_command
+from storage.settings import option_of
+from tests.command_line import trilight
 from tests.conftest import ROOT
-from tests.end_to_end.conftest import command
 
-SHELLS = {"bash": "complete_bash", "zsh": "complete_zsh", "fish": "complete_fish"}
-EXPECTED_FILES = {
-    "bash": ".bash_completions/trilight.sh",
-    "zsh": ".zfunc/_trilight",
-    "fish": ".config/fish/completions/trilight.fish",
+ALL = {found.name: found for found in every_command()}
+TYPED = "pre"
+COMPLETED = {
+    "zsh": "",
+    "bash": f"source FILE; COMP_WORDS=(trilight generate {TYPED}); COMP_CWORD=2; _trilight; "
+    'printf "%s\\n" "${COMPREPLY[@]}"',
+    "fish": f"source FILE; complete -C 'trilight generate {TYPED}'",
 }
 
 
-def _commands(parent: Any) -> Iterator[tuple[str, Any]]:
-    for name in parent.list_commands(None):
-        found = parent.get_command(None, name)
-        yield name, found
-        if hasattr(found, "list_commands"):
-            yield from _commands(found)
+def test_every_command_is_there_with_those_within() -> None:
+    assert {name.split()[0] for name in ALL} == set(COMMANDS)
+    assert {"shards merge", "shards select", "shards reshard"} < set(ALL)
 
 
-COMMANDS = dict(_commands(typer.main.get_command(app)))
+@pytest.mark.parametrize("name", ALL)
+def test_every_option_says_what_it_is_and_its_default(name: str) -> None:
+    for option in ALL[name].options:
+        assert option.help[0].isupper() or ": " in option.help
+        facts = option.help.rpartition(" [")[2]
+        said = "default" in option.help or "required" in facts
+        assert said or option.is_switch, f"{option.names}: {option.help}"
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_no_help_text_loses_its_default(name: str) -> None:
-    """Rich takes `[builtin:]` for a style and drops it."""
-    found = COMMANDS[name]
-    for text in (found.help, *(parameter.help for parameter in found.params)):
-        assert Text.from_markup(text).plain == text.replace("\\[", "[")
+@pytest.mark.parametrize("name", ALL)
+def test_no_help_text_is_lost_at_80_columns(name: str) -> None:
+    """Rich would take `[builtin:]` for a style and drop it."""
+    shown = trilight([*name.split(), "--help"], env={"COLUMNS": "80"})
+    assert max(map(len, shown.stdout.splitlines())) <= 80
+    words = shown.stdout.split()
+    for option in ALL[name].options:
+        assert set(option.help.split()) <= set(words), option.names
 
 
-def test_the_default_of_objects_is_seen() -> None:
-    shown = CliRunner().invoke(app, ["generate", "--help"], env={"COLUMNS": "200"}).output
-    assert "builtin: or objaverse: [builtin:]" in " ".join(shown.split())
+def test_every_name_is_that_of_its_field() -> None:
+    for found in ALL.values():
+        for option in found.options:
+            if option.names[0].startswith("--"):
+                assert option.names[0] == option_of(option.field)
+            assert option.names[1:] == tuple(filter(None, [ALIASES.get(option.field)]))
 
 
 def test_the_short_option_helps_everywhere() -> None:
     for words in (["-h"], ["verify", "-h"], ["shards", "-h"], ["shards", "merge", "-h"]):
-        shown = CliRunner().invoke(app, words)
+        shown = trilight(words)
         assert shown.exit_code == 0
-        assert "Usage:" in shown.output
+        assert shown.stdout.startswith(f"Usage: {' '.join(['trilight', *words[:-1]])} ")
+
+
+def test_no_words_are_a_question_for_help() -> None:
+    assert trilight([]).stdout == trilight(["--help"]).stdout
+    assert "--extend FILE.py" in trilight([]).stdout
 
 
 def test_the_version_is_that_of_the_distribution() -> None:
-    shown = CliRunner().invoke(app, ["--version"])
-    assert (shown.exit_code, shown.output.split()[0]) == (0, "trilight")
-    assert shown.output.split()[1][0].isdigit()
+    shown = trilight(["--version"])
+    assert (shown.exit_code, shown.stdout.split()[0]) == (0, "trilight")
+    assert shown.stdout.split()[1][0].isdigit()
+
+
+MISTAKES = {
+    "evaluat": "command 'evaluat' is unknown; did you mean evaluate? Expected one of doctor,",
+    "shards merg": "shards: command 'merg' is unknown; did you mean merge?",
+    "generate smoke --objekts x": "option '--objekts' is unknown; did you mean --objects?",
+    "verify": "verify: DATASET is missing; expected: The dataset, a folder",
+    "generate smoke --seed": "generate: --seed has no value; expected: Seed of every draw",
+    "generate smoke --seed 1 --seed 2": "generate: --seed is there twice; expected it once.",
+    "verify here there": "verify: 'there' is one word too many",
+    "verify here --fast=3": "verify: --fast is '3'; expected no value.",
+    "render x --out y.exr --engine neurl": "--engine is 'neurl'; did you mean neural? Expected",
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_mistyped_command_line_is_one_line(words: str) -> None:
+    ended = trilight(words.split())
+    assert (ended.exit_code, ended.stdout) == (2, "")
+    assert ended.stderr.startswith("trilight: ") and ended.stderr.count("\n") == 1
+    assert MISTAKES[words] in ended.stderr
+    assert f"See trilight {words.split()[0] if ': ' in ended.stderr[10:] else ''}" in ended.stderr
+
+
+REFUSED = {
+    "generate smoke --scenes 0": "--scenes is 0; expected a whole number from 1 to 1000000000",
+    "generate smoke --scenes few": "--scenes is 'few'; expected a whole number from 1 to",
+    "generate smoke --noise-floor nan": "--noise-floor-db is nan; expected a number above 0",
+    "plan smoke --samples 3": "--samples is 3; expected a whole number from 4",
+    "train smoke --processes 0": "--processes is 0; expected a whole number from 1 to 1024",
+    "render x --out y.exr --exposure -99": "--exposure-ev is -99",
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_a_value_that_the_settings_refuse_is_named_by_its_option(words: str) -> None:
+    ended = trilight(words.split())
+    assert ended.exit_code == 1
+    assert ended.stderr.startswith(f"trilight: {REFUSED[words]}")
+
+
+def test_the_real_command_names_no_module() -> None:
+    for words in (["verify"], ["verify", "-h"]):
+        found = _run([sys.executable, "-m", "trilight", *words], dict(os.environ))
+        assert "infra.cli" not in found.stdout + found.stderr
+        assert "trilight verify" in found.stdout + found.stderr
+    assert found.returncode == 0
 
 
 def _run(words: list[str], environment: dict[str, str]) -> "subprocess.CompletedProcess[str]":
@@ -67,44 +128,45 @@ def _run(words: list[str], environment: dict[str, str]) -> "subprocess.Completed
     )
 
 
-def test_usage_names_the_command_and_no_module() -> None:
-    found = _run([sys.executable, "-m", "infra.cli.app", "verify"], dict(os.environ))
-    assert found.returncode == 2
-    assert "infra.cli" not in found.stderr
-    assert "Usage: trilight verify" in found.stderr
-
-
-@pytest.mark.parametrize(("typed", "meant"), [("evaluat", "evaluate"), ("shard", "shards")])
-def test_a_mistyped_command_brings_the_near_one(typed: str, meant: str) -> None:
-    shown = CliRunner().invoke(app, [typed])
-    assert shown.exit_code == 2
-    assert f"Did you mean '{meant}'" in shown.output
-
-
-def test_a_mistyped_option_brings_the_near_one() -> None:
-    shown = CliRunner().invoke(app, ["generate", "smoke", "--objekts", "x"])
-    assert "--objects" in shown.output
-
-
-@pytest.mark.parametrize("shell", SHELLS)
+@pytest.mark.parametrize("shell", COMPLETED)
 def test_completion_installs_and_completes(shell: str, tmp_path: Path) -> None:
-    """In a home of its own; the shell itself asks as this test does."""
-    home = {
-        **os.environ,
-        "HOME": str(tmp_path),
-        "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1",
-    }
-    installed = _run(command("--install-completion", shell), home)
+    """In a home of its own; the shell itself asks for the names of builds."""
+    home = {**os.environ, "HOME": str(tmp_path), "PATH": f"{_bin(tmp_path)}:{os.environ['PATH']}"}
+    script = tmp_path / "completion"
+    words = ["--install-completion", "--shell", shell, "--output", str(script)]
+    installed = _run([sys.executable, "-m", "trilight", *words], home)
     assert installed.returncode == 0, installed.stderr
-    assert (tmp_path / EXPECTED_FILES[shell]).is_file()
-    asked = {
-        **os.environ,
-        "_TRILIGHT_COMPLETE": SHELLS[shell],
-        "COMP_WORDS": "trilight generate pre",  # of bash
-        "COMP_CWORD": "2",
-        "_TYPER_COMPLETE_ARGS": "trilight generate pre",  # of zsh and fish
-        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
-    }
-    completed = _run(command(), asked)
-    assert "pretrain-256" in completed.stdout
-    assert "smoke" not in completed.stdout
+    text = script.read_text()
+    assert "--albedo-over-one" in text and "refuse" in text
+    if not COMPLETED[shell] or shutil.which(shell) is None:
+        return
+    asked = [shell, "-c", COMPLETED[shell].replace("FILE", str(script))]
+    assert _run(asked, home).stdout.split() == ["pretrain-256"]
+
+
+def _bin(folder: Path) -> Path:
+    """Return a folder with the command of this checkout."""
+    program = folder / "bin" / "trilight"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m trilight "$@"\n')
+    program.chmod(0o755)
+    return program.parent
+
+
+def test_the_page_of_the_command_line_is_current() -> None:
+    assert FILE.read_text() == command_line_page(), "run `make settings`"
+
+
+def test_an_option_that_two_classes_have_is_refused() -> None:
+    from infra.cli.options import Shown, command
+
+    def twice(one: Shown, other: Shown) -> None:
+        pass
+
+    with pytest.raises(AssertionError, match="json"):
+        command()(twice)
+
+
+def test_the_command_of_a_page_has_its_options() -> None:
+    assert isinstance(ALL["doctor"], Command)
+    assert [option.names for option in ALL["doctor"].options] == [("--json",)]

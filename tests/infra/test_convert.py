@@ -9,9 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from pipeline.flows import convert_scene
 from pipeline.flows.scene_source import load_source, scene_source
 from pipeline.scenes.renderformer_json_write import described_files
@@ -23,6 +21,7 @@ from storage.sample import encode_sample
 from storage.scene import Scene
 from storage.scene_file import encode_scene
 from storage.shard_writer import write_shard
+from tests.command_line import trilight
 from tests.scenes.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
@@ -33,7 +32,7 @@ PROFILE: Profile = "lossless"
 def convert(*arguments: str | Path) -> dict[str, Any]:
     """Return what `trilight convert --json` prints."""
     words = ["convert", *(str(argument) for argument in arguments), "--json"]
-    result = CliRunner().invoke(app, words)
+    result = trilight(words)
     assert result.exit_code == 0, result.exception
     return dict(json.loads(result.output))
 
@@ -41,7 +40,7 @@ def convert(*arguments: str | Path) -> dict[str, Any]:
 def refused(*arguments: str | Path) -> str:
     """Return the one line that a mistake ends in."""
     words = ["convert", *(str(argument) for argument in arguments)]
-    result = CliRunner().invoke(app, words)
+    result = trilight(words)
     assert isinstance(result.exception, TrilightError), result.exception
     assert "\n" not in str(result.exception)
     return str(result.exception)
@@ -167,5 +166,5 @@ def test_a_crash_in_native_code_is_one_line(
 
 def test_budgets_that_cannot_be(tmp_path: Path) -> None:
     stage = write_stage(tmp_path)
-    assert "expected at least 1" in refused(stage, tmp_path / "a.json", "--budget", "0")
+    assert "from 1 to" in refused(stage, tmp_path / "a.json", "--budget", "0")
     assert "emitters take" in refused(stage, tmp_path / "a.json", "--budget", "20")

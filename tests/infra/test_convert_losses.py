@@ -1,6 +1,7 @@
 """No form drops what it does not know in silence: an eleventh column, a right, a record."""
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,50 +9,89 @@ import pytest
 
 from pipeline.flows.convert_scene import write_scene
 from pipeline.flows.scene_source import load_source, scene_source
-from storage import carried, conventions
-from storage import scene as scenes
+from storage import carried
 from storage.carried import lost_members
+from storage.errors import TrilightError
+from storage.material import PUBLISHED_COLUMNS, columns_in_use, laid_out
 from storage.scene import Scene, SceneObject
+from tests.columns_kit import COAT, TINT, WAVES, declared
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 
-FORMS = ("usda", "usdc", "usdz", "json", "h5")
 EXACT = ("usda", "usdc", "usdz", "safetensors")
 
 
 def coated(coat: float) -> Scene:
-    """Return the tiny scene with an eleventh material column, which no form knows."""
-    base = tiny_scene()
-    column = np.zeros((len(base.materials), 1), np.float32)
-    column[FLOOR] = coat
-    return dataclasses.replace(base, materials=np.concatenate([base.materials, column], axis=1))
+    """Return the tiny scene with a coat, and two more columns of other widths beside it."""
+    scene = tiny_scene()
+    for column, part in laid_out():
+        if column.name not in PUBLISHED_COLUMNS and coat:
+            scene.materials[FLOOR, part] = coat
+    return scene
 
 
 @pytest.fixture
-def eleven(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let scenes have the column, as they would where one more is declared."""
-    monkeypatch.setitem(scenes.ARRAY_FIELDS, "materials", (np.float32, (None, 11)))
+def more_columns() -> Iterator[None]:
+    with declared(COAT, TINT, WAVES):
+        yield
 
 
-@pytest.mark.parametrize("declared", [True, False])
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.usefixtures("eleven")
-def test_a_column_that_a_form_does_not_know_is_said_to_be_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str, declared: bool
-) -> None:
-    name = "materials.10 to 10"
-    if declared:
-        monkeypatch.setitem(conventions.MATERIAL_COLUMNS, "coat", slice(10, 11))
-        name = "materials.coat"
-    assert any(name in note for note in write_scene(tmp_path / f"a.{form}", coated(0.3)))
-    assert not any(name in note for note in write_scene(tmp_path / f"b.{form}", coated(0.0)))
-
-
-@pytest.mark.usefixtures("eleven")
-def test_a_form_of_whole_arrays_carries_new_columns(tmp_path: Path) -> None:
-    path = tmp_path / "a.safetensors"
-    assert write_scene(path, coated(0.3)) == ()
+@pytest.mark.parametrize("form", ["json", "h5"])
+@pytest.mark.usefixtures("more_columns")
+def test_a_column_that_a_form_does_not_know_is_said_to_be_lost(tmp_path: Path, form: str) -> None:
+    lost = "materials.coat, materials.tint, materials.waves"
+    path = tmp_path / f"a.{form}"
+    assert any(lost in note for note in write_scene(path, coated(0.3)))
+    assert not any("coat" in note for note in write_scene(tmp_path / f"b.{form}", coated(0.0)))
     back = load_source(scene_source(str(path))).scene
-    assert np.array_equal(back.materials, coated(0.3).materials)
+    assert columns_in_use(back.materials) == PUBLISHED_COLUMNS
+
+
+@pytest.mark.parametrize("form", EXACT)
+@pytest.mark.usefixtures("more_columns")
+def test_what_carries_everything_carries_new_columns(tmp_path: Path, form: str) -> None:
+    path = tmp_path / f"a.{form}"
+    assert write_scene(path, coated(0.3)) == ()
+    back = load_source(scene_source(str(path)))
+    assert back.notes == ()
+    assert np.array_equal(back.scene.materials, coated(0.3).materials)
+
+
+@pytest.mark.parametrize("form", EXACT)
+def test_a_column_at_its_default_changes_no_byte(tmp_path: Path, form: str) -> None:
+    before, after = tmp_path / f"a.{form}", tmp_path / f"b.{form}"
+    write_scene(before, tiny_scene())
+    with declared(COAT, WAVES):
+        write_scene(after, tiny_scene())
+        assert load_source(scene_source(str(before))).scene.materials.shape == (2, 16)
+    assert after.read_bytes() == before.read_bytes()
+
+
+@pytest.mark.parametrize("form", EXACT)
+def test_a_column_that_is_not_declared_is_an_error_that_names_it(tmp_path: Path, form: str) -> None:
+    path = tmp_path / f"a.{form}"
+    with declared(COAT):
+        write_scene(path, tiny_coated := coated(0.3))
+        assert tiny_coated.materials[FLOOR, -1] > 0
+    with pytest.raises(TrilightError, match=f"a.{form}.*'coat' is not declared here"):
+        load_source(scene_source(str(path)))
+
+
+@pytest.mark.usefixtures("more_columns")
+def test_a_usd_file_that_somebody_changed_keeps_the_columns(tmp_path: Path) -> None:
+    path = tmp_path / "a.usda"
+    write_scene(path, coated(0.3))
+    changed = path.read_text().replace("inputs:roughness = 0.5", "inputs:roughness = 0.4")
+    path.write_text(changed)
+    back = load_source(scene_source(str(path))).scene
+    assert columns_in_use(back.materials) == (*PUBLISHED_COLUMNS, "coat", "tint", "waves")
+    outside = changed.replace("trilight:column:coat = 0.3", "trilight:column:coat = 7")
+    path.write_text(outside.replace("trilight:column:tint", "trilight:column:shade"))
+    with pytest.raises(TrilightError, match="'shade' is not declared here"):
+        load_source(scene_source(str(path)))
+    path.write_text(outside)
+    loaded = load_source(scene_source(str(path)))
+    assert columns_in_use(loaded.scene.materials) == (*PUBLISHED_COLUMNS, "tint", "waves")
+    assert any("coat: expected 1 numbers from 0 to 1" in note for note in loaded.notes)
 
 
 @pytest.mark.parametrize("form", EXACT)
@@ -98,11 +138,11 @@ def test_what_emitters_reflect_is_lost_in_the_published_arrays(tmp_path: Path) -
 
 def test_the_names_of_members_are_those_of_a_scene() -> None:
     """A claim that is mistyped would claim nothing, and be noticed only as a note too many."""
-    from pipeline.flows.convert_scene import _CARRIED
+    from pipeline.flows.scene_formats import FORMATS
 
     known = {f"objects.{field.name}" for field in dataclasses.fields(SceneObject)}
-    known |= {f"materials.{name}" for name in conventions.MATERIAL_COLUMNS}
+    known |= {f"materials.{name}" for name in PUBLISHED_COLUMNS}
     known |= {field.name for field in dataclasses.fields(Scene)}
-    for members in _CARRIED.values():
-        assert members <= known
+    for form in FORMATS.values():
+        assert set(form.carried) <= known
     assert carried.lost_members(tiny_scene(), known) == ()

@@ -134,8 +134,8 @@ def test_images_can_write_buckets_and_locks_hold_each_other() -> None:
 
 
 def test_flows_write_to_volumes_whatever_their_form_says() -> None:
-    """`out` is data/smoke by default, below the checkout, which belongs to root in the images."""
-    assert DatasetInRuns().out.startswith("data/")
+    """`out` is data/BUILD by default, below the checkout, which belongs to root in the images."""
+    assert DatasetInRuns().place.startswith("data/")
     for path in IMAGES.glob("*.Dockerfile"):
         assert "ln --symbolic /data /opt/trilight/data" in path.read_text(), path.name
     found = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]

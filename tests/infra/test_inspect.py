@@ -5,15 +5,14 @@ import os
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from storage.errors import TrilightError
+from tests.command_line import trilight
 from tests.documents.dataset_by_hand import five_scenes, write_dataset
 
 
 def inspect(*arguments: str | Path) -> str:
-    result = CliRunner().invoke(app, ["inspect", *(str(argument) for argument in arguments)])
+    result = trilight(["inspect", *(str(argument) for argument in arguments)])
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -28,6 +27,7 @@ def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
     assert len(list((tmp_path / "report").iterdir())) == 5
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_another_folder(tmp_path: Path) -> None:
     five_scenes(tmp_path / "set")
     before = {path: path.read_bytes() for path in (tmp_path / "set").iterdir()}
@@ -47,6 +47,7 @@ def test_a_read_only_dataset_is_summed_up(tmp_path: Path, monkeypatch: pytest.Mo
     assert not (tmp_path / "report.html").exists()
 
 
+@pytest.mark.usefixtures("bare_reports")
 def test_json_holds_the_distributions(tmp_path: Path) -> None:
     five_scenes(tmp_path)
     read = json.loads(inspect(tmp_path, "--json"))
@@ -58,7 +59,7 @@ def test_json_holds_the_distributions(tmp_path: Path) -> None:
 
 def _refused(dataset: Path) -> str:
     """Return the one line that `inspect` ends with."""
-    result = CliRunner().invoke(app, ["inspect", str(dataset)])
+    result = trilight(["inspect", str(dataset)])
     assert isinstance(result.exception, TrilightError), result.exception
     return str(result.exception)
 

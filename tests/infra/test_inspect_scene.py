@@ -6,19 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from pipeline.flows.inspect_scene import ROWS, VIEWS, turntable_poses
 from storage.errors import TrilightError
 from storage.usd.export import write_usd
+from tests.command_line import trilight
 from tests.scenes_by_hand import tiny_scene
 
 
 def test_a_summary_and_a_sheet(tmp_path: Path) -> None:
     write_usd(tmp_path / "a.usdz", tiny_scene())
     words = ["inspect", str(tmp_path / "a.usdz"), "--turntable", str(tmp_path / "t.png"), "--json"]
-    result = CliRunner().invoke(app, words)
+    result = trilight(words)
     assert result.exit_code == 0, result.exception
     found = json.loads(result.output)
     assert found["triangles"] == 3 and found["lights"] == 1
@@ -45,7 +44,7 @@ def test_mistakes(tmp_path: Path) -> None:
         ([str(tmp_path), "--turntable", "x.png"], "expected one scene"),
         ([str(tmp_path / "absent.usda")], "no such file"),
     ):
-        result = CliRunner().invoke(app, ["inspect", *words])
+        result = trilight(["inspect", *words])
         assert isinstance(result.exception, TrilightError)
         with pytest.raises(TrilightError, match=message):
             raise result.exception

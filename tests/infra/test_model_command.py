@@ -6,18 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from typer.testing import CliRunner
 
-from infra.cli.app import app
-from model.checkpoints import open_checkpoint
+from model.open import open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
+from tests.command_line import trilight
 from tests.model.kit import awake, tiny_config
 from tests.model.test_published import publishable
 
 
 def printed(*arguments: str) -> str:
-    result = CliRunner().invoke(app, ["model", *arguments])
+    result = trilight(["model", *arguments])
     if result.exception:
         raise result.exception
     assert result.exit_code == 0
@@ -47,7 +46,7 @@ def test_a_checkpoint_is_described_measured_and_published(tmp_path: Path) -> Non
     errors = json.loads(text)["errors"]
     assert set(errors) == {"float32", "bfloat16"}
     assert errors["bfloat16"][-1]["layer"] == "decoder.head"
-    again = open_checkpoint(str(target))
+    again = open_network(str(target))
     for (name, a), b in zip(again.named_parameters(), model.parameters(), strict=True):
         assert torch.equal(a, b), name
 

@@ -12,9 +12,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from pipeline.flows import render_scene
 from pipeline.flows.scene_source import load_source, scene_source
 from storage.conventions import preview_srgb8
@@ -26,6 +24,7 @@ from storage.sample import Sample, encode_sample
 from storage.scene import Scene
 from storage.scene_file import encode_scene, scene_digest
 from storage.shard_writer import write_shard
+from tests.command_line import trilight
 from tests.infra.render_kit import SMALL, mistake, render
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
@@ -148,7 +147,7 @@ def test_the_picture_says_how_it_was_made(tmp_path: Path) -> None:
 def test_a_person_is_told_where_to_look(tmp_path: Path) -> None:
     (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
     words = ["render", str(tmp_path / "tiny.safetensors"), "--out", str(tmp_path / "x.exr"), *SMALL]
-    printed = CliRunner().invoke(app, words).output
+    printed = trilight(words).output
     for text in ("x.png", "psnr_log_db", "the cap came before", "in the PNG a pixel is 16 x 16"):
         assert text in printed.replace("\n", "")
 
@@ -243,19 +242,19 @@ def test_mistakes_on_the_command_line_are_one_line(tmp_path: Path) -> None:
     source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
     source.write_bytes(encode_scene(tiny_scene()))
     for words, message in (
-        (("--engine", "cycles"), "--engine is cycles; expected mitsuba, neural or both"),
-        (("--tone-map", "grey"), "--tone-map is grey; expected plain or filmic"),
+        (("--engine", "cycles"), "--engine is 'cycles'; expected one of mitsuba, neural, both"),
+        (("--tone-map", "grey"), "--tone-map is 'grey'; expected one of plain, filmic"),
         (("--fps", "0"), "--fps is 0"),
-        (("--exposure", "33"), "--exposure is 33.0; expected a number from -32 to 32 stops"),
-        (("--exposure", "nan"), "--exposure is nan"),
-        (("--arc", "361"), "--arc is 361"),
+        (("--exposure", "33"), "--exposure-ev is 33.0; expected a number from -32 to 32 stops"),
+        (("--exposure", "nan"), "--exposure-ev is nan"),
+        (("--arc", "361"), "--arc-deg is 361"),
         (("--orbit", "0"), "--orbit is 0"),
         (("--orbit", "3"), "expected a folder, X.mp4 or X.webp"),
         (("--orbit", "3", "--cameras", "a.json"), "expected no --orbit beside it"),
         (("--lights-per-pass", "0"), "--lights-per-pass is 0"),
         (("--resolution", "20"), "resolution is 20; expected a multiple of 8"),
         (("--max-spp", "100"), "max_spp 100; expected multiples of 8"),
-        (("--noise-floor", "0"), "--noise-floor is 0.0; expected a number above 0"),
+        (("--noise-floor", "0"), "--noise-floor-db is 0.0; expected a number above 0"),
         (("--seed", "-1"), "--seed is -1"),
         (("--threads", "0"), "--threads is 0"),
     ):

@@ -8,9 +8,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from model.neural_renderer import NeuralRenderer
 from storage.conventions import look_at_c2w, preview_srgb8
 from storage.exr import decode_exr
@@ -20,6 +18,7 @@ from storage.sample import encode_sample
 from storage.scene_file import encode_scene, scene_digest
 from storage.shard_writer import write_shard
 from storage.usd.export import write_usd
+from tests.command_line import trilight
 from tests.infra.render_kit import SMALL, mistake, render, write_network
 from tests.model.test_neural_renderer import many_lights
 from tests.scenes_by_hand import tiny_sample, tiny_scene
@@ -98,7 +97,7 @@ def test_what_no_triangle_reaches_may_stay_black(network: Path, tmp_path: Path) 
     pictures = []
     for more in ([], ["--skip-empty-bundles"]):
         words = ["render", str(scene), "--engine", "neural", "--checkpoint", str(network)]
-        CliRunner().invoke(app, [*words, "--resolution", "128", "--out", str(out), *more])
+        trilight([*words, "--resolution", "128", "--out", str(out), *more])
         pictures.append(decode_exr(out.read_bytes()))
     whole, sparse = pictures
     whole_dark, dark = ((picture == 0).all(axis=-1).mean() for picture in (whole, sparse))
@@ -126,7 +125,7 @@ def test_both_engines_stand_side_by_side(network: Path, scene: Path, tmp_path: P
     np.testing.assert_array_equal(darker[24::16, :256:16], preview_srgb8(traced / 4))
     np.testing.assert_array_equal(darker[24:, 528:], sheet[24:, 528:])  # an error stays one
     words = [str(word) for word in ("render", scene, "--out", out, *arguments, *SMALL)]
-    printed = CliRunner().invoke(app, words).output.replace("\n", "")
+    printed = trilight(words).output.replace("\n", "")
     for text in ("agreement", "samples per pixel", "model.safetensors; passes: 1", "x.png"):
         assert text in printed
 
@@ -162,7 +161,7 @@ def test_mistakes_are_one_line(network: Path, scene: Path, tmp_path: Path) -> No
         (("--engine", "neural", "--checkpoint", network, "--resolution", "20"), "resolution is 20"),
         (
             ("--engine", "neural", "--checkpoint", network, "--precision", "half"),
-            "precision 'half'",
+            "--precision is 'half'; expected one of float32",
         ),
         (("--engine", "both", "--checkpoint", network, "--view", "2"), "--view is 2"),
     ):

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from pxr import Usd, UsdGeom
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from storage.exr import decode_exr
 from storage.sample import encode_sample
 from storage.scene_file import encode_scene
 from storage.shard_writer import write_shard
+from tests.command_line import trilight
 from tests.infra.render_kit import SMALL, mistake, render, write_network
 from tests.scenes.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
@@ -74,7 +73,7 @@ def test_a_stage_that_moves_is_drawn_frame_by_frame_by_both_engines(tmp_path: Pa
     suffixes = ("mitsuba.exr", "neural.exr", "png")
     assert names == [f"{at:06d}.{suffix}" for at in range(3) for suffix in suffixes]
     words = ["render", path, "--out", out, "--engine", "both", "--checkpoint", network, *SMALL]
-    printed = CliRunner().invoke(app, [str(word) for word in words]).output
+    printed = trilight([str(word) for word in words]).output
     assert "6, of which 6 were there already" in printed
     assert "agreement" in printed and "flicker" in printed
 

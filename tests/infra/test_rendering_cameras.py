@@ -3,11 +3,12 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from infra.rendering.cameras import Camera, camera_path, orbit, own_camera, shots
+from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, shots
 from infra.rendering.sources import scene_sources
 from pipeline.flows.read_scenes import SceneReader
 from pipeline.flows.scene_source import SceneSource
@@ -23,16 +24,16 @@ from tests.scenes_by_hand import tiny_sample, tiny_scene
 class HereReader(SceneReader):
     """Reads in this process: the tests' own files crash nobody."""
 
-    def _call(self, function: Callable[[SceneSource], Result], source: SceneSource) -> Result:
-        return function(source)
+    def _call(self, name: str, function: Callable[..., Result], *args: Any) -> Result:
+        return function(*args)
 
 
 def sources(count: int) -> list[SceneSource]:
     return [SceneSource(path=Path(f"{at}.h5"), key=None) for at in range(count)]
 
 
-def cameras(count: int) -> list[Camera]:
-    return [Camera(c2w=np.eye(4, dtype=np.float32), fov_deg=40.0 + at) for at in range(count)]
+def cameras(count: int) -> list[ShotCamera]:
+    return [ShotCamera(c2w=np.eye(4, dtype=np.float32), fov_deg=40.0 + at) for at in range(count)]
 
 
 def test_a_turn_begins_at_the_camera_and_looks_at_one_point() -> None:
@@ -65,7 +66,7 @@ def test_an_arc_has_the_camera_in_its_middle() -> None:
 def test_a_camera_that_looks_away_turns_about_itself() -> None:
     scene = tiny_scene()
     away = look_at_c2w(eye=[2, 0, 1], target=[4, 0, 1], up=[0, 0, 1]).astype(np.float32)
-    turn = orbit(scene, Camera(c2w=away, fov_deg=40.0), 4, 360)
+    turn = orbit(scene, ShotCamera(c2w=away, fov_deg=40.0), 4, 360)
     for camera in turn:
         np.testing.assert_allclose(camera.c2w[:3, 3], [2, 0, 1], atol=1e-6)
 

@@ -13,7 +13,7 @@ from infra.rendering.cameras import Shot, orbit, own_camera, shots
 from infra.rendering.comparison import comparison_sheet
 from infra.rendering.engines import Engine, Rendered
 from infra.rendering.look import Look, enlarged, enlargement
-from infra.rendering.places import Place, place
+from infra.rendering.places import PicturePlaces, place
 from infra.rendering.run import FinishedShot, ShotRun
 from infra.rendering.tone_maps import require_tone_map, tone_mapped
 from infra.rendering.video import write_video
@@ -228,7 +228,7 @@ def test_out_says_what_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     one = place(tmp_path / "new/one.exr")
     assert (one.stem_of(7), one.is_sequence) == (tmp_path / "new/one", False)
     many = place(tmp_path / "turn")
-    assert many == Place(stem=None, folder=tmp_path / "turn", video=None)
+    assert many == PicturePlaces(stem=None, folder=tmp_path / "turn", video=None)
     assert many.stem_of(7) == tmp_path / "turn/000007"
     shown = place(tmp_path / "turn.webp")
     assert (shown.folder, shown.video) == (tmp_path / "turn", tmp_path / "turn.webp")

@@ -4,17 +4,18 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from infra.repair import repair
 from storage.dataset import open_dataset
 from storage.errors import TrilightError
+from tests.command_line import trilight
 from tests.flows.derive_kit import finished, scenes
+
+pytestmark = pytest.mark.usefixtures("bare_reports")
 
 
 def shards(*arguments: str | Path) -> str:
-    result = CliRunner().invoke(app, ["shards", *(str(argument) for argument in arguments)])
+    result = trilight(["shards", *(str(argument) for argument in arguments)])
     if result.exception is not None:
         raise result.exception
     return result.output
@@ -48,12 +49,12 @@ def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> Non
     a, b = finished(tmp_path / "a", scenes(0)), finished(tmp_path / "b", scenes(1), seed=1)
     shards("merge", a, b, "--out", tmp_path / "ab")
     (tmp_path / "ab" / "train-000001.tar").unlink()
-    found = CliRunner().invoke(app, ["verify", str(tmp_path / "ab")])
+    found = trilight(["verify", str(tmp_path / "ab")])
     assert found.exit_code == 1
     assert "Make it again of its sources: trilight shards merge" in found.output
     with pytest.raises(TrilightError, match=r"made by `trilight shards merge`; expected one of"):
         repair(str(tmp_path / "ab"), ["train-000001.tar"], objects=None, scenes_from=None)
-    found = CliRunner().invoke(app, ["verify", str(damaged := _without_a_shard(a))])
+    found = trilight(["verify", str(damaged := _without_a_shard(a))])
     assert f"Next: trilight verify {damaged} --repair" in found.output
 
 

@@ -3,10 +3,8 @@
 import json
 from pathlib import Path
 
-from typer.testing import CliRunner
-
-from infra.cli.app import app
 from storage.asked import write_asked
+from tests.command_line import trilight
 from tests.flows.test_publication import begin_tiny, make_tiny_shard
 
 WIDE = {"COLUMNS": "200"}
@@ -15,17 +13,17 @@ WIDE = {"COLUMNS": "200"}
 def test_an_unfinished_set_is_not_verified(tmp_path: Path) -> None:
     publication = begin_tiny(tmp_path / "my set", 12)
     place = str(tmp_path / "my set")
-    empty = CliRunner().invoke(app, ["verify", place], env=WIDE)
+    empty = trilight(["verify", place], env=WIDE)
     assert empty.exit_code == 1
     assert "Unfinished" in empty.output
     assert "Verified" not in empty.output
     make_tiny_shard(publication, 0)
     write_asked(publication.folder, ["generate", "smoke", "--seed", "7"])
-    begun = CliRunner().invoke(app, ["verify", place, "--fast"], env=WIDE)
+    begun = trilight(["verify", place, "--fast"], env=WIDE)
     assert begun.exit_code == 1
     assert "1 of 3" in begun.output
     assert f"Next: trilight generate smoke --seed 7 --out '{place}'" in begun.output
-    told = json.loads(CliRunner().invoke(app, ["verify", place, "--fast", "--json"]).output)
+    told = json.loads(trilight(["verify", place, "--fast", "--json"]).output)
     assert (told["finished"], told["shards"], told["shards_planned"]) == (False, 1, 3)
 
 
@@ -34,6 +32,6 @@ def test_words_that_do_not_print_are_not_repeated(tmp_path: Path) -> None:
     publication = begin_tiny(tmp_path, 12)
     for words in (["train", "smoke"], ["generate", "smoke\x1b[2J"], ["generate", "a\nb"]):
         write_asked(publication.folder, words)
-        shown = CliRunner().invoke(app, ["verify", str(tmp_path)], env=WIDE).output
+        shown = trilight(["verify", str(tmp_path)], env=WIDE).output
         assert "Next:" not in shown
         assert "the same trilight generate that began it" in shown

@@ -1,6 +1,7 @@
 """Tiny networks with awake heads, and random scenes for them."""
 
 import dataclasses
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -69,7 +70,7 @@ def random_scene(
     return SceneTensors(
         triangles_T33=torch.randn(num_triangles, 3, 3, generator=generator).to(dtype),
         normals_T33=(normals / normals.norm(dim=-1, keepdim=True)).to(dtype),
-        material_T10=torch.rand(num_triangles, 10, generator=generator).to(dtype),
+        material_TM=torch.rand(num_triangles, 10, generator=generator).to(dtype),
         c2w_V44=poses.to(dtype),
         fov_deg_V=(30 + 30 * fov_deg).to(dtype),
     )
@@ -81,5 +82,5 @@ def render(model: RenderFormer, *scenes: SceneTensors, resolution: int = RESOLUT
     return pictures
 
 
-def with_fields(batch: SceneBatch, **fields: Tensor) -> SceneBatch:
+def with_fields(batch: SceneBatch, **fields: Any) -> SceneBatch:
     return dataclasses.replace(batch, **fields)

@@ -38,7 +38,7 @@ def test_base_takes_a_batch_on_the_meta_device() -> None:
         batch = SceneBatch(
             triangles_BT33=torch.zeros(2, 1536, 3, 3),
             normals_BT33=torch.zeros(2, 1536, 3, 3),
-            material_BT10=torch.zeros(2, 1536, 10),
+            material_BTM=torch.zeros(2, 1536, 10),
             c2w_BV44=torch.zeros(2, 4, 4, 4),
             fov_deg_BV=torch.zeros(2, 4),
             is_triangle_BT=torch.ones(2, 1536, dtype=torch.bool),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from model.light_groups import LightGroup, light_groups
-from storage.conventions import EMISSION
+from storage.material import EMISSION
 from storage.scene import Scene
 from tests.renders.scene_kit import Part, box, flat, join, light, material, quad
 

@@ -18,8 +18,9 @@ from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import batch_scenes, scene_tensors
 from model.trained_range import RANGE_KEY, TrainedRange, trained_range
 from model.weights import encode_weights
-from storage.conventions import EMISSION, look_at_c2w
+from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
+from storage.material import EMISSION
 from storage.scene import Scene
 from tests.model.kit import awake, tiny_config
 from tests.renders.scene_kit import flat, join, light, material, quad
@@ -84,7 +85,7 @@ def _light_of(model: RenderFormer, scene: Scene, device: torch.device) -> Tensor
     tensors = scene_tensors(scene)
     a, b, c = tensors.triangles_T33.double().unbind(dim=1)
     area_T = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2
-    emission_T3 = torch.pow(10.0, tensors.material_T10[:, EMISSION].double()) - 1
+    emission_T3 = torch.pow(10.0, tensors.material_TM[:, EMISSION].double()) - 1
     return (area_T[:, None] * emission_T3).sum(dim=0)
 
 
@@ -207,3 +208,10 @@ def test_what_memory_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
         renderer.prepare(tiny_scene())
     monkeypatch.setattr(neural_renderer, "_free_bytes", lambda device: None)
     renderer.prepare(tiny_scene())
+
+
+def test_pictures_are_as_wide_as_those_that_it_was_trained_on() -> None:
+    known = NeuralRenderer(network(), TrainedRange(max_triangles=None, resolution=16))
+    assert known.render(tiny_scene()).shape == (2, 16, 16, 3)
+    with pytest.raises(TrilightError, match="resolution is None, and the network does not say"):
+        NeuralRenderer(network()).render(tiny_scene())

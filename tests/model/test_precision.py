@@ -7,6 +7,7 @@ import torch
 
 from model.layer_errors import layer_errors, probe_batch, random_network
 from model.precision import rounded_parts, set_precision, tf32
+from model.scene_tensors import converted
 from storage.errors import TrilightError
 from tests.model.kit import FAMILIES, awake, random_scene, render, tiny_config
 
@@ -45,10 +46,7 @@ def test_positions_are_never_rounded() -> None:
     far = copy.deepcopy(near)
     far.triangles_T33.add_(100.0)
     far.c2w_V44[:, :3, 3].add_(100.0)
-    pictures = [
-        render(model, type(near)(**{name: value.float() for name, value in vars(scene).items()}))
-        for scene in (near, far)
-    ]
+    pictures = [render(model, converted(scene, torch.Tensor.float)) for scene in (near, far)]
     # the angles move by 100 x 5 / 2^24; what they turn is rounded to 8 bits, so some ulps of that
     assert (pictures[0] - pictures[1]).abs().max() < 0.1 * pictures[0].std()
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import SceneTensors, batch_scenes
+from model.scene_tensors import SceneTensors, batch_scenes, converted
 from storage.errors import TrilightError
 from tests.model.kit import (
     FAMILIES,
@@ -65,7 +65,7 @@ def test_the_order_of_triangles_does_not_matter(family: str) -> None:
         scene,
         triangles_T33=scene.triangles_T33[order],
         normals_T33=scene.normals_T33[order],
-        material_T10=scene.material_T10[order],
+        material_TM=scene.material_TM[order],
     )
     model = model_for(family)
     close(render(model, shuffled), render(model, scene))
@@ -112,7 +112,7 @@ def test_views_one_by_one_or_together(family: str) -> None:
 def test_float32_stays_near_float64() -> None:
     scene = random_scene(9)
     precise = render(awake(tiny_config(), torch.float64), scene)
-    single = SceneTensors(**{name: value.float() for name, value in vars(scene).items()})
+    single = converted(scene, Tensor.float)
     rounded = render(awake(tiny_config(), torch.float32), single).double()
     # float32 through twenty layers; positions of size 3 at frequency 5 cost another digit
     torch.testing.assert_close(rounded, precise, rtol=0, atol=2e-5)

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from model.scene_tensors import batch_scenes, scene_tensors
-from storage.conventions import EMISSION, MATERIAL_WIDTH
+from model.scene_tensors import batch_scenes, scene_tensors, tensors_of
+from storage.material import EMISSION, material_width
 from storage.scene import ARRAY_FIELDS
 from tests.model.kit import random_scene
 from tests.train.toy import toy_scene
@@ -20,19 +20,19 @@ def test_every_triangle_carries_its_own_vertices_normals_and_material() -> None:
         material = scene.materials[scene.material_index[row]]
         np.testing.assert_array_equal(tensors.triangles_T33[row], scene.vertex_positions[corners])
         np.testing.assert_array_equal(tensors.normals_T33[row], scene.vertex_normals[corners])
-        np.testing.assert_array_equal(tensors.material_T10[row, :7], material[:7])
-        emission = 10.0 ** tensors.material_T10[row, 7:].double().numpy() - 1
+        np.testing.assert_array_equal(tensors.material_TM[row, :7], material[:7])
+        emission = 10.0 ** tensors.material_TM[row, 7:].double().numpy() - 1
         # emission of 20 through a float32 logarithm
         np.testing.assert_allclose(emission, material[EMISSION], atol=1e-4)
-    assert tensors.material_T10.shape[1] == MATERIAL_WIDTH
-    assert all(value.dtype == torch.float32 for value in vars(tensors).values())
+    assert tensors.material_TM.shape[1] == material_width()
+    assert all(value.dtype == torch.float32 for value in tensors_of(tensors).values())
 
 
 def test_the_scene_stays_as_it_was_and_shares_no_memory() -> None:
     scene = toy_scene(1)
     before = {name: getattr(scene, name).copy() for name in ARRAY_FIELDS}
     tensors = scene_tensors(scene)
-    for value in vars(tensors).values():
+    for value in tensors_of(tensors).values():
         value.fill_(-1)
     for name, array in before.items():
         np.testing.assert_array_equal(getattr(scene, name), array, err_msg=name)
@@ -47,7 +47,7 @@ def test_batches_are_padded_with_zeros_to_the_longest_and_no_further() -> None:
     for row, scene in enumerate(scenes):
         length = scene.num_triangles
         for name in ("triangles", "normals", "material"):
-            suffix = "10" if name == "material" else "33"
+            suffix = "M" if name == "material" else "33"
             padded = getattr(batch, f"{name}_BT{suffix}")[row]
             assert torch.equal(padded[:length], getattr(scene, f"{name}_T{suffix}"))
             assert torch.all(padded[length:] == 0)

@@ -16,11 +16,11 @@ def published_layer(patch: int) -> tuple[Tensor, Tensor]:
     return weight, torch.randn(WIDTH, generator=generator, dtype=torch.float64)
 
 
-def texture(material_T10: Tensor, patch: int) -> Tensor:
+def texture(material_TM: Tensor, patch: int) -> Tensor:
     """Return the published input [T, 13 P P], cell by cell."""
-    pictures = torch.zeros(len(material_T10), TEXTURE_CHANNELS, patch, patch, dtype=torch.float64)
-    normal = torch.tensor(TANGENT_NORMAL, dtype=torch.float64).expand(len(material_T10), 3)
-    thirteen = torch.cat([material_T10[:, :7], normal, material_T10[:, 7:]], dim=1)
+    pictures = torch.zeros(len(material_TM), TEXTURE_CHANNELS, patch, patch, dtype=torch.float64)
+    normal = torch.tensor(TANGENT_NORMAL, dtype=torch.float64).expand(len(material_TM), 3)
+    thirteen = torch.cat([material_TM[:, :7], normal, material_TM[:, 7:]], dim=1)
     for x in range(patch):
         for y in range(patch):
             if x + y <= patch:

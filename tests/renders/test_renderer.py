@@ -186,10 +186,10 @@ def test_a_scene_of_emitters_alone_is_rejected() -> None:
 def test_memory_stays_flat_over_many_scenes() -> None:
     settings = dataclasses.replace(CHEAP, resolution=16, min_spp=8, max_spp=8, aux_spp=4)
     resident = []
-    for index in range(150):
+    for index in range(90):
         scene = sampled_like_scene(np.random.default_rng(index % 10), num_views=1)
         _render(scene, dataclasses.replace(settings, min_mean_radiance=0.0))
         with open("/proc/self/statm") as stream:
             resident.append(int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
     # Allocators keep a few megabytes of what they had at their fullest.
-    assert resident[-1] < 1.05 * resident[50]
+    assert resident[-1] < 1.03 * resident[30]

@@ -46,10 +46,14 @@ def mean_radiance(scene: Scene, tracer: Tracer, passes: int = 8, resolution: int
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("roughness", ROUGHNESS)
-@pytest.mark.parametrize("tracer", [load_tracer, PluginTracer])
-def test_a_white_mirror_returns_all_light(tracer: Any, roughness: float) -> None:
-    for cosine in COSINES:
+@pytest.mark.parametrize(
+    ("tracer", "row"),
+    [*((load_tracer, row) for row in range(8)), *((PluginTracer, row) for row in (0, 3, 5, 7))],
+)
+def test_a_white_mirror_returns_all_light(tracer: Any, row: int) -> None:
+    """At every roughness from two or three sides, at the next one from the others."""
+    roughness = ROUGHNESS[row]
+    for cosine in COSINES[row % 2 :: 2]:
         scene = plate(roughness, cosine)
         mean = mean_radiance(scene, tracer(scene, max_depth=2, rr_depth=5))
         # Measured: 0.1 %, noise and table together, of the 1 % that is allowed.
@@ -69,7 +73,7 @@ from pipeline.renders.load_tracer import load_tracer
 from tests.renders.test_white_furnace import COSINES, ROUGHNESS, mean_radiance, plate
 set_threads(1)
 means = {}
-for roughness in ROUGHNESS[::2] + [1.0]:
+for roughness in ROUGHNESS[::4] + [1.0]:
     for cosine in COSINES[::2]:
         scene = plate(roughness, cosine)
         tracer = load_tracer(scene, max_depth=2, rr_depth=5)

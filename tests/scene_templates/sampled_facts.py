@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from scene_templates.layout import Emitter, Surface
+from scene_templates.layout import Emitter, SurfaceLook
 from tests.scene_templates.balls import Drawn
 from tests.scene_templates.statistics import Table, alike, by_cdf, choices, share, uniform
 
@@ -88,7 +88,11 @@ def rotation_table(rotations: Iterable[NDArray[np.float64]], *, euler: bool) -> 
 
 
 def surface_table(
-    surfaces: Sequence[Surface], *, kind: str, smooth_share: float, triangle_colours_share: float
+    surfaces: Sequence[SurfaceLook],
+    *,
+    kind: str,
+    smooth_share: float,
+    triangle_colours_share: float,
 ) -> Table:
     """Everything that a material is drawn from."""
     sums = np.array([one.diffuse_scale + one.specular_rgb[0] for one in surfaces])

@@ -11,7 +11,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.flows.scene_files import build_scene
 from pipeline.scenes.renderformer_json_write import described_files
 from pipeline.scenes.usd.read import read_usd
-from storage.conventions import EMISSION
+from storage.material import EMISSION
 from storage.renderformer_h5 import write_renderformer_h5
 from storage.renderformer_h5_read import read_renderformer_h5
 from storage.scene import Scene

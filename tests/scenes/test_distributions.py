@@ -15,11 +15,11 @@ from pipeline.scenes.budget import drawn_within
 from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
-from scene_templates.layout import ShellPart, Surface
+from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.layout_rand import layout_rand
 from scene_templates.plans import scene_plan
 from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
-from storage.conventions import DIFFUSE
+from storage.material import DIFFUSE
 from storage.scene import Scene, SceneObject
 from storage.seeds import rng_for
 from tests.scene_templates.published import DEFAULT, STAGE_1
@@ -152,8 +152,8 @@ def test_how_far_meshes_shift_sizes(pool: list[PooledAsset]) -> None:
         assert np.abs(values - np.arange(len(values)) / len(values)).max() < most
 
 
-def _surface(colours: str) -> Surface:
-    return Surface(
+def _surface(colours: str) -> SurfaceLook:
+    return SurfaceLook(
         diffuse_scale=0.8,
         diffuse_rgb=(0.1, 0.2, 0.3),
         specular_rgb=(0.1, 0.1, 0.1),

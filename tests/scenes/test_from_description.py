@@ -13,8 +13,8 @@ import trimesh
 from pipeline.scenes.description import DescribedObject
 from pipeline.scenes.from_description import placed, scene_from_description
 from pipeline.scenes.renderformer_json import read_description
-from storage.conventions import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.errors import TrilightError
+from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.scene import Scene
 from tests.scenes.example_scenes import EXAMPLES, PlainObj, corners_of, example_scene, plain_obj
 from tests.scenes.one_box import CAMERA, MATERIAL, TRANSFORM, built, changed, described, loaded

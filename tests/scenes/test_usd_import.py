@@ -10,8 +10,8 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from pipeline.scenes.usd.polygons import triangulated
 from pipeline.scenes.usd.read import UsdScene, read_usd, usd_keys
-from storage.conventions import EMISSION
 from storage.errors import TrilightError
+from storage.material import EMISSION
 from storage.scene import Scene
 from storage.scene_file import encode_scene
 from storage.usd.export import SUFFIXES, write_usd, write_usd_shard

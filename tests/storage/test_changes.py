@@ -149,7 +149,7 @@ WRONG: list[tuple[str, Any, str]] = [
     (".age", 1, "does not exist"),
     ("branch", {"heigt": 1.0}, "'branch.heigt' does not exist; did you mean height?"),
     ("branch", 1, "is a group"),
-    ("branches", {}, "expected a list"),
+    ("branches", 7, "it is a group"),
     ("branches", [{"height": 1.0}, {"leaf": {"size": "x"}}], "'branches.1.leaf.size' is 'x'"),
     ("branches.2.height", 1, "the list has 2 entries"),
     ("branches.0", 1, "expected one of its settings by name"),

@@ -7,8 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from storage.conventions import EMISSION
 from storage.errors import TrilightError
+from storage.material import EMISSION
 from storage.renderformer_h5 import FAR, NEAR, TextureType, write_renderformer_h5
 from storage.renderformer_h5_read import read_renderformer_h5
 from storage.scene import Scene

@@ -8,21 +8,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
-from typer.testing import CliRunner
 
-from infra.cli.app import app
-from model.checkpoints import save_published
 from model.config import SIZES
 from model.layers import Norm
 from model.neural_renderer import NeuralRenderer
+from model.open import save_published
 from model.renderformer import RenderFormer
 from storage.training_data import open_training_data
+from tests.command_line import trilight
 from tests.train.fake_card import CARD, fake_card
 from tests.train.toy import toy_sample, toy_scene
 from train.data.buckets import make_batch
 from train.data.scenes import training_scene
 from train.evaluation.evaluate import Contest, judged_views
-from train.loop.checkpoint import save_checkpoint
+from train.loop.checkpoints import save_checkpoint
 from train.loop.crew import Crew
 from train.loop.state import new_state
 from train.loop.step import predicted
@@ -106,7 +105,7 @@ def evaluate_command(data: str, lpips: str, out: Path) -> dict[str, set[str]]:
     save_checkpoint(network, new_state(settings), settings, data_digest="", world_size=1)
     arguments = ["evaluate", network, "--data", data, "--split", "validation", "--out", out]
     with fake_card(), register_module_forward_pre_hook(note):
-        result = CliRunner().invoke(app, [*map(str, arguments), "--lpips", lpips])
+        result = trilight([*map(str, arguments), "--lpips", lpips])
         if result.exception is not None:
             raise result.exception
     return asked

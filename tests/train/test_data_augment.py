@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from model.scene_tensors import tensors_of
 from storage.scene import Scene
 from storage.seeds import rng_for
 from tests.train.toy import toy_picture, toy_sample
@@ -58,7 +59,7 @@ SYMMETRIES: dict[str, Symmetry] = {
 def scene_behind(training: TrainingScene, original: Scene) -> Scene:
     """Return a Scene with the geometry, materials and cameras of training tensors."""
     tensors = training.tensors
-    materials = tensors.material_T10.numpy().copy()
+    materials = tensors.material_TM.numpy().copy()
     materials[:, 7:] = 10 ** materials[:, 7:] - 1
     return dataclasses.replace(
         original,
@@ -114,13 +115,13 @@ def test_mirroring_twice_is_nothing() -> None:
     scene = training_scene(toy_sample(2), 16)
     again = mirrored(mirrored(scene))
     assert torch.equal(again.target_VRR3, scene.target_VRR3)
-    for name, value in vars(scene.tensors).items():
+    for name, value in tensors_of(scene.tensors).items():
         assert torch.equal(getattr(again.tensors, name), value), name
 
 
 def test_the_original_is_left_alone() -> None:
     scene = training_scene(toy_sample(2), 16)
-    copies = {name: value.clone() for name, value in vars(scene.tensors).items()}
+    copies = {name: value.clone() for name, value in tensors_of(scene.tensors).items()}
     target = scene.target_VRR3.clone()
     augmented(scene, EVERYTHING, rng_for(1, "augment"))
     assert torch.equal(scene.target_VRR3, target)

@@ -19,7 +19,7 @@ from storage.shard_set import OpenShard
 from storage.shard_writer import write_shard
 from storage.training_data import open_training_data
 from tests.train.toy import toy_sample
-from train.data.order import Share
+from train.data.order import RankShare
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable
 
@@ -122,7 +122,7 @@ def keys(paths: list[str], unusable: Unusable, batches: int) -> list[str]:
         open_training_data(paths).split("train"),
         SETTINGS,
         0,
-        share=Share(rank=0, world_size=1),
+        share=RankShare(rank=0, world_size=1),
         workers=1,
         unusable=unusable,
     )

@@ -14,19 +14,19 @@ from storage.shard_writer import write_shard
 from tests.conftest import ROOT
 from tests.train.toy import toy_sample
 
-SHARDS, PER_SHARD, RESOLUTION = 48, 8, 128
+SHARDS, PER_SHARD, RESOLUTION = 30, 8, 128
 
 CHILD = """
 import itertools, json, resource, sys
 from contextlib import closing
 from storage.training_data import open_training_data
-from train.data.order import Share
+from train.data.order import RankShare
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable
 settings = StreamSettings(seed=0, window=2, batch_size=8, resolution=16, views_per_scene=2)
 data = open_training_data([sys.argv[1]]).split("train")
 batches = stream_batches(
-    data, settings, 0, share=Share(), workers=2, unusable=Unusable(0)
+    data, settings, 0, share=RankShare(), workers=2, unusable=Unusable(0)
 )
 count = peak = 0
 with closing(batches):
@@ -69,7 +69,7 @@ def peak_bytes(folder: Path, num_shards: int) -> int:
 
 
 def test_the_reader_holds_as_much_of_a_large_set_as_of_a_small_one(shards: Path) -> None:
-    """6 shards of 1.4 MB and 48: what is read grows by 58 MB, more when it is unpacked."""
+    """6 shards of 1.4 MB and 30: what is read grows by 33 MB, more when it is unpacked."""
     more = sum(path.stat().st_size for path in shards.iterdir()) * (SHARDS - 6) // SHARDS
     grown = peak_bytes(shards, SHARDS) - peak_bytes(shards, 6)
     # a tenth of what was read leaves room for what the allocator keeps; measured: 0.5 MB

@@ -7,14 +7,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from storage.errors import TrilightError
-from train.data.order import OrderSettings, Place, Share, Window, batches_from, windows_from
+from train.data.order import (
+    OrderSettings,
+    Place,
+    RankShare,
+    ShardWindow,
+    batches_from,
+    windows_from,
+)
 
 SIZES = st.lists(st.integers(0, 9), min_size=1, max_size=9).filter(any)
 WORLDS = (1, 2, 3, 8)
 BATCH = 24
 
 
-def windows(sizes: list[int], first: int = 0, *, seed: int = 0, window: int = 2) -> list[Window]:
+def windows(
+    sizes: list[int], first: int = 0, *, seed: int = 0, window: int = 2
+) -> list[ShardWindow]:
     """Return the windows of two epochs from the one that holds `first`."""
     chosen = OrderSettings(seed=seed, window=window)
     stream = windows_from(len(sizes), lambda shard: sizes[shard], chosen, first)
@@ -22,7 +31,7 @@ def windows(sizes: list[int], first: int = 0, *, seed: int = 0, window: int = 2)
     return list(itertools.takewhile(lambda one: one.places[0].position < end, stream))
 
 
-def places(found: list[Window]) -> list[Place]:
+def places(found: list[ShardWindow]) -> list[Place]:
     return [place for window in found for place in window.places]
 
 
@@ -76,7 +85,7 @@ def test_the_ranks_share_out_every_batch(sizes: list[int], first: int, window: i
         assert [place.position for place in batch] == list(range(first, first + BATCH))
         first += BATCH
         for world in WORLDS:
-            shares = [Share(rank=r, world_size=world).of_batch(batch) for r in range(world)]
+            shares = [RankShare(rank=r, world_size=world).of_batch(batch) for r in range(world)]
             assert {len(share) for share in shares} == {BATCH // world}
             assert sorted(itertools.chain(*shares), key=lambda p: p.position) == list(batch)
 
@@ -90,7 +99,7 @@ def test_each_rank_reads_few_shards_of_a_window() -> None:
     samples: list[list[int]] = [[], []]
     for batch in itertools.islice(batches_from(stream, 0, 64), 8):
         for rank in range(2):
-            mine = Share(rank=rank, world_size=2).of_batch(batch)
+            mine = RankShare(rank=rank, world_size=2).of_batch(batch)
             read[rank] |= {place.shard for place in mine}
             samples[rank] += [place.arrival for place in mine]
     # measured: 5 and 5 of 8; a share drawn without regard to shards needs all 8
@@ -101,12 +110,12 @@ def test_each_rank_reads_few_shards_of_a_window() -> None:
 @pytest.mark.parametrize(("rank", "world_size"), [(1, 1), (-1, 2), (0, 0)])
 def test_ranks_that_do_not_exist_are_refused(rank: int, world_size: int) -> None:
     with pytest.raises(TrilightError, match="expected a rank from 0"):
-        Share(rank=rank, world_size=world_size)
+        RankShare(rank=rank, world_size=world_size)
 
 
 def test_unequal_shares_and_empty_shards_are_refused() -> None:
     with pytest.raises(TrilightError, match="batch of 10 scenes is not divisible by 4 ranks"):
-        Share(rank=0, world_size=4).require_equal(10)
+        RankShare(rank=0, world_size=4).require_equal(10)
     chosen = OrderSettings(seed=0, window=1)
     with pytest.raises(TrilightError, match="all 3 shards are empty"):
         next(windows_from(3, lambda shard: 0, chosen, 0))

@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from model.scene_tensors import tensors_of
 from storage.dataset import Dataset
 from storage.errors import TrilightError
 from storage.training_data import TrainingData, open_training_data
 from tests.train.toy import write_toy_dataset
 from train.data.augmentation import AugmentationSettings
-from train.data.order import Share
+from train.data.order import RankShare
 from train.data.scenes import TrainingScene
 from train.data.splits import first_samples
 from train.data.stream import StreamSettings, prefetched, stream_batches
@@ -55,7 +56,7 @@ def take(
         data.split("train"),
         settings,
         first,
-        share=Share(rank=rank, world_size=world_size),
+        share=RankShare(rank=rank, world_size=world_size),
         workers=workers,
         unusable=Unusable(0),
     )
@@ -68,7 +69,8 @@ def same(a: TrainingScene, b: TrainingScene) -> bool:
         a.key == b.key
         and torch.equal(a.target_VRR3, b.target_VRR3)
         and all(
-            torch.equal(value, getattr(b.tensors, name)) for name, value in vars(a.tensors).items()
+            torch.equal(value, getattr(b.tensors, name))
+            for name, value in tensors_of(a.tensors).items()
         )
     )
 
@@ -86,7 +88,10 @@ def by_key(batch: list[TrainingScene]) -> list[TrainingScene]:
 
 def identity(scene: TrainingScene) -> tuple[str | bytes, ...]:
     """Key and bytes: two visits of a scene may differ in nothing that a sum would tell."""
-    tensors = [scene.target_VRR3, *(value for _, value in sorted(vars(scene.tensors).items()))]
+    tensors = [
+        scene.target_VRR3,
+        *(value for _, value in sorted(tensors_of(scene.tensors).items())),
+    ]
     return (scene.key, *(tensor.contiguous().numpy().tobytes() for tensor in tensors))
 
 

@@ -14,7 +14,7 @@ from storage.sample import encode_sample
 from storage.shard_writer import write_shard
 from storage.training_data import TrainingData, open_training_data
 from tests.train.toy import toy_sample, write_toy_dataset
-from train.data.order import Share
+from train.data.order import RankShare
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable
 
@@ -60,7 +60,7 @@ def keys(
         data.split("train"),
         SETTINGS,
         0,
-        share=Share(rank=rank, world_size=world_size),
+        share=RankShare(rank=rank, world_size=world_size),
         workers=2,
         unusable=unusable,
     )

@@ -8,19 +8,18 @@ import flip_evaluator
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from infra.excursion_plots import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
-from storage.conventions import ROUGHNESS
 from storage.dataset import Dataset
 from storage.errors import TrilightError
+from storage.material import ROUGHNESS
 from storage.metrics import psnr_log_db
 from storage.scene import Scene
 from storage.seeds import rng_for
 from storage.training_data import open_training_data
+from tests.command_line import trilight
 from tests.train.kit import tiny_run
 from tests.train.test_loss_lpips import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
@@ -36,7 +35,7 @@ from train.evaluation.grouped_lights import GROUPED, grouped_pictures
 from train.evaluation.groups import by_group, summary
 from train.evaluation.judge import judged_scene, median_picture, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
-from train.evaluation.picture_scores import MEANING, hdr_flip, picture_scores
+from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals
 from train.loop.state import new_state
@@ -75,7 +74,7 @@ def test_what_cannot_be_measured_is_not_a_number() -> None:
     picture = rng_for(0, "picture").uniform(0, 2, (16, 16, 3))
     hits = np.ones((16, 16), bool)
     without = picture_scores(picture, picture, hits, None)
-    assert list(without) == list(MEANING)
+    assert list(without) == list(METRICS)
     assert without["lpips"] is None
     assert (without["psnr_log_db"], without["ssim"], without["log_l1"]) == (100.0, 1.0, 0.0)
     with_weights = picture_scores(picture * 0.5, picture, hits, Lpips(*small_weights()))
@@ -112,7 +111,7 @@ def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
         judged_views(dataclasses.replace(contest(dataset), resolution=24), lambda: None)
 
 
-SCORES = dict.fromkeys(MEANING, 31.0) | {"lpips": None, "log_l1": 0.1}
+SCORES = dict.fromkeys(METRICS, 31.0) | {"lpips": None, "log_l1": 0.1}
 
 
 def with_lights(scene: Scene, lights: int) -> Scene:
@@ -137,7 +136,7 @@ def with_lights(scene: Scene, lights: int) -> Scene:
 
 
 def row(number: int, **changes: object) -> JudgedView:
-    scores = {name: 30.0 + number for name in MEANING} | {"lpips": None, "log_l1": 0.1}
+    scores = {name: 30.0 + number for name in METRICS} | {"lpips": None, "log_l1": 0.1}
     base = JudgedView(
         key=f"{number:09d}",
         view=0,
@@ -274,7 +273,7 @@ def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) 
     weights.write_bytes(encode_weights(new_state(tiny_run()).model))
     data = ["--data", str(dataset.folder.root)]
     command = ["evaluate", str(weights), *data, "--split", "validation", "--out", str(out)]
-    done = CliRunner().invoke(app, [*command, "--json", "--resolution", "16"])
+    done = trilight([*command, "--json", "--resolution", "16"])
     assert done.exit_code == 0, done.output
     found = json.loads((out / "evaluation.json").read_text())
     assert found["contestants"] == json.loads(done.output[done.output.index("{") :])["contestants"]
@@ -283,11 +282,11 @@ def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) 
     for name in ("worst.png", "median.png"):
         with Image.open(out / name) as sheet:
             assert min(sheet.size) > 200
-    shown = CliRunner().invoke(app, command, env={"COLUMNS": "160"}).output.splitlines()
+    shown = trilight(command, env={"COLUMNS": "160"}).output.splitlines()
     (scores,) = [line.split() for line in shown if line.split()[:1] == ["psnr_log_db"]]
     assert len(scores) == 1 + len(found["contestants"])  # a column for each
-    missing = CliRunner().invoke(app, ["evaluate", str(tmp_path / "no"), *data])
+    missing = trilight(["evaluate", str(tmp_path / "no"), *data])
     assert isinstance(missing.exception, TrilightError)
     assert "no such file or folder" in str(missing.exception)
-    empty = CliRunner().invoke(app, ["evaluate", str(weights), *data])
+    empty = trilight(["evaluate", str(weights), *data])
     assert "the test split holds no scene" in str(empty.exception)

@@ -22,8 +22,12 @@ from tests.train.toy import write_toy_dataset
 from train.loss.lpips_weights import LINEAR_FILE, VGG16_FILE
 from train.runs import RUNS
 
-QUICK = {run: "smoke" for run in RUNS} | {"pretrain": "tiny", "paper-pretrain-large": "large"}
-"""Every run once, and every kind of network: `small` and `base` are a larger `tiny`."""
+QUICK = {
+    "smoke": "smoke", "builtin": "smoke", "paper-pretrain": "smoke", "pretrain": "tiny",
+    "paper-pretrain-large": "large",
+}  # fmt: skip
+"""Every kind of step and of network. Second stages step as the first ones do, and `small` and
+`base` are a larger `tiny`."""
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +55,7 @@ def lpips(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.parametrize(
     ("run", "size"),
     [
-        pytest.param(run, size, marks=[] if QUICK[run] == size else pytest.mark.slow)
+        pytest.param(run, size, marks=[] if QUICK.get(run) == size else pytest.mark.slow)
         for run, size in itertools.product(RUNS, SIZES)
     ],
 )

@@ -12,6 +12,7 @@ import torch
 
 from model.config import ModelConfig
 from model.config import smoke as smoke_model
+from model.open import open_network
 from storage.metrics import psnr_log_db
 from storage.training_data import open_training_data
 from tests.train.kit import tiny_run, trained
@@ -30,7 +31,7 @@ from train.loop.optim import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective
-from train.networks import open_network
+from train.networks import network_of_run
 from train.settings import TrainSettings
 
 SMALL = dataclasses.replace(
@@ -114,7 +115,7 @@ def test_unseen_scenes_look_better_than_any_stored_picture(tmp_path: Path) -> No
     trained(settings, [str(folder.root)], tmp_path / "out")
     data = open_training_data([str(folder.root)])
     contest = Contest(
-        network=open_network(tmp_path / "out"),
+        network=open_network(tmp_path / "out", network_of_run),
         shards=data.split("validation"),
         resolution=16,
         rivals=make_rivals(data.split("train"), 16),

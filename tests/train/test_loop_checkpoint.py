@@ -10,12 +10,18 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from storage.errors import TrilightError
+from tests.extensions_kit import EXAMPLES, loaded, written
 from tests.train.kit import TINY_MODEL, tiny_run
 from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
-from train.loop.checkpoint import HEADER_KEY, read_checkpoint, resumed_state, save_checkpoint
-from train.loop.checkpoints import resumed_checkpoint
+from train.loop.checkpoints import (
+    HEADER_KEY,
+    read_checkpoint,
+    resumed_checkpoint,
+    resumed_state,
+    save_checkpoint,
+)
 from train.loop.crew import Crew
 from train.loop.metrics_log import MetricsLog, read_rows
 from train.loop.state import TrainState, new_state
@@ -174,3 +180,21 @@ def test_the_log_is_cut_back_to_the_checkpoint(tmp_path: Path) -> None:
         stream.write('{"step": 8, "lo')
     MetricsLog(path, first_step=4)
     assert [row["step"] for row in read_rows(path)] == [2, 4]
+
+
+def test_a_run_of_an_extension_is_resumed_with_the_same_one_only(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint"
+    size = EXAMPLES / "model_size.py"
+    with loaded(size) as extension:
+        save(path, trained(0))
+        load(path)
+    assert read_checkpoint(path).header["extensions"] == {"model_size.py": extension.sha256}
+    assert read_checkpoint(path).network().config == TINY_MODEL  # the network asks for no file
+    with pytest.raises(TrilightError, match=r"begun with the extension model_size\.py, which is"):
+        load(path)
+    changed = written(tmp_path, size.read_text() + "# changed\n", "model_size.py")
+    with loaded(changed), pytest.raises(TrilightError, match=r"another extension model_size\.py"):
+        load(path)
+    with loaded(EXAMPLES / "metric.py"):  # judges, and decides no weight
+        save(path, trained(0))
+    assert "extensions" not in read_checkpoint(path).header

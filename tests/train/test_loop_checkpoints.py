@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -11,18 +10,27 @@ from pathlib import Path
 import pytest
 import torch
 
+from model.neural_renderer import NeuralRenderer
+from model.open import find_network, open_network
 from model.weights import encode_weights
 from storage.errors import TrilightError
 from tests.conftest import ROOT
 from tests.train.kit import tiny_run
 from train.folder import RunFolder
-from train.loop.checkpoint import resumed_state
-from train.loop.checkpoints import checkpoint_path, keep_checkpoint, resumed_checkpoint, saved_steps
+from train.loop.checkpoints import (
+    keep_checkpoint,
+    path_of_step,
+    resumed_checkpoint,
+    resumed_state,
+    saved_steps,
+)
 from train.loop.crew import Crew
 from train.loop.state import new_state
-from train.networks import open_network
+from train.networks import network_of_run
 
 ALONE = Crew(device=torch.device("cpu"))
+
+CASES = [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")]
 
 CHILD = """
 import os, signal, sys
@@ -31,24 +39,40 @@ from tests.train.kit import tiny_run
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.state import new_state
 
-settings, state, folder = tiny_run(), new_state(tiny_run()), Path(sys.argv[1])
+settings, state = tiny_run(), new_state(tiny_run())
 
-def keep(step):
+def keep(folder, step):
     state.step = state.skipped_steps = step
     keep_checkpoint(folder, state, settings, data_digest="d", world_size=1)
 
-keep(1)
-name = sys.argv[2]
-original = getattr(os, name)
+def killed(folder, name, when):
+    keep(folder, 1)
+    original = getattr(os, name)
 
-def die(*arguments, **options):
-    if sys.argv[3] == "after":
-        original(*arguments, **options)
-    os.kill(os.getpid(), signal.SIGKILL)
+    def die(*arguments, **options):
+        if when == "after":
+            original(*arguments, **options)
+        os.kill(os.getpid(), signal.SIGKILL)
 
-setattr(os, name, die)
-keep(2)
+    setattr(os, name, die)
+    keep(folder, 2)
+
+for case in sys.argv[2:]:
+    child = os.fork()
+    if child == 0:
+        killed(Path(sys.argv[1]) / case, *case.split())
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
 """
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with one of each case, which a killed process has left."""
+    folder, cases = tmp_path_factory.mktemp("killed"), [" ".join(case) for case in CASES]
+    subprocess.run([sys.executable, "-c", CHILD, str(folder), *cases], cwd=ROOT, check=True)
+    return folder
 
 
 def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
@@ -63,22 +87,16 @@ def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
     assert saved_steps(tmp_path) == [10, 20, 24]
 
 
-@pytest.mark.parametrize(
-    ("call", "when"),
-    [("fsync", "before"), ("replace", "before"), ("replace", "after"), ("unlink", "before")],
-)
-def test_killed_while_saving_leaves_a_whole_one(tmp_path: Path, call: str, when: str) -> None:
-    killed = subprocess.run(
-        [sys.executable, "-c", CHILD, str(tmp_path), call, when], cwd=ROOT, check=False
-    )
-    assert killed.returncode == -signal.SIGKILL
-    newest = resumed_checkpoint(tmp_path, ALONE, pytest.fail)
+@pytest.mark.parametrize(("call", "when"), CASES)
+def test_killed_while_saving_leaves_a_whole_one(killed: Path, call: str, when: str) -> None:
+    folder = killed / f"{call} {when}"
+    newest = resumed_checkpoint(folder, ALONE, pytest.fail)
     step = resumed_state(newest, tiny_run(), "d").step
     assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
     state = new_state(tiny_run())
     state.step = state.skipped_steps = 3
-    keep_checkpoint(tmp_path, state, tiny_run(), data_digest="d", world_size=1)
-    assert not list(tmp_path.glob("*.part")), "what the killed one left is cleared away"
+    keep_checkpoint(folder, state, tiny_run(), data_digest="d", world_size=1)
+    assert not list(folder.glob("*.part")), "what the killed one left is cleared away"
 
 
 def keep(folder: Path, *steps: int, kept: int = 3) -> None:
@@ -109,25 +127,25 @@ def test_a_damaged_newest_one_is_named_and_the_one_before_it_is_used(
     damage: Callable[[Path], None], tmp_path: Path
 ) -> None:
     keep(tmp_path, 4, 8, 12)
-    damage(checkpoint_path(tmp_path, 12))
+    damage(path_of_step(tmp_path, 12))
     notes: list[str] = []
     assert resumed_checkpoint(tmp_path, ALONE, notes.append).header["step"] == 8
     (note,) = notes
-    assert f"checkpoint {checkpoint_path(tmp_path, 12)} is not readable: " in note
+    assert f"checkpoint {path_of_step(tmp_path, 12)} is not readable: " in note
     assert note.endswith("The run goes on from that of step 8")
     for step in (8, 4):
-        damage(checkpoint_path(tmp_path, step))
+        damage(path_of_step(tmp_path, step))
     with pytest.raises(
         TrilightError, match="none of its checkpoints can be resumed from"
     ) as caught:
         resumed_checkpoint(tmp_path, ALONE, pytest.fail)
     for step in (4, 8, 12):
-        assert f"{checkpoint_path(tmp_path, step)} is not readable" in str(caught.value)
+        assert f"{path_of_step(tmp_path, step)} is not readable" in str(caught.value)
 
 
 def test_a_damaged_later_one_takes_nobodys_place(tmp_path: Path) -> None:
     keep(tmp_path, 4, 12)
-    flip(checkpoint_path(tmp_path, 12))
+    flip(path_of_step(tmp_path, 12))
     keep(tmp_path, 8, kept=1)
     assert resumed_checkpoint(tmp_path, ALONE, lambda _: None).header["step"] == 8
 
@@ -173,10 +191,16 @@ def test_a_network_is_found_in_folder_checkpoint_and_file(tmp_path: Path) -> Non
     with torch.no_grad():
         state.mean_model.decoder.token_W.fill_(0.25)
     with pytest.raises(TrilightError, match="no checkpoint here"):
-        open_network(tmp_path)
+        open_network(tmp_path, network_of_run)
     keep_checkpoint(folder.checkpoints, state, settings, data_digest="d", world_size=1)
-    for place in (tmp_path, checkpoint_path(folder.checkpoints, 0)):
-        assert (open_network(place).decoder.token_W == 0.25).all(), "the mean is what is shown"
+    for place in (tmp_path, path_of_step(folder.checkpoints, 0)):
+        found = find_network(place, network_of_run)
+        assert found.trained.resolution == settings.resolution
+        assert (found.open().decoder.token_W == 0.25).all(), "the mean is what is shown"
+        renderer = NeuralRenderer.load(place, device="cpu", finders=[network_of_run])
+        assert renderer.trained == found.trained
     folder.weights.write_bytes(encode_weights(state.model))
     for place in (tmp_path, folder.weights):
-        assert torch.equal(open_network(place).decoder.token_W, state.model.decoder.token_W)
+        assert torch.equal(
+            open_network(place, network_of_run).decoder.token_W, state.model.decoder.token_W
+        )

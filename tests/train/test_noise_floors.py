@@ -10,8 +10,8 @@ from storage.metrics import psnr_log_db
 from storage.seeds import rng_for
 from tests.train.test_loss_lpips import small_weights
 from tests.train.toy import toy_sample
+from train.evaluation.metrics import METRICS, picture_scores
 from train.evaluation.noise_floors import noise_floors
-from train.evaluation.picture_scores import MEANING, picture_scores
 from train.loss.lpips import Lpips
 
 
@@ -35,4 +35,4 @@ def test_floors_of_metrics_without_a_measurement_are_of_drawn_noise() -> None:
     assert 39.9 < psnr_log_db(twin, target) < 43.1  # 3072 draws are good to 0.1 dB
     assert found[40.0]["ssim"] == picture_scores(twin, target, hits, None)["ssim"]
     without = noise_floors(sample.views[0], target, hits, None, rng_for(0, "noise"))
-    assert set(MEANING) - set(without) == {"lpips"}
+    assert set(METRICS) - set(without) == {"lpips"}

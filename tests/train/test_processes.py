@@ -45,7 +45,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def command(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: object) -> list:
     """Return what a person types; alone without torchrun."""
-    run = ["-m", "infra.cli.app", "train", "smoke", "--data", str(dataset.folder.root)]
+    run = ["-m", "trilight", "train", "smoke", "--data", str(dataset.folder.root)]
     run += ["--out", str(out), "--device", "cpu", *rest]
     for name, value in (SMALL | changes).items():
         run += ["--set", f"{name}={json.dumps(value)}"]

@@ -10,15 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from typer.testing import CliRunner
 
-from infra.cli.app import app
 from model.layers import Norm
 from model.trained_range import TrainedRange, trained_range
 from model.weights import decode_weights
 from storage.dataset import Dataset
 from storage.errors import TrilightError
 from storage.safe_read import safetensors_header
+from tests.command_line import trilight
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.loop.metrics_log import read_rows
@@ -219,7 +218,7 @@ def test_data_without_a_validation_split_trains_and_says_so(
     again = run(tiny_run(), few, out, resume=True)
     assert again.folder.weights.read_bytes() == judged.folder.weights.read_bytes()
     data = ["--data", str(dataset.folder.root), "--split", "validation"]
-    done = CliRunner().invoke(app, ["evaluate", str(out), *data, "--out", str(tmp_path / "page")])
+    done = trilight(["evaluate", str(out), *data, "--out", str(tmp_path / "page")])
     assert done.exit_code == 0, done.output
 
 

@@ -6,13 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from model.open import open_network
 from storage.dataset import Dataset
 from storage.errors import TrilightError
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
 from train.loss.settings import LossSettings
-from train.networks import open_network
+from train.networks import network_of_run
 from train.progress import Silent
 from train.run import train_run
 from train.settings import TrainSettings
@@ -35,7 +36,7 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
     second = tiny_run(from_weights=True, learning_rate=1e-12, warmup_steps=0)
     place = str(tmp_path / "first")
     run(second, dataset, tmp_path / "second", Start(begin_with=place))
-    before, after = (open_network(tmp_path / name) for name in ("first", "second"))
+    before, after = (open_network(tmp_path / name, network_of_run) for name in ("first", "second"))
     assert after.config == first
     for name, weight in after.state_dict().items():
         # a learning rate of 1e-12 moves nothing that float32 shows but numbers near 0
@@ -122,12 +123,12 @@ def test_a_run_goes_on_past_a_damaged_checkpoint_to_the_same_weights(
     damaged[-4] ^= 4
     path.write_bytes(damaged)
     with pytest.raises(TrilightError, match=f"{path} is not readable"):
-        open_network(path)
+        open_network(path, network_of_run)
     notes = Notes()
     again = trained(settings, data, tmp_path, resume=True, progress=notes)
     assert [str(path) in text for text in notes.texts] == [True]
     assert again.folder.weights.read_bytes() == weights
-    assert open_network(path).config == settings.model, "it was written again"
+    assert open_network(path, network_of_run).config == settings.model, "it was written again"
 
 
 def test_a_network_with_windows_is_trained(dataset: Dataset, tmp_path: Path) -> None:

@@ -5,16 +5,19 @@ which would else prove nothing of it: every second box has interpolated normals,
 Blinn and Phong over Lambert, the light has a colour, and cameras are tilted.
 """
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import DIFFUSE, ROUGHNESS, SPECULAR, camera_rays, look_at_c2w
-from storage.conventions import EMISSION as EMITTED
+from storage.conventions import camera_rays, look_at_c2w
 from storage.dataset import Dataset, open_dataset
 from storage.layout import DatasetFolder
 from storage.manifest import Manifest, index_shard, write_manifest
+from storage.material import DIFFUSE, ROUGHNESS, SPECULAR, completed_rows
+from storage.material import EMISSION as EMITTED
 from storage.sample import Sample, ViewRecord, encode_sample, sample_key
 from storage.scene import Scene, SceneObject
 from storage.seeds import rng_for
@@ -58,7 +61,7 @@ def toy_scene(index: int, *, views: int = VIEWS, boxes: int | None = None) -> Sc
         vertex_normals=_normals(corners, owner, middles).reshape(-1, 3).astype(np.float32),
         faces=np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3),
         material_index=owner.astype(np.uint16),
-        materials=materials,
+        materials=completed_rows(materials, None),
         object_index=owner.astype(np.uint16),
         c2w=np.stack(poses).astype(np.float32),
         fov_deg=rng.uniform(35, 55, views).astype(np.float32),
@@ -136,7 +139,11 @@ def _reflected(materials: NDArray, normal: NDArray, to_light: NDArray, to_eye: N
 
 
 def toy_sample(index: int, *, resolution: int = RESOLUTION, views: int = VIEWS) -> Sample:
-    scene = toy_scene(index, views=views)
+    return toy_sample_of(toy_scene(index, views=views), index, resolution)
+
+
+def toy_sample_of(scene: Scene, index: int, resolution: int = RESOLUTION) -> Sample:
+    views = scene.num_views
     pictures = [toy_picture(scene, view, resolution) for view in range(views)]
     record = ViewRecord(
         spp=1,
@@ -164,15 +171,17 @@ def write_toy_dataset(
     per_shard: int = 5,
     resolution: int = RESOLUTION,
     views: int = VIEWS,
+    scene_of: Callable[[int], Scene] | None = None,
 ) -> Dataset:
-    """Write a dataset of toy samples as storage does, and open it."""
+    """Write a dataset of toy samples, or of other scenes, as storage does, and open it."""
+    scene_of = scene_of or functools.partial(toy_scene, views=views)
     layout = DatasetFolder(folder)
     index, shards = 0, []
     for split, count in (("train", train), ("validation", validation)):
         for number, start in enumerate(range(0, count, per_shard)):
             size = min(per_shard, count - start)
             samples = [
-                toy_sample(index + row, resolution=resolution, views=views) for row in range(size)
+                toy_sample_of(scene_of(index + row), index + row, resolution) for row in range(size)
             ]
             index += size
             path = layout.shard(f"{split}-{number:06d}.tar")

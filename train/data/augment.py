@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from storage.conventions import DIFFUSE, EMISSION, SPECULAR
+from storage.material import laid_out
 from train.data.relight import with_light_scaled, with_lights_mixed
 from train.data.scenes import TrainingScene
 
@@ -98,13 +98,14 @@ def mirrored(scene: TrainingScene) -> TrainingScene:
 
 def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
     """Return the scene with its colour channels in another order; lights apart are let go."""
-    columns = np.arange(scene.tensors.material_T10.shape[1])
-    for channels in (DIFFUSE, SPECULAR, EMISSION):
-        columns[channels] = columns[channels][order]
-    material_T10 = _tensor(scene.tensors.material_T10.numpy()[:, columns])
+    numbers = np.arange(scene.tensors.material_TM.shape[1])
+    for column, part in laid_out(scene.tensors.columns):
+        if column.is_colour:
+            numbers[part] = numbers[part][order]
+    material_TM = _tensor(scene.tensors.material_TM.numpy()[:, numbers])
     return dataclasses.replace(
         scene,
-        tensors=dataclasses.replace(scene.tensors, material_T10=material_T10),
+        tensors=dataclasses.replace(scene.tensors, material_TM=material_TM),
         target_VRR3=_tensor(scene.target_VRR3.numpy()[..., order]),
         lights_VLRR3=None,
     )

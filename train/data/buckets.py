@@ -5,14 +5,13 @@ gradient is therefore of a fair mixture, and the loss is a mean over all views o
 its batches.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from model.scene_tensors import SceneBatch, batch_scenes
+from model.scene_tensors import SceneBatch, batch_scenes, converted
 from train.data.scenes import TrainingScene
 
 MOST_WASTE = 0.05
@@ -35,7 +34,7 @@ class TrainingBatch:
         if device.type == "cpu":
             return self
         return TrainingBatch(
-            scenes=_fields_to(self.scenes, device),
+            scenes=converted(self.scenes, lambda tensor: tensor.to(device, non_blocking=True)),
             target_BVRR3=self.target_BVRR3.to(device, non_blocking=True),
             noise_BV=self.noise_BV.to(device, non_blocking=True),
         )
@@ -48,7 +47,7 @@ def bucket_scenes(
 
     Args:
         scenes: of equal view count.
-        cost: what a scene of so many triangles costs (train.loop.flops); it grows with them.
+        cost: what a scene of so many triangles costs (model.costs); it grows with them.
         most: scenes of a batch.
     """
     by_length = sorted(scenes, key=lambda scene: scene.tensors.num_triangles)
@@ -74,12 +73,3 @@ def make_batch(scenes: Sequence[TrainingScene]) -> TrainingBatch:
         target_BVRR3=torch.stack([scene.target_VRR3 for scene in scenes]),
         noise_BV=torch.stack([scene.noise_V for scene in scenes]),
     )
-
-
-def _fields_to(batch: SceneBatch, device: torch.device) -> SceneBatch:
-    tensors = {
-        field.name: tensor.to(device, non_blocking=True)
-        for field in dataclasses.fields(batch)
-        if (tensor := getattr(batch, field.name)) is not None
-    }
-    return dataclasses.replace(batch, **tensors)

@@ -31,7 +31,7 @@ class Place:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Window:
+class ShardWindow:
     """Shards that are open at the same time, and the order of their samples."""
 
     shards: tuple[int, ...]
@@ -51,7 +51,7 @@ class OrderSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Share:
+class RankShare:
     """Which part of every global batch a process takes."""
 
     rank: int = 0
@@ -90,7 +90,7 @@ def shard_order(num_shards: int, settings: OrderSettings, epoch: int) -> list[in
 
 def windows_from(
     num_shards: int, num_samples: Callable[[int], int], settings: OrderSettings, first: int
-) -> Iterator[Window]:
+) -> Iterator[ShardWindow]:
     """Yield windows without end, from the one that holds position `first` on.
 
     Args:
@@ -117,7 +117,7 @@ def windows_from(
                     Place(position=start + p, shard=shards[a], row=row, arrival=at + a)
                     for p, (a, row) in enumerate(arrivals[i] for i in rng.permutation(sum(sizes)))
                 )
-                yield Window(shards=tuple(shards), places=tuple(places))
+                yield ShardWindow(shards=tuple(shards), places=tuple(places))
             start += sum(sizes)
         if start == begun:
             raise TrilightError(f"all {num_shards} shards are empty; expected a sample.")
@@ -125,7 +125,7 @@ def windows_from(
 
 
 def batches_from(
-    windows: Iterator[Window], first: int, batch_size: int
+    windows: Iterator[ShardWindow], first: int, batch_size: int
 ) -> Iterator[tuple[Place, ...]]:
     """Yield global batches without end; the first begins at position `first`."""
     places = (place for window in windows for place in window.places if place.position >= first)

@@ -10,7 +10,8 @@ import math
 import torch
 from torch import Tensor
 
-from storage.conventions import EMISSION
+from model.scene_tensors import SceneTensors
+from storage.material import laid_out
 from train.data.scenes import TrainingScene
 
 LN_10 = math.log(10.0)
@@ -18,11 +19,10 @@ LN_10 = math.log(10.0)
 
 def with_light_scaled(scene: TrainingScene, factor: float) -> TrainingScene:
     """Return the scene with all of its light `factor` times as strong; lights apart are let go."""
-    columns = scene.tensors.material_T10.clone()
-    columns[:, EMISSION] = _log10(factor * _linear(columns[:, EMISSION]))
+    factor_T = torch.full((scene.tensors.num_triangles,), factor)
     return dataclasses.replace(
         scene,
-        tensors=dataclasses.replace(scene.tensors, material_T10=columns),
+        tensors=_relit(scene.tensors, factor_T),
         target_VRR3=_log10(factor * _linear(scene.target_VRR3)),
         lights_VLRR3=None,
     )
@@ -34,16 +34,25 @@ def with_lights_mixed(scene: TrainingScene, factor_L: Tensor) -> TrainingScene:
     The scene must keep them (train.data.scenes).
     """
     assert scene.lights_VLRR3 is not None
-    columns = scene.tensors.material_T10.clone()
     factor_T = torch.cat([factor_L, torch.ones(1)])[scene.light_T]  # -1: belongs to no light
-    columns[:, EMISSION] = _log10(factor_T[:, None] * _linear(columns[:, EMISSION]))
     mixed_VRR3 = torch.einsum("l,vlijc->vijc", factor_L, scene.lights_VLRR3)
     return dataclasses.replace(
         scene,
-        tensors=dataclasses.replace(scene.tensors, material_T10=columns),
+        tensors=_relit(scene.tensors, factor_T),
         target_VRR3=_log10(mixed_VRR3),
         lights_VLRR3=None,
     )
+
+
+def _relit(tensors: SceneTensors, factor_T: Tensor) -> SceneTensors:
+    """Return the tensors with the radiance of each triangle's material so many times as strong."""
+    material_TM = tensors.material_TM.clone()
+    for column, part in laid_out(tensors.columns):
+        if column.is_radiance and column.is_log_encoded:
+            material_TM[:, part] = _log10(factor_T[:, None] * _linear(material_TM[:, part]))
+        elif column.is_radiance:
+            material_TM[:, part] *= factor_T[:, None]
+    return dataclasses.replace(tensors, material_TM=material_TM)
 
 
 def _linear(log10: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
     Place,
-    Share,
+    RankShare,
     batches_from,
     shard_order,
     windows_from,
@@ -71,7 +71,7 @@ def stream_batches(
     settings: StreamSettings,
     first: int,
     *,
-    share: Share,
+    share: RankShare,
     workers: int,
     unusable: Unusable,
 ) -> Generator[list[TrainingScene], None, None]:
@@ -115,7 +115,7 @@ def _planned(
     shards: ShardSet,
     settings: StreamSettings,
     first: int,
-    share: Share,
+    share: RankShare,
     opened: OpenShards,
     unusable: Unusable,
 ) -> Iterator[list[Place]]:

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from model.scene_tensors import SceneTensors
 from storage.conventions import radiance_from_log10
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
-from storage.ranges import Within
 from storage.sample import Sample
 from storage.seeds import rng_for
 from storage.settings import checked
@@ -24,8 +22,9 @@ from train.data.unusable import Unusable
 from train.evaluation.grouped_lights import GROUPED, grouped_pictures
 from train.evaluation.judge import JudgedScene, judged_scene, predict
 from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
+from train.evaluation.metrics import picture_scores
 from train.evaluation.noise_floors import noise_floors
-from train.evaluation.picture_scores import picture_scores
+from train.evaluation.order import SceneCount, Width
 from train.evaluation.rivals import Rivals
 from train.evaluation.sheet import SheetView
 from train.evaluation.swapped_scene import swapped_pictures
@@ -46,13 +45,13 @@ class Contest:
     """On the device where it is to run."""
     shards: SkipValidation[ShardSet]
     """The split."""
-    resolution: Annotated[int, Within(1, 8192, unit="pixels")]
+    resolution: Width
     """Pixels across, a divisor of the data's."""
     rivals: SkipValidation[Rivals | None]
     """None where no training data is at hand."""
     lpips: SkipValidation[Lpips | None]
     """Likewise. None where its weights are not at hand: LPIPS is then n/a."""
-    most_scenes: Annotated[int, Within(1, 10**9, unit="scenes")]
+    most_scenes: SceneCount
     """The first so many scenes of the split are judged."""
 
     def samples(self) -> Iterator[Sample]:

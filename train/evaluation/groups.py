@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from train.evaluation.judged_view import NETWORK, JudgedView
-from train.evaluation.picture_scores import HIGHER_IS_BETTER
+from train.evaluation.metrics import METRICS
 
 NEAR_DB = 3.0
 """Views whose psnr_log_db is within so much of their floor count as `near_floor`."""
@@ -44,15 +44,16 @@ def summary(views: Sequence[JudgedView], contestant: str = NETWORK) -> dict[str,
     set. `near_floor` is the share of views within NEAR_DB of their floor.
     """
     result: dict[str, Any] = {"views": len(views)}
-    for metric, higher in HIGHER_IS_BETTER.items():
-        values = [view.scores[contestant][metric] for view in views]
+    for name, metric in METRICS.items():
+        values = [view.scores[contestant][name] for view in views]
         known = [value for value in values if value is not None]
-        gaps = [gap for view in views if (gap := view.gap(metric, contestant)) is not None]
+        gaps = [gap for view in views if (gap := view.gap(name, contestant)) is not None]
         whole = len(known) == len(values)
-        result[metric] = {
+        worse = 5 if metric.higher_is_better else 95
+        result[name] = {
             "median": float(np.median(known)) if whole else None,
             "mean": float(np.mean(known)) if whole else None,
-            "worse_5_percent": float(np.percentile(known, 5 if higher else 95)) if whole else None,
+            "worse_5_percent": float(np.percentile(known, worse)) if whole else None,
             "median_worse_than_noise": float(np.median(gaps)) if gaps else None,
         }
     log_gaps = [view.gap("psnr_log_db", contestant) for view in views]

@@ -29,7 +29,7 @@ class JudgedScene:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Judgement:
+class ValidationJudgement:
     """How a network did on the validation split."""
 
     pictures: tuple[NDArray[np.float64], ...]
@@ -51,7 +51,7 @@ class Judge:
         self.median_views = score_pictures(stills, self.scenes)
         self.median_scores = summarise(self.median_views)
 
-    def judge(self, model: RenderFormer) -> Judgement:
+    def judge(self, model: RenderFormer) -> ValidationJudgement:
         """Judge a network on all scenes."""
         pictures = tuple(predict(model, judged.scene) for judged in self.scenes)
         views = score_pictures(pictures, self.scenes)
@@ -59,7 +59,7 @@ class Judge:
         scores["better_than_median"] = share_better(views, self.median_views)
         sizes = [len(scene.target_VRR3) for scene in self.scenes]
         ahead = lead(views, self.median_views, sizes)
-        return Judgement(pictures=pictures, views=tuple(views), scores=scores, lead=ahead)
+        return ValidationJudgement(pictures=pictures, views=tuple(views), scores=scores, lead=ahead)
 
 
 def judged_scene(sample: Sample, resolution: int) -> JudgedScene:

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from storage.conventions import ROUGHNESS
 from storage.lights import num_lights
+from storage.material import ROUGHNESS
 from storage.sample import Sample
-from train.evaluation.picture_scores import HIGHER_IS_BETTER
+from train.evaluation.metrics import METRICS
 
 NETWORK = "network"
 """Name of the contestant that is judged; the others are train.evaluation.rivals."""
@@ -44,7 +44,7 @@ class JudgedView:
         score, floor = self.scores[contestant][metric], self.floors.get(metric)
         if score is None or floor is None:
             return None
-        return floor - score if HIGHER_IS_BETTER[metric] else score - floor
+        return floor - score if METRICS[metric].higher_is_better else score - floor
 
 
 def facts_of(sample: Sample) -> dict[str, Any]:

@@ -6,18 +6,13 @@ noise was measured, the target is judged with noise of the stored size drawn ont
 behind a denoiser is smoother than such independent noise: these floors are a model.
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import log10_radiance, radiance_from_log10
 from storage.sample import ViewRecord
-from train.evaluation.picture_scores import picture_scores
+from train.evaluation.metrics import METRICS, JudgedPicture, noise_rms
 from train.loss.lpips import Lpips
-
-DRAWN = ("ssim", "lpips", "hdr_flip")
-"""Metrics whose floors are of drawn noise."""
 
 
 def noise_floors(
@@ -35,16 +30,18 @@ def noise_floors(
         view: what is stored of the view.
         target_rgb: [R, R, 3] linear radiance, as it is judged.
         hits: [R, R] which pixels see geometry.
-        lpips: as in picture_scores.
+        lpips: as in metrics.picture_scores.
         rng: draws the noise.
     """
-    rms = 10 ** (-view.noise_floor_db / 20)
-    noisy = log10_radiance(target_rgb) + rng.normal(0, rms, target_rgb.shape)
-    twin = picture_scores(radiance_from_log10(np.maximum(noisy, 0)), target_rgb, hits, lpips)
-    measured: dict[str, Any] = {
-        "psnr_log_db": view.noise_floor_db,
-        "object_psnr_log_db": view.object_noise_floor_db,
-        "psnr_linear_db": view.noise_floor_linear_db,
-        "log_l1": rms,
+    noisy = log10_radiance(target_rgb) + rng.normal(0, noise_rms(view), target_rgb.shape)
+    twin = JudgedPicture(
+        radiance_rgb=radiance_from_log10(np.maximum(noisy, 0)),
+        target_rgb=target_rgb,
+        hits=hits,
+        lpips=lpips,
+    )
+    found = {
+        name: metric.floor(view) if metric.floor else metric.score(twin)
+        for name, metric in METRICS.items()
     }
-    return measured | {name: twin[name] for name in DRAWN if twin[name] is not None}
+    return {name: floor for name, floor in found.items() if floor is not None}

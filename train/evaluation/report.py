@@ -7,7 +7,7 @@ from typing import Any
 from train.evaluation.grouped_lights import passes_compared
 from train.evaluation.groups import NEAR_DB, by_group, summary
 from train.evaluation.judged_view import NETWORK, JudgedView
-from train.evaluation.picture_scores import DECIMALS, HIGHER_IS_BETTER, MEANING
+from train.evaluation.metrics import METRICS
 from train.evaluation.published import PUBLISHED_WHERE, published_beside
 from train.evaluation.swapped_scene import loss_by_swapping
 
@@ -23,7 +23,7 @@ def record(views: Sequence[JudgedView], about: Mapping[str, Any]) -> dict[str, A
     """
     return {
         "about": dict(about),
-        "metrics": MEANING,
+        "metrics": {name: metric.meaning for name, metric in METRICS.items()},
         "contestants": {
             name: summary(views, name)
             for name in views[0].scores
@@ -57,21 +57,23 @@ def markdown(found: Mapping[str, Any]) -> str:
 def _contestants(contestants: Mapping[str, Any]) -> list[str]:
     names = list(contestants)
     rows = []
-    for metric, higher in HIGHER_IS_BETTER.items():
-        cells = [_with_tail(metric, contestants[name][metric]) for name in names]
-        rows.append([f"{metric} ({'higher' if higher else 'lower'} is better)", *cells])
+    for name, metric in METRICS.items():
+        cells = [_with_tail(name, contestants[each][name]) for each in names]
+        better = "higher" if metric.higher_is_better else "lower"
+        rows.append([f"{name} ({better} is better)", *cells])
     return _table(["metric", *names], rows)
 
 
 def _against_noise(network: Mapping[str, Any]) -> list[str]:
     rows = []
-    for metric in HIGHER_IS_BETTER:
+    for metric in METRICS:
         gap = network[metric]["median_worse_than_noise"]
         rows.append([metric, _shown(metric, gap)])
+    drawn = ", ".join(name for name, metric in METRICS.items() if metric.floor is None)
     return [
         "Median of how much worse the network's picture is than the noise of its own target. The "
         "noise of the PSNRs was measured, at the resolution of the data; log_l1 stands against an "
-        "upper bound of it, ssim, lpips and hdr_flip against independent noise of that size:",
+        f"upper bound of it, and against independent noise of that size stand {drawn}:",
         "",
         *_table(["metric", "worse than noise"], rows),
         "",
@@ -112,26 +114,25 @@ def _light_passes(passes: Mapping[str, Any] | None) -> list[str]:
     if passes is None:
         return []
     rows = [
-        [name, str(part["views"])]
-        + [_shown(metric, part[metric]["median"]) for metric in HIGHER_IS_BETTER]
+        [name, str(part["views"])] + [_shown(metric, part[metric]["median"]) for metric in METRICS]
         for name, part in passes.items()
     ]
     return [
         "",
         "## Many lights: one pass, or groups added up",
         "",
-        *_table(["", "views", *HIGHER_IS_BETTER], rows),
+        *_table(["", "views", *METRICS], rows),
     ]
 
 
 def _parts(parts: Mapping[str, Any]) -> list[str]:
     rows = [
         [_escaped(name), str(part["views"])]
-        + [_shown(metric, part[metric]["median"]) for metric in HIGHER_IS_BETTER]
+        + [_shown(metric, part[metric]["median"]) for metric in METRICS]
         + [_shown("psnr_log_db", part["psnr_log_db"]["median_worse_than_noise"])]
         for name, part in parts.items()
     ]
-    return _table(["part", "views", *HIGHER_IS_BETTER, "dB below noise floor"], rows)
+    return _table(["part", "views", *METRICS, "dB below noise floor"], rows)
 
 
 def _with_tail(metric: str, figures: Mapping[str, Any]) -> str:
@@ -142,7 +143,7 @@ def _with_tail(metric: str, figures: Mapping[str, Any]) -> str:
 
 
 def _shown(metric: str, value: float | None) -> str:
-    return NOT_AVAILABLE if value is None else f"{value:.{DECIMALS[metric]}f}"
+    return NOT_AVAILABLE if value is None else f"{value:.{METRICS[metric].decimals}f}"
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

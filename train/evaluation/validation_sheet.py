@@ -2,7 +2,7 @@
 
 from PIL import Image
 
-from train.evaluation.judge import Judge, Judgement
+from train.evaluation.judge import Judge, ValidationJudgement
 from train.evaluation.sheet import SheetView, drawn_sheet
 from train.settings import TrainSettings
 
@@ -11,7 +11,7 @@ SHEET_SCENES = 8
 
 
 def drawn_validation_sheet(
-    settings: TrainSettings, judge: Judge, judgement: Judgement, step: int
+    settings: TrainSettings, judge: Judge, judgement: ValidationJudgement, step: int
 ) -> Image.Image:
     """Return the sheet of the first scenes after a step."""
     views, at = [], 0

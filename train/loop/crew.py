@@ -1,6 +1,6 @@
 """The processes that train together: one, or as many as torchrun started.
 
-Each takes its part of every batch (train.data.order.Share); gradients are averaged by torch's
+Each takes its part of every batch (train.data.order.RankShare); gradients are averaged by torch's
 DistributedDataParallel over nccl or gloo. The first process alone logs, judges and saves.
 """
 
@@ -13,7 +13,7 @@ import torch
 import torch.distributed as dist
 
 from storage.errors import TrilightError
-from train.data.order import Share
+from train.data.order import RankShare
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +33,9 @@ class Crew:
         return self.rank == 0
 
     @property
-    def share(self) -> Share:
+    def share(self) -> RankShare:
         """Its part of every batch."""
-        return Share(rank=self.rank, world_size=self.world_size)
+        return RankShare(rank=self.rank, world_size=self.world_size)
 
     def mean(self, values: Sequence[float]) -> list[float]:
         """Return the means over all processes, alike on each; all must call it."""

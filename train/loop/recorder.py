@@ -9,7 +9,7 @@ from train.folder import RunFolder
 from train.loop.board import Board
 from train.loop.metrics_log import MetricsLog
 from train.loop.state import TrainState
-from train.progress import Progress
+from train.progress import TrainProgress
 from train.settings import TrainSettings
 
 
@@ -21,7 +21,7 @@ class Recorder:
         folder: RunFolder,
         settings: TrainSettings,
         judge: Judge | None,
-        progress: Progress,
+        progress: TrainProgress,
         *,
         first_step: int,
     ) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import torch
 
+from model.costs import Workload, training_flops
 from storage.errors import TrilightError
 from train.data.buckets import bucket_scenes
 from train.data.scenes import TrainingScene
@@ -13,9 +14,9 @@ from train.folder import RunFolder
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.crew import Crew
 from train.loop.dead_start import StartWatch
-from train.loop.flops import device_peak, scene_flops
 from train.loop.interrupts import Stopped, deferred_interrupts
 from train.loop.optim import learning_rate
+from train.loop.peak import device_peak
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
 from train.loop.step import Stepper, StepReport
@@ -52,7 +53,6 @@ class Trainer:
         self.data_digest = data_digest
         self.recorder = recorder
         self.stepper = Stepper(state, settings, objective, crew)
-        self.flops = scene_flops(settings.model, settings.views_per_scene, settings.resolution)
         self.start_watch = StartWatch(settings)
         self.window = Window()
         self.skipped_in_a_row = 0
@@ -86,13 +86,13 @@ class Trainer:
         drawn = next(batches)
         waited_s = time.monotonic() - asked
         settings, step = self.settings, self.state.step
-        buckets = bucket_scenes(drawn, self.flops, settings.scenes_per_pass)
+        buckets = bucket_scenes(drawn, self._flops, settings.scenes_per_pass)
         report = self.stepper.step(buckets, learning_rate(step, settings))
         self.window.add(
             report,
             views=settings.scenes_per_step * settings.views_per_scene,
             waited_s=waited_s,
-            flops=sum(self.flops(scene.tensors.num_triangles) for scene in drawn),
+            flops=sum(self._flops(scene.tensors.num_triangles) for scene in drawn),
         )
         self.start_watch.add(report)
         self.state.step += 1
@@ -101,6 +101,15 @@ class Trainer:
         else:
             self._skip([scene.key for scene in drawn])
         return report
+
+    def _flops(self, num_triangles: int) -> int:
+        settings = self.settings
+        workload = Workload(
+            triangles=num_triangles,
+            views=settings.views_per_scene,
+            resolution=settings.resolution,
+        )
+        return training_flops(settings.model, workload)
 
     def _skip(self, keys: Sequence[str]) -> None:
         """Count a step that was left out, and name its scenes; other processes had others."""

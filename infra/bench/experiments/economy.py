@@ -34,7 +34,7 @@ PARTS = (OBJECTS, FLOPS, LEAST_FLOPS, LEAST_KB, STORED, SAMPLES, ARRAYS, TEXTURE
 def _measure(
     workshop: Workshop, points: Sequence[Point], turn: str
 ) -> Iterable[tuple[str, Figures]]:
-    dataset = open_dataset(workshop.asked.data)
+    dataset = open_dataset(workshop.asked.data or "")
     found = list(scene_costs(dataset))
     if not found:
         raise TrilightError(f"{dataset.shown}: no scene; expected a finished dataset.")

@@ -122,7 +122,7 @@ def _render(workshop: Workshop, workers: int) -> float:
     """Return views an hour of `trilight generate`."""
     place = workshop.folder() / "set"
     count = 48 if workshop.effort.name == "careful" else 16
-    words = [sys.executable, "-m", "infra.cli.app", "generate", "smoke", "--out", str(place)]
+    words = [sys.executable, "-m", "trilight", "generate", "smoke", "--out", str(place)]
     words += ["--objects", workshop.asked.objects[0], "--scenes", str(count)]
     words += ["--resolution", "64", "--noise-floor", "20", "--workers", str(workers)]
     subprocess.run(

@@ -27,7 +27,7 @@ from storage.shard_set import ShardSet
 from storage.training_data import TrainingData, open_training_data
 
 if TYPE_CHECKING:
-    from train.data.order import Share
+    from train.data.order import RankShare
     from train.data.scenes import TrainingScene
 
 THREADS, PROCESSES = (1, 2, 4), 2
@@ -110,14 +110,14 @@ def _apart(dataset: Dataset) -> Figures:
     return {"sample_s": seconds / num_samples}
 
 
-def _of_share(data: str, share: "Share") -> "Generator[list[TrainingScene], None, None]":
+def _of_share(data: str, share: "RankShare") -> "Generator[list[TrainingScene], None, None]":
     return _stream(open_training_data([data]), 1, share)
 
 
 def _stream(
-    data: TrainingData, threads: int, share: "Share | None" = None
+    data: TrainingData, threads: int, share: "RankShare | None" = None
 ) -> "Generator[list[TrainingScene], None, None]":
-    from train.data.order import Share
+    from train.data.order import RankShare
     from train.data.stream import StreamSettings, stream_batches
     from train.data.unusable import Unusable
 
@@ -128,7 +128,7 @@ def _stream(
         data.split("train"),
         settings,
         0,
-        share=share or Share(),
+        share=share or RankShare(),
         workers=threads,
         unusable=Unusable(0),
     )

@@ -171,7 +171,7 @@ EXPERIMENTS = (
             "build.renders.noise_floor_db",
             "build.renders.reject_at_cap",
             "order.noise_floor_db",
-            "render.noise_floor",
+            "render.noise_floor_db",
         ),
         cost=CORE_S,
         error=DB,

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import torch
 
-from infra.bench.machine import ROOT
 from infra.bench.sides.networks import Contenders
 from model.costs import Workload
 from model.published.config import PublishedConfig, decode_published, encode_published
 from storage.errors import TrilightError
+from storage.installation import IMPORT_ROOT, module_name
 
 _STATUS, _FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
@@ -38,9 +38,9 @@ def peaks_of(
         "workloads": [asdict(workload) for workload in workloads],
     }
     ran = subprocess.run(
-        [sys.executable, "-m", "infra.bench.sides.network_memory"],
+        [sys.executable, "-m", module_name("infra.bench.sides.network_memory")],
         input=json.dumps(order),
-        cwd=ROOT,
+        cwd=IMPORT_ROOT,
         # freed blocks go back at once, or the next peak would start from what the last one left
         env={**os.environ, "MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"},
         capture_output=True,

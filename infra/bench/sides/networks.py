@@ -7,7 +7,6 @@ otherwise say what the weights happen to be.
 """
 
 import copy
-import dataclasses
 import time
 from collections.abc import Callable
 
@@ -25,7 +24,7 @@ from model.precision import set_precision
 from model.published.config import PublishedConfig
 from model.published.convert import from_published, to_published
 from model.renderformer import ELU_ALPHA, RenderFormer
-from model.scene_tensors import Cameras, SceneTensors, batch_scenes
+from model.scene_tensors import Cameras, SceneTensors, batch_scenes, converted
 from storage.conventions import radiance_from_log10
 from storage.metrics import psnr_log_db
 
@@ -136,9 +135,7 @@ def _view(cameras: Cameras, view: int) -> Cameras:
 
 
 def _moved(scene: SceneTensors, device: torch.device) -> SceneTensors:
-    return SceneTensors(
-        **{field.name: getattr(scene, field.name).to(device) for field in dataclasses.fields(scene)}
-    )
+    return converted(scene, lambda tensor: tensor.to(device))
 
 
 def workload_of(effort: Effort, triangles: int | None = None) -> Workload:

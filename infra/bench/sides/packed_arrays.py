@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load, save
 
-from storage.conventions import DIFFUSE, SPECULAR
+from storage.material import DIFFUSE, SPECULAR
 from storage.profiles import PROFILES, pack_arrays, unpack_arrays
 from storage.renderformer_h5 import TextureType, write_renderformer_h5
 from storage.sample import Sample, decode_sample, encode_sample

@@ -29,6 +29,7 @@ from torch.nn.functional import (
 
 from model.config import ModelConfig
 from model.published.config import PublishedConfig
+from model.published.texture import NORMAL
 from model.rays import bundle_rays, ray_directions
 from model.scene_tensors import SceneTensors
 
@@ -64,9 +65,9 @@ class PublishedInputs:
 
 def published_inputs(scene: SceneTensors, *, padded: int, texture_patch: int) -> PublishedInputs:
     """Return a scene padded to `padded` triangles, its materials spread over their textures."""
-    ten = scene.material_T10
+    ten = scene.material_TM
     normal = ten.new_tensor([0.5, 0.5, 1.0]).expand(len(ten), 3)
-    thirteen = torch.cat([ten[:, :7], normal, ten[:, 7:]], dim=1)
+    thirteen = torch.cat([ten[:, : NORMAL.start], normal, ten[:, NORMAL.start :]], dim=1)
     place = torch.arange(texture_patch, device=ten.device)
     filled = (place[:, None] + place <= texture_patch).to(ten.dtype)
     texture = (thirteen[:, :, None, None] * filled).flatten(1)

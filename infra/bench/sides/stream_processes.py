@@ -9,10 +9,10 @@ from multiprocessing.synchronize import Barrier
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from train.data.order import Share
+    from train.data.order import RankShare
     from train.data.scenes import TrainingScene
 
-    Batches = Callable[[str, Share], Generator[list[TrainingScene], None, None]]
+    Batches = Callable[[str, RankShare], Generator[list[TrainingScene], None, None]]
 
 _PATIENCE_S = 600.0
 
@@ -51,9 +51,9 @@ def _read(
     together: Barrier,
     times: "Queue[tuple[float, float]]",
 ) -> None:
-    from train.data.order import Share
+    from train.data.order import RankShare
 
-    share = Share(rank=rank, world_size=processes)
+    share = RankShare(rank=rank, world_size=processes)
     with closing(batches(data, share)) as found:
         next(found)  # the first one pays for what is imported on the way
     together.wait(_PATIENCE_S)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
-from pipeline.scenes.pieces import Piece, emitter_piece, joined, object_piece, shell_piece
-from scene_templates.layout import Emitter, ShellPart, Surface
+from pipeline.scenes.pieces import ScenePiece, emitter_piece, joined, object_piece, shell_piece
+from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.conventions import look_at_c2w
 from storage.scene import Scene, SceneObject
 from storage.seeds import rng_for
@@ -59,8 +59,8 @@ def cost_scene(num_triangles: int, num_lights: int) -> Scene:
     return scene
 
 
-def _surface(diffuse: float, specular: float, roughness: float) -> Surface:
-    return Surface(
+def _surface(diffuse: float, specular: float, roughness: float) -> SurfaceLook:
+    return SurfaceLook(
         diffuse_scale=diffuse,
         diffuse_rgb=(diffuse, diffuse, diffuse),
         specular_rgb=(specular, specular, specular),
@@ -84,9 +84,9 @@ def _object(
     exponent: float,
     num_triangles: int,
     centre: tuple[float, float, float],
-    surface: Surface,
+    surface: SurfaceLook,
     rng: np.random.Generator,
-) -> Piece:
+) -> ScenePiece:
     """Return a superquadric of 2 rings columns triangles, near `num_triangles`."""
     rings = max(2, round(math.sqrt(num_triangles / 4)))
     columns = max(3, round(num_triangles / (2 * rings)))

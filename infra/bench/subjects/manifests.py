@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from infra.bench.machine import ROOT
+from storage.installation import IMPORT_ROOT, module_name
 from storage.layout import DatasetFolder
 from storage.manifest import Manifest, ShardEntry, index_shard, write_manifest
 from storage.member_table import MemberTable
@@ -78,15 +78,16 @@ def memory_of_opening(root: Path) -> dict[str, float]:
 
     `peak_bytes` is what the process grows by at most, `held_bytes` what of it stays.
     """
-    command = [sys.executable, "-c", _CHILD, str(root)]
-    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-c", _CHILD, str(root), module_name("storage.training_data")]
+    ran = subprocess.run(command, cwd=IMPORT_ROOT, capture_output=True, text=True, check=True)
     peak, held, seconds = map(float, ran.stdout.split())
     return {"peak_bytes": peak, "held_bytes": held, "open_s": seconds}
 
 
 _CHILD = """
 import sys, time
-from storage.training_data import open_training_data
+from importlib import import_module
+open_training_data = import_module(sys.argv[2]).open_training_data
 def now(name):
     # not getrusage: its peak counts the parent too, from before this program was begun
     lines = open("/proc/self/status").read().splitlines()

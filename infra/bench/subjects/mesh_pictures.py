@@ -55,10 +55,10 @@ def picture_db(meshes: Sequence[TriangleMesh], renders: RenderSettings) -> list[
 
 def _scene(mesh: TriangleMesh, *, floor_z: float) -> Scene:
     from pipeline.scenes.pieces import emitter_piece, joined, object_piece, shell_piece
-    from scene_templates.layout import Emitter, ShellPart, Surface
+    from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 
     rng = np.random.default_rng(0)  # for materials of many colours, which these are not
-    matt = Surface(
+    matt = SurfaceLook(
         diffuse_scale=0.5, diffuse_rgb=(0.5, 0.5, 0.5), specular_rgb=(0.0, 0.0, 0.0),
         roughness=1.0, smooth=False, colours="one",
     )  # fmt: skip

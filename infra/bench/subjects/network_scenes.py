@@ -39,7 +39,7 @@ def scene_of(workload: Workload) -> SceneTensors:
     return SceneTensors(
         triangles_T33=whole.triangles_T33[rows],
         normals_T33=whole.normals_T33[rows],
-        material_T10=whole.material_T10[rows],
+        material_TM=whole.material_TM[rows],
         c2w_V44=whole.c2w_V44,
         fov_deg_V=whole.fov_deg_V,
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 from infra.bench.asked import Asked
 from pipeline.flows.accept_objects import accept_objects
 from pipeline.flows.environment import environment
-from pipeline.flows.make_scene import SceneSource, set_up_child
+from pipeline.flows.make_scene import SceneRecipe, set_up_child
 from pipeline.flows.publication import begin
 from pipeline.flows.settings import BuildSettings
 from pipeline.flows.training_builds import smoke
@@ -33,7 +33,7 @@ def render_child(
     here = environment(variant)
     publication = begin(DatasetFolder(folder), build, here, 1, accept_environment=False)
     accepted = accept_objects(objects, None, build, publication, workers=threads)
-    source = SceneSource(settings=build, variant=variant, threads=threads, objects=accepted.objects)
+    source = SceneRecipe(settings=build, variant=variant, threads=threads, objects=accepted.objects)
     return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(source,))
 
 

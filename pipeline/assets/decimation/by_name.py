@@ -1,5 +1,8 @@
 """The decimations by name, and the meshes that pymeshlab must not see."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
 import numpy as np
 
 from pipeline.assets.cleaning.clean import clean
@@ -17,25 +20,51 @@ _MAX_FACES_PER_EDGE = 8
 """Beyond these, edge collapse and remeshing have been seen to run without end."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Decimation:
+    """A way to make a mesh coarser."""
+
+    run: Callable[[TriangleMesh, int], TriangleMesh]
+    """Returns a mesh of about so many faces; raises Rejected."""
+    always_ends: bool
+    """Whether it ends on every mesh."""
+
+
+def _pre_simplified(mesh: TriangleMesh, budget: int) -> TriangleMesh:
+    if len(mesh.faces) > 1.25 * _DETOUR * budget:
+        return clean(meshopt.simplify(mesh, _DETOUR * budget))
+    return mesh
+
+
+def _remesh_evenly(mesh: TriangleMesh, budget: int) -> TriangleMesh:
+    from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
+
+    return pymeshlab_filters.remesh_evenly(_pre_simplified(mesh, budget), budget)
+
+
+def _collapse(mesh: TriangleMesh, budget: int) -> TriangleMesh:
+    from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
+
+    return pymeshlab_filters.collapse(_pre_simplified(mesh, budget), budget)
+
+
+DECIMATIONS: Mapping[str, Decimation] = {
+    "pymeshlab_uniform": Decimation(run=_remesh_evenly, always_ends=False),
+    "pymeshlab_collapse": Decimation(run=_collapse, always_ends=False),
+    "meshoptimizer": Decimation(run=meshopt.simplify, always_ends=True),
+    "meshoptimizer_sloppy": Decimation(run=meshopt.simplify_sloppily, always_ends=True),
+}
+"""By the names of `recipe.methods_of`, which says in which order they are tried."""
+
+
 def decimate(mesh: TriangleMesh, budget: int, method: str) -> TriangleMesh:
     """Return a mesh of about `budget` faces by a method of `recipe.methods_of`; raises Rejected."""
-    if method.startswith("pymeshlab"):
-        from pipeline.assets.decimation import pymeshlab_filters  # may not be installed
-
-        if len(mesh.faces) > 1.25 * _DETOUR * budget:
-            mesh = clean(meshopt.simplify(mesh, _DETOUR * budget))
-        if method == "pymeshlab_uniform":
-            return pymeshlab_filters.remesh_evenly(mesh, budget)
-        return pymeshlab_filters.collapse(mesh, budget)
-    if method == "meshoptimizer":
-        return meshopt.simplify(mesh, budget)
-    assert method == "meshoptimizer_sloppy", method
-    return meshopt.simplify_sloppily(mesh, budget)
+    return DECIMATIONS[method].run(mesh, budget)
 
 
 def safe_method(mesh: TriangleMesh, method: str) -> str:
-    """Return `method`, or `meshoptimizer` for a mesh on which pymeshlab would not end."""
-    if not method.startswith("pymeshlab"):
+    """Return `method`, or `meshoptimizer` for a mesh on which that method might not end."""
+    if DECIMATIONS[method].always_ends:
         return method
     valence = np.bincount(mesh.faces.ravel()).max()
     wild = valence > _MAX_VALENCE or count_edges(mesh).most_faces > _MAX_FACES_PER_EDGE

@@ -28,7 +28,7 @@ def build_dataset(**parameters: Any) -> None:
     given = {field.name: parameters[field.name] for field in dataclasses.fields(DatasetOrder)}
     prepare_assets(**given)
     if order.flow_runs > 1:
-        own, *others = ranges_of(read_status(order.out).shards_planned, order.flow_runs)
+        own, *others = ranges_of(read_status(order.place).shards_planned, order.flow_runs)
         for shards in others:
             ranged = {name: _json(value) for name, value in given.items()} | {"shards": shards}
             run_deployment(order.deployment, parameters=ranged, timeout=0, as_subflow=False)

@@ -90,7 +90,7 @@ def _threads(client: "Client", address: str) -> list[int]:
 
 def _require_shared(client: "Client", order: DatasetOrder) -> None:
     """Refuse a cluster of whose workers one would make its scenes where nobody finds them."""
-    folder = dataset_folder(order.out)
+    folder = dataset_folder(order.place)
     seen_by_all = folder.staging.resolve() / f"met-{uuid.uuid4().hex}"
     write_atomically(seen_by_all, b"")
     try:

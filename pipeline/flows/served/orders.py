@@ -19,7 +19,7 @@ from storage.shard_places import MAX_SHARDS
 DATASET_FORMS: Mapping[str, Any] = {
     "build": BuildName,
     "objects": PublicUrl | None,
-    "out": PublicPlace,
+    "out": PublicPlace | None,
     "changes": BuildChanges | None,
 }
 """Types of parameters that are narrower in a form than in an order."""
@@ -61,8 +61,8 @@ def run_name() -> str:
     """Return what the flow run that begins is called: what is made of what, and where."""
     from prefect.runtime import flow_run
 
-    given = {"build": DatasetOrder.build, "out": DatasetOrder.out, **flow_run.parameters}
-    parts = (given["build"], given.get("scenes"), given["out"])
+    given = {"build": DatasetOrder.build, **flow_run.parameters}
+    parts = (given["build"], given.get("scenes"), given.get("out"))
     return "-".join(str(part) for part in parts if part is not None)
 
 

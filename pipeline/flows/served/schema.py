@@ -8,6 +8,7 @@ The groups of a build's settings become forms within the form, where every field
 
 import dataclasses
 import inspect
+import re
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING
@@ -17,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from pipeline.flows.builds import BUILDS
 from pipeline.flows.settings import BuildSettings
+from pipeline.objects.registry import SOURCES
 from storage.settings import described
 
 Returned = TypeVar("Returned")
@@ -71,7 +73,8 @@ def changes_form(settings: type, example: Any) -> type[BaseModel]:
 def changed_values(form: BaseModel | None) -> dict[str, Any]:
     """Return what was filled in, by dotted name, as `storage.changes` takes it."""
     values: dict[str, Any] = {}
-    for name in form.model_fields_set if form else ():
+    fields = type(form).model_fields if form else {}  # in order, which the set of those given lacks
+    for name in fields:
         value = getattr(form, name)
         if isinstance(value, BaseModel):
             values |= {f"{name}.{below}": entry for below, entry in changed_values(value).items()}
@@ -85,8 +88,9 @@ def _form_type(hint: Any) -> Any:
     return dict[str, Any] if get_origin(hint) in (Mapping, dict) else hint
 
 
+_NAMED = "|".join(re.escape(name) for name, source in SOURCES.items() if not source.is_place)
 _NO_SECRET = (
-    r"^(?:env:TRILIGHT_SOURCE_\w*|(?:builtin|objaverse):[^@?]*"
+    rf"^(?:env:TRILIGHT_SOURCE_\w*|(?:{_NAMED}):[^@?]*"
     r"|[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|[^:]*)$"
 )
 """URLs without a user, a password or a query: whoever may see the server would see them too. The

@@ -49,7 +49,7 @@ class Watched:
         """
         self._order = order
         self._price = usd_per_core_hour()
-        self._folder = dataset_folder(order.out)
+        self._folder = dataset_folder(order.place)
         self._began: float | None = None  # the first scene; objects are prepared before
         self._told = -_EVERY_S
         self._scenes = 0
@@ -100,7 +100,7 @@ class Watched:
     def _begin(self) -> None:
         # Prefect's functions return coroutines only where an event loop runs
         self._progress = cast(
-            UUID, create_progress_artifact(0.0, key="shards", description=self._order.out)
+            UUID, create_progress_artifact(0.0, key="shards", description=self._order.place)
         )
 
     def _tell(self, run: Run) -> None:
@@ -129,11 +129,11 @@ class Watched:
             self._table("summary", rows)
             return
         # a page of Prefect's server cannot show files of the worker: it says where they are
-        self._table("summary", [*rows, ("report", f"{self._order.out}/report.html")])
-        if url := report_url(self._order.out):
+        self._table("summary", [*rows, ("report", f"{self._order.place}/report.html")])
+        if url := report_url(self._order.place):
             create_link_artifact(url, key="report", link_text="report")
         sheet = small_picture(self._folder.contact_sheet)
-        create_image_artifact(sheet, key="contact-sheet", description=self._order.out)
+        create_image_artifact(sheet, key="contact-sheet", description=self._order.place)
 
     def _percent(self, percent: float) -> None:
         if self._progress is not None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.objects.licences import UNKNOWN, refuse_licences
-from pipeline.objects.listing import Fetched, Listing, Progress, failure
+from pipeline.objects.listing import CountDone, Fetched, Listing, failure
 from pipeline.objects.objaverse.package import ObjaversePackage
 from pipeline.objects.transfer import fetch_all
 from storage.errors import TrilightError
@@ -118,7 +118,9 @@ def _record(uid: str, annotation: dict[str, Any]) -> ObjectRecord:
     )
 
 
-def _fetch(package: ObjaversePackage, records: list[ObjectRecord], downloaded: Progress) -> Fetched:
+def _fetch(
+    package: ObjaversePackage, records: list[ObjectRecord], downloaded: CountDone
+) -> Fetched:
     def fetch(record: ObjectRecord) -> ObjectRecord:
         path = package.fetch(record.uid.removeprefix(_name("")))
         return dataclasses.replace(record, path=str(path))

@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
-from pipeline.objects.listing import Fetched, Listing, Progress, failure
+from pipeline.objects.listing import CountDone, Fetched, Listing, failure
 from pipeline.objects.local.catalogue import CATALOGUE_NAMES, only_catalogue, read_catalogue
 from pipeline.objects.local.folder import file_record
 from pipeline.objects.remote.files import RemoteFiles
@@ -92,7 +92,7 @@ def _uncatalogued(
 
 
 def _fetch(
-    folder: RemoteFolder, files: RemoteFiles, records: list[ObjectRecord], downloaded: Progress
+    folder: RemoteFolder, files: RemoteFiles, records: list[ObjectRecord], downloaded: CountDone
 ) -> Fetched:
     def fetch(record: ObjectRecord) -> ObjectRecord:
         name = _name(files, record)

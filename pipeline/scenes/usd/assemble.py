@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.pieces import Piece, joined
+from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.shading import ShadedMesh, flat_shaded
 from pipeline.scenes.usd.cameras import camera_that_sees_all, cameras
 from pipeline.scenes.usd.lights import light_triangles, radiance
-from pipeline.scenes.usd.materials import Surface, material_rows
+from pipeline.scenes.usd.materials import MeshToShade, material_rows
 from pipeline.scenes.usd.meshes import TriangleSoup, read_mesh
 from pipeline.scenes.usd.placed import Placed, placed_prims
-from storage.conventions import EMISSION, MATERIAL_WIDTH, ROUGHNESS
 from storage.errors import TrilightError
+from storage.material import EMISSION, ROUGHNESS, default_rows
 from storage.rows import distinct_rows
 from storage.scene import ObjectKind, Scene, SceneObject
 from storage.usd.names import OBJECT_TEXTS
@@ -33,7 +33,7 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
             no light at all.
     """
     placed = placed_prims(stage, time, opened.lost)
-    pieces: list[Piece] = []
+    pieces: list[ScenePiece] = []
     names: set[str] = set()
     triangles = 0
     for each in placed:
@@ -58,7 +58,7 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
 
 
 def _scene(
-    pieces: Sequence[Piece], placed: Sequence[Placed], time: Any, opened: OpenedUsd
+    pieces: Sequence[ScenePiece], placed: Sequence[Placed], time: Any, opened: OpenedUsd
 ) -> Scene:
     arrays = joined(pieces)
     seen = [each for each in placed if each.prim.GetTypeName() == "Camera"]
@@ -80,13 +80,13 @@ def _scene(
 
 def _pieces(
     each: Placed, time: Any, opened: OpenedUsd, licence: str, names: set[str]
-) -> list[Piece]:
+) -> list[ScenePiece]:
     prim = each.prim
     if prim.GetTypeName() != "Mesh":
         triangles = light_triangles(each, time, opened.lost)
         if triangles is None:
             return []
-        rows = np.zeros((len(triangles), MATERIAL_WIDTH), np.float32)
+        rows = default_rows(len(triangles))
         rows[:, ROUGHNESS] = 1
         rows[:, EMISSION] = radiance(prim, triangles, time)
         corners = triangles.reshape(-1, 3)
@@ -105,7 +105,7 @@ def _mesh_rows(prim: Any, soup: TriangleSoup, time: Any, opened: OpenedUsd) -> N
     from pxr import UsdGeom
 
     indices = np.array(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get(time), np.int64)
-    rows = material_rows(Surface(prim=prim, soup=soup, indices=indices), time, opened)
+    rows = material_rows(MeshToShade(prim=prim, soup=soup, indices=indices), time, opened)
     if prim.HasAPI("MeshLightAPI"):
         light = radiance(prim, soup.positions, time)
         mode = prim.GetAttribute("light:materialSyncMode").Get(time)
@@ -126,7 +126,7 @@ def _split(
     rows: NDArray[np.float32],
     licence: str,
     names: set[str],
-) -> list[Piece]:
+) -> list[ScenePiece]:
     """Return the part of a mesh that reflects, and the part that emits, where there are both."""
     emits = (rows[:, EMISSION] > 0).any(axis=1)
     found = []
@@ -142,7 +142,7 @@ def _piece(
     positions: NDArray[np.float32],
     normals: NDArray[np.float32],
     rows: NDArray[np.float32],
-) -> Piece:
+) -> ScenePiece:
     corners = np.concatenate([positions, normals], axis=2).reshape(-1, 6)
     first, index = distinct_rows(corners)
     kept, faces = corners[first], index.reshape(-1, 3).astype(np.uint32)
@@ -153,7 +153,9 @@ def _piece(
         faces=faces,
         groups=np.zeros(len(faces), np.int64),
     )
-    return Piece(entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index)
+    return ScenePiece(
+        entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
+    )
 
 
 def _entry(prim: Any, kind: ObjectKind, licence: str, names: set[str]) -> SceneObject:

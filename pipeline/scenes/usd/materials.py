@@ -1,4 +1,4 @@
-"""What a USD material comes to here: ten numbers a triangle.
+"""What a USD material comes to here: one row of material columns a triangle.
 
 UsdPreviewSurface in both workflows, and the constants of OpenPBR and Standard Surface where a
 material has no preview. Our BRDF has no Fresnel term: the specular albedo is what such a material
@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.usd.meshes import TriangleSoup, per_corner
 from pipeline.scenes.usd.textures import Texture, read_texture
-from storage.conventions import DIFFUSE, EMISSION, MATERIAL_WIDTH, ROUGHNESS, SPECULAR
+from storage.material import (
+    DIFFUSE,
+    EMISSION,
+    REFLECTING,
+    ROUGHNESS,
+    SPECULAR,
+    default_rows,
+    laid_out,
+)
+from storage.usd.names import added_column
 from storage.usd.opening import OpenedUsd
 
 _DEFAULT_DIFFUSE = (0.18, 0.18, 0.18)
@@ -55,7 +64,7 @@ _LOST = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Surface:
+class MeshToShade:
     """A mesh whose triangles get materials."""
 
     prim: Any
@@ -66,12 +75,12 @@ class Surface:
     """Point of each of its corners."""
 
 
-def material_rows(surface: Surface, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:
-    """Return the material row [T, 10] of each triangle of a mesh."""
+def material_rows(surface: MeshToShade, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:
+    """Return the material row of each triangle of a mesh."""
     from pxr import UsdShade
 
     binding = UsdShade.MaterialBindingAPI(surface.prim)
-    rows = np.zeros((len(surface.soup.polygons), MATERIAL_WIDTH), np.float32)
+    rows = default_rows(len(surface.soup.polygons))
     rows[:] = _shaded(binding.ComputeBoundMaterial()[0], surface, time, opened)
     for subset in binding.GetMaterialBindSubsets():
         chosen = np.isin(surface.soup.polygons, np.array(subset.GetIndicesAttr().Get(time) or []))
@@ -88,10 +97,12 @@ def material_rows(surface: Surface, time: Any, opened: OpenedUsd) -> NDArray[np.
     return rows
 
 
-def _shaded(material: Any, surface: Surface, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:
-    """Return rows [T, 10] of a material over the whole mesh; of its display colour without one."""
+def _shaded(
+    material: Any, surface: MeshToShade, time: Any, opened: OpenedUsd
+) -> NDArray[np.float32]:
+    """Return rows of a material over the whole mesh; of its display colour without one."""
     shader = _shader(material, opened.lost) if material else None
-    rows = np.zeros((len(surface.soup.polygons), MATERIAL_WIDTH), np.float32)
+    rows = default_rows(len(surface.soup.polygons))
     if shader is None:
         rows[:, DIFFUSE] = _display_colour(surface, time)
         rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
@@ -110,11 +121,43 @@ def _shaded(material: Any, surface: Surface, time: Any, opened: OpenedUsd) -> ND
         rows[:, DIFFUSE] = base * (1 - metal)
         rows[:, SPECULAR] = head_on * (1 - metal) + base * metal
     rows[:, ROUGHNESS] = value("roughness", 0.5)[:, 0]
-    rows[:, : EMISSION.start] = np.clip(rows[:, : EMISSION.start], 0, 1)
+    rows[:, REFLECTING] = np.clip(rows[:, REFLECTING], 0, 1)
     strength = value("strength", 0.0) if "strength" in names else 1.0
     rows[:, EMISSION] = np.maximum(value("emissiveColor", 0.0) * strength, 0)
     _note_losses(shader, time, opened.lost)
+    _take_added_columns(rows, material, time, opened.lost)
     return rows
+
+
+def _take_added_columns(
+    rows: NDArray[np.float32], material: Any, time: Any, lost: list[str]
+) -> None:
+    """Take the columns beyond the published ones from the attributes that Trilight writes."""
+    places = {column.name: (column, part) for column, part in laid_out()}
+    for attribute in material.GetPrim().GetAttributes():
+        name = added_column(attribute.GetName())
+        if name is None:
+            continue
+        if name not in places:
+            lost.append(f"{attribute.GetPath()}: this material column is not declared here")
+            continue
+        column, part = places[name]
+        value = _numbers(attribute.Get(time))
+        if len(value) == column.width and np.all(column.within.holds(value)):
+            rows[:, part] = value
+        else:
+            lost.append(
+                f"{attribute.GetPath()}: expected {column.width} numbers {column.within}; "
+                "the default taken"
+            )
+
+
+def _numbers(value: Any) -> NDArray[np.float64]:
+    """Return what an attribute holds as a row of numbers; an empty one of anything else."""
+    try:
+        return np.array(value, np.float64).reshape(-1)
+    except (TypeError, ValueError):
+        return np.zeros(0)
 
 
 def _shader(material: Any, lost: list[str]) -> Any:
@@ -131,7 +174,7 @@ def _shader(material: Any, lost: list[str]) -> Any:
 
 
 def _value(
-    shader: Any, name: str, default: Any, surface: Surface, time: Any, opened: OpenedUsd
+    shader: Any, name: str, default: Any, surface: MeshToShade, time: Any, opened: OpenedUsd
 ) -> NDArray[np.float32]:
     """Return an input for each triangle, [T, 3]; a single number stands in every column."""
     from pxr import UsdShade
@@ -162,7 +205,7 @@ def _value(
 
 
 def _textured(
-    texture: Texture, name: str, surface: Surface, time: Any, opened: OpenedUsd
+    texture: Texture, name: str, surface: MeshToShade, time: Any, opened: OpenedUsd
 ) -> NDArray[np.float32] | None:
     from pxr import UsdGeom
 
@@ -181,7 +224,7 @@ def _textured(
     return means
 
 
-def _display_colour(surface: Surface, time: Any) -> NDArray[np.float32]:
+def _display_colour(surface: MeshToShade, time: Any) -> NDArray[np.float32]:
     from pxr import UsdGeom
 
     primvar = UsdGeom.PrimvarsAPI(surface.prim).FindPrimvarWithInheritance("displayColor")

@@ -1,4 +1,4 @@
-"""Counted work: the parabola against torch's counter, what batching wastes, and a peak."""
+"""Work of training: the formula against torch's counter, what batching wastes, and a peak."""
 
 import dataclasses
 
@@ -9,13 +9,14 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from model.config import ModelConfig
+from model.costs import Workload, training_flops
 from model.renderformer import RenderFormer
 from storage.seeds import rng_for
 from tests.train.kit import TINY_MODEL
 from tests.train.toy import toy_sample
 from train.data.buckets import MOST_WASTE, bucket_scenes, make_batch
 from train.data.scenes import TrainingScene, training_scene
-from train.loop.flops import SceneFlops, device_peak
+from train.loop.peak import device_peak
 
 RESOLUTION = 16
 DEEPER = dataclasses.replace(TINY_MODEL, encoder_layers=2, decoder_layers=2)
@@ -29,10 +30,14 @@ def counted(config: ModelConfig, scenes: list[TrainingScene]) -> int:
     return int(counter.get_total_flops())
 
 
+def flops(num_triangles: int) -> int:
+    workload = Workload(triangles=num_triangles, views=2, resolution=RESOLUTION)
+    return training_flops(DEEPER, workload)
+
+
 @pytest.mark.parametrize("boxes", [1, 5])
-def test_three_counts_say_what_any_scene_needs(boxes: int) -> None:
+def test_the_formula_says_what_any_scene_needs(boxes: int) -> None:
     scene = with_triangles(training_scene(toy_sample(0), RESOLUTION), 12 * boxes)
-    flops = SceneFlops(DEEPER, num_views=2, resolution=RESOLUTION)
     # a first layer needs no gradient of its inputs, which our factor of 3 counts: below 10 %
     assert flops(12 * boxes) == pytest.approx(counted(DEEPER, [scene]), rel=0.1)
 
@@ -44,14 +49,13 @@ def with_triangles(scene: TrainingScene, count: int) -> TrainingScene:
         old,
         triangles_T33=old.triangles_T33[rows],
         normals_T33=old.normals_T33[rows],
-        material_T10=old.material_T10[rows],
+        material_TM=old.material_TM[rows],
     )
     return dataclasses.replace(scene, tensors=tensors)
 
 
 def test_batching_wastes_less_than_it_may() -> None:
     """Counted by torch, against the sum of single scenes, over lengths as they are drawn."""
-    flops = SceneFlops(DEEPER, num_views=2, resolution=RESOLUTION)
     one = training_scene(toy_sample(0), RESOLUTION)
     lengths = rng_for(0, "lengths").integers(10, 300, 12)
     scenes = [with_triangles(one, int(length)) for length in lengths]

@@ -1,13 +1,18 @@
-"""Opening a network, wherever it comes from: one function, and no pickle anywhere.
+"""Opening a network, wherever it comes from: the one place for it, and no pickle anywhere.
 
 ours, shipped      builtin:
 our own            model.safetensors of `trilight train`, or the folder that holds one
 published, local   a folder with config.json and model.safetensors
 published, hub     microsoft/renderformer-v1-base, microsoft/renderformer-v1.1-swin-large
+
+A caller may add forms: `open_network(place, network_of_run)` also opens the checkpoints of training
+(train.networks).
 """
 
 import json
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors.torch import save
@@ -15,7 +20,8 @@ from safetensors.torch import save
 from model.published.config import PublishedConfig, decode_published, encode_published
 from model.published.convert import from_published, to_published
 from model.renderformer import RenderFormer
-from model.weights import CONFIG_KEY, from_tensors, read_tensors
+from model.trained_range import PUBLISHED_RANGE, TrainedRange, trained_range
+from model.weights import CONFIG_KEY, from_tensors, read_metadata, read_tensors
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 
@@ -28,6 +34,9 @@ PUBLISHED = ("microsoft/renderformer-v1-base", "microsoft/renderformer-v1.1-swin
 BUILTIN = "builtin:"
 """Name of the small network that comes with Trilight; model/builtin/README.md is its card."""
 
+BUILTIN_WEIGHTS = Path(__file__).parent / "builtin" / WEIGHTS_NAME
+"""Its file."""
+
 MAX_CONFIG_BYTES = 1 << 16
 """A published config.json has about 1 KiB."""
 
@@ -38,17 +47,65 @@ _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 _PICKLES = (".pt", ".pth", ".bin", ".ckpt", ".pkl")
 
 
-def open_checkpoint(source: str) -> RenderFormer:
-    """Return the network of a checkpoint, float32, in evaluation mode on the CPU.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundNetwork:
+    """A network that is there; its weights are read when it is opened."""
+
+    path: Path
+    """The file that holds them."""
+    trained: TrainedRange
+    """What it was trained on, as far as the file says."""
+    open: Callable[[], RenderFormer]
+    """Returns the network, float32, in evaluation mode on the CPU; raises TrilightError where the
+    file is damaged, or its tensors are not those of its configuration."""
+
+
+Finder = Callable[[Path], FoundNetwork | None]
+"""Finds the network of a place in a form that this package does not know (train.networks has one);
+None for any other place."""
+
+
+def open_network(place: str | Path, *finders: Finder) -> RenderFormer:
+    """Return a network, float32, in evaluation mode on the CPU.
 
     Args:
-        source: BUILTIN, a file, a folder, or the name of a repository on the Hugging Face hub.
+        place: as in `find_network`.
+        finders: as there.
 
     Raises:
-        TrilightError: there is no such checkpoint, it holds pickled code, or its tensors are not
+        TrilightError: there is none, it holds pickled code, it is damaged, or its tensors are not
             those of its configuration; names are listed.
     """
-    path = checkpoint_path(source)
+    return find_network(place, *finders).open()
+
+
+def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
+    """Return a network before its weights are read; of a published name, after it is fetched.
+
+    Args:
+        place: BUILTIN, a file, a folder, or the name of a repository on the Hugging Face hub.
+        finders: are asked first, such as `train.networks.network_of_run`.
+
+    Raises:
+        TrilightError: there is none, or it holds pickled code.
+    """
+    source = str(place)
+    path = BUILTIN_WEIGHTS if source == BUILTIN else Path(source)
+    for finder in finders:
+        if found := finder(path):
+            return found
+    weights = _weights_file(source, path)
+    metadata = read_metadata(weights)
+    if CONFIG_KEY in metadata:
+        trained = trained_range(metadata) or TrainedRange()
+        return FoundNetwork(
+            path=weights, trained=trained, open=lambda: from_tensors(*read_tensors(weights))
+        )
+    return FoundNetwork(path=weights, trained=PUBLISHED_RANGE, open=lambda: _published(weights))
+
+
+def _weights_file(source: str, path: Path) -> Path:
+    """Return the safetensors file that is meant; raises as `find_network`."""
     if not path.exists():
         if path.suffix in _PICKLES or not _HUB_NAME.fullmatch(source):
             raise TrilightError(
@@ -67,15 +124,12 @@ def open_checkpoint(source: str) -> RenderFormer:
             f"checkpoint {source}: expected {WEIGHTS_NAME}; pickled weights could run code and are "
             "not read. Convert them with the tool that wrote them."
         )
-    tensors, metadata = read_tensors(weights)
-    if CONFIG_KEY in metadata:
-        return from_tensors(tensors, metadata)
+    return weights
+
+
+def _published(weights: Path) -> RenderFormer:
+    tensors, _ = read_tensors(weights)
     return from_published(tensors, _read_config(weights.parent / CONFIG_NAME))
-
-
-def checkpoint_path(source: str) -> Path:
-    """Return the file or folder that is meant; of a name on the hub there is none yet."""
-    return Path(__file__).parent / "builtin" / WEIGHTS_NAME if source == BUILTIN else Path(source)
 
 
 def _has_pickles(folder: Path) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from model.checkpoints import CONFIG_NAME, PUBLISHED, WEIGHTS_NAME, open_checkpoint, save_published
+from model.open import CONFIG_NAME, PUBLISHED, WEIGHTS_NAME, open_network, save_published
 from model.renderformer import RenderFormer
 from model.weights import encode_weights
 from storage.errors import TrilightError
@@ -39,7 +39,7 @@ def same(a: RenderFormer, b: RenderFormer) -> bool:
 def test_ours_opens_as_file_and_as_folder(ours: Path) -> None:
     expected = awake(tiny_config(), torch.float32)
     for source in (ours, ours / WEIGHTS_NAME):
-        model = open_checkpoint(str(source))
+        model = open_network(str(source))
         assert same(model, expected)
         assert not model.training
         assert all(weight.requires_grad for weight in model.parameters())
@@ -47,8 +47,8 @@ def test_ours_opens_as_file_and_as_folder(ours: Path) -> None:
 
 def test_published_opens_as_folder_and_as_file(published: Path) -> None:
     expected = awake(publishable("swin"), torch.float32)
-    assert same(open_checkpoint(str(published)), expected)
-    assert same(open_checkpoint(str(published / WEIGHTS_NAME)), expected)
+    assert same(open_network(str(published)), expected)
+    assert same(open_network(str(published / WEIGHTS_NAME)), expected)
 
 
 def test_a_published_name_is_fetched_from_the_hub(
@@ -62,7 +62,7 @@ def test_a_published_name_is_fetched_from_the_hub(
         return str(published / filename)
 
     _stand_in_hub(monkeypatch, download, lambda name, timeout: None)
-    assert same(open_checkpoint(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
+    assert same(open_network(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
     assert asked == [(PUBLISHED[1], CONFIG_NAME), (PUBLISHED[1], WEIGHTS_NAME)]
 
 
@@ -83,7 +83,7 @@ def test_a_hub_that_does_not_answer_is_one_line(monkeypatch: pytest.MonkeyPatch)
 
     _stand_in_hub(monkeypatch, download, _no_route)
     with pytest.raises(TrilightError, match=r"the hub did not give it \(no route to host\)") as got:
-        open_checkpoint(PUBLISHED[0])
+        open_network(PUBLISHED[0])
     assert "\n" not in str(got.value)
 
 
@@ -95,19 +95,19 @@ def test_what_was_fetched_before_is_opened_without_the_hub(
         return str(published / filename)
 
     _stand_in_hub(monkeypatch, download, _no_route)
-    assert same(open_checkpoint(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
+    assert same(open_network(PUBLISHED[1]), awake(publishable("swin"), torch.float32))
 
 
 def test_without_the_hub_library_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(TrilightError, match="huggingface_hub, which would fetch it, is not"):
-        open_checkpoint(PUBLISHED[0])
+        open_network(PUBLISHED[0])
 
 
 @pytest.mark.parametrize("source", ["nowhere/at/all", "/nowhere", "weights.pt", "a/weights.bin"])
 def test_a_missing_file_is_not_asked_of_the_hub(source: str) -> None:
     with pytest.raises(TrilightError, match="no such file or folder"):
-        open_checkpoint(source)
+        open_network(source)
 
 
 @pytest.mark.parametrize("name", ["pytorch_model.bin", "weights.pt", "renamed.safetensors"])
@@ -115,26 +115,26 @@ def test_pickled_code_is_refused_unread(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     torch.save({"weight": torch.zeros(2)}, path)
     with pytest.raises(TrilightError, match="pickled"):
-        open_checkpoint(str(path))
+        open_network(str(path))
 
 
 def test_a_folder_of_pickles_is_refused(tmp_path: Path) -> None:
     torch.save({"weight": torch.zeros(2)}, tmp_path / "pytorch_model.bin")
     with pytest.raises(TrilightError, match=f"expected {WEIGHTS_NAME}; pickled"):
-        open_checkpoint(str(tmp_path))
+        open_network(str(tmp_path))
 
 
 def test_weights_without_their_config_are_refused(published: Path) -> None:
     (published / CONFIG_NAME).unlink()
     with pytest.raises(TrilightError, match=r"config.json: cannot be read .* need the published"):
-        open_checkpoint(str(published))
+        open_network(str(published))
 
 
 @pytest.mark.parametrize("text", ["", "[1]", "{", "[" * 50_000])
 def test_a_config_that_is_none_is_refused(published: Path, text: str) -> None:
     (published / CONFIG_NAME).write_text(text)
     with pytest.raises(TrilightError, match="config.json"):
-        open_checkpoint(str(published))
+        open_network(str(published))
 
 
 @pytest.mark.parametrize("size", [0, 7, 8, 1000])
@@ -142,11 +142,11 @@ def test_a_truncated_file_is_refused(ours: Path, size: int) -> None:
     path = ours / WEIGHTS_NAME
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(TrilightError, match="model.safetensors"):
-        open_checkpoint(str(path))
+        open_network(str(path))
 
 
 def test_a_header_that_claims_the_memory_is_refused(ours: Path) -> None:
     path = ours / WEIGHTS_NAME
     path.write_bytes((1 << 40).to_bytes(8, "little") + path.read_bytes()[8:])
     with pytest.raises(TrilightError, match="the header claims 1099511627776 bytes"):
-        open_checkpoint(str(path))
+        open_network(str(path))

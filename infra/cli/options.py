@@ -1,0 +1,170 @@
+"""Commands whose options are the fields of settings, so that each is described once.
+
+    @command("build")
+    def generate(order: DatasetOrder, shown: Shown) -> None: ...
+
+makes the argument BUILD, and an option of every other field. Each parameter of the function is a
+class of settings (storage.settings) and a section of the help, with the class's first sentence as
+its title. Words only become values here (infra.cli.words): the class checks them, and what it says
+of a wrong one then names the option.
+"""
+
+import inspect
+import re
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING
+from typing import Annotated, Any
+
+from cyclopts import Group, Parameter, Token
+
+from infra.cli.completion import NAMES
+from infra.cli.extending import registered
+from infra.cli.words import FileName, choices_of, is_repeated, kind_of, takes_names, value_of
+from storage.errors import TrilightError
+from storage.ranges import shown_number
+from storage.settings import Described, checked, described, option_of
+
+ALIASES = {
+    "allow_licences": "--allow-licence",
+    "arc_deg": "--arc",
+    "begin_with": "--from",
+    "changes": "--set",
+    "exposure_ev": "--exposure",
+    "min_noise_floor_db": "--min-noise-floor",
+    "most_unusable": "--skip-unusable",
+    "noise_floor_db": "--noise-floor",
+}
+"""Second, shorter words for options; the first is always the name of the field."""
+
+_METAVARS = {int: "INT", float: "NUMBER"}
+
+
+@checked()
+class Shown:
+    """What is printed."""
+
+    json: bool = False
+    """Print the outcome as one JSON document, and nothing else."""
+
+
+def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator that makes a command of a function of settings.
+
+    Args:
+        arguments: fields that are given by their place, and must be given unless they are lists
+            with a default of none; all others are options.
+    """
+
+    def made(function: Callable[..., None]) -> Callable[..., None]:
+        kinds = typing.get_type_hints(function)
+        kinds.pop("return")
+        parameters = {
+            field.name: _parameter(field, group, by_place=field.name in arguments)
+            for kind in kinds.values()
+            for group in [Group.create_ordered(_title(kind))]
+            for field in described(kind)
+        }
+        assert len(parameters) == sum(len(described(kind)) for kind in kinds.values()), parameters
+        in_order = [*arguments, *(name for name in parameters if name not in arguments)]
+        signature = inspect.Signature([parameters[name] for name in in_order])
+
+        def run(*_words: Any, **_options: Any) -> None:
+            given = signature.bind(*_words, **_options).arguments
+            function(**{name: _settings(kind, given) for name, kind in kinds.items()})
+
+        run.__name__ = function.__name__
+        run.__signature__ = signature  # type: ignore[attr-defined]
+        return run
+
+    return made
+
+
+def _title(kind: type) -> str:
+    return (inspect.getdoc(kind) or "").split("\n")[0].removesuffix(".")
+
+
+def _parameter(field: Described, group: Group, *, by_place: bool) -> inspect.Parameter:
+    """Return a field as cyclopts reads it from a function's signature."""
+    # a place for several may stay empty where the field says what none of them means
+    required = field.default is MISSING or (by_place and field.default != ())
+    several = is_repeated(field.hint) or takes_names(field.hint)
+    choices = choices_of(field.hint)
+    kind, complete = kind_of(field.hint), _completer(field.name)
+    word: Any = bool if kind is bool else str  # numbers are read when the class is made
+    if kind is str and not (choices or complete or takes_names(field.hint)):
+        word = FileName
+    names = [option_of(field.name), *filter(None, [ALIASES.get(field.name)])]
+    declared = Parameter(
+        name=None if by_place else names,
+        help=_help(field, choices, several=several, required=required),
+        group=group,
+        metavar=None if kind is bool else _metavar(field, choices),
+        negative=(),
+        show_default=False,
+        show_choices=False,
+        choices=choices or None,
+        json_list=False,
+        completer=complete,
+        converter=None if kind is bool else _several if several else _word,
+    )
+    return inspect.Parameter(
+        field.name,
+        inspect.Parameter.POSITIONAL_ONLY if by_place else inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if required else None,
+        annotation=Annotated[(list[word] if several else word) | None, declared],
+    )
+
+
+def _help(field: Described, choices: tuple[str, ...], *, several: bool, required: bool) -> str:
+    """Return the sentence of a field, and in brackets its choices, range and default."""
+    facts = [", ".join(choices)] if choices else []
+    facts += [str(field.within)] if field.within else []
+    facts += ["may be repeated"] if several else []
+    if required:
+        facts.append("required")
+    elif field.default is not None and field.default is not False and field.default not in ((), {}):
+        facts.append(f"default {_shown(field.default)}")
+    return f"{field.sentence} [{'; '.join(facts)}]" if facts else field.sentence
+
+
+def _shown(default: Any) -> str:
+    if isinstance(default, tuple):
+        return ", ".join(map(_shown, default))
+    return shown_number(default) if isinstance(default, int | float) else str(default)
+
+
+def _metavar(field: Described, choices: tuple[str, ...]) -> str:
+    if takes_names(field.hint):
+        return "NAME=VALUE"
+    return "CHOICE" if choices else _METAVARS.get(kind_of(field.hint), "TEXT")
+
+
+def _completer(name: str) -> Callable[[Any], list[str]] | None:
+    return (lambda _: NAMES[name]()) if name in NAMES else None
+
+
+def _word(_: Any, tokens: tuple[Token, ...]) -> str:
+    """Return what was typed, as it was typed."""
+    return tokens[0].value
+
+
+def _several(_: Any, tokens: tuple[Token, ...]) -> list[str]:
+    return [token.value for token in tokens]
+
+
+def _settings(kind: type, given: Mapping[str, Any]) -> Any:
+    """Return the instance that words make; a complaint about a field names its option."""
+    fields = {field.name: field for field in described(kind)}
+    values = {
+        name: registered(name, value_of(words, fields[name].hint))
+        for name, words in given.items()
+        if name in fields and words is not None
+    }
+    try:
+        return kind(**values)
+    except TrilightError as error:
+        name = re.match(r"\w+(?= is )", str(error))
+        if name is None or name[0] not in fields:
+            raise
+        raise TrilightError(option_of(name[0]) + str(error)[name.end() :]) from error

@@ -1,0 +1,151 @@
+"""A trained network judged on a dataset: the figures, and the files that show them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from infra.excursion_plots import plot_excursions
+from model.open import find_network
+from model.weights import network_digest
+from storage.atomic import write_atomically
+from storage.training_data import TrainingData, open_training_data
+from train.evaluation.evaluate import (
+    Contest,
+    judged_views,
+    make_rivals,
+    sheet_views,
+    stored_resolution,
+    worst_and_median,
+    worst_of_each_excursion,
+)
+from train.evaluation.judged_view import JudgedView
+from train.evaluation.report import markdown, record
+from train.evaluation.sheet import drawn_sheet, write_picture
+from train.loop.crew import choose_device
+from train.loss.lpips_weights import load_lpips
+from train.networks import network_of_run
+from train.result import pretty_json
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Judgement:
+    """What came of it."""
+
+    record: dict[str, Any]
+    """All that was measured, as JSON values (train.evaluation.report)."""
+    views: tuple[JudgedView, ...]
+    """View by view."""
+    contest: Contest
+    """Who was judged on what."""
+
+
+def judge_network(
+    checkpoint: str,
+    data: Sequence[str],
+    *,
+    split: str = "test",
+    train_data: Sequence[str] | None = None,
+    resolution: int | None = None,
+    most_scenes: int = 10**6,
+    lpips: str | None = None,
+    device: str | None = None,
+    done: Callable[[int, int], None] = lambda now, total: None,
+) -> Judgement:
+    """Judge a network view by view, beside each view's own noise floor and simple rivals.
+
+    Args:
+        checkpoint: folder of a run, its model.safetensors, a checkpoint, or `builtin:`.
+        data: root of a dataset, or shards by name or pattern.
+        split: which of its splits.
+        train_data: data of the rivals' training pictures; by default `data`, if it has any.
+        resolution: pixels across; by default what the network was trained at, else the data's.
+        most_scenes: the first so many scenes are judged.
+        lpips: folder of LPIPS' weights, or `hub`; without them LPIPS is n/a.
+        device: cpu or cuda; by default cuda where there is one.
+        done: called with (finished, all) scenes.
+
+    Raises:
+        TrilightError: no such network or data, or a split that holds no scene.
+    """
+    opened = open_training_data(data)
+    rivals = opened if train_data is None else open_training_data(train_data)
+    found, shards = find_network(checkpoint, network_of_run), opened.split(split)
+    if resolution is None:
+        stored = stored_resolution(shards)
+        resolution = min(found.trained.resolution or stored, stored)
+    place, distance = choose_device(device), load_lpips(lpips)
+    contest = Contest(
+        network=found.open().to(place),
+        shards=shards,
+        resolution=resolution,
+        rivals=make_rivals(rivals.split("train"), resolution) if "train" in rivals.splits else None,
+        lpips=None if distance is None else distance.to(place),
+        most_scenes=most_scenes,
+    )
+    counted = _Counted(done, _num_scenes(contest))
+    views = judged_views(contest, counted.one_more)
+    about = _about(checkpoint, opened, contest, split, views)
+    return Judgement(record=record(views, about), views=tuple(views), contest=contest)
+
+
+def write_judgement(judgement: Judgement, out: str | Path) -> None:
+    """Write evaluation.json, evaluation.md and sheets of pictures into a folder.
+
+    Raises:
+        TrilightError: the folder cannot be written.
+    """
+    folder, found = Path(out), judgement.record
+    write_atomically(folder / "evaluation.json", pretty_json(found))
+    write_atomically(folder / "evaluation.md", markdown(found).encode())
+    contest, views = judgement.contest, list(judgement.views)
+    chosen = worst_and_median(views)
+    if excursions := worst_of_each_excursion(views):
+        chosen["worst of each axis"] = excursions
+        plot_excursions(folder / "excursions.png", views)
+    shown = iter(sheet_views(contest, [row for rows in chosen.values() for row in rows]))
+    for name, rows in chosen.items():
+        title = (f"{name}, of {len(views)} views at {contest.resolution} pixels, by psnr_log_db",)
+        sheet = drawn_sheet([next(shown) for _ in rows], title)
+        write_picture(folder / f"{name.replace(' ', '_')}.png", sheet)
+
+
+class _Counted:
+    """Tells how many scenes are judged, of how many."""
+
+    def __init__(self, done: Callable[[int, int], None], total: int) -> None:
+        self._done, self._total, self._now = done, total, 0
+        done(0, total)
+
+    def one_more(self) -> None:
+        self._now += 1
+        self._done(self._now, self._total)
+
+
+def _about(
+    checkpoint: str,
+    opened: TrainingData,
+    contest: Contest,
+    split: str,
+    views: Sequence[JudgedView],
+) -> dict[str, str | int]:
+    """Return what the report says of itself; no path of this machine."""
+    return {
+        "network": Path(checkpoint).name,
+        "network sha256": network_digest(contest.network),
+        "data": opened.shown.rstrip("/").rsplit("/", 1)[-1],
+        "build": opened.build or "unknown",
+        "data digest": opened.digest,
+        "split": split,
+        "resolution": contest.resolution,
+        "scenes": len({view.key for view in views}),
+    }
+
+
+def _num_scenes(contest: Contest) -> int:
+    """Return how many scenes will be judged; opens no shard that is not judged anyway."""
+    count = 0
+    for number in range(len(contest.shards.names)):
+        if count < contest.most_scenes:
+            count += contest.shards.num_samples(number)
+    return min(count, contest.most_scenes)

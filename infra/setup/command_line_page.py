@@ -1,0 +1,101 @@
+"""Writes docs/reference/command-line.md: every command with its options, as --help shows them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cyclopts import App
+
+from infra.cli.commands import COMMANDS, app
+from pipeline.documents.markdown import table
+
+FILE = Path(__file__).parents[2] / "docs/reference/command-line.md"
+
+_HEAD = """# Command line
+
+Made by `make settings` from the classes of settings that the commands take, which are also what is
+checked and what Prefect's forms show: an option has the name of the field that it fills, `-` for
+`_`, and a second, shorter word where one is given. An option that may be repeated is written once
+for each value: `--data A --data B`. What the settings within settings are, which `--set` changes,
+is in [settings.md](settings.md).
+"""
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of a command, or an argument that is given by its place."""
+
+    field: str
+    """Name of the field that it fills."""
+    names: tuple[str, ...]
+    """Its words; of an argument, its name in capitals."""
+    takes: str
+    """What stands after it; empty for a switch."""
+    help: str
+    """Sentence, and in brackets range, choices and default."""
+
+    @property
+    def is_switch(self) -> bool:
+        """Whether it takes no value."""
+        return not self.takes
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command with its options."""
+
+    name: str
+    """What is typed after trilight."""
+    help: str
+    """What it does."""
+    options: tuple[Option, ...]
+    """In the order of the help."""
+
+
+def main() -> None:
+    """Write the file."""
+    FILE.write_text(command_line_page())
+
+
+def every_command() -> list[Command]:
+    """Return every command that does something, those within groups included."""
+    return [found for name in COMMANDS for found in _commands(app[name], name)]
+
+
+def _commands(found: App, name: str) -> Iterator[Command]:
+    if found.default_command is None:
+        for inner in found:
+            if not inner.startswith("-"):
+                yield from _commands(found[inner], f"{name} {inner}")
+        return
+    options = tuple(map(_option, found.assemble_argument_collection()))
+    yield Command(name=name, help=found.help, options=options)
+
+
+def _option(argument: Any) -> Option:
+    by_place = argument.index is not None
+    name: str = argument.field_info.name
+    return Option(
+        field=name,
+        names=(name.upper(),) if by_place else tuple(argument.names),
+        takes=argument.parameter.metavar or "",
+        help=argument.parameter.help,
+    )
+
+
+def command_line_page() -> str:
+    """Return docs/reference/command-line.md."""
+    parts = [_HEAD]
+    for found in every_command():
+        parts.append(f"## `trilight {found.name}`\n\n{found.help}\n")
+        rows = [
+            (f"`{', '.join(option.names)}`", option.takes, option.help.replace("|", "\\|"))
+            for option in found.options
+        ]
+        parts.append(table(("option", "takes", "meaning"), rows) + "\n")
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""The source tree that a wheel is built from: our packages below `trilight`, imports with them.
+
+In a checkout `storage`, `model` and `train` are top-level packages. In somebody's environment such
+names would collide with modules of the user's own, so a wheel has them as `trilight.storage` and so
+on, as pip holds the libraries that it brings along. Only import statements change, in their own
+line, so that line numbers stay. Names of modules in strings are not touched: code that needs one
+asks storage.installation, or uses `__package__`.
+
+Nothing outside Python's standard library is imported here: builds run in environments of their own.
+"""
+
+import ast
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+FACE = "trilight"
+PACKAGES = ("storage", "scene_templates", "pipeline", "model", "train", "infra")
+"""Packages that move below FACE."""
+
+_BESIDE = ("pyproject.toml", "README.md", "LICENSE", "requirements")
+"""What a build reads beside the packages."""
+_LEFT_OUT = shutil.ignore_patterns("__pycache__", "*.pyc", ".*")
+
+
+def write_wheel_tree(checkout: Path, tree: Path) -> None:
+    """Copy all that a wheel is built from into the empty folder `tree`, imports rewritten.
+
+    Raises:
+        SyntaxError: an import that cannot be rewritten in place; it names file and line.
+    """
+    for name in _BESIDE:
+        source = checkout / name
+        copy = shutil.copytree if source.is_dir() else shutil.copy2
+        copy(source, tree / name)
+    shutil.copytree(checkout / FACE, tree / FACE, ignore=_LEFT_OUT)
+    for package in PACKAGES:
+        shutil.copytree(checkout / package, tree / FACE / package, ignore=_LEFT_OUT)
+    shutil.copy2(checkout / "prefect.yaml", tree / FACE)
+    for path in (tree / FACE).rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        path.write_text(with_prefix(text, str(path.relative_to(tree / FACE))), encoding="utf-8")
+
+
+def with_prefix(source: str, name: str = "<source>") -> str:
+    """Return a module's source with `trilight.` before our packages wherever it imports them.
+
+    Args:
+        source: text of the module.
+        name: of the file, for messages.
+
+    Raises:
+        SyntaxError: the source is none, or a statement such as `import storage.scene`, which binds
+            the name `storage` and has no form with a prefix: write `from storage import scene`.
+    """
+    lines = source.splitlines(keepends=True)
+    for line, column in sorted(_places(ast.parse(source, name), name), reverse=True):
+        row = lines[line - 1].encode()  # ast counts columns in bytes
+        lines[line - 1] = (row[:column] + f"{FACE}.".encode() + row[column:]).decode()
+    return "".join(lines)
+
+
+def _places(module: ast.Module, name: str) -> Iterator[tuple[int, int]]:
+    """Yield line and column of the name of every package of ours that is imported."""
+    for node in ast.walk(module):
+        if isinstance(node, ast.ImportFrom) and node.level == 0 and _is_ours(node.module):
+            yield node.lineno, node.col_offset + len("from ")
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                if _is_ours(alias.name):
+                    if alias.asname is None:
+                        problem = f"`import {alias.name}` cannot get a prefix; use from ... import"
+                        raise SyntaxError(problem, (name, alias.lineno, alias.col_offset, None))
+                    yield alias.lineno, alias.col_offset
+
+
+def _is_ours(name: str | None) -> bool:
+    return name is not None and name.split(".")[0] in PACKAGES

@@ -1,0 +1,84 @@
+"""`TrainOrder`: what a person says of a training run, on the command line or in Prefect's form."""
+
+import sys
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Annotated, Any, Literal
+
+from pipeline.flows.order_words import option_words
+from storage.errors import TrilightError
+from storage.extensions import function_name
+from storage.ranges import Within
+from storage.settings import checked
+from train.runs import changed_run
+from train.settings import TrainSettings
+from train.start import Start
+
+
+@checked()
+class TrainOrder:
+    """Which run to train, on what, and how."""
+
+    run: str = "smoke"
+    """Named run, such as smoke or pretrain."""
+    data: tuple[str, ...] = ("data/smoke",)
+    """Root of a dataset, a folder or a URL; or shards, by name or pattern such as
+    s3://b/{train,validation}-{000000..000007}.tar."""
+    out: str | None = None
+    """Folder of the run, as the worker sees it; by default runs/RUN."""
+    resume: bool = False
+    """Go on from the newest checkpoint."""
+    begin_with: str | None = None
+    """Folder of a run, or checkpoint, whose weights a finetune run begins with; by default other
+    runs begin with random ones."""
+    lpips: str | None = None
+    """Folder with vgg16-397923af.pth and vgg.pth, or hub to download them; by default what
+    TRILIGHT_LPIPS says."""
+    device: Literal["cpu", "cuda"] | None = None
+    """What computes; by default cuda where there is one."""
+    steps: Annotated[int | None, Within(1, 10**9, unit="steps")] = None
+    """How many steps; by default the run's. Fewer shorten its warm-up and intervals."""
+    most_unusable: Annotated[int | None, Within(0, 10**9, unit="samples")] = None
+    """Replace up to so many damaged samples by others; by default the run stops at one."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Other settings of the run by dotted name, such as loss.perceptual=none or model=large (values
+    are JSON); by default none differ."""
+    workers: Annotated[int, Within(1, 1024, unit="threads")] = 1
+    """Threads that decode samples."""
+    processes: Annotated[int, Within(1, 1024, unit="processes")] = 1
+    """Processes on this machine, started by torchrun; one for each graphics card."""
+
+    def __post_init__(self) -> None:
+        if not self.data:
+            raise TrilightError("data is empty; expected at least one dataset.")
+
+    @property
+    def place(self) -> str:
+        """The folder of the run."""
+        return f"runs/{function_name(self.run)}" if self.out is None else self.out
+
+    def settings(self) -> TrainSettings:
+        """Return the settings of the run.
+
+        Raises:
+            TrilightError: no such run or setting, a value that is refused, or a start that is not
+                the run's.
+        """
+        settings = changed_run(
+            self.run, self.changes, steps=self.steps, most_unusable=self.most_unusable
+        )
+        self.start().check(settings)
+        return settings
+
+    def start(self) -> Start:
+        """Return how the run begins."""
+        return Start(resume=self.resume, begin_with=self.begin_with, lpips=self.lpips)
+
+    def command(self) -> list[str]:
+        """Return the command line that trains."""
+        launch = ["-m", "trilight"]
+        if self.processes > 1:
+            several = f"--nproc-per-node={self.processes}"
+            launch = ["-m", "torch.distributed.run", "--standalone", several, *launch]
+        options = option_words(self, leave_out=("run", "processes"))
+        return [sys.executable, *launch, "train", self.run, *options]

@@ -1,0 +1,42 @@
+"""Random values of material columns that were declared with a draw (storage.material)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import TrilightError
+from storage.material import EMISSION, laid_out
+from storage.seeds import rng_for
+
+
+def with_drawn_columns(
+    materials: NDArray[np.float32], *, seed: int, scene_index: int, attempt: int
+) -> NDArray[np.float32]:
+    """Return the material rows of a scene with values for the columns that have a draw.
+
+    Each column has a random stream of its own, so that it changes no other draw of the scene. Rows
+    that emit keep the default.
+
+    Args:
+        materials: rows with all declared columns, which stay unchanged.
+        seed: of the dataset.
+        scene_index: which scene.
+        attempt: how many times this scene was rejected before.
+
+    Raises:
+        TrilightError: a draw returns another shape, or a value outside of its column's range.
+    """
+    drawn = materials.copy()
+    reflects = (materials[:, EMISSION] == 0).all(axis=1)
+    for column, part in laid_out():
+        if column.draw is None:
+            continue
+        rng = rng_for(seed, f"material column {column.name}", scene_index, attempt)
+        values = np.asarray(column.draw(rng, int(reflects.sum())), np.float32)
+        wanted = (int(reflects.sum()), column.width)
+        if values.shape != wanted or not np.all(column.within.holds(values)):
+            raise TrilightError(
+                f"material column {column.name!r}: its draw returned shape {values.shape}; "
+                f"expected {wanted}, with every number {column.within}."
+            )
+        drawn[reflects, part] = values
+    return drawn

@@ -1,0 +1,128 @@
+"""`Registry`: a table of things that have a name, ours first, to which extensions may add.
+
+Each kind of thing that can be added from outside has one such table beside its own type: templates,
+families, builds, runs, sizes of networks, object sources, decimations, metrics, scene formats and
+executors. Whoever wants to know what there is lists the table.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Generic, TypeVar
+
+from storage.errors import TrilightError
+from storage.extensions import Decided, Extension, is_reference, loading, opened, short_name
+from storage.suggestion import expected_one_of
+
+Entry = TypeVar("Entry")
+
+_NAME = re.compile(r"[\w.+:\-]{1,64}")
+
+
+class Registry(Mapping[str, Entry], Generic[Entry]):
+    """Entries by name, in the order in which they came."""
+
+    def __init__(
+        self,
+        what: str,
+        kind: Any,
+        entries: Mapping[str, Entry],
+        *,
+        decides: tuple[Decided, ...] = (),
+    ) -> None:
+        """Begin a table.
+
+        Args:
+            what: one entry is called in messages, such as `template`.
+            kind: type of every entry, as isinstance takes it.
+            entries: our own.
+            decides: what depends on its entries. Extensions that add to a table that decides
+                nothing are not recorded: they change how something is done, not what it means.
+        """
+        self.what = what
+        self._kind = kind
+        self._decides = frozenset(decides)
+        self._entries = dict(entries)
+        self._origins: dict[str, Extension] = {}
+
+    def register(self, name: str, entry: Entry) -> None:
+        """Add an entry; call this in a file that `--extend` names.
+
+        Raises:
+            TrilightError: the name is taken or no word, the entry is of another kind, or something
+                is made of it and no file is being loaded, so that nothing could record it.
+        """
+        extension = loading()
+        if extension is None and self._decides:
+            raise TrilightError(
+                f"{self.what} {name!r} is registered by no extension, so that nothing made of it "
+                "could record where it comes from; expected this in a file that --extend names, or "
+                "that storage.extensions.load_extension loads."
+            )
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise TrilightError(
+                f"{self.what} {name!r}: no name; expected up to 64 letters, digits and _ . + : -"
+            )
+        if name in self._entries:
+            origin = self._origins.get(name)
+            owner = origin.name if origin else "Trilight itself"
+            raise TrilightError(f"{self.what} {name!r} is taken by {owner}; expected another name.")
+        if not isinstance(entry, self._kind):
+            wanted = getattr(self._kind, "__name__", str(self._kind))
+            raise TrilightError(
+                f"{self.what} {name!r} is a {type(entry).__name__}; expected a {wanted}."
+            )
+        own = getattr(entry, "name", name)
+        if own != name:
+            raise TrilightError(
+                f"{self.what} {name!r} calls itself {own!r}; expected one name for both."
+            )
+        self._entries[name] = entry
+        if extension:
+            self._origins[name] = extension
+            extension.decides.update(self._decides)
+            extension.undo.append(lambda: self._remove(name))
+
+    def typed(self, typed: str, as_entry: Callable[[Any], Entry]) -> str:
+        """Return the name of an entry that a person typed on a command line, and nothing else did.
+
+        FILE.py:FUNCTION runs a file of their own and registers what the function returns as
+        `FILE.py:FUNCTION` without the folder.
+
+        Args:
+            typed: a name, which may be unknown, or FILE.py:FUNCTION.
+            as_entry: makes an entry of what the function returned, or raises TrilightError.
+
+        Raises:
+            TrilightError: the file cannot be loaded (storage.extensions), or does not define it.
+        """
+        if not is_reference(typed):
+            return typed
+        name = short_name(typed)
+        with opened(typed) as found:
+            if name not in self._entries:
+                self.register(name, as_entry(found))
+        return name
+
+    def find(self, name: str) -> Entry:
+        """Return an entry; raises TrilightError for a name that nobody has registered."""
+        if name not in self._entries:
+            raise TrilightError(
+                f"{self.what} {name!r} is unknown; {expected_one_of(name, self._entries)}."
+            )
+        return self._entries[name]
+
+    def is_ours(self, name: str) -> bool:
+        """Return whether an entry comes with Trilight, and from no extension."""
+        return name in self._entries and name not in self._origins
+
+    def _remove(self, name: str) -> None:
+        del self._entries[name], self._origins[name]
+
+    def __getitem__(self, name: str) -> Entry:
+        return self._entries[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)

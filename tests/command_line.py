@@ -1,0 +1,57 @@
+"""The command line in this process: what it prints, and how it ends."""
+
+import contextlib
+import io
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from unittest import mock
+
+from cyclopts import CycloptsError
+
+from infra.cli.commands import app, complaint
+from storage.errors import TrilightError
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended."""
+
+    exit_code: int
+    stdout: str
+    stderr: str
+    exception: Exception | None = None
+    """The mistake that ended it, of which the real command prints one line."""
+
+    @property
+    def mistake(self) -> str:
+        """The one line that a mistake becomes, without the name of the command."""
+        assert self.exit_code in (1, 2) and self.stderr.count("\n") == 1, self.output
+        return self.stderr.strip().removeprefix("trilight: ")
+
+    @property
+    def output(self) -> str:
+        return self.stdout + self.stderr
+
+
+def trilight(words: Sequence[str], env: Mapping[str, str] | None = None) -> Ended:
+    """Run a command; any exception but a mistake of the user is raised."""
+    out, errors = io.StringIO(), io.StringIO()
+    code = 0
+    caught: Exception | None = None
+    with (
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(errors),
+        mock.patch.dict(os.environ, env or {}),
+    ):
+        try:
+            app(list(words))
+        except CycloptsError as mistake:
+            code, caught = 2, mistake
+            errors.write(f"trilight: {complaint(mistake)}\n")
+        except TrilightError as mistake:
+            code, caught = 1, mistake
+            errors.write(f"trilight: {mistake}\n")
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return Ended(code, out.getvalue(), errors.getvalue(), caught)

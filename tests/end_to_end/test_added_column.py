@@ -1,0 +1,237 @@
+"""A material column that is declared outside of the product goes through all of it."""
+
+import contextlib
+import dataclasses
+import itertools
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar, cast
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from infra.rendering.engines import MitsubaEngine
+from model.neural_renderer import NeuralRenderer
+from model.open import open_network, save_published
+from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
+from pipeline.flows.convert_scene import write_scene
+from pipeline.flows.inspect_scene import _facts
+from pipeline.flows.render_scene import PathTracer
+from pipeline.flows.scene_source import load_source, scene_source
+from scene_templates.families.default_families import DEFAULT_FAMILIES
+from scene_templates.settings import SceneSettings
+from storage.dataset import Dataset
+from storage.errors import TrilightError
+from storage.material import EMISSION, PUBLISHED_COLUMNS
+from storage.scene import Scene
+from storage.scene_file import scene_digest
+from storage.training_data import open_training_data
+from tests.columns_kit import COAT, TINT, WITH_COAT, declared
+from tests.model.kit import awake, tiny_config
+from tests.scenes.small_pool import first_scene, small_pool
+from tests.scenes_by_hand import FLOOR, tiny_scene
+from tests.train.kit import TINY_MODEL, tiny_run, trained
+from tests.train.toy import toy_sample, write_toy_dataset
+from train.data.augment import with_channels
+from train.data.order import RankShare
+from train.data.relight import with_light_scaled
+from train.data.scenes import training_scene
+from train.data.stream import stream_batches
+from train.data.unusable import Unusable
+from train.loop.state import new_state
+from train.networks import network_of_run
+from train.run import stream_settings
+from train.settings import TrainSettings
+
+SETTINGS = SceneSettings(families=DEFAULT_FAMILIES, num_views=2, max_triangles=600)
+
+FOUR = tiny_run(num_steps=4, shuffle_shards=1)
+
+
+def coated_run() -> TrainSettings:
+    return dataclasses.replace(
+        FOUR, model=dataclasses.replace(TINY_MODEL, material_columns=WITH_COAT)
+    )
+
+
+def composed(index: int) -> Scene:
+    return first_scene(SETTINGS, small_pool(), seed=0, scene_index=index)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coat() -> Iterator[None]:
+    with declared(COAT):
+        yield
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("coated")
+    return write_toy_dataset(
+        folder, train=4, validation=1, per_shard=2, resolution=16, scene_of=composed
+    )
+
+
+@pytest.fixture(scope="module")
+def run(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "coated"
+    trained(coated_run(), [str(data.folder.root)], out)
+    return out
+
+
+def coats(tensors: SceneTensors) -> NDArray[np.float32]:
+    assert tensors.columns == WITH_COAT
+    return np.asarray(tensors.material_TM[:, -1].numpy())
+
+
+def test_composed_scenes_differ_in_the_column_alone() -> None:
+    scene = composed(0)
+    reflects = (scene.materials[:, EMISSION] == 0).all(axis=1)
+    drawn = scene.materials[:, -1]
+    assert len(np.unique(drawn[reflects])) == reflects.sum() > 1
+    assert ((drawn[reflects] >= 0.1) & (drawn[reflects] <= 0.9)).all()
+    assert (drawn[~reflects] == 0).all()
+    with declared(dataclasses.replace(COAT, draw=None)):
+        plain = composed(0)
+    assert (plain.materials[:, -1] == 0).all()
+    assert np.array_equal(plain.materials[:, :-1], scene.materials[:, :-1])
+    assert np.array_equal(plain.vertex_positions, scene.vertex_positions)
+    assert np.array_equal(plain.c2w, scene.c2w)
+
+
+@pytest.mark.parametrize("number", [2.0, float("nan")])
+def test_a_draw_outside_of_the_range_is_named(number: float) -> None:
+    wrong = dataclasses.replace(COAT, draw=lambda rng, count: np.full((count, 1), number))
+    with declared(wrong), pytest.raises(TrilightError, match="'coat': its draw returned"):
+        composed(0)
+
+
+def test_the_stream_shows_what_was_composed(data: Dataset) -> None:
+    settings = dataclasses.replace(stream_settings(coated_run()), batch_size=4)
+    batches = stream_batches(
+        open_training_data([str(data.folder.root)]).split("train"),
+        settings,
+        0,
+        share=RankShare(rank=0, world_size=1),
+        workers=1,
+        unusable=Unusable(0),
+    )
+    with contextlib.closing(batches):
+        (batch,) = itertools.islice(batches, 1)
+    assert {scene.key for scene in batch} == {f"{index:09d}" for index in range(4)}
+    for shown in batch:
+        scene = composed(int(shown.key))
+        assert np.array_equal(coats(shown.tensors), scene.materials[scene.material_index, -1])
+
+
+def test_symmetries_permute_and_scale_an_added_colour_and_leave_a_scalar() -> None:
+    with declared(COAT, TINT):
+        sample = toy_sample(0)
+        rng = np.random.default_rng(0)
+        sample.scene.materials[:, -4:] = rng.random((len(sample.scene.materials), 4))
+        scene = training_scene(sample, 16)
+        before = scene.tensors.material_TM[:, -4:]
+        turned = with_channels(scene, np.array([2, 0, 1])).tensors.material_TM[:, -4:]
+        assert torch.equal(turned[:, 0], before[:, 0])
+        assert torch.equal(turned[:, 1:], before[:, [3, 1, 2]])
+        scaled = with_light_scaled(scene, 2.0).tensors.material_TM[:, -4:]
+        assert torch.equal(scaled[:, 0], before[:, 0])
+        assert torch.equal(scaled[:, 1:], 2 * before[:, 1:])
+
+
+def test_a_network_learns_from_it_and_is_opened_again(run: Path) -> None:
+    checkpoint = run / "checkpoints" / "step-000000004.safetensors"
+    pictures = []
+    for place in (run, checkpoint):
+        network = open_network(place, network_of_run)
+        assert network.config.material_columns == WITH_COAT
+        with torch.no_grad():
+            pictures.append(network(batch_scenes([scene_tensors(composed(0))]), 16))
+    assert torch.equal(*pictures)
+    start = new_state(coated_run()).model.encoder.tokens.material.weight
+    learnt = open_network(run, network_of_run).encoder.tokens.material.weight
+    assert learnt.shape == start.shape == (36, 11)
+    assert not torch.equal(learnt[:, -1], start[:, -1]), "no gradient reached the column"
+
+
+def test_its_pictures_change_with_the_column(run: Path) -> None:
+    renderer = NeuralRenderer.load(run / "model.safetensors")
+    plain, coated = tiny_scene(), tiny_scene()
+    coated.materials[FLOOR, -1] = 0.9
+    assert not np.array_equal(renderer.render(plain, 16), renderer.render(coated, 16))
+    assert not renderer.prepare(coated).notes
+
+
+def test_a_checkpoint_whose_column_is_not_declared_says_so(run: Path) -> None:
+    with declared():
+        for place in (run, run / "checkpoints" / "step-000000004.safetensors"):
+            with pytest.raises(TrilightError, match="'coat'.*has to be declared first"):
+                open_network(place, network_of_run)
+
+
+def test_the_published_form_refuses_it(tmp_path: Path) -> None:
+    config = dataclasses.replace(tiny_config("dpt"), material_columns=WITH_COAT)
+    with pytest.raises(TrilightError, match="material_columns .*coat"):
+        save_published(awake(config), tmp_path)
+
+
+@pytest.mark.parametrize("form", ["safetensors", "usdc"])
+def test_a_composed_scene_comes_back_from_exact_forms(tmp_path: Path, form: str) -> None:
+    scene = composed(0)
+    assert write_scene(tmp_path / f"a.{form}", scene) == ()
+    back = load_source(scene_source(str(tmp_path / f"a.{form}"))).scene
+    assert np.array_equal(back.materials, scene.materials)
+    assert scene_digest(back) == scene_digest(scene)
+
+
+@pytest.mark.parametrize("form", ["json", "h5"])
+def test_other_forms_say_that_they_lose_it(tmp_path: Path, form: str) -> None:
+    notes = write_scene(tmp_path / f"a.{form}", composed(0))
+    assert any("materials.coat" in note for note in notes)
+
+
+def test_the_shipped_network_gives_the_same_bytes_and_says_what_it_does_not_read() -> None:
+    renderer = NeuralRenderer(open_network("builtin:"))
+    assert open_network("builtin:").config.material_columns == PUBLISHED_COLUMNS
+    coated = tiny_scene()
+    coated.materials[FLOOR, -1] = 0.9
+    with pytest.warns(UserWarning, match="does not read coat"):
+        shown = renderer.render(coated, 16)
+    with declared():
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert np.array_equal(renderer.render(tiny_scene(), 16), shown)
+
+
+def test_the_path_tracer_says_what_it_does_not_read() -> None:
+    class Tracer:
+        identity: ClassVar[dict[str, str]] = {}
+
+        def open(self, scene: Scene, name: str) -> None:
+            assert scene.num_triangles
+
+    engine = MitsubaEngine(cast(PathTracer, Tracer()))
+    scene = tiny_scene()
+    assert engine.open(scene, "floor") == ()
+    scene.materials[FLOOR, -1] = 0.9
+    assert engine.open(scene, "floor") == ("floor: the path tracer does not read coat",)
+
+
+def test_inspect_names_the_columns_in_use(tmp_path: Path) -> None:
+    scene = tiny_scene()
+    for coat, named in ((0.9, "coat"), (0.0, None)):
+        scene.materials[FLOOR, -1] = coat
+        write_scene(tmp_path / "a.safetensors", scene)
+        facts = _facts(scene_source(str(tmp_path / "a.safetensors"))).facts
+        assert facts.get("added_columns") == named
+
+
+def test_a_network_of_four_columns_trains_on_the_same_data(data: Dataset, tmp_path: Path) -> None:
+    trained(FOUR, [str(data.folder.root)], tmp_path / "four")
+    assert open_network(tmp_path / "four", network_of_run).encoder.tokens.material.weight.shape == (
+        36,
+        10,
+    )

@@ -1,0 +1,226 @@
+"""Each file of examples/, copied to another folder and used from there as its first lines say."""
+
+import dataclasses
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from infra.cli.extending import extended
+from model.config import SIZES, ModelConfig
+from pipeline.flows.builds import BUILDS, named_build, typed_build
+from pipeline.flows.convert_scene import write_scene
+from pipeline.flows.executors import EXECUTORS
+from pipeline.flows.scene_source import load_source, scene_source
+from pipeline.objects.sources import find_objects, look_at_source
+from storage.changes import changed
+from storage.errors import TrilightError
+from storage.manifest import read_manifest
+from storage.scene_file import decode_scene_file, encode_scene
+from tests.end_to_end.conftest import Trilight
+from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
+from tests.scene_templates.balls import one_drawn
+from tests.scenes_by_hand import tiny_scene
+from train.evaluation.metrics import METRICS, picture_scores
+from train.runs import changed_run, typed_run
+
+FILES = sorted(path.name for path in EXAMPLES.glob("*.py"))
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Callable[[str], Path]:
+    def copy(name: str) -> Path:
+        return Path(shutil.copy(EXAMPLES / name, tmp_path))
+
+    return copy
+
+
+def test_there_is_one_of_each() -> None:
+    assert FILES == [
+        "build.py", "executor.py", "family.py", "material_column.py", "metric.py", "model_size.py",
+        "object_source.py", "run.py", "scene_format.py", "template.py",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_an_example_is_short_and_shows_its_command(name: str) -> None:
+    text = (EXAMPLES / name).read_text()
+    assert 20 <= len(text.splitlines()) <= 60
+    shown = re.findall(r"^    trilight .*$", text, re.MULTILINE)
+    assert shown
+    assert all(f" {name}" in line for line in shown)
+
+
+def test_a_template_makes_scenes(copied: Callable[[str], Path]) -> None:
+    with loaded(copied("template.py")):
+        settings = named_build("smoke", changes={"scenes.families": "corridor"}).scenes
+        layouts = [one_drawn(settings, index).layout for index in range(8)]
+    assert {tuple(part.name for part in layout.shell) for layout in layouts} == {
+        ("floor", "wall1", "wall2")
+    }
+
+
+def test_a_family_makes_scenes(copied: Callable[[str], Path]) -> None:
+    with loaded(copied("family.py")):
+        settings = named_build("smoke", changes={"scenes.families": "crowd"}).scenes
+        assert 5 <= len(one_drawn(settings, 0).layout.objects) <= 8
+
+
+def test_a_material_column_is_drawn_and_stored(copied: Callable[[str], Path]) -> None:
+    with loaded(copied("material_column.py")):
+        scene = tiny_scene()
+        assert scene.materials.shape[1] == 11
+        scene.materials[:, 10] = 0.5
+        stored = encode_scene(scene)
+        assert (decode_scene_file(stored, "scene").materials[:, 10] == 0.5).all()
+        assert SIZES["coated"]().material_columns[-1] == "coat"
+    with pytest.raises(TrilightError, match="'coat' is not declared here"):
+        decode_scene_file(stored, "scene")
+
+
+def test_a_build_of_a_file(copied: Callable[[str], Path]) -> None:
+    with room_for_extensions():
+        build = typed_build(f"{copied('build.py')}:sunsets")
+        settings = named_build(build, seed=3)
+        assert (settings.build, settings.seed, BUILDS[build].num_scenes) == ("sunsets", 3, 32)
+        assert settings.scenes.lights.count == (1, 2)
+
+
+def test_a_run_of_a_file(copied: Callable[[str], Path]) -> None:
+    with room_for_extensions():
+        run = typed_run(f"{copied('run.py')}:quick_lights")
+        assert changed_run(run, {"seed": 4}, steps=60).warmup_steps == 10
+
+
+def test_a_source_lists_objects(copied: Callable[[str], Path], tmp_path: Path) -> None:
+    asked: dict[str, Any] = {"allowed_licences": ("CC0-1.0",)}
+    with loaded(copied("object_source.py")):
+        found = find_objects("dice:3", work_dir=tmp_path, **asked)
+        assert [Path(record.path).is_file() for record in found.records] == [True] * 3
+        with pytest.raises(TrilightError, match=r"dice:x'; expected dice:N with N from 1"):
+            find_objects("dice:x", work_dir=tmp_path, **asked)
+        with pytest.raises(TrilightError, match="dice: states the licence of every object"):
+            look_at_source("dice:3", licence="MIT", **asked)
+    with pytest.raises(TrilightError, match="'dice:3' does not exist"):
+        look_at_source("dice:3", licence=None, **asked)
+
+
+def test_a_metric_joins_the_others(copied: Callable[[str], Path]) -> None:
+    target = np.full((32, 32, 3), 2.0)
+    with loaded(copied("metric.py")):
+        scores = picture_scores(target * 1.5, target, np.ones((32, 32), np.bool_), None)
+        assert scores["relative_mse"] == pytest.approx(1 / 4.01)
+        assert list(scores)[-1] == "relative_mse"
+    assert "relative_mse" not in METRICS
+
+
+def test_a_format_carries_a_scene_and_says_what_it_lost(
+    copied: Callable[[str], Path], tmp_path: Path
+) -> None:
+    scene, path = tiny_scene(), tmp_path / "a.npz"
+    with loaded(copied("scene_format.py")):
+        (lost,) = write_scene(path, scene)
+        assert "objects.name" in lost
+        assert "materials" not in lost
+        back = load_source(scene_source(str(path))).scene
+        np.testing.assert_array_equal(back.materials, scene.materials)
+        np.testing.assert_array_equal(back.triangle_emits, scene.triangle_emits)
+        broken = dataclasses.replace(scene, faces=scene.faces + 10_000)
+        write_scene(path, broken)
+        with pytest.raises(TrilightError, match="faces"):  # by Trilight, not by the file
+            load_source(scene_source(str(path)))
+    with pytest.raises(TrilightError, match="cannot be read as a scene; expected a scene"):
+        scene_source(str(path))
+
+
+def test_a_size_is_a_setting(copied: Callable[[str], Path]) -> None:
+    with loaded(copied("model_size.py")):
+        run = changed_run("smoke", {"model": "nano", "model.num_registers": 3})
+        assert (run.model.width, run.model.num_registers) == (72, 3)
+        assert SIZES["nano"]() == changed(run, {"model.num_registers": 2}).model
+    assert "nano" not in ModelConfig.PRESETS
+
+
+def test_an_executor_is_a_runner(copied: Callable[[str], Path]) -> None:
+    path = copied("executor.py")
+    with room_for_extensions():
+        words = extended(["generate", "smoke", f"--extend={path}", "--runner", "commands"])
+        assert words == ["generate", "smoke", "--runner", "commands"]
+        assert "commands" in EXECUTORS
+        again = extended(["--extend", str(path), "doctor", "--", "--extend"])
+        assert again == ["doctor", "--", "--extend"]
+        for nothing in (["--extend"], ["--extend="]):
+            with pytest.raises(TrilightError, match=r"--extend: names no file; expected"):
+                extended(nothing)
+
+
+TINY = (
+    "--resolution", "32", "--noise-floor", "20", "--set", "renders.max_spp=32",
+    "--set", "scenes.num_views=1", "--set", "splits.scenes_per_shard=1",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_data_of_one_s_own_files_by_the_real_command(
+    copied: Callable[[str], Path], trilight: Trilight, tmp_path: Path
+) -> None:
+    """Executor, source, template, family: the same bytes by another executor; then the checks."""
+    for name in FILES:
+        copied(name)
+    own = ("--extend", "template.py", "--extend", "object_source.py")
+    families = ("--set", 'scenes.families=["corridor", "plane-single"]')
+    asked = ("generate", "smoke", *own, "--objects", "dice:40", "--scenes", "6", *TINY, *families)
+    ran = trilight(*asked, "--extend", "executor.py", "--runner", "commands", "--out", "a")
+    assert ran.returncode == 0, ran.stderr
+    assert trilight(*asked, "--out", "b").returncode == 0
+    digests = [read_manifest(tmp_path / out / "manifest.json").dataset_digest for out in "ab"]
+    assert digests[0] == digests[1]
+    assert set(read_manifest(tmp_path / "a" / "manifest.json").extensions) == {own[1], own[3]}
+    for command in (("verify", "a"), ("inspect", "a"), ("status", "a")):  # without the files
+        ran = trilight(*command)
+        assert ran.returncode == 0, (command, ran.stderr)
+    assert "corridor" in (tmp_path / "a" / "README.md").read_text()
+    (tmp_path / "a" / "train-000001.tar").write_bytes(b"")
+    refused = trilight("verify", "a", "--repair", "--objects", "dice:40")
+    assert (refused.returncode, "add --extend object_source.py" in refused.stderr) == (1, True)
+    mended = trilight("verify", "a", "--repair", "--objects", "dice:40", *own)
+    assert mended.returncode == 0, mended.stderr
+    trained = trilight(
+        "train", "smoke", "--data", "a", "--out", "r", "--steps", "3",
+        "--set", "resolution=32", "--set", "views_per_scene=1",
+        "--extend", "model_size.py", "--set", "model=nano",
+    )  # fmt: skip
+    assert trained.returncode == 0, trained.stderr
+    record = json.loads((tmp_path / "r" / "settings.json").read_text())
+    assert list(record["extensions"]) == ["model_size.py"]
+    judged = trilight("evaluate", "r", "--data", "a", "--extend", "metric.py", "--out", "j")
+    assert judged.returncode == 0, judged.stderr
+    assert "relative_mse" in (tmp_path / "j" / "evaluation.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_run_of_one_s_own_file_by_the_real_command(
+    copied: Callable[[str], Path], trilight: Trilight, tmp_path: Path
+) -> None:
+    path, build = copied("run.py"), copied("build.py")
+    made = trilight("generate", f"{build.name}:sunsets", *TINY, "--scenes", "6", "--out", "d")
+    assert made.returncode == 0, made.stderr
+    quick = ("--set", "resolution=32", "--set", "views_per_scene=1", "--data", "d", "--out", "r")
+    train = ("train", f"{path.name}:quick_lights", "--steps", "12", *quick)
+    assert trilight(*train).returncode == 0
+    resumed = trilight(*train, "--resume")
+    assert resumed.returncode == 0, resumed.stderr
+    with path.open("a") as file:
+        file.write("# changed\n")
+    refused = trilight(*train, "--resume")
+    assert refused.returncode == 1
+    assert "was begun with another extension run.py" in refused.stderr
+    opened = trilight("model", "r")  # the network itself asks for no file
+    assert opened.returncode == 0, opened.stderr

@@ -1,0 +1,116 @@
+"""A wheel is built, installed in a fresh environment, and used in a folder of somebody's own."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from storage.dataset import open_dataset
+from storage.scene_file import encode_scene, read_scene_file
+from tests.conftest import ROOT
+from tests.scenes_by_hand import tiny_scene
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+
+Run = Callable[..., str]
+
+PROGRAM = """
+import model, storage, trilight
+assert (model.WHOSE, storage.WHOSE) == ("mine", "mine")
+scene = trilight.read_scene("scene.safetensors")
+picture = trilight.render(scene, resolution=16, noise_floor_db=10, max_spp=8)
+assert picture.radiance_rgb.shape == (16, 16, 3)
+print(trilight.__file__)
+"""
+
+
+def _call(command: list[str], folder: Path, **more: str) -> str:
+    """Run a program outside of any checkout's environment; return what it says."""
+    ran = subprocess.run(
+        command,
+        cwd=folder,
+        env={**{k: v for k, v in os.environ.items() if k != "PYTHONPATH"}, **more},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, f"{command}\n{ran.stdout[-2000:]}\n{ran.stderr[-2000:]}"
+    return ran.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps"]
+    _call([*pip, "--wheel-dir", str(folder), str(ROOT)], folder)
+    return next(folder.glob("trilight-*.whl"))
+
+
+@pytest.fixture(scope="module")
+def place(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a fresh environment, and with modules that are called as ours are."""
+    folder = tmp_path_factory.mktemp("place")
+    _call([sys.executable, "-m", "venv", "env"], folder)
+    pip = [str(folder / "env/bin/python"), "-m", "pip", "install", "--quiet"]
+    _call([*pip, "--constraint", str(ROOT / "requirements/all.txt"), f"{wheel}[train]"], folder)
+    (folder / "train").mkdir()
+    for name in ("model.py", "train/__init__.py", "storage.py", "pipeline.py"):
+        (folder / name).write_text('WHOSE = "mine"\n')
+    (folder / "scene.safetensors").write_bytes(encode_scene(tiny_scene()))
+    return folder
+
+
+@pytest.fixture
+def trilight(place: Path) -> Run:
+    def run(*words: str) -> str:
+        return _call([str(place / "env/bin/trilight"), *words], place)
+
+    return run
+
+
+def test_the_wheel_holds_one_package_and_what_belongs_to_it(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+        tops = {name.split("/")[0] for name in names}
+        (listed,) = (name for name in names if name.endswith("top_level.txt"))
+        assert archive.read(listed).split() == [b"trilight"]
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"trilight"}
+    for name in (
+        "py.typed", "prefect.yaml", "model/builtin/model.safetensors", "infra/slurm/train.sbatch",
+        "infra/kubernetes/pool.yaml", "infra/images/cpu.Dockerfile", "infra/serving/pool.json",
+    ):  # fmt: skip
+        assert f"trilight/{name}" in names
+
+
+def test_it_says_its_version(trilight: Run) -> None:
+    assert trilight("--version").startswith("trilight 0.")
+
+
+def test_it_renders_by_both_engines(place: Path, trilight: Run) -> None:
+    small = ("--resolution", "16", "--max-spp", "8", "--noise-floor", "10")
+    trilight("render", "scene.safetensors", "--engine", "both", *small, "--out", "both.exr")
+    assert (place / "both.mitsuba.exr").is_file()
+    assert (place / "both.neural.exr").is_file()
+    trilight("convert", "scene.safetensors", "scene.usdc")
+    trilight("convert", "scene.usdc", "back.safetensors")
+    back = read_scene_file(place / "back.safetensors")
+    assert back.num_triangles == tiny_scene().num_triangles
+
+
+def test_it_makes_a_dataset_and_trains_on_it(place: Path, trilight: Run) -> None:
+    size = ("--scenes", "8", "--resolution", "64", "--noise-floor", "20")
+    trilight("generate", "smoke", *size, "--out", "data/set")
+    assert open_dataset(str(place / "data/set")).manifest.num_samples == 8
+    trilight("verify", "data/set")
+    trilight("train", "smoke", "--data", "data/set", "--out", "runs/it", "--steps", "10")
+    assert (place / "runs/it/model.safetensors").is_file()
+
+
+def test_a_program_of_a_user_keeps_its_modules(place: Path) -> None:
+    (place / "program.py").write_text(PROGRAM)
+    said = _call([str(place / "env/bin/python"), "program.py"], place)
+    assert Path(said.strip()).is_relative_to(place / "env")

@@ -1,0 +1,75 @@
+"""What `import trilight` offers: the same names to programs, to type checkers, and in documents."""
+
+import ast
+import re
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+import trilight
+from infra.setup.wheel_tree import PACKAGES
+from tests.conftest import ROOT
+
+SOURCE = (ROOT / "trilight/__init__.py").read_text()
+
+
+def test_every_name_is_there() -> None:
+    for name in trilight.__all__:
+        assert getattr(trilight, name) is not None, name
+    assert trilight.__version__ == metadata.version("trilight")
+    with pytest.raises(AttributeError, match="no attribute 'rendr'"):
+        trilight.rendr  # noqa: B018
+
+
+def test_type_checkers_see_the_same_names_in_the_same_modules() -> None:
+    block = next(node for node in ast.parse(SOURCE).body if isinstance(node, ast.If))
+    seen = {
+        alias.asname: (node.module or "").removeprefix("trilight.")
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert seen == trilight._HOME
+
+
+def test_no_name_is_one_that_a_wheel_needs() -> None:
+    """There `trilight.train` is a package: importing it would replace a function of that name."""
+    modules = {path.stem for path in (ROOT / "trilight").glob("*.py")}
+    assert not {*trilight.__all__, *modules} & {*PACKAGES, "tests"}
+
+
+def test_extensions_have_one_place_to_import_from() -> None:
+    from trilight import extend
+
+    block = ast.parse((ROOT / "trilight/extend.py").read_text()).body
+    seen = {
+        alias.name: node.module
+        for node in next(node for node in block if isinstance(node, ast.If)).body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert seen == extend._HOME
+    for name in extend.__all__:
+        assert getattr(extend, name) is not None, name
+
+
+@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.name)
+def test_examples_import_from_the_face_alone(example: Path) -> None:
+    ours = {
+        node.module
+        for node in ast.walk(ast.parse(example.read_text()))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES
+    }
+    assert not ours
+
+
+@pytest.mark.parametrize("page", ["docs/python.md", "README.md"])
+def test_documents_name_what_is_there(page: str) -> None:
+    text = (ROOT / page).read_text()
+    named = set(re.findall(r"\btrilight\.([A-Za-z_]+)", "\n".join(_code(text))))
+    assert named <= {*trilight.__all__, "extend"}
+
+
+def _code(text: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)

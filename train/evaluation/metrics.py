@@ -1,0 +1,158 @@
+"""Every figure that a picture is judged by: what it is, which way is better, how it is printed."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from model.precision import tf32
+from storage.conventions import log10_radiance
+from storage.registry import Registry
+from storage.sample import ViewRecord
+from train.evaluation.scores import ViewScore, score_view
+from train.loss.lpips import Lpips
+from train.loss.ms_ssim import ssim
+from train.loss.tone_map import tone_mapped
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JudgedPicture:
+    """A picture beside its target; what several metrics need of both is computed once."""
+
+    radiance_rgb: NDArray
+    """[R, R, 3] linear radiance of the picture."""
+    target_rgb: NDArray
+    """[R, R, 3] of the target."""
+    hits: NDArray[np.bool_]
+    """[R, R] which pixels see geometry."""
+    lpips: Lpips | None
+    """None where its weights are not at hand."""
+
+    @cached_property
+    def tone_mapped_13RR(self) -> tuple[Tensor, Tensor]:
+        """Picture and target as clamp(log2(1 + radiance), 0, 1), float64."""
+        return _tone_mapped(self.radiance_rgb), _tone_mapped(self.target_rgb)
+
+    @cached_property
+    def score(self) -> ViewScore:
+        """What validations of a training run judge by."""
+        return score_view(self.radiance_rgb, self.target_rgb, self.hits)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """One figure."""
+
+    score: Callable[[JudgedPicture], float | None]
+    """Computes it; None stands for n/a, such as where the metric's weights are not at hand."""
+    higher_is_better: bool
+    """Which way is better."""
+    meaning: str
+    """Unit, tone map, range and library, for whoever reads the figure."""
+    decimals: int = 4
+    """With which it is printed."""
+    floor: Callable[[ViewRecord], float] | None = None
+    """What the measured noise of a target alone scores; where it is None, noise of the measured
+    size is drawn onto the target and judged (evaluation.noise_floors)."""
+
+
+def hdr_flip(radiance_rgb: NDArray, target_rgb: NDArray) -> float | None:
+    """Return the mean HDR-FLIP (Andersson et al. 2021), or None for a black target."""
+    import flip_evaluator  # native code, half a second to import
+
+    if not target_rgb.max() > 0:
+        return None
+    pictures = [np.ascontiguousarray(p, np.float32) for p in (target_rgb, radiance_rgb)]
+    _, mean, _ = flip_evaluator.evaluate(*pictures, "HDR", applyMagma=False)
+    return float(mean)
+
+
+@torch.no_grad()
+def _lpips(picture: JudgedPicture) -> float | None:
+    """Return LPIPS, computed where its weights are; in all bits of float32, as it was published."""
+    if picture.lpips is None:
+        return None
+    device = picture.lpips.shift_311.device
+    with tf32(False):
+        ours, target = (mapped.float().to(device) for mapped in picture.tone_mapped_13RR)
+        return float(picture.lpips(ours, target))
+
+
+def _tone_mapped(radiance_rgb: NDArray) -> Tensor:
+    log10 = torch.from_numpy(np.ascontiguousarray(log10_radiance(radiance_rgb), np.float64))
+    return tone_mapped(log10).movedim(-1, 0)[None]
+
+
+def noise_rms(view: ViewRecord) -> float:
+    """Return the root mean square of a target's noise, in log10(1 + radiance)."""
+    return float(10 ** (-view.noise_floor_db / 20))
+
+
+METRICS: Registry[Metric] = Registry(
+    "metric",
+    Metric,
+    {
+        "psnr_log_db": Metric(
+            score=lambda picture: picture.score.psnr_log_db,
+            higher_is_better=True,
+            meaning="PSNR of log10(1 + radiance), peak 1, nothing clamped (storage.metrics)",
+            decimals=2,
+            floor=lambda view: view.noise_floor_db,
+        ),
+        "object_psnr_log_db": Metric(
+            score=lambda picture: picture.score.object_psnr_log_db,
+            higher_is_better=True,
+            meaning="the same over pixels whose ray meets geometry",
+            decimals=2,
+            floor=lambda view: view.object_noise_floor_db,
+        ),
+        "psnr_linear_db": Metric(
+            score=lambda picture: picture.score.psnr_linear_db,
+            higher_is_better=True,
+            meaning="PSNR of radiance clamped to [0, 1], peak 1; for published figures only",
+            decimals=2,
+            floor=lambda view: view.noise_floor_linear_db,
+        ),
+        "ssim": Metric(
+            score=lambda picture: float(ssim(*picture.tone_mapped_13RR)),
+            higher_is_better=True,
+            meaning="SSIM of clamp(log2(1 + radiance), 0, 1), Gaussian windows of 11 pixels "
+            "(Wang 2004)",
+        ),
+        "lpips": Metric(
+            score=_lpips,
+            higher_is_better=False,
+            meaning="LPIPS 0.1 on VGG16 of the same tone map, with the published weights",
+        ),
+        "hdr_flip": Metric(
+            score=lambda picture: hdr_flip(picture.radiance_rgb, picture.target_rgb),
+            higher_is_better=False,
+            meaning="mean HDR-FLIP of radiance (flip-evaluator, 67 pixels per degree, ACES)",
+        ),
+        "log_l1": Metric(
+            score=lambda picture: picture.score.log_l1,
+            higher_is_better=False,
+            meaning="mean absolute error of log10(1 + radiance), after the output's ELU",
+            floor=noise_rms,
+        ),
+    },
+)
+"""Every metric, in the order of reports."""
+
+
+def picture_scores(
+    radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_], lpips: Lpips | None
+) -> dict[str, float | None]:
+    """Return every metric of one picture [R, R, 3] of linear radiance; None stands for n/a.
+
+    LPIPS is n/a without its weights, HDR-FLIP where the target is black all over, since it takes
+    its exposures from there.
+    """
+    picture = JudgedPicture(
+        radiance_rgb=radiance_rgb, target_rgb=target_rgb, hits=hits, lpips=lpips
+    )
+    return {name: metric.score(picture) for name, metric in METRICS.items()}

@@ -1,0 +1,85 @@
+"""Trilight from Python: scenes, pictures, datasets and networks; `docs/python.md` shows them.
+
+    import trilight
+
+    scene = trilight.read_scene("scene.usdz")
+    picture = trilight.render(scene, noise_floor_db=35)
+    print(picture.radiance_rgb.shape, picture.noise_floor_db)
+
+Everything here stands for something of the packages, and works the same there. Nothing is loaded
+before it is used: `import trilight` takes milliseconds, and no torch, Mitsuba, USD or Prefect.
+Mistakes are `TrilightError`s, which say what was found, what was expected, and what to do.
+
+World: metres, +Z up, right-handed; networks were trained on scenes within [-0.5, 0.5]^3. Colours
+are linear with Rec.709 primaries. `trilight.extend` is for those who add templates, builds or runs.
+"""
+
+from importlib import import_module, metadata
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from trilight.compose import SceneBuilder as SceneBuilder
+    from trilight.datasets import Dataset as Dataset
+    from trilight.datasets import DatasetOrder as DatasetOrder
+    from trilight.datasets import Outcome as Outcome
+    from trilight.datasets import Sample as Sample
+    from trilight.datasets import Statistics as Statistics
+    from trilight.datasets import dataset_statistics as dataset_statistics
+    from trilight.datasets import generate as generate
+    from trilight.datasets import open_dataset as open_dataset
+    from trilight.errors import TrilightError as TrilightError
+    from trilight.learning import Judgement as Judgement
+    from trilight.learning import TrainResult as TrainResult
+    from trilight.learning import TrainSettings as TrainSettings
+    from trilight.learning import judge_network as judge_network
+    from trilight.learning import named_run as named_run
+    from trilight.learning import train_network as train_network
+    from trilight.learning import write_judgement as write_judgement
+    from trilight.parts import Material as Material
+    from trilight.pictures import FirstHits as FirstHits
+    from trilight.pictures import NeuralRenderer as NeuralRenderer
+    from trilight.pictures import RenderedView as RenderedView
+    from trilight.pictures import first_hits as first_hits
+    from trilight.pictures import open_network as open_network
+    from trilight.pictures import preview_srgb8 as preview_srgb8
+    from trilight.pictures import render as render
+    from trilight.pictures import render_views as render_views
+    from trilight.pictures import write_picture as write_picture
+    from trilight.scenes import Scene as Scene
+    from trilight.scenes import SceneObject as SceneObject
+    from trilight.scenes import read_scene as read_scene
+    from trilight.scenes import read_scenes as read_scenes
+    from trilight.scenes import within_budget as within_budget
+    from trilight.scenes import write_scene as write_scene
+
+_NAMES = {
+    "compose": "SceneBuilder",
+    "datasets": "Dataset DatasetOrder Outcome Sample Statistics "
+    "dataset_statistics generate open_dataset",
+    "errors": "TrilightError",
+    "learning": "Judgement TrainResult TrainSettings "
+    "judge_network named_run train_network write_judgement",
+    "parts": "Material",
+    "pictures": "FirstHits NeuralRenderer RenderedView "
+    "first_hits open_network preview_srgb8 render render_views write_picture",
+    "scenes": "Scene SceneObject read_scene read_scenes within_budget write_scene",
+}
+"""What there is, by the module of this package that has it. No name is one of a package of ours:
+an installed wheel has `trilight.train` and its kin as subpackages."""
+_HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+__all__ = sorted(["__version__", *_HOME])  # noqa: PLE0605
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return metadata.version("trilight")
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

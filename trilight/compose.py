@@ -1,0 +1,283 @@
+"""A scene from Python: meshes with materials, a floor, lamps and cameras, put together.
+
+The builder writes down what a RenderFormer scene file would say, and what gives such files their
+meaning (pipeline.scenes.from_description) makes the scene.
+"""
+
+import dataclasses
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipeline.flows.read_scenes import SceneReader
+from pipeline.objects.generated import builtin_mesh
+from pipeline.objects.licences import USER_PROVIDED
+from pipeline.scenes.description import (
+    DescribedCamera,
+    DescribedObject,
+    DescribedTransform,
+    SceneDescription,
+    Vector,
+)
+from pipeline.scenes.from_description import SHELL_FOLDER, LoadedMesh, scene_from_description
+from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from storage.conventions import look_at_c2w
+from storage.errors import TrilightError
+from storage.scene import Scene
+from trilight.parts import Material, described_material, mesh_of_arrays, vector
+
+_CC0 = "CC0-1.0"
+_TEMPLATE = "python"
+_TRIANGLE = np.array([[0.0, 1.0, 0.0], [-(0.75**0.5), -0.5, 0.0], [0.75**0.5, -0.5, 0.0]]) / 3**0.5
+"""Equilateral, edge 1, its middle at the origin."""
+
+
+_STAYS = DescribedTransform(
+    translation=(0.0, 0.0, 0.0),
+    rotation_deg=(0.0, 0.0, 0.0),
+    scale=(1.0, 1.0, 1.0),
+    normalize=False,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _MeshFile:
+    """A file that is read when the scene is made."""
+
+    path: Path
+    licence: str
+
+
+class SceneBuilder:
+    """Gathers what a scene is made of; `scene` makes it. Every method returns the builder."""
+
+    def __init__(self, name: str = "scene") -> None:
+        """Begin an empty scene; `name` stands in messages and in its provenance."""
+        self._name = name
+        self._objects: list[DescribedObject] = []
+        self._meshes: list[LoadedMesh | _MeshFile] = []
+        self._cameras: list[DescribedCamera] = []
+
+    def add_mesh(
+        self,
+        mesh: str | os.PathLike[str] | tuple[ArrayLike, ArrayLike],
+        material: Material | None = None,
+        *,
+        name: str | None = None,
+        at: Vector = (0.0, 0.0, 0.0),
+        size: float | None = None,
+        rotation_deg: Vector = (0.0, 0.0, 0.0),
+        licence: str = USER_PROVIDED,
+    ) -> Self:
+        """Add an object.
+
+        Args:
+            mesh: a file `.glb .gltf .obj .ply .stl .off`, which `scene` reads; or vertices [V, 3]
+                and triangles [F, 3] of their rows, counter-clockwise seen from outside.
+            material: of the whole object; grey by default.
+            name: unique in the scene; after the file, or `objectN`, by default.
+            at: where the origin of the mesh comes to lie, metres; with `size` the mean of its
+                vertices.
+            size: diameter in metres of the sphere around that mean that holds it; by default the
+                mesh keeps the units of its file.
+            rotation_deg: angles about the world's X, then Y, then Z.
+            licence: SPDX identifier, or `LicenseRef-...`.
+
+        Raises:
+            TrilightError: no such file, arrays that are no mesh, or numbers that mean nothing.
+        """
+        if isinstance(mesh, tuple):
+            name = name or f"object{len(self._objects)}"
+            found: LoadedMesh | _MeshFile = mesh_of_arrays(*mesh, uid=name, licence=licence)
+        else:
+            found = _MeshFile(path=Path(mesh), licence=licence)
+            if not found.path.is_file():
+                raise TrilightError(f"{found.path}: no such file; expected a mesh.")
+            name = name or self._unused(found.path.stem)
+        if size is not None and not 0 < size < np.inf:
+            raise TrilightError(f"{name}: size is {size}; expected metres above 0.")
+        if size is not None and isinstance(found, LoadedMesh) and found.reach == 0:
+            raise TrilightError(f"{name}: all vertices are one point; expected a mesh.")
+        scale = 1.0 if size is None else float(size)
+        transform = DescribedTransform(
+            translation=vector(f"{name}: at", at),
+            rotation_deg=vector(f"{name}: rotation_deg", rotation_deg),
+            scale=(scale, scale, scale),
+            normalize=size is not None,
+        )
+        return self._add(name, found, transform, material or Material())
+
+    def add_builtin(
+        self,
+        family: str,
+        material: Material | None = None,
+        *,
+        number: int = 0,
+        name: str | None = None,
+        at: Vector = (0.0, 0.0, 0.0),
+        size: float = 0.6,
+        rotation_deg: Vector = (0.0, 0.0, 0.0),
+    ) -> Self:
+        """Add a procedural object, such as the 3rd `rock` or `torus_knot` of `builtin:`.
+
+        Args:
+            family: a name of pipeline.objects.builtin.families.
+            number: which of the family, from 0.
+            material, name, at, size, rotation_deg: as `add_mesh`.
+
+        Raises:
+            TrilightError: there is no such family, or as `add_mesh`.
+        """
+        return self.add_mesh(
+            builtin_mesh(family, number),
+            material,
+            name=name or self._unused(family),
+            at=at,
+            size=size,
+            rotation_deg=rotation_deg,
+            licence=_CC0,
+        )
+
+    def add_floor(
+        self, material: Material | None = None, *, size: float = 2.0, height: float = -0.5
+    ) -> Self:
+        """Add a level square of 128 triangles, as the rooms of our datasets have.
+
+        Args:
+            material: of the floor; grey by default.
+            size: side in metres; its middle is above the origin.
+            height: where it lies, metres; the floor of the nominal room is at -0.5.
+        """
+        placement = PatchPlacement(
+            rotation_deg=(0, 0, 0),
+            reach=1,
+            scale=(size, size, 1),
+            translation=(0, 0, 1 + 2 * height),
+        )
+        name = self._unused("floor")
+        square = (patch(SIDES["floor"], placement), PATCH_FACES)
+        mesh = mesh_of_arrays(*square, uid=f"{SHELL_FOLDER}{name}", licence=_CC0)
+        flat = dataclasses.replace(material or Material(), smooth=False)
+        return self._add(name, mesh, _STAYS, flat)
+
+    def add_lamp(
+        self,
+        *,
+        at: Vector,
+        radiance: float | Vector = 2000.0,
+        size: float = 0.15,
+        towards: Vector = (0.0, 0.0, 0.0),
+    ) -> Self:
+        """Add an emitter: one triangle with equal sides, hidden from the camera, bright on both.
+
+        Args:
+            at: its middle, metres.
+            radiance: linear red, green, blue, or one number for white.
+            size: its side in metres; the power grows with its square.
+            towards: the point that it faces.
+
+        Raises:
+            TrilightError: numbers that mean nothing.
+        """
+        name = self._unused("lamp")
+        middle, target = (
+            vector(f"{name}: {what}", value) for what, value in (("at", at), ("towards", towards))
+        )
+        if middle == target or not 0 < size < np.inf:
+            raise TrilightError(
+                f"{name}: size is {size} and towards is {target} from {middle}; expected metres "
+                "above 0, and another point."
+            )
+        up = (0.0, 0.0, 1.0) if middle[:2] != target[:2] else (0.0, 1.0, 0.0)
+        pose = look_at_c2w(eye=middle, target=target, up=up)
+        corners = size * _TRIANGLE @ pose[:3, :3].T + np.array(middle)
+        rgb = (radiance, radiance, radiance) if isinstance(radiance, float | int) else radiance
+        shining = Material(diffuse=(0.0, 0.0, 0.0), roughness=1.0, emission=rgb)
+        mesh = mesh_of_arrays(corners, [[0, 2, 1]], uid=name, licence=_CC0)
+        return self._add(name, mesh, _STAYS, shining)
+
+    def add_camera(
+        self,
+        *,
+        at: Vector,
+        look_at: Vector = (0.0, 0.0, 0.0),
+        fov_deg: float = 40.0,
+        up: Vector = (0.0, 0.0, 1.0),
+    ) -> Self:
+        """Add a view.
+
+        Args:
+            at: where the camera is, metres.
+            look_at: the point in the middle of the picture.
+            fov_deg: full angle of view, equal in width and height.
+            up: roughly upwards in the picture; not along the view.
+        """
+        row = len(self._cameras)
+        camera = DescribedCamera(
+            position=vector(f"camera {row}: at", at),
+            look_at=vector(f"camera {row}: look_at", look_at),
+            up=vector(f"camera {row}: up", up),
+            fov_deg=float(fov_deg),
+        )
+        self._cameras.append(camera)
+        return self
+
+    def scene(self) -> Scene:
+        """Return the scene; it passes `Scene.check`. Files are read here, by a child process.
+
+        Raises:
+            TrilightError: a file is unusable, two objects have one name, albedos add up to more
+                than 1, or there is no lamp, no camera or no surface.
+        """
+        if not self._objects:
+            raise TrilightError(f"{self._name}: holds no object; expected add_mesh and its kin.")
+        description = SceneDescription(
+            file=self._name,
+            scene_name=self._name,
+            objects=tuple(self._objects),
+            cameras=tuple(self._cameras),
+            unknown_fields=(),
+        )
+        return scene_from_description(
+            description,
+            self._read(),
+            num_views=len(self._cameras),
+            provenance={"template": _TEMPLATE, "name": self._name},
+            albedo_over_one="refuse",
+        )
+
+    def _read(self) -> list[LoadedMesh]:
+        with SceneReader() as reader:  # starts no child where no mesh is a file
+            return [
+                reader.mesh(mesh.path, mesh.licence) if isinstance(mesh, _MeshFile) else mesh
+                for mesh in self._meshes
+            ]
+
+    def _add(
+        self,
+        name: str,
+        mesh: LoadedMesh | _MeshFile,
+        transform: DescribedTransform,
+        material: Material,
+    ) -> Self:
+        described = DescribedObject(
+            name=name,
+            mesh_path=str(mesh.path) if isinstance(mesh, _MeshFile) else mesh.uid,
+            transform=transform,
+            material=described_material(material),
+            remesh=False,
+            remesh_target_face_num=0,
+        )
+        self._objects.append(described)
+        self._meshes.append(mesh)
+        return self
+
+    def _unused(self, name: str) -> str:
+        """Return a name that no object has yet: `name`, `name1`, `name2`."""
+        taken = {described.name for described in self._objects}
+        tries = (f"{name}{number or ''}" for number in range(len(taken) + 1))
+        return next(text for text in tries if text not in taken)

@@ -1,0 +1,134 @@
+"""Networks trained and judged; torch is loaded when a function is called."""
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from infra.torch_library import require_torch
+from train.runs import changed_run, named_run
+from train.settings import TrainSettings
+from train.start import Start
+
+if TYPE_CHECKING:
+    from infra.judging import Judgement
+    from train.progress import TrainProgress
+    from train.result import TrainResult
+
+__all__ = [
+    "Judgement",
+    "TrainResult",
+    "TrainSettings",
+    "judge_network",
+    "named_run",
+    "train_network",
+    "write_judgement",
+]
+
+
+def train_network(
+    run: str = "smoke",
+    *,
+    data: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    steps: int | None = None,
+    changes: Mapping[str, Any] | None = None,
+    resume: bool = False,
+    begin_with: str | None = None,
+    lpips: str | None = None,
+    workers: int = 1,
+    device: str | None = None,
+    progress: "TrainProgress | None" = None,
+) -> "TrainResult":
+    """Train a network on a dataset and judge it, as `trilight train` does, in this process.
+
+    Several processes or machines train by the command: `torchrun -m trilight train`.
+
+    Args:
+        run: named run, such as `smoke` or `pretrain`.
+        data: root of a dataset, with a train split.
+        out: folder of the run.
+        steps: replaces the run's number of steps.
+        changes: other settings by dotted name, such as `{"model.width": 64}`.
+        resume: go on from the folder's newest checkpoint.
+        begin_with: network that a finetune run begins with.
+        lpips: folder of LPIPS' weights, or `hub`.
+        workers: threads that decode samples.
+        device: cpu or cuda; by default cuda where there is one.
+        progress: is told how it goes.
+
+    Raises:
+        TrilightError: PyTorch is not installed, a setting or the data is refused, or the folder
+            already holds a run.
+    """
+    require_torch("train_network")
+    settings = changed_run(run, changes or {}, steps=steps)
+    start = Start(resume=resume, begin_with=begin_with, lpips=lpips)
+    start.check(settings)
+    from train.loop.crew import Crew, choose_device
+    from train.run import train_run
+
+    result = train_run(
+        settings,
+        data=[os.fspath(data)],
+        out=Path(out),
+        start=start,
+        crew=Crew(device=choose_device(device)),
+        workers=workers,
+        progress=progress,
+    )
+    assert result is not None  # the first process of a crew of one
+    return result
+
+
+def judge_network(
+    checkpoint: str | os.PathLike[str],
+    *,
+    data: str | os.PathLike[str],
+    split: str = "test",
+    resolution: int | None = None,
+    most_scenes: int = 10**6,
+    lpips: str | None = None,
+    device: str | None = None,
+    done: Callable[[int, int], None] = lambda now, total: None,
+) -> "Judgement":
+    """Judge a network on a split of a dataset, as `trilight evaluate` does.
+
+    Arguments, result and errors are those of infra.judging.judge_network; `data` is one dataset.
+
+    Raises:
+        TrilightError: also where PyTorch is not installed.
+    """
+    require_torch("judge_network")
+    from infra import judging
+
+    return judging.judge_network(
+        os.fspath(checkpoint),
+        [os.fspath(data)],
+        split=split,
+        resolution=resolution,
+        most_scenes=most_scenes,
+        lpips=lpips,
+        device=device,
+        done=done,
+    )
+
+
+def write_judgement(judgement: "Judgement", out: str | os.PathLike[str]) -> None:
+    """Write evaluation.json, evaluation.md and sheets of pictures into the folder `out`."""
+    from infra import judging
+
+    judging.write_judgement(judgement, Path(out))
+
+
+def __getattr__(name: str) -> object:
+    require_torch(name)
+    if name == "Judgement":
+        from infra.judging import Judgement
+
+        return Judgement
+    if name == "TrainResult":
+        from train.result import TrainResult
+
+        return TrainResult
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,173 @@
+"""Pictures of a scene: what its pixels see, path traced, or by a trained network."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.rendering.cameras import own_camera
+from infra.torch_library import require_torch
+from pipeline.renders.renderer import RenderedView
+from pipeline.renders.settings import one_picture
+from storage.atomic import write_atomically
+from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
+from storage.errors import TrilightError
+from storage.first_hits import FirstHits, first_hits
+from storage.scene import Scene
+
+if TYPE_CHECKING:
+    from model.neural_renderer import NeuralRenderer
+
+__all__ = [
+    "FirstHits",
+    "NeuralRenderer",
+    "RenderedView",
+    "first_hits",
+    "open_network",
+    "preview_srgb8",
+    "render",
+    "render_views",
+    "write_picture",
+]
+
+
+def render(
+    scene: Scene,
+    *,
+    view: int = 0,
+    resolution: int = 256,
+    noise_floor_db: float = 40.0,
+    max_spp: int = 4096,
+    seed: int = 0,
+    threads: int | None = None,
+) -> RenderedView:
+    """Return the path traced picture of one camera, with its measured error.
+
+    Equal arguments give equal pictures. A child process with limits renders; each call pays for
+    its start, so several cameras are cheaper by `render_views`.
+
+    Args:
+        scene: passes `Scene.check`.
+        view: row of `scene.c2w`.
+        resolution: width and height in pixels, a multiple of 8.
+        noise_floor_db: sampling stops when the measured error (psnr_log_db) reaches this.
+        max_spp: or at so many samples per pixel.
+        seed: of the samples.
+        threads: of the processor; all cores by default.
+
+    Returns:
+        `radiance_rgb` [R, R, 3] float32 linear radiance, `noise_floor_db`, `spp` and more.
+
+    Raises:
+        TrilightError: a number that is refused, or a scene that cannot be rendered.
+    """
+    (picture,) = render_views(
+        scene,
+        views=[view],
+        resolution=resolution,
+        noise_floor_db=noise_floor_db,
+        max_spp=max_spp,
+        seed=seed,
+        threads=threads,
+    )
+    return picture
+
+
+def render_views(
+    scene: Scene,
+    *,
+    views: Sequence[int] | None = None,
+    resolution: int = 256,
+    noise_floor_db: float = 40.0,
+    max_spp: int = 4096,
+    seed: int = 0,
+    threads: int | None = None,
+) -> list[RenderedView]:
+    """Return the path traced pictures of several cameras of a scene, which is loaded once.
+
+    Args:
+        scene: passes `Scene.check`.
+        views: rows of `scene.c2w`; all by default.
+        resolution, noise_floor_db, max_spp, seed, threads: as `render`, which says what comes back
+            and what is refused.
+    """
+    from pipeline.flows.render_scene import PathTracer
+    from pipeline.renders.variant import choose_variant
+
+    rows = range(scene.num_views) if views is None else views
+    cameras = [own_camera(scene, row, named="view") for row in rows]
+    scene.check()
+    tracer = PathTracer(
+        one_picture(resolution=resolution, noise_floor_db=noise_floor_db, max_spp=max_spp),
+        seed=seed,
+        variant=choose_variant(),
+        threads=threads or os.cpu_count() or 1,
+        sampled=lambda now: None,
+    )
+    try:
+        tracer.open(scene, "scene")
+        return [
+            tracer.render(camera.c2w, camera.fov_deg, f"view {row}")
+            for row, camera in zip(rows, cameras, strict=True)
+        ]
+    finally:
+        tracer.close()
+
+
+def open_network(
+    checkpoint: str | os.PathLike[str] = "builtin:",
+    *,
+    device: str | None = None,
+    precision: str = "float32",
+) -> "NeuralRenderer":
+    """Return a trained network; its `render(scene)` gives pictures [V, R, R, 3] of all cameras.
+
+    Args:
+        checkpoint: `builtin:`, the model.safetensors of a run, or the published network's folder
+            or name on the Hugging Face hub.
+        device: of torch; by default the graphics card where there is one.
+        precision: a name of model.precision.PRECISIONS.
+
+    Raises:
+        TrilightError: no such file, no network, or PyTorch is not installed.
+    """
+    require_torch("open_network")
+    from model.neural_renderer import NeuralRenderer
+
+    return NeuralRenderer.load(os.fspath(checkpoint), device=device, precision=precision)
+
+
+def write_picture(path: str | os.PathLike[str], radiance_rgb: NDArray[np.float32]) -> None:
+    """Write a picture as OpenEXR (radiance in half floats) or as PNG (for looking).
+
+    Args:
+        path: ends in `.exr` or `.png`.
+        radiance_rgb: [R, R, 3] linear radiance of at least 0; beyond 65504 it is clipped.
+
+    Raises:
+        TrilightError: another suffix, a value that is no radiance, or a place that cannot be
+            written.
+    """
+    from pipeline.documents.png import encode_png
+    from storage.exr import encode_exr
+
+    target = Path(path)
+    picture = np.minimum(radiance_rgb, np.float32(HALF_FLOAT_MAX))
+    if target.suffix.lower() == ".exr":
+        write_atomically(target, encode_exr(picture))
+    elif target.suffix.lower() == ".png":
+        write_atomically(target, encode_png(preview_srgb8(picture)))
+    else:
+        raise TrilightError(f"{target}: cannot be written as a picture; expected .exr or .png.")
+
+
+def __getattr__(name: str) -> object:
+    if name != "NeuralRenderer":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    require_torch(name)
+    from model.neural_renderer import NeuralRenderer
+
+    return NeuralRenderer

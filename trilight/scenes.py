@@ -1,0 +1,88 @@
+"""Scenes of files: read, written, and brought to the size that a network knows."""
+
+import os
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.rendering.sources import scene_sources
+from pipeline.flows.convert_scene import write_scene as write_in_form
+from pipeline.flows.read_scenes import SceneReader
+from pipeline.flows.scene_source import LoadedScene, scene_source
+from storage.scene import Scene, SceneObject
+
+__all__ = ["Scene", "SceneObject", "read_scene", "read_scenes", "within_budget", "write_scene"]
+
+
+def read_scene(source: str | os.PathLike[str]) -> Scene:
+    """Return one scene with all of its cameras; it passes `Scene.check`.
+
+    Warns of what of the file means nothing, or could not be carried over. A child process with
+    limits reads it, so that no file can crash or fill this one.
+
+    Args:
+        source: `.usda .usdc .usdz .usd`, RenderFormer's `.json` or `.h5`, `.safetensors`, or
+            `SHARD.tar::KEY`.
+
+    Raises:
+        TrilightError: anything in the file is unusable, or breaks a law of scenes.
+    """
+    with SceneReader() as reader:
+        return _noted(reader.load(scene_source(os.fspath(source))))
+
+
+def read_scenes(source: str | os.PathLike[str]) -> Iterator[Scene]:
+    """Yield every scene of a shard, a moving USD stage, a folder of scene files, or numbered files.
+
+    Warns and raises as `read_scene`, which says what a scene file may be.
+
+    Args:
+        source: such as `train-000000.tar`, `stage.usdc`, `scenes/` or `scenes/{000..119}.json`.
+    """
+    with SceneReader() as reader:
+        for found in scene_sources(os.fspath(source), reader):
+            yield _noted(reader.load(found))
+
+
+def write_scene(
+    scene: Scene,
+    path: str | os.PathLike[str],
+    *,
+    radiance_rgb: NDArray[np.float32] | None = None,
+) -> tuple[str, ...]:
+    """Write a scene in the form that the path's suffix says; return what that form cannot hold.
+
+    Args:
+        scene: passes `Scene.check`.
+        path: ends in `.usda .usdc .usdz .json .h5` or `.safetensors`. Meshes of a `.json` are
+            written beside it.
+        radiance_rgb: [V, R, R, 3] linear radiance of its views, which `.h5` alone holds.
+
+    Raises:
+        TrilightError: the scene breaks a law, there is no such form, or it cannot be written.
+    """
+    scene.check()
+    return write_in_form(Path(path), scene, radiance_rgb)
+
+
+def within_budget(scene: Scene, max_triangles: int) -> Scene:
+    """Return the scene with at most so many triangles; emitters stay whole. Warns of what it cost.
+
+    Args:
+        scene: passes `Scene.check`.
+        max_triangles: such as the 768 of the network that comes with Trilight.
+
+    Raises:
+        TrilightError: emitters alone are more, or an object cannot be reduced that far.
+    """
+    with SceneReader() as reader:
+        return _noted(reader.within_budget(scene, max_triangles))
+
+
+def _noted(loaded: LoadedScene) -> Scene:
+    for note in loaded.notes:
+        warnings.warn(note, stacklevel=3)
+    return loaded.scene
