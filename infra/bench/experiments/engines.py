@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from infra.bench.curve import Level, at_error
 from infra.bench.experiment import Column, Experiment, Figures, Point
 from infra.bench.experiments.sampling import DB
 from infra.bench.sides.bare_pictures import bare_pictures
+from infra.bench.sides.levels import Levels
 from infra.bench.subjects.held_out import build_within, held_out
 from infra.bench.subjects.render_child import render_child
 from infra.bench.workshop import Workshop
@@ -59,23 +61,25 @@ def _measure(
     )
     levels_spp = [1 << step for step in range(workshop.effort.max_spp.bit_length())]
     raw, denoised = child.call(bare_pictures, one.scene, width, levels_spp)
-    for name, levels in ((DENOISED, denoised), (RAW, raw)):
-        priced = [
-            Level(spp=one.spp, core_s=one.core_s, db=psnr_log_db(one.radiance_rgb, reference))
-            for one in levels.levels
-        ]
-        equal, has_it = at_error(priced, db)
-        yield (
-            name,
-            {
-                "core_s": levels.load_core_s + equal.core_s,
-                "view_s": equal.core_s,
-                "db": db,
-                "spp": equal.spp,
-                "one_is_better": float(not has_it and equal.db >= db),
-                "none_is_as_good": float(not has_it and equal.db < db),
-            },
-        )
+    yield DENOISED, _at_its_error(denoised, reference, db)
+    yield RAW, _at_its_error(raw, reference, db)
+
+
+def _at_its_error(found: Levels, reference: NDArray[np.float32], db: float) -> Figures:
+    """Return what the path tracer takes for an error of `db`."""
+    priced = [
+        Level(spp=one.spp, core_s=one.core_s, db=psnr_log_db(one.radiance_rgb, reference))
+        for one in found.levels
+    ]
+    equal, has_it = at_error(priced, db)
+    return {
+        "core_s": found.load_core_s + equal.core_s,
+        "view_s": equal.core_s,
+        "db": db,
+        "spp": equal.spp,
+        "one_is_better": float(not has_it and equal.db >= db),
+        "none_is_as_good": float(not has_it and equal.db < db),
+    }
 
 
 def _set_up(workshop: Workshop) -> Any:
