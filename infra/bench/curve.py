@@ -1,5 +1,6 @@
 """The points of a run as a table's rows: columns, spread, cost ratio, and whether on the front."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -104,10 +105,12 @@ _OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
 
 
 def _effort(run: Run) -> Effort:
-    asked = run.plan.get("effort")
-    if isinstance(asked, dict):
-        return Effort(**{**asked, "widths": tuple(asked["widths"])})
-    return QUICK if asked == QUICK.name else CAREFUL
+    asked = run.plan["effort"]
+    base = QUICK if asked["name"] == QUICK.name else CAREFUL
+    known: dict[str, Any] = {
+        key: tuple(x) if isinstance(x, list) else x for key, x in asked.items()
+    }
+    return dataclasses.replace(base, **known)
 
 
 def _base(experiment: Experiment, known: Sequence[Point]) -> Point:
@@ -162,7 +165,7 @@ def _dominates(other: tuple[float, Sequence[float]], mine: tuple[float, Sequence
 
 
 @dataclass(frozen=True, kw_only=True)
-class Level:
+class PricedLevel:
     """A path tracer at one number of samples."""
 
     spp: float
@@ -173,7 +176,7 @@ class Level:
     """psnr_log_db to the reference."""
 
 
-def at_error(levels: Sequence[Level], db: float) -> tuple[Level, bool]:
+def at_error(levels: Sequence[PricedLevel], db: float) -> tuple[PricedLevel, bool]:
     """Return the level at which a path tracer first has an error of `db`, and whether it has it.
 
     Between two levels dB are taken linear in log2 of the samples, and core-seconds linear in the
@@ -194,4 +197,4 @@ def at_error(levels: Sequence[Level], db: float) -> tuple[Level, bool]:
     share = (db - below.db) / (above.db - below.db)
     spp = below.spp * 2 ** (share * math.log2(above.spp / below.spp))
     slope = (above.core_s - below.core_s) / (above.spp - below.spp)
-    return Level(spp=spp, core_s=below.core_s + slope * (spp - below.spp), db=db), True
+    return PricedLevel(spp=spp, core_s=below.core_s + slope * (spp - below.spp), db=db), True

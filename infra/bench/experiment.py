@@ -94,6 +94,11 @@ class Experiment:
     """What the machine or the user has to provide."""
 
 
+def percent(share: float) -> float:
+    """Return a share in per cent, for `Column.then`."""
+    return 100 * share
+
+
 def one_by_one(measure: Callable[["Workshop", Point, str], Figures]) -> Measure:
     """Return the measuring of a turn whose points have nothing in common; adds `seconds`."""
     import time

@@ -37,7 +37,7 @@ def machine() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
         "versions": versions,
-        "revision": _revision(),
+        "revision": revision(),
     }
 
 
@@ -50,12 +50,17 @@ def _processor() -> str:
     return names[0] if names else platform.processor()
 
 
-def _revision() -> str:
-    result = subprocess.run(
-        ["git", "describe", "--always", "--dirty"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return result.stdout.strip() or "unknown"
+def revision(root: Path = ROOT) -> str:
+    """Return the commit of a checkout, with -dirty where files besides the documents differ.
+
+    Results are documents: a run that writes them goes on as the same revision.
+    """
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["git", *words], cwd=root, capture_output=True, text=True, check=False
+        )
+
+    commit = git("describe", "--always").stdout.strip()
+    changed = git("diff", "--quiet", "HEAD", "--", ".", ":(exclude)docs").returncode == 1
+    return f"{commit}-dirty" if changed else commit or "unknown"

@@ -112,8 +112,7 @@ def _reading(folder: Path) -> Iterator[str]:
 
 
 def _is_quick(run: Run) -> bool:
-    effort = run.plan["effort"]
-    return (effort["name"] if isinstance(effort, dict) else effort) == QUICK.name
+    return bool(run.plan["effort"]["name"] == QUICK.name)
 
 
 def _section(experiment: Experiment, folder: Path) -> Iterator[str]:
@@ -145,5 +144,5 @@ def _section(experiment: Experiment, folder: Path) -> Iterator[str]:
 def _measured_on(experiment: Experiment, run: Run) -> str:
     quick = " --quick" if _is_quick(run) else ""
     notes = "; ".join(run.notes)
-    on = f"{run.plan['date']}, {run.plan['machine']['processor']}, {run.plan['machine']['cores']}"
+    on = f"{run.date}, {run.plan['machine']['processor']}, {run.plan['machine']['cores']}"
     return f"`trilight bench {experiment.name}{quick}` ({on} cores){f': {notes}' if notes else ''}"

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from infra.bench.asked import Asked
-from infra.bench.curve import rows
 from infra.bench.effort import Effort
 from infra.bench.experiment import Experiment
 from infra.bench.machine import ROOT, machine
@@ -71,9 +70,8 @@ def run(
     if not current.whole_turns():
         reasons = "; ".join(sorted(set(current.left_out.values())))
         raise TrilightError(f"bench {experiment.name}: no turn could be measured: {reasons}.")
-    rows(experiment, current)  # what cannot be told must not count as ended
+    plot(experiment, current, store.path.with_suffix(".png"))  # what cannot be told has not ended
     store.end(current, time.perf_counter() - began, notes)
-    plot(experiment, current, store.path.with_suffix(".png"))
     return store
 
 
@@ -95,7 +93,6 @@ def _plan(experiment: Experiment, effort: Effort, asked: Asked) -> dict[str, obj
     folder = described(asked.scenes) if experiment.takes_scenes else []
     return {
         "experiment": experiment.name,
-        "date": time.strftime("%Y-%m-%d"),
         "effort": dataclasses.asdict(effort),
         "asked": wanted,
         "machine": machine(),

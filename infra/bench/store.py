@@ -4,6 +4,7 @@ A file holds the runs of one experiment, one after the other. Of a run the first
 the last one its end; a line that was being written when the power failed is cut off.
 """
 
+import datetime
 import json
 import os
 from collections.abc import Mapping
@@ -20,6 +21,8 @@ class Run:
 
     plan: Mapping[str, Any]
     """All that its figures depend on: points, turns, effort, what was asked for, machine."""
+    date: str
+    """The day on which it began, such as 2026-11-22."""
     turns: dict[str, dict[str, Figures]] = field(default_factory=dict)
     """Figures by turn and point."""
     left_out: dict[str, str] = field(default_factory=dict)
@@ -29,7 +32,7 @@ class Run:
     notes: list[str] = field(default_factory=list)
     """What was found out on the way."""
     seconds: float | None = None
-    """What it took on the clock; None where it has not ended."""
+    """On the clock since it last went on; None where it has not ended."""
 
     def whole_turns(self) -> list[str]:
         """Return the turns in which every point of the plan was measured."""
@@ -58,7 +61,7 @@ class Store:
         for line in self._whole_lines():
             record = json.loads(line)
             if "plan" in record:
-                found.append(Run(plan=record["plan"]))
+                found.append(Run(plan=record["plan"], date=record["date"]))
             else:
                 _take(found[-1], record)
         return found
@@ -73,8 +76,9 @@ class Store:
         runs = self.runs()
         if runs and runs[-1].seconds is None and runs[-1].plan == plain:
             return runs[-1]
-        self._append({"plan": plain})
-        return Run(plan=plain)
+        today = datetime.date.today().isoformat()
+        self._append({"plan": plain, "date": today})
+        return Run(plan=plain, date=today)
 
     def add(self, run: Run, turn: str, point: str, figures: Figures) -> None:
         """Write the figures of one point in one turn."""

@@ -2,6 +2,7 @@
 
 import json
 import math
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,9 @@ from PIL import Image
 
 from infra.bench import run as running
 from infra.bench.asked import Asked
-from infra.bench.curve import COST_NOISE, Level, at_error, on_front, rows, spread
+from infra.bench.curve import COST_NOISE, PricedLevel, at_error, on_front, rows, spread
 from infra.bench.experiment import Experiment
-from infra.bench.machine import machine
+from infra.bench.machine import machine, revision
 from infra.bench.run import newest_run, run
 from infra.bench.store import Run, Store
 from infra.bench.table import cells, markdown, shown
@@ -160,7 +161,7 @@ def test_what_is_not_on_the_front_is_dominated_by_what_is_no_worse(
             assert mark
 
 
-LEVELS = [Level(spp=1 << k, core_s=2.0**k, db=30 + 3.0 * k) for k in range(5)]
+LEVELS = [PricedLevel(spp=1 << k, core_s=2.0**k, db=30 + 3.0 * k) for k in range(5)]
 
 
 def test_equal_error_lies_between_the_levels() -> None:
@@ -191,3 +192,18 @@ def test_the_machine_is_told() -> None:
     here = machine()
     assert {"processor", "cores", "system", "versions", "revision"} == set(here)
     assert here["cores"] >= 1
+
+
+def test_results_that_are_written_do_not_make_the_revision_another(tmp_path: Path) -> None:
+    """Else a run that was killed would never go on: it has changed its own file of results."""
+    for name in ("docs/result.jsonl", "code.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("one\n")
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
+    for words in (["init", "-q"], ["add", "."], [*identity, "commit", "-q", "-m", "all"]):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    clean = revision(tmp_path)
+    (tmp_path / "docs" / "result.jsonl").write_text("two\n")
+    assert revision(tmp_path) == clean != "unknown"
+    (tmp_path / "code.py").write_text("two\n")
+    assert revision(tmp_path) == f"{clean}-dirty"

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.curve import Level, at_error
+from infra.bench.curve import PricedLevel, at_error
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point
+from infra.bench.experiment import Column, Experiment, Figures, Point, percent
 from infra.bench.experiments.sampling import CORE_S, DB, WORST
 from infra.bench.sides.plain_mitsuba import render_levels
 from infra.bench.sides.shots import SEED, shots
@@ -107,7 +107,7 @@ def beside(theirs: Theirs) -> Any:
             name, picture, core_s, load_s = made
             found[name] = {"core_s": core_s, "load_s": load_s, "spp": float(point.settings)}
             found[name] |= _errors(picture, subject)
-            levels.append(Level(spp=point.settings, core_s=core_s, db=found[name]["db"]))
+            levels.append(PricedLevel(spp=point.settings, core_s=core_s, db=found[name]["db"]))
         for name, shot in taken.items():
             figures = _errors(shot.view.radiance_rgb, subject)
             stated = shot.view.noise_floor_db
@@ -135,10 +135,6 @@ def _errors(picture: Picture, subject: Subject) -> dict[str, float]:
         "db": psnr_log_db(picture, subject.reference_rgb),
         "linear_db": psnr_linear_db(picture, subject.reference_rgb),
     }
-
-
-def percent(share: float) -> float:
-    return 100 * share
 
 
 _BESIDE = (

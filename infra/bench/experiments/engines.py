@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.curve import Level, at_error
-from infra.bench.experiment import Column, Experiment, Figures, Point
+from infra.bench.curve import PricedLevel, at_error
+from infra.bench.experiment import Column, Experiment, Figures, Point, percent
 from infra.bench.experiments.sampling import DB
 from infra.bench.sides.bare_pictures import bare_pictures
-from infra.bench.sides.levels import Levels
+from infra.bench.sides.levels import SampledPictures
 from infra.bench.subjects.held_out import build_within, held_out
 from infra.bench.subjects.render_child import render_child
 from infra.bench.workshop import Workshop
@@ -65,10 +65,10 @@ def _measure(
     yield RAW, _at_its_error(raw, reference, db)
 
 
-def _at_its_error(found: Levels, reference: NDArray[np.float32], db: float) -> Figures:
+def _at_its_error(found: SampledPictures, reference: NDArray[np.float32], db: float) -> Figures:
     """Return what the path tracer takes for an error of `db`."""
     priced = [
-        Level(spp=one.spp, core_s=one.core_s, db=psnr_log_db(one.radiance_rgb, reference))
+        PricedLevel(spp=one.spp, core_s=one.core_s, db=psnr_log_db(one.radiance_rgb, reference))
         for one in found.levels
     ]
     equal, has_it = at_error(priced, db)
@@ -116,10 +116,6 @@ def _timed(renderer: "NeuralRenderer", scene: Scene, px: int) -> tuple[Any, floa
     return picture, float(encoding), float(view)
 
 
-def _percent(share: float) -> float:
-    return 100 * share
-
-
 EXPERIMENTS = (
     Experiment(
         name="engines",
@@ -145,13 +141,13 @@ EXPERIMENTS = (
                 name="scenes where 1 sample is better %",
                 figure="one_is_better",
                 over="mean",
-                then=_percent,
+                then=percent,
             ),
             Column(
                 name="scenes where no samples suffice %",
                 figure="none_is_as_good",
                 over="mean",
-                then=_percent,
+                then=percent,
             ),
         ),
         because="Default: the path tracer, since the error of its picture is chosen and measured, "

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
+from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent, repeats
 from infra.bench.sides import remeshing
 from infra.bench.workshop import Workshop
 from pipeline.assets.settings import AssetSettings
@@ -103,7 +103,7 @@ EXPERIMENTS = (
             Column(name="objects", figure="objects"),
             Column(name="accepted", figure="accepted"),
             Column(name="triangles, mean of the finest", figure="faces"),
-            Column(name="largest p99 distance %", figure="largest", then=lambda x: 100 * x),
+            Column(name="largest p99 distance %", figure="largest", then=percent),
             Column(name=f"beyond {EPSILON:.1%}", figure="over"),
         ),
         points=_stages,

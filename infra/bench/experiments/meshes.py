@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one
+from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent
 from infra.bench.sides import remeshing
 from infra.bench.sides.shots import fixed_samples
 from infra.bench.subjects.mesh_pictures import coarser, picture_db
@@ -93,10 +93,6 @@ def prepared(path: Path, epsilon: float | None) -> dict[str, float]:
 
 def _measure_epsilon(workshop: Workshop, point: Point, turn: str) -> Figures:
     return workshop.mesh_child.call(prepared, workshop.source(turn, LARGE), point.settings)
-
-
-def percent(share: float) -> float:
-    return 100 * share
 
 
 def _times_1000(value: float) -> float:

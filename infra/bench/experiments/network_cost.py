@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
+from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent, repeats
 from infra.bench.workshop import Workshop
 
 if TYPE_CHECKING:
@@ -206,7 +206,7 @@ EXPERIMENTS = (
             Column(
                 name="of the device's dense bfloat16 peak, %",
                 figure="of_peak",
-                then=lambda share: 100 * share,
+                then=percent,
             ),
         ),
         points=lambda effort: [

@@ -6,7 +6,7 @@ import time
 import numpy as np
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one
+from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent
 from infra.bench.sides.shots import warm_up_denoiser, warm_up_kernels
 from infra.bench.subjects.named_scenes import first_sample, sampled_scene
 from infra.bench.workshop import Workshop
@@ -92,7 +92,7 @@ EXPERIMENTS = (
                 name="views at the target %",
                 figure="reached",
                 over="mean",
-                then=lambda share: 100 * share,
+                then=percent,
             ),
             Column(name="MB", figure="mb", over="mean"),
         ),

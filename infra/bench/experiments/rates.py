@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
-from infra.bench.experiments.beside import BROKEN_DB, TARGETS_DB, adaptive, percent
+from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent, repeats
+from infra.bench.experiments.beside import BROKEN_DB, TARGETS_DB, adaptive
 from infra.bench.experiments.sampling import CORE_S
 from infra.bench.sides.shots import SEED, shots
 from infra.bench.subjects.cost_scene import cost_scene

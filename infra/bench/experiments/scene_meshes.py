@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point
-from infra.bench.experiments.meshes import NETWORK, percent
+from infra.bench.experiment import Column, Experiment, Figures, Point, percent
+from infra.bench.experiments.meshes import NETWORK
 from infra.bench.experiments.sampling import DB, WORST
 from infra.bench.subjects.scene_detail import ERRORS, Fit, picture_errors, scene_fits
 from infra.bench.workshop import Workshop

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
+from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent, repeats
 from infra.bench.experiments.sampling import DB, WORST, scenes
 from infra.bench.sides.codecs import codecs, picture_figures
 from infra.bench.sides.packed_arrays import ARRAYS, COLOURS, SAMPLES, array_figures, sample_figures
@@ -123,7 +123,7 @@ EXPERIMENTS = (
             Column(
                 name=f"views at {LAW_DB:.0f} dB or more %",
                 figure="lawful",
-                then=lambda share: 100 * share,
+                then=percent,
             ),
         ),
         because="Default: `compact`. For each view the coarsest level of DWAB that adds at most a "

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.sides.levels import Level, Levels
+from infra.bench.sides.levels import SampledPicture, SampledPictures
 from infra.bench.sides.shots import SEED, warm_up_denoiser
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
@@ -25,7 +25,7 @@ _PASSES = (*PASS_SPP, 1)
 
 def bare_pictures(
     scene: Scene, resolution: int, levels_spp: Sequence[int]
-) -> tuple[Levels, Levels]:
+) -> tuple[SampledPictures, SampledPictures]:
     """Return a scene's first view as sampled, and denoised; runs in a render child.
 
     Args:
@@ -46,14 +46,14 @@ def bare_pictures(
         total += _sum_of_samples(tracer, camera, done, spp)
         picture = (total / spp).astype(np.float32)
         spent, done = spent + time.process_time() - started, spp
-        raw.append(Level(spp=spp, radiance_rgb=picture, core_s=spent))
+        raw.append(SampledPicture(spp=spp, radiance_rgb=picture, core_s=spent))
         started = time.process_time()
         clean = _denoised(tracer, camera, picture, spp)
         core_s = spent + time.process_time() - started
-        denoised.append(Level(spp=spp, radiance_rgb=clean, core_s=core_s))
+        denoised.append(SampledPicture(spp=spp, radiance_rgb=clean, core_s=core_s))
     return (
-        Levels(load_core_s=load_core_s, levels=tuple(raw)),
-        Levels(load_core_s=load_core_s, levels=tuple(denoised)),
+        SampledPictures(load_core_s=load_core_s, levels=tuple(raw)),
+        SampledPictures(load_core_s=load_core_s, levels=tuple(denoised)),
     )
 
 

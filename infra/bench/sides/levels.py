@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Level:
+class SampledPicture:
     """One view with a fixed number of samples."""
 
     spp: int
@@ -19,10 +19,10 @@ class Level:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Levels:
+class SampledPictures:
     """One view at every level."""
 
     load_core_s: float
     """Core-seconds of loading the scene."""
-    levels: tuple[Level, ...]
+    levels: tuple[SampledPicture, ...]
     """From few samples to many: each holds the samples of the one before."""

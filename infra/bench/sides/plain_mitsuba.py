@@ -12,7 +12,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.sides.levels import Level, Levels
+from infra.bench.sides.levels import SampledPicture, SampledPictures
 from infra.bench.sides.shots import warm_up_denoiser
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
@@ -26,7 +26,9 @@ _RR_DEPTH = 5
 """Mitsuba's default."""
 
 
-def render_levels(scene: Scene, resolution: int, levels_spp: tuple[int, ...], seed: int) -> Levels:
+def render_levels(
+    scene: Scene, resolution: int, levels_spp: tuple[int, ...], seed: int
+) -> SampledPictures:
     """Render a scene's first view with each number of samples; no sample is traced twice.
 
     Core-seconds are those of the samples, the guide pictures, and one denoise.
@@ -57,9 +59,9 @@ def render_levels(scene: Scene, resolution: int, levels_spp: tuple[int, ...], se
         started = time.process_time()
         picture = denoise((total / spp).astype(np.float32), features, "high")
         finished_core_s = core_s + time.process_time() - started
-        levels.append(Level(spp=spp, radiance_rgb=picture, core_s=finished_core_s))
+        levels.append(SampledPicture(spp=spp, radiance_rgb=picture, core_s=finished_core_s))
         before = spp
-    return Levels(load_core_s=load_core_s, levels=tuple(levels))
+    return SampledPictures(load_core_s=load_core_s, levels=tuple(levels))
 
 
 def _features(scene: Scene, camera: Camera, seed: int) -> tuple[Features, float]:
