@@ -141,7 +141,7 @@ def paper_finetune_large() -> TrainSettings:
 def pretrain() -> TrainSettings:
     """Return our first stage: half the paper's steps, every symmetry, less said by noisy views.
 
-    Which of these choices helps is for `infra.bench.training_table` to measure; at this size none
+    Which of these choices helps was measured in small trainings (docs/log); at this size none
     has been.
     """
     return dataclasses.replace(

@@ -35,7 +35,7 @@ COMMANDS = {
     "train": "Train a model; writes checkpoints, metrics.jsonl, TensorBoard curves and a sheet."
     "\n\nFor processes on several machines: torchrun -m trilight train ...",
     "evaluate": "Judge a network; writes evaluation.json, evaluation.md and sheets of pictures.",
-    "bench": "Run a benchmark; writes a dated JSON line and a figure under docs/bench.",
+    "bench": "Measure cost against error; an interrupted run goes on. Without a name, list all.",
     "shards": "Make new datasets of finished ones.",
 }
 """What each does. It is the function of its name, or for a group of commands `app`, in the file of

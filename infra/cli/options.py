@@ -31,11 +31,9 @@ ALIASES = {
     "begin_with": "--from",
     "changes": "--set",
     "exposure_ev": "--exposure",
-    "knobs": "--knob",
     "min_noise_floor_db": "--min-noise-floor",
     "most_unusable": "--skip-unusable",
     "noise_floor_db": "--noise-floor",
-    "parts": "--part",
 }
 """Second, shorter words for options; the first is always the name of the field."""
 
@@ -54,7 +52,8 @@ def command(*arguments: str) -> Callable[[Callable[..., None]], Callable[..., No
     """Return a decorator that makes a command of a function of settings.
 
     Args:
-        arguments: fields that are given by their place and must be given; all others are options.
+        arguments: fields that are given by their place, and must be given unless they are lists
+            with a default of none; all others are options.
     """
 
     def made(function: Callable[..., None]) -> Callable[..., None]:
@@ -87,7 +86,8 @@ def _title(kind: type) -> str:
 
 def _parameter(field: Described, group: Group, *, by_place: bool) -> inspect.Parameter:
     """Return a field as cyclopts reads it from a function's signature."""
-    required = by_place or field.default is MISSING
+    # a place for several may stay empty where the field says what none of them means
+    required = field.default is MISSING or (by_place and field.default != ())
     several = is_repeated(field.hint) or takes_names(field.hint)
     choices = choices_of(field.hint)
     kind, complete = kind_of(field.hint), _completer(field.name)

@@ -1,4 +1,4 @@
-"""Each curve is about settings that exist."""
+"""Each experiment is about settings that exist."""
 
 import dataclasses
 import inspect
@@ -6,7 +6,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from infra.bench.trade.knobs import KNOBS
+from infra.bench.catalogue import every_experiment
 from infra.cli.render import render
 from pipeline.flows.order import DatasetOrder
 from pipeline.flows.settings import BuildSettings
@@ -57,5 +57,5 @@ def test_the_walk_reaches_all_groups() -> None:
         assert name in found
 
 
-def test_what_a_knob_is_about_exists() -> None:
-    assert {name for knob in KNOBS for name in knob.covers} - _every_setting() == set()
+def test_what_an_experiment_is_about_exists() -> None:
+    assert {name for one in every_experiment() for name in one.covers} - _every_setting() == set()

@@ -71,7 +71,7 @@ BAD_INPUT = [
     (("train", "nonsense", "--data", "empty"), "'nonsense'"),
     (("shards", "merge", "empty", "empty", "--out", "c"), "no manifest.json"),
     (("shards", "select", "empty", "--out", "c", "--split", "no"), "--split is 'no'"),
-    (("bench", "nonsense"), "benchmark 'nonsense' is unknown"),
+    (("bench", "nonsense"), "experiment 'nonsense' is unknown"),
 ]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from infra.bench.renders.cost_scene import cost_scene
+from infra.bench.subjects.cost_scene import cost_scene
 from pipeline.scenes.renderformer_json_write import described_files
 from storage.errors import TrilightError
 from storage.material import EMISSION

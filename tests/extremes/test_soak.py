@@ -2,7 +2,7 @@
 
 import pytest
 
-from infra.bench.soak import soaked
+from tests.extremes.soak_kit import soaked
 
 SCENES = 600
 """Sixty to a tenth; twelve shards of 50, each packed and published; three children of 200 calls."""
@@ -10,7 +10,7 @@ SCENES = 600
 
 @pytest.mark.slow
 def test_nothing_grows_and_nothing_stays_behind() -> None:
-    """The bench's own run, shorter. Times are not looked at: other work would decide them."""
+    """Times are not looked at: other work would decide them."""
     found = soaked("builtin:", SCENES)
     # The first tenth is left out: what is made once, such as kernels, is still being made there.
     megabytes = [part.megabytes for part in found.parts[1:]]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from infra.bench.manifests import SAMPLES_PER_SHARD, write_manifest_of
+from infra.bench.subjects.manifests import SAMPLES_PER_SHARD, write_manifest_of
 from pipeline.flows.derive_dataset import derive_dataset
 from pipeline.shards.derive import Derive, derive_shards
 from pipeline.shards.finished import open_finished

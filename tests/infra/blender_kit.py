@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.cycles import environment
-from infra.bench.cycles.child import our_picture
+from infra.bench.sides.blender_environment import installed_python
+from infra.bench.sides.shots import fixed_samples, shots
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import activate, choose_variant
 from storage.scene import Scene
@@ -22,9 +22,9 @@ def run_blender(process: str, folder: Path, request: dict[str, Any]) -> NDArray[
 
     Skips where Blender has not been installed: that is 380 MB, which tests do not download.
     """
-    python = environment.installed_python()
+    python = installed_python()
     if python is None:
-        pytest.skip("Blender is not installed: run `python -m infra.bench.cycles` once")
+        pytest.skip("Blender is not installed: run `trilight bench cycles` once")
     folder.mkdir(exist_ok=True)
     asked = {"bounces": 8, "denoise": True, "seed": 0, "threads": 2, **request}
     (folder / "request.json").write_text(json.dumps(asked))
@@ -45,6 +45,7 @@ def ours(scene: Scene, resolution: int, spp: int) -> NDArray[np.float32]:
     limits = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1)
     child = IsolatedChild(limits=limits, setup=activate, setup_args=(choose_variant(),))
     try:
-        return child.call(our_picture, scene, 0, resolution, spp, 0).radiance_rgb
+        settings = {"ours": fixed_samples(resolution, spp)}
+        return child.call(shots, scene, settings)["ours"].view.radiance_rgb
     finally:
         child.close()

@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import load_file
 from torch.nn.functional import elu
 
-from infra.bench.model.published_forward import published_forward, published_inputs
+from infra.bench.sides.published_network import published_forward, published_inputs
 from model.check_reference import read_reference
 from model.published.config import PublishedConfig
 from model.published.convert import from_published, to_published

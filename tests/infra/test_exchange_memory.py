@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from infra.bench.renders.cost_scene import cost_scene
+from infra.bench.subjects.cost_scene import cost_scene
 from pipeline.flows.convert_scene import write_scene
 from pipeline.flows.scene_source import SceneSource, load_source
 from pipeline.isolation import ChildLimits, IsolatedChild

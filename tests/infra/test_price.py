@@ -6,7 +6,7 @@ from storage.errors import TrilightError
 from tests.command_line import trilight
 
 
-@pytest.mark.parametrize("command", [("plan", "smoke"), ("status", "nowhere"), ("bench", "soak")])
+@pytest.mark.parametrize("command", [("plan", "smoke"), ("status", "nowhere")])
 @pytest.mark.parametrize("price", ["-1", "nan", "inf", "1000.5"])
 def test_a_price_that_is_none_is_refused_before_anything_is_done(
     command: tuple[str, str], price: str

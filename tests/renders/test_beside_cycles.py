@@ -1,4 +1,4 @@
-"""Blender's Cycles, run by infra.bench.cycles, beside closed forms, our pictures and stored ones.
+"""Blender's Cycles, run by infra.bench.sides.cycles, beside closed forms and our pictures.
 
 Skips where Blender has not been installed for it: that is 380 MB, which tests do not download.
 """
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.cycles.cycles_picture import Request, cycles_picture
-from infra.bench.cycles.environment import installed_python
+from infra.bench.sides.blender_environment import installed_python
+from infra.bench.sides.cycles import Request, cycles_picture
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
 from storage.exr import decode_exr
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 def blender() -> None:
     """Skips where Blender is not installed."""
     if installed_python() is None:
-        pytest.skip("Blender is not installed: python -m infra.bench.cycles does that")
+        pytest.skip("Blender is not installed: trilight bench cycles does that")
 
 
 def _cycles(scene: Scene, resolution: int, spp: int, bounces: int = 8) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from infra.bench.manifests import memory_of_opening, write_manifest_of
+from infra.bench.subjects.manifests import memory_of_opening, write_manifest_of
 from storage import json_pieces
 from storage.json_pieces import entries
 from storage.member_table import MemberTable

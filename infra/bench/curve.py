@@ -1,0 +1,200 @@
+"""The points of a run as a table's rows: columns, spread, cost ratio, and whether on the front."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from infra.bench.effort import CAREFUL, QUICK, Effort
+from infra.bench.experiment import Column, Experiment, Point
+from infra.bench.store import Run
+from storage.errors import TrilightError
+
+COST_NOISE = 0.03
+"""Costs that differ by less than this share are equal: core-seconds of one run vary by as much."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """One figure over the turns."""
+
+    median: float
+    """What to quote."""
+    low: float
+    """The smallest."""
+    high: float
+    """The largest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One point beside the others."""
+
+    point: Point
+    """Its declaration."""
+    values: Mapping[str, float]
+    """By name of the column; without those that were not measured."""
+    cost_ratio: float
+    """Its cost divided by that of the default."""
+    cost_spread: Spread | None
+    """The cost over the turns; None where it was not kept or there was one turn."""
+    on_front: bool | None
+    """Whether no other point dominates it (`on_front`); None without an error, and for what is no
+    choice."""
+
+
+def rows(experiment: Experiment, run: Run) -> list[Row]:
+    """Return the points of a run in their declared order, without those it did not measure.
+
+    Raises:
+        TrilightError: nothing was measured, or the default was not.
+    """
+    points = {point.name: point for point in experiment.points(_effort(run))}
+    known = [points.get(name, Point(name=name)) for name in run.plan["points"]]
+    values = {point.name: _values(experiment, run, point.name) for point in known}
+    known = [point for point in known if experiment.cost.name in values[point.name]]
+    base = values[_base(experiment, known).name][experiment.cost.name]
+    front = _front(experiment, known, values)
+    return [
+        Row(
+            point=point,
+            values=values[point.name],
+            cost_ratio=values[point.name][experiment.cost.name] / base,
+            cost_spread=_cost_spread(experiment, run, point.name),
+            on_front=front.get(point.name),
+        )
+        for point in known
+    ]
+
+
+def columns_of(experiment: Experiment) -> tuple[Column, ...]:
+    """Return the columns of a table: cost, error where there is one, and the further ones."""
+    error = (experiment.error,) if experiment.error else ()
+    return (experiment.cost, *error, *experiment.columns)
+
+
+def on_front(figures: Sequence[tuple[float, Sequence[float]]]) -> list[bool]:
+    """Return which of some points no other one dominates.
+
+    One with less error dominates where none of its costs is more than COST_NOISE higher; one with
+    the same error where none is higher and one is more than COST_NOISE lower. Some point always
+    stays: whoever dominates has less error, or the same and less cost.
+
+    Args:
+        figures: error (smaller is better) and costs above 0 of each point, equally many.
+    """
+    return [not any(_dominates(other, mine) for other in figures) for mine in figures]
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Return median, smallest and largest of the figures of all turns."""
+    return Spread(median=float(np.median(values)), low=min(values), high=max(values))
+
+
+_OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
+    "median": np.median,
+    "mean": np.mean,
+    "least": np.min,
+    "most": np.max,
+    "p5": lambda values: np.percentile(values, 5),
+    "p95": lambda values: np.percentile(values, 95),
+}
+
+
+def _effort(run: Run) -> Effort:
+    asked = run.plan["effort"]
+    base = QUICK if asked["name"] == QUICK.name else CAREFUL
+    known: dict[str, Any] = {
+        key: tuple(x) if isinstance(x, list) else x for key, x in asked.items()
+    }
+    return dataclasses.replace(base, **known)
+
+
+def _base(experiment: Experiment, known: Sequence[Point]) -> Point:
+    defaults = [point for point in known if point.default]
+    if not known or len(defaults) > 1:
+        raise TrilightError(
+            f"experiment {experiment.name}: {len(known)} points were measured, {len(defaults)} of "
+            "them the default; expected one point or more and at most one default. Run it again."
+        )
+    return (defaults or known)[0]
+
+
+def _values(experiment: Experiment, run: Run, point: str) -> dict[str, float]:
+    turns = [run.turns[turn][point] for turn in run.whole_turns()]
+    found = dict(run.columns.get(point, {}))
+    for column in columns_of(experiment):
+        figures = [turn[column.figure] for turn in turns if column.figure in turn]
+        if figures:
+            value = float(_OVER[column.over](figures))
+            found[column.name] = column.then(value) if column.then else value
+    return found
+
+
+def _cost_spread(experiment: Experiment, run: Run, point: str) -> Spread | None:
+    column = experiment.cost
+    figures = [run.turns[turn][point][column.figure] for turn in run.whole_turns()]
+    if len(figures) < 2:
+        return None
+    return spread([column.then(value) if column.then else value for value in figures])
+
+
+def _front(
+    experiment: Experiment, known: Sequence[Point], values: Mapping[str, Mapping[str, float]]
+) -> dict[str, bool]:
+    if experiment.error is None:
+        return {}
+    error, sign = experiment.error.name, -1 if experiment.better == "higher" else 1
+    costs = (experiment.cost.name, *experiment.also_cost)
+    choices = [point.name for point in known if point.judged and error in values[point.name]]
+    figures = [
+        (sign * values[name][error], [values[name][cost] for cost in costs]) for name in choices
+    ]
+    return dict(zip(choices, on_front(figures), strict=True))
+
+
+def _dominates(other: tuple[float, Sequence[float]], mine: tuple[float, Sequence[float]]) -> bool:
+    costs = list(zip(other[1], mine[1], strict=True))
+    if other[0] < mine[0]:
+        return all(a <= (1 + COST_NOISE) * b for a, b in costs)
+    lower = any((1 + COST_NOISE) * a < b for a, b in costs)
+    return other[0] == mine[0] and lower and all(a <= b for a, b in costs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PricedLevel:
+    """A path tracer at one number of samples."""
+
+    spp: float
+    """Samples per pixel."""
+    core_s: float
+    """Core-seconds."""
+    db: float
+    """psnr_log_db to the reference."""
+
+
+def at_error(levels: Sequence[PricedLevel], db: float) -> tuple[PricedLevel, bool]:
+    """Return the level at which a path tracer first has an error of `db`, and whether it has it.
+
+    Between two levels dB are taken linear in log2 of the samples, and core-seconds linear in the
+    samples. Outside of what was measured the nearest level is returned, with False: its cost is a
+    lower bound where no level is good enough, and an upper one where all are better.
+
+    Args:
+        levels: rising in samples; one at least.
+        db: psnr_log_db that is asked for, to the same reference.
+    """
+    row = next((row for row, level in enumerate(levels) if level.db >= db), None)
+    if row is None:
+        return levels[-1], False
+    above = levels[row]
+    if row == 0:
+        return above, above.db == db
+    below = levels[row - 1]
+    share = (db - below.db) / (above.db - below.db)
+    spp = below.spp * 2 ** (share * math.log2(above.spp / below.spp))
+    slope = (above.core_s - below.core_s) / (above.spp - below.spp)
+    return PricedLevel(spp=spp, core_s=below.core_s + slope * (spp - below.spp), db=db), True

@@ -1,0 +1,75 @@
+"""How much is measured: minutes with `--quick`, otherwise what figures to quote need."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """Numbers that experiments draw their points and turns from."""
+
+    name: str
+    """`quick` or `careful`."""
+    scenes: int
+    """Scenes of the named set, for errors of pictures."""
+    resolution: int
+    """Pixels across those pictures: a divisor of the references' 128."""
+    max_spp: int
+    """Most samples per pixel, of fixed numbers and as a cap; a multiple of 128."""
+    fixed_spp: int
+    """Samples per pixel where something else is varied."""
+    picture_px: int
+    """Pixels across where the whole pipeline's pictures are meant."""
+    widths: tuple[int, ...]
+    """Picture widths where the resolution is varied, doubling; the third is the default."""
+    objects: int
+    """Objects that are decimated."""
+    samples: int
+    """Rendered scenes of `smoke` that are packed and read."""
+    composed: int
+    """Scenes that are composed and not rendered."""
+    network: str
+    """A name of model.config.SIZES."""
+    network_triangles: int
+    """Triangles of the scene that the network renders."""
+    network_px: int
+    """Pixels across the pictures of the network."""
+    repeats: int
+    """Counted rounds where the same is done several times."""
+    growth: int
+    """How far sizes that double go: largest source of a mesh, triangles and views of a network."""
+
+
+CAREFUL = Effort(
+    name="careful",
+    scenes=12,
+    resolution=128,
+    max_spp=1024,
+    fixed_spp=256,
+    picture_px=256,
+    widths=(64, 128, 256, 512),
+    objects=24,
+    samples=12,
+    composed=200,
+    network="base",
+    network_triangles=1536,
+    network_px=256,
+    repeats=3,
+    growth=4,
+)
+QUICK = Effort(
+    name="quick",
+    scenes=4,
+    resolution=128,
+    max_spp=512,
+    fixed_spp=128,
+    picture_px=128,
+    widths=(64, 128, 256, 512),
+    objects=6,
+    samples=2,
+    composed=40,
+    network="base",
+    network_triangles=1536,
+    network_px=256,
+    repeats=1,
+    growth=2,
+)

@@ -1,0 +1,119 @@
+"""What an experiment declares: its points, what it measures of each, and how a table shows it.
+
+No heavy library is imported here: the catalogue, the tests and the pages read declarations without
+measuring anything.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from infra.bench.effort import Effort
+
+if TYPE_CHECKING:
+    from infra.bench.workshop import Workshop
+
+Figures = Mapping[str, float]
+"""What one turn measures of one point, by name."""
+
+Over = Literal["median", "mean", "least", "most", "p5", "p95"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """One column of the table: a figure of every turn, made one number."""
+
+    name: str
+    """Its heading, with the unit."""
+    figure: str
+    """Name of the figure among those that a turn returns."""
+    over: Over = "median"
+    """How the figures of all turns become one number."""
+    then: Callable[[float], float] | None = None
+    """What is done to that number, for example `3600 / seconds`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """One setting that is measured."""
+
+    name: str
+    """What the table calls it."""
+    settings: Any = None
+    """What measuring it needs to know."""
+    default: bool = False
+    """Whether this is what the product does when nobody says otherwise."""
+    judged: bool = True
+    """Whether the point is a choice; a yardstick, which shows what cannot be told apart, is not."""
+
+
+Measure = Callable[["Workshop", Sequence[Point], str], Iterable[tuple[str, Figures]]]
+"""Measures all points in one turn, in order, and yields the name of each with its figures. Raises
+`Rejected` or `ChildFailed` where the turn's scene or object cannot be used: it then counts for
+no point."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """Cost against error of the settings of one choice."""
+
+    name: str
+    """On the command line."""
+    title: str
+    """Heading of its section."""
+    about: str
+    """One sentence: what is measured, and on what."""
+    cost: Column
+    """The first column; above 0."""
+    points: Callable[[Effort], Sequence[Point]]
+    """The settings, in the order of the table."""
+    turns: Callable[[Effort], Sequence[str]]
+    """Scenes, objects or repeats: in each turn every point is measured once."""
+    measure: Measure = field(repr=False)
+    """Measures a turn."""
+    error: Column | None = None
+    """The second column; None where there is nothing to be wrong."""
+    better: Literal["higher", "lower"] = "lower"
+    """Which errors are good: decibels are higher where pictures agree."""
+    against: str = ""
+    """What the error is measured to."""
+    columns: tuple[Column, ...] = ()
+    """Further columns."""
+    also_cost: tuple[str, ...] = ()
+    """Further columns that count as costs too: a setting that is cheaper in any of them stays."""
+    because: str = ""
+    """The default and its reason, or what the figures mean."""
+    covers: tuple[str, ...] = ()
+    """Dotted names of the settings that this is about: `build.` as in `--set` of generate, `order.`
+    what a dataset order says, `train.` as in `--set` of train, `render.` an option."""
+    warm_up: bool = False
+    """Whether one turn that is not counted comes first: for turns that are repeats."""
+    takes_scenes: bool = False
+    """Whether the scenes of the user's folder are turns as well."""
+    needs: tuple[Literal["torch", "blender", "data"], ...] = ()
+    """What the machine or the user has to provide."""
+
+
+def percent(share: float) -> float:
+    """Return a share in per cent, for `Column.then`."""
+    return 100 * share
+
+
+def one_by_one(measure: Callable[["Workshop", Point, str], Figures]) -> Measure:
+    """Return the measuring of a turn whose points have nothing in common; adds `seconds`."""
+    import time
+
+    def turn_of(
+        workshop: "Workshop", points: Sequence[Point], turn: str
+    ) -> Iterable[tuple[str, Figures]]:
+        for point in points:
+            began = time.perf_counter()
+            found = measure(workshop, point, turn)
+            yield point.name, {"seconds": time.perf_counter() - began, **found}
+
+    return turn_of
+
+
+def repeats(effort: Effort) -> tuple[str, ...]:
+    """Return the turns of an experiment that does the same several times."""
+    return tuple(f"round {number}" for number in range(1, effort.repeats + 1))

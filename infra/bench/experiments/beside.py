@@ -1,0 +1,188 @@
+"""Our renderer beside plain Mitsuba and Blender's Cycles: cost at equal true error.
+
+Errors are true ones, to converged references of our own renderer: where another renderer
+transports light differently it cannot come nearer than that difference, as its error at many
+samples shows. The sides take turns on every scene.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.bench.curve import PricedLevel, at_error
+from infra.bench.effort import Effort
+from infra.bench.experiment import Column, Experiment, Figures, Point, percent
+from infra.bench.experiments.sampling import CORE_S, DB, WORST
+from infra.bench.sides.plain_mitsuba import render_levels
+from infra.bench.sides.shots import SEED, shots
+from infra.bench.subjects.named_scenes import NUM_SAMPLED, sampled_names
+from infra.bench.workshop import Subject, Workshop
+from pipeline.flows.training_builds import pretrain_256
+from pipeline.renders.settings import RenderSettings
+from storage.metrics import psnr_linear_db, psnr_log_db
+from storage.scene import Scene
+
+TARGETS_DB = (38.0, 42.0, 46.0, 50.0)
+BROKEN_DB = 1.0
+"""A stated floor that is better than the truth by more than this is wrong."""
+
+Picture = NDArray[np.float32]
+
+
+def adaptive(target_db: float, resolution: int, max_spp: int) -> RenderSettings:
+    """Return the settings of `pretrain-256` with another target, width and cap."""
+    return dataclasses.replace(
+        pretrain_256().renders,
+        resolution=resolution,
+        noise_floor_db=target_db,
+        max_spp=max_spp,
+        min_mean_radiance=0.0,
+    )
+
+
+def _ours(effort: Effort) -> list[Point]:
+    return [
+        Point(
+            name=f"trilight {target_db:.0f} dB",
+            settings=adaptive(target_db, effort.resolution, effort.max_spp),
+            default=target_db == pretrain_256().renders.noise_floor_db,
+        )
+        for target_db in TARGETS_DB
+    ]
+
+
+def _mitsuba(effort: Effort) -> list[Point]:
+    """Return fixed numbers of samples up to four times our cap."""
+    doublings = range((4 * effort.max_spp // 64).bit_length())
+    return [Point(name=f"mitsuba {64 << step}", settings=64 << step) for step in doublings]
+
+
+def _cycles(effort: Effort) -> list[Point]:
+    most = 4 * effort.max_spp
+    return [Point(name=f"cycles {spp}", settings=spp) for spp in (128, most) if spp <= most]
+
+
+Theirs = Callable[[Workshop, Scene, Sequence[Point]], Iterable[tuple[str, Picture, float, float]]]
+"""Renders the points of the other side: name, picture, core-seconds, seconds before."""
+
+
+def _by_mitsuba(
+    workshop: Workshop, scene: Scene, points: Sequence[Point]
+) -> Iterable[tuple[str, Picture, float, float]]:
+    levels_spp = tuple(point.settings for point in points)
+    found = workshop.call(render_levels, scene, workshop.effort.resolution, levels_spp, SEED)
+    for point, level in zip(points, found.levels, strict=True):
+        yield point.name, level.radiance_rgb, level.core_s, found.load_core_s
+
+
+def _by_cycles(
+    workshop: Workshop, scene: Scene, points: Sequence[Point]
+) -> Iterable[tuple[str, Picture, float, float]]:
+    from infra.bench.sides.cycles import Request, cycles_picture
+
+    for point in points:
+        request = Request(
+            resolution=workshop.effort.resolution, spp=point.settings, denoise=True, threads=2
+        )
+        picture = cycles_picture(scene, 0, request)
+        yield point.name, picture.radiance_rgb, picture.core_s, picture.prepare_s
+
+
+def beside(theirs: Theirs) -> Any:
+    """Return the measuring of our targets beside another renderer's fixed numbers of samples."""
+
+    def measure(
+        workshop: Workshop, points: Sequence[Point], turn: str
+    ) -> Iterable[tuple[str, Figures]]:
+        subject = workshop.subject(turn)
+        ours = {p.name: p.settings for p in points if isinstance(p.settings, RenderSettings)}
+        taken = workshop.call(shots, subject.scene, ours)
+        others = [point for point in points if point.name not in ours]
+        found: dict[str, dict[str, float]] = {}
+        levels = []
+        for point, made in zip(others, theirs(workshop, subject.scene, others), strict=True):
+            name, picture, core_s, load_s = made
+            found[name] = {"core_s": core_s, "load_s": load_s, "spp": float(point.settings)}
+            found[name] |= _errors(picture, subject)
+            levels.append(PricedLevel(spp=point.settings, core_s=core_s, db=found[name]["db"]))
+        for name, shot in taken.items():
+            figures = _errors(shot.view.radiance_rgb, subject)
+            stated = shot.view.noise_floor_db
+            equal, has_it = at_error(levels, figures["db"])
+            yield (
+                name,
+                {
+                    **figures,
+                    "core_s": shot.core_s,
+                    "load_s": shot.load_core_s,
+                    "spp": float(shot.view.spp),
+                    "floor_db": stated,
+                    "wrong": float(stated - figures["db"] > BROKEN_DB),
+                    "times": equal.core_s / shot.core_s,
+                    "bound": float(not has_it),
+                },
+            )
+        yield from found.items()
+
+    return measure
+
+
+def _errors(picture: Picture, subject: Subject) -> dict[str, float]:
+    return {
+        "db": psnr_log_db(picture, subject.reference_rgb),
+        "linear_db": psnr_linear_db(picture, subject.reference_rgb),
+    }
+
+
+_BESIDE = (
+    Column(name="samples", figure="spp", over="mean"),
+    Column(name="5th percentile dB", figure="db", over="p5"),
+    WORST,
+    Column(name="linear dB", figure="linear_db"),
+    Column(name="stated floors wrong by over 1 dB, %", figure="wrong", over="mean", then=percent),
+    Column(name="other side at equal error, times", figure="times"),
+    Column(name="least times", figure="times", over="least"),
+    Column(name="of them bounds, %", figure="bound", over="mean", then=percent),
+)
+
+EXPERIMENTS = (
+    Experiment(
+        name="frontier",
+        title="Cost at equal error beside plain Mitsuba",
+        about="Our stated floors beside Mitsuba's `path` integrator at fixed numbers of samples "
+        "with one OIDN and our guide pictures, scene by scene in turns.",
+        cost=CORE_S,
+        error=DB,
+        better="higher",
+        against="converged references of our renderer; median over the scenes",
+        columns=_BESIDE,
+        because="`other side at equal error` is the median over the scenes of Mitsuba's "
+        "core-seconds, interpolated between its numbers of samples, divided by ours; where it "
+        "cannot be interpolated it is a bound.",
+        points=lambda effort: [*_ours(effort), *_mitsuba(effort)],
+        turns=lambda effort: sampled_names(
+            NUM_SAMPLED if effort.name == "careful" else effort.scenes
+        ),
+        takes_scenes=True,
+        measure=beside(_by_mitsuba),
+    ),
+    Experiment(
+        name="cycles",
+        title="Cost at equal error beside Blender's Cycles",
+        about="Our stated floors beside Cycles with OIDN at fixed numbers of samples, in a process "
+        "of Blender's own; the first run installs Blender (GPL-3, 380 MB) in its own environment.",
+        cost=CORE_S,
+        error=DB,
+        better="higher",
+        against="converged references of our renderer, which favours ours",
+        columns=_BESIDE,
+        points=lambda effort: [*_ours(effort), *_cycles(effort)],
+        turns=lambda effort: sampled_names(min(6, effort.scenes)),
+        takes_scenes=True,
+        measure=beside(_by_cycles),
+        needs=("blender",),
+    ),
+)

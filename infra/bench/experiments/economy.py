@@ -1,0 +1,137 @@
+"""What the scenes of a dataset cost part by part, and what was left out, from its own records.
+
+The sources' triangles are looked up in this machine's asset store: make the set here.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from infra.bench.experiment import Column, Experiment, Figures, Point
+from infra.bench.subjects.scene_costs import SceneCosts, hdf5_bytes, scene_costs
+from infra.bench.workshop import Workshop
+from storage.dataset import Dataset, open_dataset
+from storage.errors import TrilightError
+from storage.profiles import LAW_DB
+from storage.renderformer_h5 import CELLS, CHANNELS
+
+PASSES = {"colour": 3, "diffuse": 3, "glossy": 3, "normal": 3, "albedo": 3, "depth": 1}
+"""Channels by pass: what the published pipeline writes for every view, of which its exporter for
+training reads the colour alone."""
+HALF_BYTES = 2
+OBJECTS, FLOPS = "triangles of the objects", "G FLOPs of all views (Base), padded as published"
+LEAST_FLOPS, LEAST_KB = "G FLOPs of the smallest scene, not the largest", "kB of its arrays"
+SAMPLES, ARRAYS = "samples of a pixel, not the cap", "kB of arrays and record, not published HDF5"
+TEXTURES, PICTURES = "MB of materials, not textures", "kB of pictures, not raw half floats"
+WHOLE, STORED = "kB of a whole sample", "passes of a view that are stored, of those published"
+ALL_FLOPS, ALL_KB = "in all: G FLOPs, not with the objects' sources", "in all: kB, six raw passes"
+PARTS = (OBJECTS, FLOPS, LEAST_FLOPS, LEAST_KB, STORED, SAMPLES, ARRAYS, TEXTURES, PICTURES, WHOLE,
+         ALL_FLOPS, ALL_KB)  # fmt: skip
+
+
+def _measure(
+    workshop: Workshop, points: Sequence[Point], turn: str
+) -> Iterable[tuple[str, Figures]]:
+    dataset = open_dataset(workshop.asked.data or "")
+    found = list(scene_costs(dataset))
+    if not found:
+        raise TrilightError(f"{dataset.shown}: no scene; expected a finished dataset.")
+    manifest = dataset.manifest
+    workshop.note(f"{len(found)} scenes of `{manifest.build}`, {manifest.num_views} views each")
+    for note in _errors(found, manifest.settings):
+        workshop.note(note)
+    parts = {**_geometry(found, manifest.settings), **_bytes(dataset, found)}
+    for point in points:
+        everything, kept = parts[point.name]
+        yield point.name, {"kept": kept, "everything": everything, "times": everything / kept}
+
+
+def _geometry(found: Sequence[SceneCosts], settings: Any) -> dict[str, tuple[float, float]]:
+    """Return what each part would take and takes: triangles, FLOPs, samples."""
+    from infra.bench.subjects.network_scenes import PUBLISHED_LENGTH, base_flops
+
+    px, views = int(settings["renders"]["resolution"]), len(found[0].spp)
+
+    def flops(triangles: Iterable[int]) -> float:
+        return float(np.mean([base_flops(count, views, px) for count in triangles])) / 1e9
+
+    least = min(found, key=lambda one: one.triangles)
+    most = max(found, key=lambda one: one.triangles)
+    counted = flops(one.triangles for one in found)
+    padded = PUBLISHED_LENGTH.get(px, max(PUBLISHED_LENGTH.values()))
+    sources = flops(one.triangles - one.object_faces + one.source_faces for one in found)
+    return {
+        OBJECTS: (_mean(found, "source_faces"), _mean(found, "object_faces")),
+        FLOPS: (flops([padded]), counted),
+        LEAST_FLOPS: (flops([most.triangles]), flops([least.triangles])),
+        LEAST_KB: (most.array_bytes / 1e3, least.array_bytes / 1e3),
+        SAMPLES: (
+            float(settings["renders"]["max_spp"]),
+            float(np.mean([spp for one in found for spp in one.spp])),
+        ),
+        ALL_FLOPS: (sources, counted),
+    }
+
+
+def _bytes(dataset: Dataset, found: Sequence[SceneCosts]) -> dict[str, tuple[float, float]]:
+    """Return what each part would take and takes on disk and in memory."""
+    px, views = int(dataset.manifest.settings["renders"]["resolution"]), len(found[0].spp)
+    published = hdf5_bytes(dataset) / 1e3
+    arrays = (_mean(found, "array_bytes") + _mean(found, "record_bytes")) / 1e3
+    pictures = _mean(found, "picture_bytes") / 1e3
+    raw = {passes: views * px * px * passes * HALF_BYTES / 1e3 for passes in (3, 16)}
+    textures = _mean(found, "triangles") * CHANNELS * CELLS**2 * HALF_BYTES / 1e6
+    return {
+        STORED: (float(len(PASSES)), _mean(found, "stored_pictures") / views),
+        ARRAYS: (published, arrays),
+        TEXTURES: (textures, arrays / 1e3),
+        PICTURES: (raw[PASSES["colour"]], pictures),
+        WHOLE: (published + raw[PASSES["colour"]], arrays + pictures),
+        ALL_KB: (published + raw[sum(PASSES.values())], arrays + pictures),
+    }
+
+
+def _mean(found: Sequence[SceneCosts], name: str) -> float:
+    return float(np.mean([getattr(one, name) for one in found]))
+
+
+def _errors(found: Sequence[SceneCosts], settings: Any) -> Iterable[str]:
+    """Yield what the savings add in error, in words."""
+    floors = np.array([floor for one in found for floor in one.floors_db])
+    lossless = settings["storage"]["profile"] == "lossless"
+    lost = 0.0 if lossless else 10 * math.log10(1 + 10 ** (-LAW_DB / 10))
+    middle, low = np.median(floors), np.percentile(floors, 5)
+    at_cap = np.mean([capped for one in found for capped in one.at_cap])
+    errors = 100 * np.array([error for one in found for error in one.object_errors])
+    empty = 100 * _mean(found, "empty_share")
+    yield f"{100 * at_cap:.0f} % of the views end at the cap"
+    yield (
+        f"stated per view: median {middle:.1f} dB as rendered, {middle - lost:.1f} or more as "
+        f"stored; 5th percentile {low:.1f} and {low - lost:.1f}"
+    )
+    yield (
+        f"p99 distance of the objects to their sources: median {np.median(errors):.2f} %, 95th "
+        f"percentile {np.percentile(errors, 95):.2f} %, largest {errors.max():.2f} %"
+    )
+    yield f"{empty:.0f} % of the ray bundles see nothing, and are computed"
+
+
+EXPERIMENTS = (
+    Experiment(
+        name="economy",
+        title="What a set left out",
+        about="Means per scene of one finished dataset (`--data SET`), from its manifest, samples "
+        "and the asset store: what every part would take with nothing left out, and takes.",
+        cost=Column(name="what is kept", figure="kept"),
+        columns=(
+            Column(name="with everything", figure="everything"),
+            Column(name="saving, times", figure="times"),
+        ),
+        points=lambda effort: [Point(name=name) for name in PARTS],
+        turns=lambda effort: ["the set"],
+        measure=_measure,
+        needs=("torch", "data"),
+    ),
+)

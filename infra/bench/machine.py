@@ -1,0 +1,66 @@
+"""On what a figure was measured: processor, cores, system, versions of libraries, revision."""
+
+import os
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+
+_LIBRARIES = (
+    "trilight",
+    "mitsuba",
+    "drjit",
+    "pyoidn",
+    "numpy",
+    "torch",
+    "pymeshlab",
+    "meshoptimizer",
+    "libigl",
+    "OpenEXR",
+    "h5py",
+)
+
+
+def machine() -> dict[str, Any]:
+    """Return what a figure depends on, as JSON values."""
+    versions = {}
+    for library in _LIBRARIES:
+        try:
+            versions[library] = metadata.version(library)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+        "versions": versions,
+        "revision": revision(),
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def revision(root: Path = ROOT) -> str:
+    """Return the commit of a checkout, with -dirty where files besides the documents differ.
+
+    Results are documents: a run that writes them goes on as the same revision.
+    """
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["git", *words], cwd=root, capture_output=True, text=True, check=False
+        )
+
+    commit = git("describe", "--always").stdout.strip()
+    changed = git("diff", "--quiet", "HEAD", "--", ".", ":(exclude)docs").returncode == 1
+    return f"{commit}-dirty" if changed else commit or "unknown"

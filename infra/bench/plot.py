@@ -1,0 +1,105 @@
+"""The one figure of an experiment: its points, error against cost, or costs alone as bars."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from infra.bench.curve import Row, rows
+from infra.bench.experiment import Experiment
+from infra.bench.labels import place_labels
+from infra.bench.store import Run
+
+_WIDE, _HIGH, _DPI = 6.0, 4.0, 90
+"""Inches of the figure, and its resolution."""
+
+
+def plot(experiment: Experiment, run: Run, path: Path) -> None:
+    """Draw a run into a PNG file."""
+    import matplotlib
+
+    matplotlib.use("Agg")  # before pyplot: no display is needed
+    import matplotlib.pyplot as plt
+
+    points = rows(experiment, run)
+    high = _HIGH if experiment.error else 1.2 + 0.28 * len(points)
+    figure, axes = plt.subplots(figsize=(_WIDE, high), dpi=_DPI, layout="constrained")
+    axes.set_title(f"{experiment.title} ({experiment.name})", fontsize=9)
+    axes.grid(alpha=0.3)
+    axes.tick_params(labelsize=7)
+    if experiment.error is None:
+        _bars(axes, experiment, points)
+    else:
+        names = _points(axes, experiment, points)
+        figure.canvas.draw()  # places are known from here on
+        place_labels(axes, names)
+    figure.savefig(path, metadata={"Software": None})
+    plt.close(figure)
+
+
+def _bars(axes: Any, experiment: Experiment, points: Sequence[Row]) -> None:
+    costs = [one.values[experiment.cost.name] for one in points]
+    spreads = [
+        (cost - one.cost_spread.low, one.cost_spread.high - cost) if one.cost_spread else (0, 0)
+        for one, cost in zip(points, costs, strict=True)
+    ]
+    bars = [[max(0.0, side) for side in sides] for sides in zip(*spreads, strict=True)]
+    axes.barh([one.point.name for one in points], costs, xerr=bars, ecolor="grey")
+    axes.invert_yaxis()
+    axes.set_xlabel(experiment.cost.name, fontsize=7)
+    if max(costs) > 30 * min(costs):
+        axes.set_xscale("log")
+        _plain_log(axes.xaxis)
+
+
+def _points(
+    axes: Any, experiment: Experiment, points: Sequence[Row]
+) -> list[tuple[str, tuple[float, float]]]:
+    """Draw error against cost ratio; return names and places, those that matter most first."""
+    assert experiment.error is not None
+    name = experiment.error.name
+    errors = [one.values[name] for one in points if name in one.values]
+    _scale(axes, [one.cost_ratio for one in points], errors)
+    for one in points:
+        if name in one.values:
+            _mark(axes, one, one.values[name], "x" if one.on_front is None else "o")
+    front = sorted((one.cost_ratio, one.values[name]) for one in points if one.on_front)
+    if front and not experiment.also_cost:  # with more costs than this axis a front is no line
+        axes.plot(*zip(*front, strict=True), "-", color="C0", linewidth=1)
+    lowest, highest = axes.get_ylim()
+    for one in points:
+        if name not in one.values:  # its cost is known, and stands at the lower edge
+            _mark(axes, one, lowest, "^")
+    axes.set_ylim(lowest, highest)
+    base = "that of the default" if any(one.point.default for one in points) else "the first"
+    axes.set_xlabel(f"{experiment.cost.name}, divided by {base}", fontsize=7)
+    axes.set_ylabel(f"{name}\n{experiment.better} is better", fontsize=7)
+    first = sorted(points, key=lambda one: (not one.point.default, not one.on_front))
+    return [(one.point.name, (one.cost_ratio, one.values.get(name, lowest))) for one in first]
+
+
+def _scale(axes: Any, ratios: Sequence[float], errors: Sequence[float]) -> None:
+    """Choose logarithmic axes where figures are of several sizes."""
+    if max(ratios) > 3 * min(ratios):
+        axes.set_xscale("log")
+        _plain_log(axes.xaxis)
+    if errors and max(errors) > 30 * min(errors) > 0:
+        axes.set_yscale("log")
+    axes.margins(0.18)
+
+
+def _plain_log(axis: Any) -> None:
+    """Label a logarithmic axis with 0.3, 20 and 5000 instead of powers of ten."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 3)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _mark(axes: Any, one: Row, height: float, style: str) -> None:
+    """Draw one point: coloured where it is on the front, ringed where it is the default."""
+    colour = "C0" if one.on_front else "0.6"
+    axes.plot(one.cost_ratio, height, style, color=colour, markersize=5, clip_on=False)
+    if one.point.default:
+        ring = {"color": "C3", "markersize": 10, "fillstyle": "none", "clip_on": False}
+        axes.plot(one.cost_ratio, height, "o", **ring)

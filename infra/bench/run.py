@@ -1,0 +1,118 @@
+"""Runs one experiment: turn after turn, every point once in each, written down as it is measured.
+
+Machines drift. The points of an experiment therefore take turns (A B A B ...), and only ratios
+within one run are claims.
+"""
+
+import contextlib
+import dataclasses
+import importlib.util
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from infra.bench.asked import Asked
+from infra.bench.effort import Effort
+from infra.bench.experiment import Experiment
+from infra.bench.machine import ROOT, machine
+from infra.bench.plot import plot
+from infra.bench.store import Run, Store
+from infra.bench.subjects.named_scenes import described
+from infra.bench.workshop import Workshop
+from pipeline.isolation import ChildFailed
+from storage.errors import Rejected, TrilightError
+
+RESULTS = ROOT / "docs" / "bench"
+
+TurnDone = Callable[[int, int], None]
+"""Called with the number of turns that are done and of all."""
+
+
+def store_of(folder: Path, name: str, effort: str) -> Store:
+    """Return the results of an experiment at an effort (`quick` or `careful`)."""
+    suffix = "" if effort == "careful" else f"-{effort}"
+    return Store(folder / f"{name}{suffix}.jsonl")
+
+
+def newest_run(folder: Path, name: str) -> tuple[Run, Store] | None:
+    """Return the last careful run of an experiment, else the last quick one, with its file."""
+    for effort in ("careful", "quick"):
+        store = store_of(folder, name, effort)
+        if found := store.newest():
+            return found, store
+    return None
+
+
+def run(
+    experiment: Experiment,
+    effort: Effort,
+    asked: Asked,
+    *,
+    folder: Path = RESULTS,
+    turn_done: TurnDone = lambda done, total: None,
+) -> Store:
+    """Measure what is missing of an experiment, draw its figure, and return its results.
+
+    A run of the same plan that was interrupted goes on. Turns that were measured are not measured
+    again; one that was interrupted is.
+
+    Raises:
+        TrilightError: something that the experiment needs is missing, or no turn could be measured.
+    """
+    if lack := lacking(experiment, asked):
+        raise TrilightError(f"bench {experiment.name}: {lack}.")
+    store = store_of(folder, experiment.name, effort.name)
+    current = store.begin(_plan(experiment, effort, asked))
+    began = time.perf_counter()
+    with contextlib.closing(Workshop(effort, asked)) as workshop:
+        _measure(experiment, current, store, workshop, turn_done)
+        notes = list(workshop.notes)
+    if not current.whole_turns():
+        reasons = "; ".join(sorted(set(current.left_out.values())))
+        raise TrilightError(f"bench {experiment.name}: no turn could be measured: {reasons}.")
+    plot(experiment, current, store.path.with_suffix(".png"))  # what cannot be told has not ended
+    store.end(current, time.perf_counter() - began, notes)
+    return store
+
+
+def lacking(experiment: Experiment, asked: Asked) -> str:
+    """Return what an experiment needs and is not there, or nothing."""
+    if "torch" in experiment.needs and importlib.util.find_spec("torch") is None:
+        return "torch is not installed; run `make setup-all`"
+    if "data" in experiment.needs and not asked.data:
+        return "expected --data SET, the root of a finished dataset"
+    return ""
+
+
+def _plan(experiment: Experiment, effort: Effort, asked: Asked) -> dict[str, object]:
+    if "blender" in experiment.needs:
+        from infra.bench.sides.blender_environment import blender_python
+
+        blender_python()  # before anything is measured
+    wanted = {**dataclasses.asdict(asked), "scenes": asked.scenes.name if asked.scenes else None}
+    folder = described(asked.scenes) if experiment.takes_scenes else []
+    return {
+        "experiment": experiment.name,
+        "effort": dataclasses.asdict(effort),
+        "asked": wanted,
+        "machine": machine(),
+        "points": [point.name for point in experiment.points(effort)],
+        "turns": [*(named.name for named in folder), *experiment.turns(effort)],
+    }
+
+
+def _measure(
+    experiment: Experiment, current: Run, store: Store, workshop: Workshop, turn_done: TurnDone
+) -> None:
+    points = experiment.points(workshop.effort)
+    missing, total = current.missing_turns(), len(current.plan["turns"])
+    if experiment.warm_up and missing:
+        for _ in experiment.measure(workshop, points, missing[0]):
+            pass
+    for number, turn in enumerate(missing, total - len(missing) + 1):
+        try:
+            for point, figures in experiment.measure(workshop, points, turn):
+                store.add(current, turn, point, figures)
+        except (Rejected, ChildFailed) as error:
+            store.leave_out(current, turn, str(error))
+        turn_done(number, total)

@@ -1,0 +1,102 @@
+"""A view of a `Scene` as Blender's Cycles renders it, with what it took."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.bench.sides.blender_environment import blender_python
+from storage.errors import TrilightError
+from storage.scene import ARRAY_FIELDS, Scene
+
+_SCRIPT = Path(__file__).with_name("blender_process.py")
+_TIMEOUT_S = 4 * 3600
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """How Cycles shall render a view."""
+
+    resolution: int
+    """Width and height in pixels."""
+    spp: int
+    """Samples per pixel; adaptive sampling is off."""
+    denoise: bool
+    """Whether Open Image Denoise cleans the picture, with Cycles' own albedo and normals."""
+    bounces: int = 8
+    """Of every kind, and in sum: 8 is Mitsuba's max_depth 10, and 0 is direct light alone."""
+    seed: int = 0
+    """Of the samples."""
+    threads: int = 1
+    """Of Cycles; the denoiser takes what the process may use."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CyclesPicture:
+    """One finished picture and what it took."""
+
+    radiance_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance."""
+    render_s: float
+    """What Cycles itself states, to 10 ms: sampling and denoising, on the clock. Starting Blender,
+    reading the scene and building its tree of triangles came before."""
+    core_s: float
+    """Core-seconds of that call, with what little Blender does around it; other work on the
+    machine moves them less than the clock."""
+    prepare_s: float
+    """What came before: filling Blender's scene, and a picture of one sample; on the clock."""
+
+
+def cycles_picture(scene: Scene, view: int, request: Request) -> CyclesPicture:
+    """Render one view in a process of its own.
+
+    Args:
+        scene: that passes `Scene.check`.
+        view: row of its cameras.
+        request: how.
+
+    Raises:
+        TrilightError: Blender cannot be had (infra.bench.sides.blender_environment), or it failed.
+    """
+    python = blender_python()
+    camera = {"c2w": scene.c2w[view].tolist(), "fov_deg": float(scene.fov_deg[view])}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        np.savez(folder / "scene.npz", **{field: getattr(scene, field) for field in ARRAY_FIELDS})
+        asked = {**dataclasses.asdict(request), **camera}
+        (folder / "request.json").write_text(json.dumps(asked))
+        _run_blender(python, folder)
+        timing = json.loads((folder / "timing.json").read_text())
+        return CyclesPicture(
+            radiance_rgb=np.load(folder / "picture.npy", allow_pickle=False),
+            render_s=timing["render_s"],
+            core_s=timing["core_s"],
+            prepare_s=timing["prepare_s"],
+        )
+
+
+def _run_blender(python: Path, folder: Path) -> None:
+    """Run the script; what Blender writes of its own accord stays in the folder."""
+    surroundings = {**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)}
+    try:
+        result = subprocess.run(
+            [str(python), "-I", str(_SCRIPT), str(folder)],
+            env=surroundings,
+            capture_output=True,
+            text=True,
+            timeout=_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise TrilightError(f"Cycles: no picture within {_TIMEOUT_S} s.") from error
+    if result.returncode or not (folder / "timing.json").is_file():
+        said = (result.stderr or result.stdout).strip().splitlines()
+        raise TrilightError(
+            f"Cycles: exit status {result.returncode}: {said[-1] if said else 'no message'}."
+        )

@@ -1,0 +1,141 @@
+"""Our renderer as a side: one view under many settings, each with its price.
+
+Core-seconds are those of the process: sampling, guide pictures, measuring the floor, and the one
+denoise that makes the picture. Loading the scene is counted apart; kernels are warm.
+"""
+
+import copy
+import dataclasses
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from infra.bench.sides.remembering_tracer import RememberingTracer
+from pipeline.renders.denoiser import Quality, denoise
+from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import Features
+from storage.lights import encode_lights_exr
+from storage.metrics import MAX_DB
+from storage.profiles import pack_picture
+from storage.scene import Scene
+
+SEED = 20_261_122
+"""Of pictures and of scenes that are drawn here: no build and no run has it."""
+
+_SMALL = 32
+"""Pixels each way of what only compiles."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shot:
+    """One view under one setting."""
+
+    view: RenderedView
+    """The picture with its floor and its samples."""
+    core_s: float
+    """What it takes alone: samples, guide pictures, measuring the floor, the last denoise."""
+    load_core_s: float
+    """Loading the scene: arrays, tree of triangles, tables of lights."""
+    packed_bytes: int
+    """In the profile `compact`, with the pictures of single lights where there are any."""
+
+
+def fixed_samples(resolution: int, spp: int) -> RenderSettings:
+    """Return settings that no noise floor stops early.
+
+    Args:
+        resolution: pixels each way.
+        spp: samples per pixel; a multiple of 128 for the best sampling.
+    """
+    return RenderSettings(
+        resolution=resolution,
+        noise_floor_db=MAX_DB - 1,
+        min_spp=spp,
+        max_spp=spp,
+        min_mean_radiance=0.0,
+    )
+
+
+def shots(scene: Scene, variants: Mapping[str, RenderSettings]) -> dict[str, Shot]:
+    """Return a scene's first view under each setting, with equal seeds; runs in a render child.
+
+    Settings of equal depths and resolution share what is traced, and each is charged for it.
+    """
+    renderers: dict[tuple[int, ...], tuple[RememberingRenderer, float]] = {}
+    found = {}
+    for name, settings in variants.items():
+        key = (settings.max_depth, settings.rr_depth, settings.resolution)
+        if settings.per_light:
+            warm_up_kernels(scene, settings)
+            found[name] = _alone(scene, settings)
+            continue
+        if key not in renderers:
+            warm_up_kernels(scene, settings)
+            started = time.process_time()
+            renderer = RememberingRenderer(scene, settings)
+            renderers[key] = renderer, time.process_time() - started
+        if settings.denoiser != "off":
+            warm_up_denoiser(settings.resolution, settings.denoiser)
+        renderer, load_core_s = renderers[key]
+        view, core_s = renderer.timed_view(SEED, settings)
+        found[name] = _shot(view, core_s, load_core_s)
+    return found
+
+
+def warm_up_kernels(scene: Scene, settings: RenderSettings) -> None:
+    """Let this process compile the tracer for a scene with a camera: kernels depend on the depths.
+
+    They do not depend on the resolution; the denoiser's memory does (`warm_up_denoiser`).
+    """
+    small = dataclasses.replace(settings, resolution=_SMALL, max_spp=settings.min_spp)
+    SceneRenderer(scene, small).render_view(scene.c2w[0], float(scene.fov_deg[0]), seed=0)
+
+
+def warm_up_denoiser(resolution: int, quality: Quality = "high") -> None:
+    """Let this process make its filter for pictures of a size."""
+    black = np.zeros((resolution, resolution, 3), np.float32)
+    denoise(black, Features(albedo=black, normal=black), quality)
+
+
+class RememberingRenderer(SceneRenderer):
+    """The product's renderer around a tracer that remembers the passes of its one view."""
+
+    def __init__(self, scene: Scene, settings: RenderSettings) -> None:
+        super().__init__(scene, settings)
+        self._camera = (scene.c2w[0], float(scene.fov_deg[0]))
+        self._remembering = RememberingTracer(self._tracer)
+        self._tracer, self._parts = self._remembering, [self._remembering]
+
+    def timed_view(self, seed: int, settings: RenderSettings) -> tuple[RenderedView, float]:
+        """Return the first view under other settings, and the core-seconds it would take alone.
+
+        Args:
+            seed: of the view.
+            settings: with the depths that the tracer was made with, and lights together.
+        """
+        other = copy.copy(self)
+        other._settings = settings
+        self._remembering.owed_core_s = 0.0
+        started = time.process_time()
+        view = other.render_view(*self._camera, seed)
+        return view, time.process_time() - started + self._remembering.owed_core_s
+
+
+def _alone(scene: Scene, settings: RenderSettings) -> Shot:
+    started = time.process_time()
+    renderer = SceneRenderer(scene, settings)
+    loaded = time.process_time()
+    view = renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), SEED)
+    return _shot(view, time.process_time() - loaded, loaded - started)
+
+
+def _shot(view: RenderedView, core_s: float, load_core_s: float) -> Shot:
+    if view.lights_rgb is None:
+        packed = len(pack_picture(view.radiance_rgb, view.noise_floor_db, "compact"))
+    else:  # as storage.sample packs them: pictures stay the exact sum of their lights
+        packed = len(pack_picture(view.radiance_rgb, view.noise_floor_db, "lossless"))
+        packed += len(encode_lights_exr(view.lights_rgb))
+    return Shot(view=view, core_s=core_s, load_core_s=load_core_s, packed_bytes=packed)

@@ -1,0 +1,99 @@
+"""Datasets to measure reading on: many copies of few samples, or a manifest without its shards."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from storage.installation import IMPORT_ROOT, module_name
+from storage.layout import DatasetFolder
+from storage.manifest import Manifest, ShardEntry, index_shard, write_manifest
+from storage.member_table import MemberTable
+from storage.sample import sample_key
+from storage.shard_writer import write_shard
+
+SAMPLES_PER_SHARD = 256
+SUFFIXES = ("0.exr", "1.exr", "2.exr", "3.exr", "json", "scene.safetensors.gz")
+MEMBER_BYTES = 25_600
+"""Of each member with its header: a sample of four small pictures takes about 150 kB."""
+
+COPIES = 16
+"""Keys of each sample that is copied."""
+_COPIES_PER_SHARD = 16
+
+
+def write_copies(root: Path, members: list[dict[str, bytes]]) -> int:
+    """Write a dataset that holds each sample under COPIES keys; return how many there are."""
+    folder = DatasetFolder(root)
+    every = [(sample_key(k), members[k % len(members)]) for k in range(COPIES * len(members))]
+    names = []
+    for number, start in enumerate(range(0, len(every), _COPIES_PER_SHARD)):
+        names.append(f"train-{number:06d}.tar")
+        write_shard(folder.shard(names[-1]), every[start : start + _COPIES_PER_SHARD])
+    manifest = Manifest(
+        build="copies",
+        settings={},
+        environment={},
+        num_scenes=len(every),
+        num_views=4,
+        objects_lock_sha256="",
+        shards=tuple(index_shard(folder.shard(name)) for name in names),
+    )
+    write_manifest(folder.manifest, manifest)
+    return len(every)
+
+
+def write_manifest_of(root: Path, num_samples: int) -> None:
+    """Write the manifest of a dataset whose every scene is for training."""
+    shards = [
+        _shard(number, range(first, min(first + SAMPLES_PER_SHARD, num_samples)))
+        for number, first in enumerate(range(0, num_samples, SAMPLES_PER_SHARD))
+    ]
+    manifest = Manifest(
+        build="manifest",
+        settings={},
+        environment={},
+        num_scenes=num_samples,
+        num_views=4,
+        objects_lock_sha256="",
+        shards=tuple(shards),
+    )
+    write_manifest(DatasetFolder(root).manifest, manifest)
+
+
+def _shard(number: int, indices: range) -> ShardEntry:
+    names = [f"{sample_key(index)}.{suffix}" for index in indices for suffix in SUFFIXES]
+    rows = ((name, 512 + at * MEMBER_BYTES, MEMBER_BYTES - 512) for at, name in enumerate(names))
+    return ShardEntry(
+        name=f"train-{number:06d}.tar",
+        split="train",
+        num_samples=len(indices),
+        num_bytes=len(names) * MEMBER_BYTES + 10_240,
+        sha256=f"{number:064x}",
+        members=MemberTable(rows),
+    )
+
+
+def memory_of_opening(root: Path) -> dict[str, float]:
+    """Open a dataset for training in a fresh process; returns what it takes and how long.
+
+    `peak_bytes` is what the process grows by at most, `held_bytes` what of it stays.
+    """
+    command = [sys.executable, "-c", _CHILD, str(root), module_name("storage.training_data")]
+    ran = subprocess.run(command, cwd=IMPORT_ROOT, capture_output=True, text=True, check=True)
+    peak, held, seconds = map(float, ran.stdout.split())
+    return {"peak_bytes": peak, "held_bytes": held, "open_s": seconds}
+
+
+_CHILD = """
+import sys, time
+from importlib import import_module
+open_training_data = import_module(sys.argv[2]).open_training_data
+def now(name):
+    # not getrusage: its peak counts the parent too, from before this program was begun
+    lines = open("/proc/self/status").read().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(name))
+peak, held, began = now("VmHWM"), now("VmRSS"), time.perf_counter()
+data = open_training_data([sys.argv[1]])
+seconds = time.perf_counter() - began
+print(now("VmHWM") - peak, now("VmRSS") - held, seconds)
+"""
