@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from unittest import mock
 
 from cyclopts import CycloptsError
+from rich.console import Console
 
 from infra.cli.commands import app, complaint
 from storage.errors import TrilightError
@@ -45,7 +46,8 @@ def trilight(words: Sequence[str], env: Mapping[str, str] | None = None) -> Ende
         mock.patch.dict(os.environ, env or {}),
     ):
         try:
-            app(list(words))
+            # cyclopts keeps the first console that it made, and with it the width
+            app(list(words), console=Console(width=int(os.environ.get("COLUMNS", "80"))))
         except CycloptsError as mistake:
             code, caught = 2, mistake
             errors.write(f"trilight: {complaint(mistake)}\n")

@@ -20,7 +20,7 @@ class Measured:
     """What is measured."""
 
     names: tuple[str, ...] = ()
-    """Experiments, or families of them; without any, all are listed."""
+    """Experiments, or families of them; by default all are listed."""
     quick: bool = False
     """Take minutes instead of measuring carefully."""
     out: Path | None = None
