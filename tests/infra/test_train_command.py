@@ -58,7 +58,7 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
     words, mistake = said("smoke", "--steps", "24")
     assert "warmup_steps=3, log_every=1, validate_every=4, checkpoint_every=4" in words
     assert "Run smoke: 24 steps of 4 scenes at 64 pixels. Loading torch" in words
-    assert "train needs PyTorch, which is not installed" in mistake
+    assert "PyTorch, which is not installed" in mistake
 
 
 def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_a_wait_policy_of_the_users_own_stays() -> None:
 
 
 def test_several_processes_are_launched_by_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As one command line; under torchrun it would be twice as many."""
+    """As one command line, with what a file says in it; under torchrun that would be twice."""
     seen: list[list[str]] = []
 
     def replaced(program: str, words: list[str]) -> NoReturn:
