@@ -128,3 +128,22 @@ def test_a_run_is_followed_on_the_command_line(tmp_path: Path) -> None:
     assert "warmup_steps is 50" in trilight(words).mistake
     ended = trilight([*words, "--set", "warmup_steps=2"])
     assert "Run smoke: 7 steps" in ended.stdout
+
+
+def test_licences_are_allowed_beside_those_of_a_file(tmp_path: Path) -> None:
+    order = DatasetOrder(allow_licences=("CC-BY-NC-4.0",))
+    for text, others in (
+        ("seed: 1\n", named_build("smoke").allowed_licences),
+        ("allowed_licences: [MIT]\n", ("MIT",)),
+    ):
+        found = with_shared(order, Shared(settings=_file(tmp_path, text)))
+        settings = named_build("smoke", allow_licences=found.allow_licences, changes=found.changes)
+        assert settings.allowed_licences == tuple(sorted({*others, "CC-BY-NC-4.0"}))
+
+
+def test_an_order_without_shared_settings_stays_as_it_is_and_is_checked() -> None:
+    order = DatasetOrder(resolution=64, seed=3, changes={"renders.max_spp": 128})
+    assert with_shared(order, Shared()) == order
+    ended = trilight(["generate", "smoke", "--resolution", "20"])
+    assert "resolution is 20; expected a multiple of 8" in ended.mistake
+    assert ended.stdout == "", "before any work is announced"
