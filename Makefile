@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: setup setup-all dataset test test-slow test-elsewhere train serve stop lint lock third-party settings clean
+.PHONY: setup setup-all dataset test test-slow test-elsewhere train serve stop lint lock third-party settings docs clean
 
 setup: $(VENV)/.dataset-ready  ## what making data needs
 
@@ -52,8 +52,11 @@ settings: setup-all  ## write docs/reference/settings.md and command-line.md ane
 	python -m infra.setup.settings_page
 	python -m infra.setup.command_line_page
 
+docs: $(VENV)/.docs-ready  ## the documentation as a site that opens from disk: site/index.html
+	mkdocs build --strict --quiet
+
 clean:  ## everything that make has made, except data/ and runs/
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache *.egg-info
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache *.egg-info site
 
 $(VENV)/.dataset-ready: requirements/dataset.txt pyproject.toml infra/setup/system_libraries.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -66,4 +69,8 @@ $(VENV)/.dataset-ready: requirements/dataset.txt pyproject.toml infra/setup/syst
 $(VENV)/.all-ready: requirements/all.txt $(VENV)/.dataset-ready
 	$(BIN)/python -m pip install --quiet --requirement requirements/all.txt
 	$(if $(WITHOUT_GPL),infra/setup/without_gpl.sh $(BIN)/python)
+	touch $@
+
+$(VENV)/.docs-ready: requirements/docs.txt $(VENV)/.dataset-ready
+	$(BIN)/python -m pip install --quiet --requirement requirements/docs.txt
 	touch $@

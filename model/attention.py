@@ -5,7 +5,7 @@ signature, so that nothing above it knows.
 
 Torch picks the kernel: flash attention on CUDA in half precision without a mask, which inference
 never has, and its memory-efficient one with a mask; a fused one on CPUs. Alternatives were tried on
-a CPU (DECISIONS.md): lengths evened out by buckets take 1.1 times what scene after scene does,
+a CPU (docs/explanation): lengths evened out by buckets take 1.1 times what scene after scene does,
 jagged tensors 14, one packed sequence with a mask 8, FlexAttention 32 and it has no backward there;
 variable-length attention has no CPU kernel. A scene alone has no mask.
 """

@@ -3,7 +3,7 @@
 A bundle is kept where the bounds of some projected triangle touch it, or touch a neighbour of it.
 That is conservative: no bundle that sees geometry is ever left out. What is left out is black,
 which is what it would have been asked to learn; but bundles also attend to each other, so that
-those which remain change a little. How much, and what is saved, is measured in DECISIONS.md.
+those which remain change a little. How much, and what is saved, is measured in docs/explanation.
 """
 
 import torch

@@ -41,7 +41,8 @@ def object_psnr_log_db(a: ArrayLike, b: ArrayLike, hits: NDArray[np.bool_]) -> f
     Empty background earns nothing here. A picture without any hit scores MAX_DB.
 
     Args:
-        a, b: [R, R, 3] linear radiance.
+        a: [R, R, 3] linear radiance.
+        b: the same shape.
         hits: [R, R] whether the pixel's ray hits geometry.
     """
     return _db(_squared_log_error(a, b)[hits])

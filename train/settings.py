@@ -33,7 +33,7 @@ class TrainSettings:
     model: ModelConfig
     """The network."""
     from_weights: bool = False
-    """Whether the run begins with given weights (`--from`) instead of random ones."""
+    """Whether the run begins with given weights (`begin_with`) instead of random ones."""
     resolution: Annotated[int, Within(1, 2048, unit="pixels")]
     """Pixels across the training pictures: a divisor of the data's, a multiple of the bundle's, or
     of a window of bundles."""

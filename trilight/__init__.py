@@ -1,4 +1,4 @@
-"""Trilight from Python: scenes, pictures, datasets and networks; `docs/python.md` shows them.
+"""Trilight from Python: scenes, pictures, datasets, networks. See docs/reference/python.md.
 
     import trilight
 

@@ -31,4 +31,4 @@ def generate_from_meshes(
         words += ["--set", "splits.one_split=true"]
     elif enough < shards:
         words += ["--scenes", str(enough * splits.scenes_per_shard)]
-    return [*words, *(word for name in allow_licences for word in ("--allow-licence", name))]
+    return [*words, *(word for name in allow_licences for word in ("--allow-licences", name))]

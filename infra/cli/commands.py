@@ -47,8 +47,8 @@ GROUPS = ("shards",)
 app = App(
     name="trilight",
     help="Triangles in, light out: make data for, train and judge RenderFormer-style renderers.",
-    help_epilogue="Anywhere on the line: --extend FILE.py, a file of your own that adds templates, "
-    "builds, runs, formats and more (docs/how-to).",
+    help_epilogue="--extend FILE.py, anywhere on the line, adds what a file of your own registers: "
+    "docs/how-to.",
     help_format="plaintext",
     help_formatter=Sections(),
     version=lambda: f"trilight {metadata.version('trilight')}",

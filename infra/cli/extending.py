@@ -1,15 +1,9 @@
 """`--extend FILE.py`, anywhere on the line: files of the user's own, loaded before any command."""
 
 from collections.abc import Sequence
-from typing import Any
 
 from storage.errors import TrilightError
-from storage.extensions import (
-    is_reference,
-    load_extension,
-    load_named_extensions,
-    loaded_files,
-)
+from storage.extensions import load_extension, load_named_extensions, loaded_files
 
 OPTION = "--extend"
 
@@ -45,21 +39,3 @@ def extended(words: Sequence[str]) -> list[str]:
 def extend_words() -> list[str]:
     """Return the words that load what is loaded here, for a command that goes on from this one."""
     return [word for path, _ in loaded_files() for word in (OPTION, path)]
-
-
-def registered(option: str, value: Any) -> Any:
-    """Return the name of a build or run that was typed; FILE.py:FUNCTION is loaded and named.
-
-    Only the command line comes here: what a form or a dataset says never names a file.
-    """
-    if not isinstance(value, str) or not is_reference(value):
-        return value
-    if option == "build":
-        from pipeline.flows.builds import typed_build
-
-        return typed_build(value)
-    if option == "run":
-        from train.runs import typed_run
-
-        return typed_run(value)
-    return value

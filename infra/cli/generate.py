@@ -16,24 +16,24 @@ from storage.settings import checked
 
 
 @checked()
-class ExecutorChoice:
+class Execution:
     """Who does the work."""
 
     runner: str = "threads"
-    """Threads of this process, the workers of a dask cluster, or an executor of your own
-    (--extend)."""
+    """Whose work it is: threads of this process, the workers of a dask cluster, or an executor of
+    your own."""
     address: str | None = None
     """With --runner dask: the scheduler, such as tcp://host:8786; by default there is none."""
 
 
 @command("build")
-def generate(order: DatasetOrder, shared: Shared, runner: ExecutorChoice, shown: Shown) -> None:
+def generate(order: DatasetOrder, shared: Shared, execution: Execution, shown: Shown) -> None:
     order = with_shared(order, shared)
     folder, started = dataset_folder(order.place), time.monotonic()
     first_words(f"Making {folder.shown} with the build {order.build}", silent=shown.json)
-    executor = find_executor(runner.runner, runner.address, order.workers)
+    executor = find_executor(execution.runner, execution.address, order.workers)
     if (text := choose_variant().note) and not shown.json:
         note(f"{text}; see trilight doctor")
     with watched(folder, silent=shown.json):
-        outcome = executor.make(order, runner.address)
+        outcome = executor.make(order, execution.address)
     report(folder, outcome, time.monotonic() - started, as_json=shown.json)

@@ -18,8 +18,7 @@ from typing import Annotated, Any
 
 from cyclopts import Group, Parameter, Token
 
-from infra.cli.completion import NAMES
-from infra.cli.extending import registered
+from infra.cli.names import NAMES
 from infra.cli.words import FileName, choices_of, is_repeated, kind_of, takes_names, value_of
 from storage.errors import TrilightError
 from storage.ranges import shown_number
@@ -141,7 +140,7 @@ def _metavar(field: Described, choices: tuple[str, ...]) -> str:
 
 
 def _completer(name: str) -> Callable[[Any], list[str]] | None:
-    return (lambda _: NAMES[name]()) if name in NAMES else None
+    return (lambda _: NAMES[name].known()) if name in NAMES else None
 
 
 def _word(_: Any, tokens: tuple[Token, ...]) -> str:
@@ -157,7 +156,7 @@ def _settings(kind: type, given: Mapping[str, Any]) -> Any:
     """Return the instance that words make; a complaint about a field names its option."""
     fields = {field.name: field for field in described(kind)}
     values = {
-        name: registered(name, value_of(words, fields[name].hint))
+        name: NAMES[name].read(words) if name in NAMES else value_of(words, fields[name].hint)
         for name, words in given.items()
         if name in fields and words is not None
     }

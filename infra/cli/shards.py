@@ -34,7 +34,7 @@ class Datasets:
 
 
 @checked()
-class Selected:
+class SelectedScenes:
     """Which scenes are kept."""
 
     dataset: Path
@@ -69,7 +69,7 @@ def merge(sources: Datasets, new: NewDataset, shown: Shown) -> None:
 
 @app.command(help="Keep the scenes that meet every condition, under their keys.")
 @command("dataset")
-def select(chosen: Selected, new: NewDataset, shown: Shown) -> None:
+def select(chosen: SelectedScenes, new: NewDataset, shown: Shown) -> None:
     selection = Selection(
         split=chosen.split,
         template=chosen.template,

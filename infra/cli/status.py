@@ -12,7 +12,7 @@ from storage.settings import checked
 
 
 @checked()
-class StatusOrder:
+class WatchedDataset:
     """What is looked at."""
 
     dataset: str
@@ -20,7 +20,7 @@ class StatusOrder:
 
 
 @command("dataset")
-def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
+def status(watched: WatchedDataset, core: CorePrice, shown: Shown) -> None:
     found = read_status(watched.dataset)
     cost = None if found.core_hours is None else found.core_hours * core.price
     if shown.json:

@@ -86,7 +86,7 @@ def train(order: TrainOrder, shared: Shared, shown: Shown) -> None:
     if order.processes > 1:
         _launch(order, shown)
     if os.environ.get("RANK", "0") == "0" and not shown.json:
-        _announce(order, settings)
+        _announce(settings, order)
     result = _trained(order, settings, quiet=shown.json)
     if result is None:
         return
@@ -135,13 +135,13 @@ def _trained(order: TrainOrder, settings: TrainSettings, *, quiet: bool) -> "Tra
             ) from stopped
 
 
-def _announce(order: TrainOrder, settings: TrainSettings) -> None:
+def _announce(settings: TrainSettings, order: TrainOrder) -> None:
     """Say what begins, before torch is imported."""
-    if (steps := order.steps) is not None:
-        shorter = in_proportion(named_run(order.run), steps, order.changes)
+    if order.steps is not None:
+        shorter = in_proportion(named_run(order.run), order.steps, order.changes)
         if shorter:
             shown = ", ".join(f"{name}={value}" for name, value in shorter.items())
-            console.print(f"In proportion to {steps} steps: {shown}")
+            console.print(f"In proportion to {order.steps} steps: {shown}")
     console.print(
         f"Run {settings.run}: {settings.num_steps} steps of {settings.scenes_per_step} scenes at "
         f"{settings.resolution} pixels. Loading torch and the data ..."

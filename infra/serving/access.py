@@ -2,7 +2,7 @@
 
 Prefect's commands read `prefect.toml` in the folder where they run. So the server's URL and
 password stand in a file of that name among what serving keeps (mode 0600), and in the checkout a
-link leads there: every command of the README works from the checkout with nothing exported, the
+link leads there: every command of the documents works from the checkout with nothing exported, the
 password is in no copy of the checkout, and it goes with `make stop`. Where TRILIGHT_STATE names
 another folder there is no link, since a second server must not take the commands away from the
 first.

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+import cyclopts
+from cyclopts import Parameter
 
 from model.open import BUILTIN, BUILTIN_WEIGHTS
 from model.weights import decode_weights, network_digest
@@ -39,10 +40,10 @@ ALLOWED_LICENCES = {"CC0-1.0"}
 
 
 def main(
-    run: Annotated[Path, typer.Argument(help="folder of the finished run")],
-    data: Annotated[str, typer.Option(help="root of the dataset that it learned from")],
-    evaluation: Annotated[Path, typer.Option(help="folder that `trilight evaluate` wrote")],
-    command: Annotated[str, typer.Option(help="how the dataset was made, for the card")],
+    run: Annotated[Path, Parameter(help="folder of the finished run")],
+    data: Annotated[str, Parameter(help="root of the dataset that it learned from")],
+    evaluation: Annotated[Path, Parameter(help="folder that `trilight evaluate` wrote")],
+    command: Annotated[str, Parameter(help="how the dataset was made, for the card")],
 ) -> None:
     """Copy the weights and write the card."""
     folder, dataset = RunFolder(run), open_dataset(data)
@@ -144,6 +145,6 @@ def _shown(figures: Mapping[str, Any]) -> str:
 
 if __name__ == "__main__":
     try:
-        typer.run(main)
+        cyclopts.run(main)
     except TrilightError as mistake:
         raise SystemExit(str(mistake)) from mistake

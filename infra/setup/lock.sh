@@ -16,3 +16,4 @@ lock() {
 lock dataset.txt dataset.in
 lock served.txt --constraint dataset.txt dataset.in served.in
 lock all.txt all.in
+lock docs.txt docs.in

@@ -32,7 +32,8 @@ def benchmark_v1() -> BuildSettings:
     """200 frozen scenes, 50 of each layout, one view each, to 48 dB or 2048 samples.
 
     The settings, the seed and the built-in objects are frozen: whoever runs it gets the same
-    scenes (their digest is in `README.md`). For the second resolution use `--resolution 512`.
+    scenes (their digest is below, and in docs/reference). For the second resolution use
+    `--resolution 512`.
     """
     return dataclasses.replace(
         BUILD_V1,

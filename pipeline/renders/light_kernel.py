@@ -22,7 +22,7 @@ the densities, per area at each vertex, are
 
 The path tracer carries the ratio L / P * product of C+_i r_i / (c_i C-_(i+1)), a light path its
 inverse, once for `hit` and once for `pick`. Roulette is in none of them. Direct light (k = 2) never
-lands: the stratified picks of the path tracer had 4 to 25 times less variance there (LOG.md).
+lands: the stratified picks of the path tracer had 4 to 25 times less variance there (docs/log).
 
 The BRDF is not reciprocal: in a light path the viewer's side is that of the next vertex. Light
 arrives by the cosine of the shading normal but spreads by that of the triangle, hence a factor

@@ -5,7 +5,7 @@ the mean of two; that was too optimistic in 84 of 84 measured cases, by up to 9 
 denoiser smears, and rare paths that neither half found, are common to both. But a picture that
 still misses rare paths shows it: those that it did find stand out of their surroundings, and the
 denoiser takes their light away. So what is taken off grows with the share of the light that lies in
-such outliers, and with how few samples there are. LOG.md has the calibration.
+such outliers, and with how few samples there are. docs/log has the calibration.
 """
 
 import math
@@ -70,7 +70,7 @@ def measure_floor(a: Half, b: Half, hits: NDArray[np.bool_], spp: int) -> Measur
 
     It cannot see light that no sample has found: a view whose only caustic was never hit looks
     converged. Of 40 held-out views at four targets, 13 of 160 cases were worse than stated by more
-    than 1 dB (LOG.md).
+    than 1 dB (docs/log).
 
     Args:
         a, b: halves that share no sample, denoised apart.

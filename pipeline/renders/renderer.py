@@ -193,7 +193,7 @@ class SceneRenderer:
         Lights apart are shares of one denoised picture, pixel by pixel and channel by channel: of
         all light together, in proportion to what each is when it is denoised alone. The sum of
         pictures that were denoised alone carries the bias of each: in four scenes it was 1.7 to 5.2
-        dB worse than this one, and claimed a floor up to 5.9 dB better than the truth (LOG.md).
+        dB worse than this one, and claimed a floor up to 5.9 dB better than the truth (docs/log).
         """
         quality = self._settings.denoiser
         if parts_rgb.max() >= _MAX_RAW:

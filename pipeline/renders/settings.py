@@ -12,7 +12,7 @@ PASS_SPP = (64, 16, 4)
 """Samples per pixel of one pass of a half, from best to cheapest: squares, as the sampler needs.
 
 A pass of 64 is stratified finer than four of 16: 0.1 to 0.3 dB less error on sampled scenes, and 1
-to 2 dB in the median pixel of the easy ones (LOG.md). The small ones are for quick previews.
+to 2 dB in the median pixel of the easy ones (docs/log). The small ones are for quick previews.
 """
 
 FIRST_SPP = 2 * PASS_SPP[1]
@@ -58,7 +58,7 @@ class RenderSettings:
     """Longest path in edges: 1 sees emitters alone, 2 adds direct light."""
     rr_depth: Depth = 2
     """From this many edges on, paths go on by Russian roulette. 2 instead of 5 takes 20 % less
-    time for the same error on sampled scenes (LOG.md)."""
+    time for the same error on sampled scenes (docs/log)."""
     aux_spp: Annotated[int, Within(PASS_SPP[-1], PASS_SPP[0], unit="samples")] = 64
     """Samples per pixel of the albedo and normal pictures that guide the denoiser."""
     denoiser: Literal["high", "fast", "off"] = "high"

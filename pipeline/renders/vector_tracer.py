@@ -30,7 +30,7 @@ from storage.seeds import seed_for
 
 LIGHT_PATHS = 0.25
 """Light paths for each camera path: a quarter has most of the gain, and the whole then takes 1.1 to
-1.4 times as long (LOG.md)."""
+1.4 times as long (docs/log)."""
 
 
 class VectorTracer:

@@ -18,7 +18,7 @@ import pytest
 
 from tests.conftest import ROOT
 
-README = (ROOT / "README.md").read_text()
+SERVERS = (ROOT / "docs/how-to/servers-and-clusters.md").read_text()
 START, STOP = (["-m", "infra.serving.local", action] for action in ("start", "stop"))
 """What `make serve` and `make stop` run, as arguments of Python."""
 START_S = 300
@@ -121,30 +121,30 @@ def postgres() -> Iterator[Postgres]:
             database.stop()
 
 
-def readme_block() -> list[str]:
-    """Return the lines with which the README shows how flows are served and run."""
-    (block,) = re.findall(r"```\n(make serve\n.*?)```", README, re.DOTALL)
+def documented_serving() -> list[str]:
+    """Return the lines with which the documents show how flows are served and run."""
+    (block,) = re.findall(r"```sh\n(make serve\n.*?)```", SERVERS, re.DOTALL)
     return str(block).splitlines()
 
 
-def readme_run(flow: str = "", **replaced: object) -> list[str]:
-    """Return the README's command that runs a flow, as arguments of Python.
+def documented_run(flow: str = "", **replaced: object) -> list[str]:
+    """Return the documents' command that runs a flow, as arguments of Python.
 
     Args:
-        flow: another flow, of those that the README names below.
+        flow: another flow, of those that the page names below.
         replaced: values of its parameters that a test has smaller, or elsewhere; others are added.
     """
-    _, line, _ = readme_block()
+    _, line, _ = documented_serving()
     command, *words = shlex.split(line)
     assert command == "prefect"
     places = [at for at, word in enumerate(words) if word == "-p"]
     names = {words[at + 1].partition("=")[0] for at in places}
     kept = [word for at, word in enumerate(words) if at not in places and at - 1 not in places]
     if flow:
-        assert f"`{flow}`" in README
+        assert f"`{flow}`" in SERVERS
         kept = [word.replace("generate-scenes", flow) for word in kept]
     else:
-        assert names <= set(replaced), "the README's sizes and folders are not a test's"
+        assert names <= set(replaced), "the page's sizes and folders are not a test's"
     given = [word for name, value in replaced.items() for word in ("-p", f"{name}={value}")]
     return ["-m", "prefect", *kept, *given]
 
@@ -177,7 +177,7 @@ def served(
 
 
 def copy_of_the_project(folder: Path) -> None:
-    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (LOG.md)."""
+    """Copy what git tracks, and lend the environment: set-up is proved elsewhere (docs/log)."""
     listed = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout

@@ -1,4 +1,4 @@
-"""From objects to shards to a training model with the commands of the README, small."""
+"""From objects to shards to a training model with the documents' commands, small."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The README's production path, in its own words: one dataset by four ways has one digest."""
+"""The documented production path, word for word: one dataset by four ways has one digest."""
 
 import json
 import os
@@ -22,10 +22,10 @@ from tests.end_to_end.production_kit import (
     call,
     copy_of_the_project,
     dask_cluster,
+    documented_run,
+    documented_serving,
     free_port,
     postgres,
-    readme_block,
-    readme_run,
     served,
 )
 
@@ -54,7 +54,7 @@ def _verified(out: Path) -> str:
 
 def test_the_readme_serves_runs_and_stops_as_is_done_here() -> None:
     """`served` runs what `make serve` and `make stop` run; the line between is run below."""
-    serve, run, stop = readme_block()
+    serve, run, stop = documented_serving()
     assert run.startswith("prefect deployment run generate-scenes/local ")
     for line, last in ((serve, START), (stop, STOP)):
         # under `make test` a make that is called says in which folder it works
@@ -62,7 +62,9 @@ def test_the_readme_serves_runs_and_stops_as_is_done_here() -> None:
         make += shlex.split(line)[1:]
         done = subprocess.run(make, cwd=ROOT, capture_output=True, text=True, check=True)
         assert done.stdout.splitlines()[-1].split() == ["python", *last]
-    assert readme_run("build-dataset", scenes=1, out="a", flow_runs=2)[4] == "build-dataset/local"
+    assert (
+        documented_run("build-dataset", scenes=1, out="a", flow_runs=2)[4] == "build-dataset/local"
+    )
 
 
 @pytest.mark.slow
@@ -71,9 +73,9 @@ def test_four_ways_one_digest(tmp_path: Path) -> None:
     _generate(tmp_path / "plain", MANY)
     digests = {"plain": _verified(tmp_path / "plain")}
     with postgres() as database, served(tmp_path, database.url, workers=2) as environment:
-        call(readme_run(**SMALL, out=tmp_path / "one"), environment, RUN_S)
+        call(documented_run(**SMALL, out=tmp_path / "one"), environment, RUN_S)
         digests["one worker"] = _verified(tmp_path / "one")
-        several = readme_run("build-dataset", **SMALL, out=tmp_path / "two", flow_runs=2)
+        several = documented_run("build-dataset", **SMALL, out=tmp_path / "two", flow_runs=2)
         call(several, environment, RUN_S)
         digests["two workers"] = _verified(tmp_path / "two")
         assert len(_makers(tmp_path / "two")) >= 2
@@ -107,7 +109,7 @@ def _trains(tmp_path: Path, environment: dict[str, str]) -> None:
         "steps": 4,
         "changes": json.dumps(changes),
     }
-    call(readme_run("train-model", **where), environment, RUN_S)
+    call(documented_run("train-model", **where), environment, RUN_S)
     assert NeuralRenderer.load(tmp_path / "run").trained.resolution == 64
 
 
@@ -115,7 +117,7 @@ def _refuses_secrets(tmp_path: Path, environment: dict[str, str], database: Post
     """Neither the database, its log nor ours ever sees what was refused, and the rest names it."""
     with pytest.raises(AssertionError, match="Validation failed for field 'objects'"):
         secret = f"https://me:{CANARY}@host/folder"
-        call(readme_run(**SMALL, out=tmp_path / "no", objects=secret), environment, RUN_S)
+        call(documented_run(**SMALL, out=tmp_path / "no", objects=secret), environment, RUN_S)
     rows = database.dump()
     assert str(tmp_path / "one") in rows  # parameters are in what is looked through, and so are
     assert "packed, 4 scenes" in rows  # the lines of logs
@@ -142,9 +144,9 @@ def test_the_lines_of_the_readme_need_nothing_exported(tmp_path: Path) -> None:
     port = str(free_port())
     try:
         told = call(START, {**bare, "TRILIGHT_PORT": port}, RUN_S, checkout)
-        assert told.splitlines()[-1] == f"Next: {' '.join(readme_block()[1].split()[:5])}"
+        assert told.splitlines()[-1] == f"Next: {' '.join(documented_serving()[1].split()[:5])}"
         assert call(["-m", "prefect", "config", "view"], bare, RUN_S, checkout).count(port)
-        run = readme_run(**{**SMALL, "scenes": 4}, out=tmp_path / "mine")
+        run = documented_run(**{**SMALL, "scenes": 4}, out=tmp_path / "mine")
         call(run, bare, RUN_S, checkout)
         _verified(tmp_path / "mine")
     finally:

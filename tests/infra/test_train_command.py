@@ -8,7 +8,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NoReturn
 
+import pytest
+
+from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
@@ -50,11 +54,11 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
 
     assert "run 'smok': no such run; did you mean smoke?" in said("smok")[1]
     assert "setting 'widht' does not exist" in said("smoke", "--set", "widht=3")[1]
-    assert "name one with --begin-with" in said("finetune")[1]
+    assert "name one with begin_with" in said("finetune")[1]
     words, mistake = said("smoke", "--steps", "24")
     assert "warmup_steps=3, log_every=1, validate_every=4, checkpoint_every=4" in words
     assert "Run smoke: 24 steps of 4 scenes at 64 pixels. Loading torch" in words
-    assert "torch is not installed" in mistake
+    assert "PyTorch, which is not installed" in mistake
 
 
 def test_a_run_that_is_stopped_says_what_goes_on_and_that_does(tmp_path: Path) -> None:
@@ -144,3 +148,22 @@ def test_a_wait_policy_of_the_users_own_stays() -> None:
             [sys.executable, "-c", code], cwd=ROOT, env=unset | own, capture_output=True, text=True
         )
         assert done.stdout.splitlines()[-1] == expected
+
+
+def test_several_processes_are_launched_by_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one command line, with what a file says in it; under torchrun that would be twice."""
+    seen: list[list[str]] = []
+
+    def replaced(program: str, words: list[str]) -> NoReturn:
+        seen.append(words)
+        sys.exit(0)
+
+    monkeypatch.setattr(os, "execv", replaced)
+    asked = ["train", "smoke", "--processes", "2", "--set", "seed=3", "--skip-unusable", "1"]
+    assert trilight([*asked, "--json"]).exit_code == 0
+    (words,) = seen
+    assert words[1:6] == ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m"]
+    assert " ".join(words[6:]) == "trilight train smoke --most-unusable 1 --changes seed=3 --json"
+    monkeypatch.setenv("RANK", "0")
+    assert trilight(asked).mistake.startswith("--processes is 2 under torchrun")
+    assert len(seen) == 1

@@ -1,7 +1,7 @@
 """`python -m tests.renders.stored_pictures`: makes the raw pictures that z-tests compare with.
 
 Each is the mean of many independent passes, with the variance of one pass at every pixel. Make them
-anew only when the light itself is meant to change, and say so in LOG.md.
+anew only when the light itself is meant to change, and say so in docs/log.
 """
 
 from dataclasses import dataclass

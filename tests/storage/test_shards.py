@@ -55,7 +55,7 @@ PINNED = "34fe3b8b9ef7e13f706ad65041b050257f8fafe56d80fb5364e220a7f4e3a41c"
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_stock_webdataset_reads_a_shard(tmp_path: Path, profile: Profile) -> None:
-    """In three lines, which stand in the README of `storage`; it undoes `.gz` by itself."""
+    """In three lines, which stand in docs/reference/formats.md; it undoes `.gz` by itself."""
     import OpenEXR
     import webdataset
     from safetensors.numpy import load

@@ -42,7 +42,7 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
         # a learning rate of 1e-12 moves nothing that float32 shows but numbers near 0
         torch.testing.assert_close(weight, before.state_dict()[name], rtol=1e-6, atol=1e-10)
     run(second, dataset, tmp_path / "second", Start(resume=True))
-    with pytest.raises(TrilightError, match="begins with a trained network; name one with --from"):
+    with pytest.raises(TrilightError, match="trained network; name one with begin_with"):
         run(second, dataset, tmp_path / "third", Start())
     with pytest.raises(TrilightError, match="to begin with those: --set from_weights=true"):
         run(tiny_run(), dataset, tmp_path / "third", Start(begin_with=place))

@@ -64,7 +64,7 @@ def test_examples_import_from_the_face_alone(example: Path) -> None:
     assert not ours
 
 
-@pytest.mark.parametrize("page", ["docs/python.md", "README.md"])
+@pytest.mark.parametrize("page", ["docs/reference/python.md", "README.md"])
 def test_documents_name_what_is_there(page: str) -> None:
     text = (ROOT / page).read_text()
     named = set(re.findall(r"\btrilight\.([A-Za-z_]+)", "\n".join(_code(text))))

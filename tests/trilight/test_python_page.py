@@ -1,4 +1,4 @@
-"""The code of docs/python.md, as somebody would paste it into a file of theirs."""
+"""The code of docs/reference/python.md, as somebody would paste it into a file of theirs."""
 
 import os
 import re
@@ -10,7 +10,8 @@ import pytest
 
 from tests.conftest import ROOT
 
-CODE = re.findall(r"```python\n(.*?)```", (ROOT / "docs/python.md").read_text(), re.DOTALL)
+PAGE = (ROOT / "docs/reference/python.md").read_text()
+CODE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
 def test_the_page_is_a_program() -> None:

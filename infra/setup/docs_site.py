@@ -1,0 +1,79 @@
+"""MkDocs hook: files of the checkout that a page links to become pages of the site.
+
+Pages of docs/ link to files beside that folder (`../../examples/template.py`), which a reader of
+the checkout can follow. A site holds only its own folder, so each of those files gets a page under
+`source/`, outside the navigation, and the links lead there.
+"""
+
+import os
+import posixpath
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files, InclusionLevel
+
+ROOT = Path(__file__).parents[2]
+LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#:\s]+)(#[^)\s]*)?\)")
+"""A relative link or picture: bang, words, target, anchor."""
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add a page for every file outside docs/ that a page links to, and for theirs in turn."""
+    waiting = [f"docs/{file.src_uri}" for file in files.documentation_pages()]
+    known = set(waiting)
+    while waiting:
+        page = waiting.pop()
+        for target in _targets(page, (ROOT / page).read_text()):
+            if target in known or target.startswith("docs/") or not (ROOT / target).is_file():
+                continue
+            known.add(target)
+            added = File.generated(config, _site_uri(target), content=_source_page(target))
+            added.inclusion = InclusionLevel.NOT_IN_NAV
+            files.append(added)
+            if target.endswith(".md"):
+                waiting.append(target)
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Lead links out of docs/ to the pages under `source/`; what has no page loses its link."""
+    here = page.file.src_uri
+    origin = here.removeprefix("source/") if here.startswith("source/") else f"docs/{here}"
+
+    def led(found: re.Match[str]) -> str:
+        bang, words, target, anchor = found[1], found[2], found[3], found[4] or ""
+        path = _resolved(origin, target)
+        if not origin.startswith("docs/") or not path.startswith("docs/"):
+            if files.get_file_from_path(_site_uri(path)) is None:
+                return words
+            target = posixpath.relpath(_site_uri(path), posixpath.dirname(here) or ".")
+        return f"{bang}[{words}]({target}{anchor})"
+
+    return LINK.sub(led, markdown)
+
+
+def _targets(page: str, text: str) -> Iterator[str]:
+    for found in LINK.finditer(text):
+        yield _resolved(page, found[3])
+
+
+def _resolved(page: str, target: str) -> str:
+    """Return a link's target as a path below the checkout."""
+    return posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
+
+
+def _site_uri(path: str) -> str:
+    """Return where the site has a file of the checkout, as a source of MkDocs."""
+    if path.startswith("docs/"):
+        return path.removeprefix("docs/")
+    return f"source/{path}" if path.endswith(".md") else f"source/{path}.md"
+
+
+def _source_page(path: str) -> str:
+    text = (ROOT / path).read_text()
+    if path.endswith(".md"):
+        return text
+    language = os.path.splitext(path)[1].lstrip(".") or "text"
+    return f"# `{path}`\n\n````{language}\n{text}````\n"
