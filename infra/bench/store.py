@@ -37,11 +37,7 @@ class Run:
     def whole_turns(self) -> list[str]:
         """Return the turns in which every point of the plan was measured."""
         points = set(self.plan["points"])
-        return [
-            turn
-            for turn in self.plan["turns"]
-            if turn not in self.left_out and points <= set(self.turns.get(turn, {}))
-        ]
+        return [turn for turn in self.plan["turns"] if points <= set(self.turns.get(turn, {}))]
 
     def missing_turns(self) -> list[str]:
         """Return the turns that are still to be measured."""

@@ -1,6 +1,6 @@
 """The one table of an experiment, for the terminal and for pages."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from infra.bench.curve import Row, columns_of, rows
 from infra.bench.experiment import Column, Experiment
@@ -30,31 +30,44 @@ def front_word(row: Row) -> str:
     return {True: "yes", False: "no", None: "n/a"}[row.on_front]
 
 
-def headings(experiment: Experiment) -> list[str]:
-    """Return the heading of every column."""
+def headings(experiment: Experiment, points: Sequence[Row]) -> list[str]:
+    """Return the heading of every column; costs are divided by the default's where there is one."""
     cost, *others = (column.name for column in columns_of(experiment))
+    ratio = ["ratio"] if _has_default(points) else []
     front = ["front"] if experiment.error else []
-    return ["setting", cost, "ratio", *others, *front]
+    return ["setting", cost, *ratio, *others, *front]
 
 
-def cells(experiment: Experiment, run: Run, *, spread: bool = False) -> Iterator[list[str]]:
-    """Yield the cells of every point; `spread` adds smallest and largest of the cost."""
+def cells(experiment: Experiment, row: Row, points: Sequence[Row]) -> list[str]:
+    """Return the cells of one point of a table."""
     cost, *others = columns_of(experiment)
-    for row in rows(experiment, run):
-        price = shown_in(cost, row)
-        if spread and row.cost_spread:
-            price += f" ({shown(row.cost_spread.low)} to {shown(row.cost_spread.high)})"
-        front = [front_word(row)] if experiment.error else []
-        further = [shown_in(column, row) for column in others]
-        name = f"{row.point.name}{' *' if spread and row.point.default else ''}"
-        yield [name, price, f"{shown(row.cost_ratio)} x", *further, *front]
+    ratio = [f"{shown(row.cost_ratio)} x"] if _has_default(points) else []
+    further = [shown_in(column, row) for column in others]
+    front = [front_word(row)] if experiment.error else []
+    return [row.point.name, shown_in(cost, row), *ratio, *further, *front]
+
+
+def printed(experiment: Experiment, run: Run) -> Iterator[list[str]]:
+    """Yield the headings, and the cells of every point with smallest and largest of its cost."""
+    points = rows(experiment, run)
+    yield headings(experiment, points)
+    for row in points:
+        name, cost, *rest = cells(experiment, row, points)
+        if row.cost_spread:
+            cost += f" ({shown(row.cost_spread.low)} to {shown(row.cost_spread.high)})"
+        yield [f"{name}{' *' if row.point.default else ''}", cost, *rest]
 
 
 def markdown(experiment: Experiment, run: Run) -> Iterator[str]:
     """Yield the table as lines of Markdown, the default in bold."""
-    names = headings(experiment)
+    points = rows(experiment, run)
+    names = headings(experiment, points)
     yield f"| {' | '.join(names)} |"
     yield f"|{'---|' * len(names)}"
-    defaults = {row.point.name for row in rows(experiment, run) if row.point.default}
-    for name, *rest in cells(experiment, run):
-        yield f"| {' | '.join([f'**{name}**' if name in defaults else name, *rest])} |"
+    for row in points:
+        name, *rest = cells(experiment, row, points)
+        yield f"| {' | '.join([f'**{name}**' if row.point.default else name, *rest])} |"
+
+
+def _has_default(points: Sequence[Row]) -> bool:
+    return any(row.point.default for row in points)

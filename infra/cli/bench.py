@@ -59,13 +59,14 @@ def bench(measured: Measured, asked: Asked) -> None:
 
 
 def _print(experiment: "Experiment", store: "Store") -> None:
-    from infra.bench.table import cells, headings
+    from infra.bench.table import printed
 
     found = store.newest()
     assert found is not None
-    table = Table(*headings(experiment), box=None, title=experiment.title)
-    for row in cells(experiment, found, spread=True):
-        table.add_row(*row)
+    names, *lines = printed(experiment, found)
+    table = Table(*names, box=None, title=experiment.title)
+    for line in lines:
+        table.add_row(*line)
     console.print(table)
     for note in (
         *found.notes,

@@ -17,7 +17,7 @@ from infra.bench.experiment import Experiment
 from infra.bench.machine import machine, revision
 from infra.bench.run import newest_run, run
 from infra.bench.store import Run, Store
-from infra.bench.table import cells, markdown, shown
+from infra.bench.table import markdown, printed, shown
 from storage.errors import TrilightError
 from tests.infra.bench_kit import FIGURES, TINY, calls, experiment
 
@@ -131,7 +131,7 @@ def test_the_table_has_every_point_and_the_figure_is_a_picture(tmp_path: Path) -
     assert lines[0] == "| setting | core-seconds | ratio | psnr_log_db, dB | a second | front |"
     assert lines[3] == "| **default** | 2.25 | 1.00 x | 40.0 | 0.44 | yes |"
     assert len(lines) == 2 + len(FIGURES)
-    assert next(cells(one, found, spread=True))[1] == "1.25 (1.00 to 1.50)"
+    assert list(printed(one, found))[1][1] == "1.25 (1.00 to 1.50)"
     with Image.open(tmp_path / "made-up-quick.png") as picture:
         assert picture.width > 300 and len(set(picture.convert("L").tobytes())) > 20
 

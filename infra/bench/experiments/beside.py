@@ -6,6 +6,7 @@ samples shows. The sides take turns on every scene.
 """
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -85,7 +86,10 @@ def _by_cycles(
 
     for point in points:
         request = Request(
-            resolution=workshop.effort.resolution, spp=point.settings, denoise=True, threads=2
+            resolution=workshop.effort.resolution,
+            spp=point.settings,
+            denoise=True,
+            threads=os.cpu_count() or 1,
         )
         picture = cycles_picture(scene, 0, request)
         yield point.name, picture.radiance_rgb, picture.core_s, picture.prepare_s
