@@ -4,7 +4,7 @@ import importlib
 import pkgutil
 from collections.abc import Mapping, Sequence
 
-import infra.bench.experiments
+from infra.bench import experiments
 from infra.bench.experiment import Experiment
 from storage.errors import TrilightError
 from storage.suggestion import expected_one_of
@@ -12,10 +12,10 @@ from storage.suggestion import expected_one_of
 
 def families() -> Mapping[str, tuple[Experiment, ...]]:
     """Return the experiments by the name of their file, in the order of the alphabet."""
-    package = infra.bench.experiments
-    names = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
+    names = sorted(module.name for module in pkgutil.iter_modules(experiments.__path__))
     return {
-        name: importlib.import_module(f"{package.__name__}.{name}").EXPERIMENTS for name in names
+        name: importlib.import_module(f"{experiments.__name__}.{name}").EXPERIMENTS
+        for name in names
     }
 
 
