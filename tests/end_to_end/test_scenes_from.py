@@ -86,7 +86,7 @@ def test_bad_scenes_are_one_clear_line(
     (tmp_path / "bad" / "bad.json").write_text('{"scene_name": "x", "version": "1.0"}')
     for arguments, message in (
         (("--scenes-from", "bad"), "none of the 1 scene files is usable; the first: bad.json: "),
-        (("--scenes-from", "scenes", "--albedo-over-one", "no"), "expected scale or refuse"),
+        (("--scenes-from", "scenes", "--albedo-over-one", "no"), "expected one of scale, refuse"),
         (("--scenes-from", "nowhere"), "no such folder"),
         (("--views", "2"), "--views is 2"),
     ):
