@@ -28,8 +28,11 @@ def _size(workshop: Workshop, point: Point, turn: str) -> Figures:
     from model.layer_errors import random_network
     from model.renderformer import count_parameters
 
-    model = random_network(_config(point.name))
-    _, figures = timed_forward(forward_of(model, workload_of(workshop.effort)), CPU)
+    config, workload = _config(point.name), workload_of(workshop.effort)
+    least = max(workload.resolution, config.picture_px)  # some sizes have windows of ray bundles
+    model = random_network(config)
+    forward = forward_of(model, dataclasses.replace(workload, resolution=least))
+    _, figures = timed_forward(forward, CPU)
     return {**figures, "parameters": count_parameters(model) / 1e6, **trained_scores(point.name)}
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from infra.bench.workshop import Workshop
-from pipeline.flows.prefect_server import prefect_server, quiet_prefect
+from pipeline.flows.prefect_server import SERVER, prefect_server, quiet_prefect
 from pipeline.flows.runners import in_window
 
 _RECORDS_S = 600.0
@@ -91,7 +91,7 @@ def server() -> int:
     for place in Path("/proc").glob("[0-9]*"):
         try:
             parent = int((place / "stat").read_text().rpartition(")")[2].split()[1])
-            if parent == os.getpid() and b"prefect_server" in (place / "cmdline").read_bytes():
+            if parent == os.getpid() and SERVER[-1].encode() in (place / "cmdline").read_bytes():
                 return int(place.name)
         except OSError:
             continue
