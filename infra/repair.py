@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 from pipeline.flows.builds import named_build
 from pipeline.flows.dataset_run import make_dataset
@@ -9,7 +10,7 @@ from pipeline.flows.order import DatasetOrder
 from pipeline.flows.runners import ThreadRunner
 from pipeline.flows.settings import differences
 from pipeline.objects.licences import BY_USER
-from pipeline.scenes.described_albedos import require_choice
+from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.asked import read_asked, value_of
 from storage.dataset import Dataset, open_dataset
 from storage.derived import derivation_of
@@ -57,9 +58,6 @@ def repair(
     require_same_extensions(str(root), manifest.extensions, recorded("data"))
     changes, licence = _changes(manifest), _stated_licence(opened)
     asked = read_asked(opened) or ()
-    for name in bad_shards:
-        if (root / name).exists():
-            (root / name).replace(root / f"{name}{ASIDE}")
     order = DatasetOrder(
         build=manifest.build,
         objects=None if scenes_from else objects,
@@ -68,9 +66,12 @@ def repair(
         licence=licence,
         scenes_from=scenes_from,
         views=manifest.num_views if scenes_from else None,
-        albedo_over_one=require_choice(value_of(asked, "--albedo-over-one") or "scale"),
+        albedo_over_one=cast(AlbedoOverOne, value_of(asked, "--albedo-over-one") or "scale"),
         changes=changes,
-    )
+    )  # which checks it all, before anything is moved
+    for name in bad_shards:
+        if (root / name).exists():
+            (root / name).replace(root / f"{name}{ASIDE}")
     outcome = make_dataset(order, ThreadRunner())
     if outcome.digest != manifest.dataset_digest:
         raise TrilightError(
@@ -105,8 +106,6 @@ def _changes(manifest: Manifest) -> dict[str, object]:
     """Return in what the settings of a dataset differ from those of its build's name."""
     build = named_build(manifest.build).as_json()
     changed = {name: now for name, _, now in differences(build, manifest.settings)}
-    if isinstance(families := changed.get("scenes.families"), list):
-        changed["scenes.families"] = [family["name"] for family in families]  # compared in full
     if manifest.settings["splits"].get("listed_scenes") is not None:
         return {name: now for name, now in changed.items() if name not in _OF_SCENE_FILES}
     return changed

@@ -1,4 +1,4 @@
-"""The one attention function of the network; `attention_reference` is its slow twin.
+"""The one attention function of the network; tests/model/attention_reference.py is its slow twin.
 
 Everything that may later be faster (kernels, precisions, packed sequences) goes behind this
 signature, so that nothing above it knows.

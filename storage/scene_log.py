@@ -62,12 +62,6 @@ def read_scene_logs(folder: DatasetFolder) -> Iterator[SceneLog]:
         yield from decode_scene_log(path.read_text())
 
 
-def read_shard_log(folder: DatasetFolder, shard: str) -> list[SceneLog]:
-    """Return what the log of one shard, such as `train-000003.tar`, says; nothing without one."""
-    path = folder.root / log_name(shard)
-    return list(decode_scene_log(path.read_text())) if path.is_file() else []
-
-
 def log_name(shard: str) -> str:
     """Return the name of a shard's log, relative to the dataset."""
     return f"logs/{shard}.jsonl"

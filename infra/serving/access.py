@@ -17,8 +17,9 @@ from pathlib import Path
 from pipeline.flows.prefect_server import CLIENT_PASSWORD, PASSWORD, new_password
 from storage.cache import cache_folder, open_private, private_folder
 from storage.errors import TrilightError
+from storage.installation import FILES_ROOT
 
-ROOT = Path(__file__).parents[2]
+ROOT = FILES_ROOT
 LINK = ROOT / "prefect.toml"
 """Where Prefect's commands look in the checkout; git ignores it."""
 

@@ -6,7 +6,7 @@ One number for all channels keeps the hue of both, and one for both keeps how gl
 against how coloured; a number for each channel would bleach a red of 1.1 towards white.
 """
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,6 @@ from storage.scene import ALBEDO_SUM_TOLERANCE
 
 AlbedoOverOne = Literal["scale", "refuse"]
 """What to do with materials whose diffuse and specular albedos add up to more than 1."""
-
-
-def require_choice(over_one: str) -> AlbedoOverOne:
-    """Return the choice as it was typed; raises TrilightError where it is none."""
-    for known in get_args(AlbedoOverOne):
-        if over_one == known:
-            return known
-    raise TrilightError(f"--albedo-over-one is {over_one!r}; expected scale or refuse.")
 
 
 def lawful_albedos(

@@ -8,7 +8,7 @@ from tests.end_to_end.conftest import Trilight
 
 SMALL = (
     "--scenes", "8", "--seed", "3", "--resolution", "32", "--noise-floor", "20",
-    "--set", "scenes.num_views=2",
+    "--set", "scenes.num_views=2", "--set", "scenes.families.0.weight=2",
 )  # fmt: skip
 
 

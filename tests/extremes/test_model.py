@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from model.attention import attend
-from model.attention_reference import attend_reference
 from model.config import SIZES
 from model.layer_errors import layer_errors, probe_batch, random_network
 from model.layers import LAYER_NORM_EPS, Norm
@@ -22,6 +21,7 @@ from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneBatch, batch_scenes, scene_tensors
 from storage.errors import TrilightError
 from storage.scene import MAX_POSITION_M
+from tests.model.attention_reference import attend_reference
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 from tests.train.toy import toy_sample, toy_scene
 from train.data.buckets import make_batch

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from model.attention import attend
-from model.attention_reference import attend_reference
+from tests.model.attention_reference import attend_reference
 
 SHAPES = [(1, 1, 1, 1, 2), (2, 2, 5, 7, 6), (3, 1, 17, 33, 8), (1, 4, 64, 130, 16)]
 """(B, H, Q, N, D): one token, odd sizes, and more keys than a kernel's block."""

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.attention_reference import attend_reference
 from model.layers import CrossAttention, merge_heads, split_heads
 from model.positions import Rotation, camera_rotation, rotate, token_places, world_rotation
 from model.scene_tensors import Cameras, batch_scenes
+from tests.model.attention_reference import attend_reference
 from tests.model.kit import FAMILIES, RESOLUTION, awake, random_scene, render, tiny_config
 
 TIGHT = 1e-11

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.attention_reference import attend_reference
 from model.layers import SelfAttention
 from model.windows import attend_in_windows, cut_windows
+from tests.model.attention_reference import attend_reference
 
 CPU = torch.device("cpu")
 
