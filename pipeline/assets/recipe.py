@@ -1,5 +1,7 @@
 """The recipe by name: its methods and what can change its results; loads no mesh library."""
 
+import ast
+import functools
 import hashlib
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -49,9 +51,23 @@ def methods_of(profile: Profile) -> tuple[str, ...]:
     return tuple(name for name in _METHODS[profile] if not name.startswith("pymeshlab"))
 
 
-def code_sha256() -> str:
-    """Return the digest of this stage's own source: another program may give another outcome."""
+@functools.cache
+def code_sha256(folder: Path = Path(__file__).parent) -> str:
+    """Return the digest of this stage's own source: another program may give another outcome.
+
+    Import statements are left out: they say where things are, not what they do, and differ between
+    a checkout and a wheel.
+    """
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(_without_imports(path.read_bytes()))
     return digest.hexdigest()
+
+
+def _without_imports(source: bytes) -> bytes:
+    lines = source.splitlines(keepends=True)
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            for number in range(node.lineno - 1, node.end_lineno or node.lineno):
+                lines[number] = b""
+    return b"".join(lines)
