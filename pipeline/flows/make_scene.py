@@ -101,7 +101,10 @@ def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
 def _scene(split: str, scene_index: int, attempt: int) -> Scene:
     source = _state.source
     if source.files is not None:
-        return source.files.scene(scene_index, source.settings)
+        settings = source.settings
+        return source.files.scene(
+            scene_index, settings.assets, num_views=settings.scenes.num_views, seed=settings.seed
+        )
     return compose_scene(
         source.settings.scenes,
         assets_of(split),

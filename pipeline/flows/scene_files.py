@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.flows.settings import BuildSettings
 from pipeline.scenes.described_albedos import AlbedoOverOne
 from pipeline.scenes.description import DescribedObject, SceneDescription
 from pipeline.scenes.from_description import (
@@ -50,8 +49,14 @@ class SceneFiles:
     notes: tuple[str, ...] = ()
     """What a person should know of the scenes that were built."""
 
-    def scene(self, scene_index: int, settings: BuildSettings) -> Scene:
-        """Build a scene; only children come here.
+    def scene(self, scene_index: int, assets: AssetSettings, *, num_views: int, seed: int) -> Scene:
+        """Build a scene; only children come here, since it reads meshes.
+
+        Args:
+            scene_index: which.
+            assets: limits on meshes.
+            num_views: cameras to take from its file.
+            seed: of the dataset; stands in the provenance, and decides nothing here.
 
         Raises:
             Rejected: "unusable_scene_file", for a file of which none can be made.
@@ -63,11 +68,11 @@ class SceneFiles:
         scene, digests = build_scene(
             self.root,
             name,
-            settings.assets,
+            assets,
             licence=self.licence,
-            num_views=settings.scenes.num_views,
+            num_views=num_views,
             scene_index=scene_index,
-            seed=settings.seed,
+            seed=seed,
             albedo_over_one=self.albedo_over_one,
         )
         for uid, digest in digests.items():

@@ -88,6 +88,11 @@ def _settings(folder: Path, views: int | None = None) -> BuildSettings:
     return settings_for_files(named_build("smoke"), find_scene_files(str(folder)), views)
 
 
+def _scene(files: SceneFiles, scene_index: int, settings: BuildSettings) -> Scene:
+    views = settings.scenes.num_views
+    return files.scene(scene_index, settings.assets, num_views=views, seed=settings.seed)
+
+
 def _accept(folder: Path, out: Path, licence: str | None = None) -> None:
     found, settings = find_scene_files(str(folder)), _settings(folder)
     publication = begin(DatasetFolder(out), settings, {}, 1, accept_environment=False)
@@ -236,11 +241,11 @@ def test_a_file_that_changes_during_a_run_stops_it(folder: Path) -> None:
         licence="MIT",
     )
     settings = _settings(folder)
-    assert files.scene(1, settings).provenance["scene_file"]["name"] == "b.json"
+    assert _scene(files, 1, settings).provenance["scene_file"]["name"] == "b.json"
     with (folder / "meshes/tri.obj").open("a") as stream:
         stream.write("# later\n")
     with pytest.raises(TrilightError, match="meshes/tri.obj: has changed while"):
-        files.scene(1, settings)
+        _scene(files, 1, settings)
 
 
 def test_the_licence_is_the_users_word(folder: Path, tmp_path: Path) -> None:
@@ -273,9 +278,9 @@ def test_a_bad_file_keeps_its_number_and_stops_nobody(folder: Path, tmp_path: Pa
     assert sorted(files.unusable) == ["aa.json", "c.json"]
     for scene_index in (1, 3):
         with pytest.raises(Rejected, match="unusable_scene_file") as rejection:
-            files.scene(scene_index, settings)
+            _scene(files, scene_index, settings)
         assert found.names[scene_index] in rejection.value.message
-    assert files.scene(2, settings).provenance["scene_file"]["name"] == "b.json"
+    assert _scene(files, 2, settings).provenance["scene_file"]["name"] == "b.json"
     assert {"aa.json", "c.json"} & set(files.sha256) == set()
     assert any("c.json is left out: c.json: objects.green" in note for note in files.notes), (
         files.notes
