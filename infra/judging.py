@@ -9,7 +9,7 @@ from infra.excursion_plots import plot_excursions
 from model.open import find_network
 from model.weights import network_digest
 from storage.atomic import write_atomically
-from storage.training_data import TrainingData, open_training_data
+from storage.dataset.training_data import TrainingData, open_training_data
 from train.evaluation.evaluate import (
     Contest,
     judged_views,

@@ -14,20 +14,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.flows.builds import BUILDS, named_build
-from pipeline.flows.dataset_run import prepare_dataset
-from pipeline.flows.machine import cores_owned
-from pipeline.flows.make_task import ShardJob, close_children, make_task
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.pieces import MOST_TASKS, TASK_S, Piece
-from pipeline.flows.settings import BuildSettings
+from pipeline.builds.named import BUILDS, named_build
+from pipeline.builds.settings import BuildSettings
+from pipeline.making.dataset_run import prepare_dataset
+from pipeline.making.machine import cores_owned
+from pipeline.making.make_task import ShardJob, close_children, make_task
+from pipeline.making.order import DatasetOrder
+from pipeline.making.pieces import MOST_TASKS, TASK_S, Piece
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import index_shard
+from storage.dataset.splits import planned_scenes, shard_name, shards_for
+from storage.dataset.staging import read_staged_scene
 from storage.extensions import recorded
-from storage.layout import DatasetFolder
-from storage.manifest import index_shard
-from storage.sample import sample_key
+from storage.records.sample import sample_key
 from storage.seeds import rng_for
-from storage.splits import planned_scenes, shard_name, shards_for
-from storage.staging import read_staged_scene
 
 _DRAWS = 2000
 _BYTES_PER_TASK_RUN = 19_400

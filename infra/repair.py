@@ -4,19 +4,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
-from pipeline.flows.builds import named_build
-from pipeline.flows.dataset_run import make_dataset
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.runners import ThreadRunner
-from pipeline.flows.settings import differences
+from pipeline.builds.named import named_build
+from pipeline.builds.settings import differences
+from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.making.dataset_run import make_dataset
+from pipeline.making.order import DatasetOrder
+from pipeline.making.runners import ThreadRunner
 from pipeline.objects.licences import BY_USER
-from pipeline.scenes.described_albedos import AlbedoOverOne
-from storage.asked import read_asked, value_of
-from storage.dataset import Dataset, open_dataset
-from storage.derived import derivation_of
+from storage.dataset.asked import read_asked, value_of
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.derived import derivation_of
+from storage.dataset.manifest import Manifest
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
-from storage.manifest import Manifest
 from storage.remote.url import parse_url
 
 ASIDE = ".bad"
@@ -36,7 +36,7 @@ def repair(
 
     Args:
         dataset: folder of the dataset.
-        bad_shards: their names (storage.verify).
+        bad_shards: their names (storage.dataset.verify).
         objects: where the objects come from, as it was said to `generate`.
         scenes_from: folder of the scene files, as it was said to `generate`; their digests are in
             the lock, so that no other files are taken.

@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, ClassVar, Literal
 
 from storage.errors import TrilightError
-from storage.material import PUBLISHED_COLUMNS, material_columns
-from storage.ranges import Within
+from storage.records.material import PUBLISHED_COLUMNS, material_columns
 from storage.registry import Registry
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 Head = Literal["dpt", "linear"]
 
@@ -30,7 +30,7 @@ class ModelConfig:
     """All numbers of one network."""
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
-    """The named sizes, by which a setting of this kind may be given (storage.changes)."""
+    """The named sizes, by which a setting of this kind may be given (storage.settings.changes)."""
     width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)]
     """Width of every token."""
     num_heads: Annotated[int, Within(1, 512)]

@@ -18,7 +18,7 @@ from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
 from model.renderformer import RenderFormer, count_parameters
 from model.windows import cut_windows
-from storage.material import material_width
+from storage.records.material import material_width
 
 TRAINING_BYTES = 16
 """Per parameter while training in float32: weight, gradient, and AdamW's two memories."""

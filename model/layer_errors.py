@@ -14,7 +14,7 @@ from model.config import ModelConfig
 from model.precision import set_precision
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, converted
-from storage.material import material_columns, material_width
+from storage.records.material import material_columns, material_width
 
 PROBE_TRIANGLES, PROBE_RESOLUTION = 256, 64
 """Of the random scene that stands for all where none is given."""

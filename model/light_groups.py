@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.material import EMISSION
-from storage.scene import Scene
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

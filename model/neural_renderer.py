@@ -27,8 +27,8 @@ from model.scene_tensors import Cameras, batch_scenes, scene_tensors
 from model.trained_range import MAX_LIGHTS, TrainedRange
 from model.weights import network_digest
 from storage.errors import TrilightError
-from storage.material import unread_columns
-from storage.scene import Scene
+from storage.records.material import unread_columns
+from storage.records.scene import Scene
 
 _FLOAT_BYTES = 4
 

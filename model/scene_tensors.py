@@ -22,8 +22,8 @@ from torch import Tensor
 
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
-from storage.material import PUBLISHED_COLUMNS, chosen_columns, laid_out, material_columns
-from storage.scene import MAX_POSITION_M, Scene
+from storage.records.material import PUBLISHED_COLUMNS, chosen_columns, laid_out, material_columns
+from storage.records.scene import MAX_POSITION_M, Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,7 +41,7 @@ class SceneTensors:
     fov_deg_V: Tensor
     """Full field of view in degrees."""
     columns: tuple[str, ...] = PUBLISHED_COLUMNS
-    """Names of the columns of `material_TM`, in order (storage.material)."""
+    """Names of the columns of `material_TM`, in order (storage.records.material)."""
 
     @property
     def num_triangles(self) -> int:

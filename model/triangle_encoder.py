@@ -19,7 +19,7 @@ from model.positions import (
 )
 from model.precision import as_given
 from model.scene_tensors import SceneBatch
-from storage.material import material_width
+from storage.records.material import material_width
 
 
 class TriangleTokens(nn.Module):

@@ -17,8 +17,8 @@ from model.config import ModelConfig
 from model.renderformer import RenderFormer
 from model.trained_range import TrainedRange
 from storage.errors import TrilightError
-from storage.material import PUBLISHED_COLUMNS
-from storage.safe_read import MAX_HEADER_BYTES, safetensors_header
+from storage.records.material import PUBLISHED_COLUMNS
+from storage.records.safe_read import MAX_HEADER_BYTES, safetensors_header
 
 CONFIG_KEY = "trilight_model"
 """Metadata entry that holds the configuration as JSON."""

@@ -3,7 +3,7 @@
 from typing import Annotated
 
 from storage.errors import TrilightError
-from storage.ranges import LowFirst, Within
+from storage.settings.ranges import LowFirst, Within
 
 Range = Annotated[tuple[float, float], LowFirst()]
 """Least and greatest value, both included."""

@@ -5,18 +5,18 @@ from typing import Literal
 
 import numpy as np
 
-from scene_templates.contents.lights import emitters_rand
-from scene_templates.contents.materials import surface_rand
-from scene_templates.contents.placement import ObjectSpace, PlaceableShape, poses_rand
-from scene_templates.families.family import Family
+from scene_templates.family import Family
 from scene_templates.layout import Layout, ObjectPlacement, SurfaceLook
+from scene_templates.lights import emitters_rand
+from scene_templates.materials import surface_rand
+from scene_templates.patches import SIDES, patch
+from scene_templates.placement import ObjectSpace, PlaceableShape, poses_rand
 from scene_templates.plans import ScenePlan
+from scene_templates.rooms import plane_of
+from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
-from scene_templates.shell.patches import SIDES, patch
-from scene_templates.shell.rooms import plane_of
-from scene_templates.shell.separate_sides import SeparateSides
-from scene_templates.templates.registry import TEMPLATES
-from scene_templates.templates.template import LayoutParams
+from scene_templates.template import LayoutParams
+from scene_templates.templates import TEMPLATES
 
 
 def layout_rand(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scene_templates.families.family import Family
+from scene_templates.family import Family
 from scene_templates.settings import SceneSettings
 from storage.seeds import rng_for
 

@@ -9,19 +9,20 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated, Literal
 
+from scene_templates.cameras import CameraSettings
 from scene_templates.checks import OFFSET, require
-from scene_templates.contents.cameras import CameraSettings
-from scene_templates.contents.lights import LightSettings
-from scene_templates.contents.materials import MaterialSettings
-from scene_templates.contents.placement import PlacementSettings
-from scene_templates.families.excursions import Excursion
-from scene_templates.families.family import Family
-from storage.changes import changed
-from storage.ranges import Share, Within
-from storage.settings import checked
+from scene_templates.excursions import Excursion
+from scene_templates.family import Family
+from scene_templates.lights import LightSettings
+from scene_templates.materials import MaterialSettings
+from scene_templates.placement import PlacementSettings
+from storage.settings.changes import changed
+from storage.settings.described import checked
+from storage.settings.ranges import Share, Within
 
 MAX_TRIANGLES = 65_535
-"""Materials and objects are counted in 16 bits (storage.scene); a triangle may be a material."""
+"""Materials and objects are counted in 16 bits (storage.records.scene); a triangle may be a
+material."""
 
 MIN_TRIANGLES = 129
 """A floor and one emitter."""

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from storage import material
-from storage.material import COLUMNS, PUBLISHED_COLUMNS, MaterialColumn
-from storage.ranges import Within
+from storage.records import material
+from storage.records.material import COLUMNS, PUBLISHED_COLUMNS, MaterialColumn
 from storage.registry import Registry
+from storage.settings.ranges import Within
 
 WITH_COAT = (*PUBLISHED_COLUMNS, "coat")
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from scene_templates.templates.registry import TEMPLATES
+from scene_templates.templates import TEMPLATES
 from storage import extensions
 from storage.extensions import VARIABLE, Extension, load_extension, unload
 from tests.conftest import ROOT

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from storage.conventions import look_at_c2w
-from storage.material import completed_rows
-from storage.sample import Sample, ViewRecord
-from storage.scene import Scene, SceneObject
+from storage.records.material import completed_rows
+from storage.records.sample import Sample, ViewRecord
+from storage.records.scene import Scene, SceneObject
 
 FLOOR, LIGHT = 0, 1
 

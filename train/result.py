@@ -8,7 +8,7 @@ from model.renderformer import count_parameters
 from model.trained_range import TrainedRange
 from model.weights import encode_weights
 from storage.atomic import write_atomically
-from storage.training_data import TrainingData
+from storage.dataset.training_data import TrainingData
 from train.evaluation.judge import Judge
 from train.evaluation.scores import Lead
 from train.evaluation.sheet import write_picture

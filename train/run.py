@@ -13,11 +13,11 @@ from model.open import open_network
 from model.renderformer import count_parameters
 from model.weights import decode_config, encode_weights
 from storage.atomic import write_atomically
+from storage.dataset.training_data import TrainingData, open_training_data
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import recorded
-from storage.settings import settings_record
-from storage.training_data import TrainingData, open_training_data
+from storage.settings.described import settings_record
 from train.data.scenes import training_scene
 from train.data.splits import first_samples
 from train.data.stream import StreamSettings, stream_batches
@@ -63,7 +63,8 @@ def train_run(
 
     Args:
         settings: the run; `train.runs.named_run` returns those that have a name.
-        data: root of a dataset, or a list of shards (storage.training_data), with a train split;
+        data: root of a dataset, or a list of shards (storage.dataset.training_data), with a train
+        split;
             without a validation split nothing is judged.
         out: folder of the run (train.folder), new unless it resumes.
         start: how it begins; anew unless said.

@@ -15,9 +15,9 @@ from typing import Any
 from model.config import base as base_model
 from model.config import large as large_model
 from model.config import smoke as smoke_model
-from storage.changes import changed
 from storage.errors import TrilightError
 from storage.registry import Registry
+from storage.settings.changes import changed
 from storage.suggestion import expected_one_of
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
@@ -247,7 +247,7 @@ def changed_run(
 
     Args:
         name: of the run.
-        changes: values by dotted name, as `storage.changes` takes them.
+        changes: values by dotted name, as `storage.settings.changes` takes them.
         steps: replaces the number of steps; where it is smaller, the warm-up and the intervals
             that `changes` do not name become shorter in proportion.
         most_unusable: replaces that setting, after the changes.

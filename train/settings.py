@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from model.config import ModelConfig
 from storage.errors import TrilightError
-from storage.ranges import Seed, Share, Within
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import Seed, Share, Within
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
 

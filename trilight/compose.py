@@ -1,7 +1,7 @@
 """A scene from Python: meshes with materials, a floor, lamps and cameras, put together.
 
 The builder writes down what a RenderFormer scene file would say, and what gives such files their
-meaning (pipeline.scenes.from_description) makes the scene.
+meaning (pipeline.exchange.from_description) makes the scene.
 """
 
 import dataclasses
@@ -13,21 +13,21 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.flows.read_scenes import SceneReader
-from pipeline.objects.generated import builtin_mesh
-from pipeline.objects.licences import USER_PROVIDED
-from pipeline.scenes.description import (
+from pipeline.exchange.description import (
     DescribedCamera,
     DescribedObject,
     DescribedTransform,
     SceneDescription,
     Vector,
 )
-from pipeline.scenes.from_description import SHELL_FOLDER, LoadedMesh, scene_from_description
-from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from pipeline.exchange.from_description import SHELL_FOLDER, LoadedMesh, scene_from_description
+from pipeline.exchange.reader import SceneReader
+from pipeline.objects.generated import builtin_mesh
+from pipeline.objects.licences import USER_PROVIDED
+from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
-from storage.scene import Scene
+from storage.records.scene import Scene
 from trilight.parts import Material, described_material, mesh_of_arrays, vector
 
 _CC0 = "CC0-1.0"

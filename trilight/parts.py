@@ -5,11 +5,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.scenes.description import DescribedMaterial, Vector
-from pipeline.scenes.from_description import LoadedMesh
+from pipeline.exchange.description import DescribedMaterial, Vector
+from pipeline.exchange.from_description import LoadedMesh
 from storage.errors import TrilightError
-from storage.ranges import FLOAT32_MAX, Within
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import FLOAT32_MAX, Within
 
 
 @checked("material")

@@ -15,8 +15,8 @@ from pipeline.renders.settings import one_picture
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
-from storage.first_hits import FirstHits, first_hits
-from storage.scene import Scene
+from storage.records.first_hits import FirstHits, first_hits
+from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
@@ -94,7 +94,7 @@ def render_views(
         resolution, noise_floor_db, max_spp, seed, threads: as `render`, which says what comes back
             and what is refused.
     """
-    from pipeline.flows.render_scene import PathTracer
+    from pipeline.making.render_scene import PathTracer
     from pipeline.renders.variant import choose_variant
 
     rows = range(scene.num_views) if views is None else views
@@ -152,7 +152,7 @@ def write_picture(path: str | os.PathLike[str], radiance_rgb: NDArray[np.float32
             written.
     """
     from pipeline.documents.png import encode_png
-    from storage.exr import encode_exr
+    from storage.records.exr import encode_exr
 
     target = Path(path)
     picture = np.minimum(radiance_rgb, np.float32(HALF_FLOAT_MAX))

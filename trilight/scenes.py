@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.rendering.sources import scene_sources
-from pipeline.flows.convert_scene import write_scene as write_in_form
-from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_source import LoadedScene, scene_source
-from storage.scene import Scene, SceneObject
+from pipeline.exchange.convert import write_scene as write_in_form
+from pipeline.exchange.open_scene import LoadedScene, scene_source
+from pipeline.exchange.reader import SceneReader
+from storage.records.scene import Scene, SceneObject
 
 __all__ = ["Scene", "SceneObject", "read_scene", "read_scenes", "within_budget", "write_scene"]
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pipeline.objects.licences import DEFAULT_ALLOWED
-from storage.settings import checked
+from storage.settings.described import checked
 
 
 @checked()

@@ -20,15 +20,15 @@ from infra.bench.effort import Effort
 from infra.bench.subjects.named_scenes import described, first_sample, sampled
 from infra.bench.subjects.references import make_reference
 from infra.bench.subjects.render_child import asked_child, smoke_child
-from pipeline.flows.prepare_isolated import preload_mesh_libraries
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.making.prepare_isolated import preload_mesh_libraries
 from storage.errors import Rejected, TrilightError
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 if TYPE_CHECKING:
-    from pipeline.flows.settings import BuildSettings
-    from storage.records import ObjectRecord
-    from storage.sample import Sample
+    from pipeline.builds.settings import BuildSettings
+    from storage.records.objects import ObjectRecord
+    from storage.records.sample import Sample
 
 Result = TypeVar("Result")
 
@@ -168,8 +168,8 @@ class Workshop:
     @functools.cached_property
     def samples(self) -> "list[Sample]":
         """Scenes of `smoke` as a run would make them."""
-        from pipeline.flows.training_builds import smoke
-        from storage.changes import changed
+        from pipeline.builds.training import smoke
+        from storage.settings.changes import changed
 
         px = max(self.effort.picture_px, 2 * self.effort.resolution)
         child = self.child_of(changed(smoke(), {"renders.resolution": px}))

@@ -21,13 +21,13 @@ from infra.cli.options import Shown, command
 from pipeline.assets.settings import AssetSettings, Profile
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
-from storage.failures import count_by_reason
-from storage.ranges import Within
-from storage.safe_url import safe_url
-from storage.settings import checked, described
+from storage.records.failures import count_by_reason
+from storage.remote.safe_url import safe_url
+from storage.settings.described import checked, described
+from storage.settings.ranges import Within
 
 if TYPE_CHECKING:
-    from pipeline.flows.make_assets import AssetReport
+    from pipeline.making.make_assets import AssetReport
 
 _BUDGET = 1400
 """The finest level of the builds with 1536 triangles a scene."""
@@ -65,7 +65,7 @@ def assets(asked: Meshes, shown: Shown) -> None:
     settings = _settings(asked)
     source, out = asked.source, asked.out
     first_words(f"Meshes of {safe_url(source)} to {out}", silent=shown.json)
-    from pipeline.flows.make_assets import AssetFolder, make_assets
+    from pipeline.making.make_assets import AssetFolder, make_assets
 
     folder = AssetFolder(out)
     with progress_bars() as bars:

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.flows.builds import BUILDS, named_build
-from storage.splits import shards_for, split_of_object, split_of_shard
+from pipeline.builds.named import BUILDS, named_build
+from storage.dataset.splits import shards_for, split_of_object, split_of_shard
 
 _BUILD = "smoke"
 

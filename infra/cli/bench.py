@@ -8,7 +8,7 @@ from rich.table import Table
 from infra.bench.asked import Asked
 from infra.cli.console import console, first_words, progress_bars
 from infra.cli.options import command
-from storage.settings import checked
+from storage.settings.described import checked
 
 if TYPE_CHECKING:
     from infra.bench.experiment import Experiment

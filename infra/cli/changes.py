@@ -5,9 +5,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from storage.changes import changed
 from storage.errors import TrilightError
-from storage.settings import checked, settings_record
+from storage.settings.changes import changed
+from storage.settings.described import checked, settings_record
 
 if TYPE_CHECKING:
     from infra.cli.settings_file import Stated
@@ -108,7 +108,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str,
 
 def dataset_record(shared: Shared) -> dict[str, Any]:
     """Return the settings of the dataset that is to be followed, without the name of its build."""
-    from storage.dataset import open_dataset
+    from storage.dataset.dataset import open_dataset
 
     settings = {} if shared.like is None else open_dataset(shared.like).manifest.settings
     return {name: value for name, value in settings.items() if name not in ("build", "derived")}

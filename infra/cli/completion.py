@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 
 def _builds() -> list[str]:
-    from pipeline.flows.builds import BUILDS
+    from pipeline.builds.named import BUILDS
 
     return list(BUILDS)
 

@@ -5,9 +5,9 @@ from typing import Annotated
 
 from infra.cli.console import first_words, note, print_json, print_rows, progress_bars
 from infra.cli.options import Shown, command
-from pipeline.scenes.described_albedos import AlbedoOverOne
-from storage.ranges import Within
-from storage.settings import checked
+from pipeline.exchange.described_albedos import AlbedoOverOne
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 
 @checked()
@@ -31,8 +31,8 @@ class Conversion:
 @command("source", "target")
 def convert(asked: Conversion, shown: Shown) -> None:
     first_words(f"Converting {asked.source} to {asked.target}", silent=shown.json)
-    from pipeline.flows.convert_scene import convert_scene
-    from pipeline.flows.scene_source import scene_source
+    from pipeline.exchange.convert import convert_scene
+    from pipeline.exchange.open_scene import scene_source
 
     wanted = scene_source(
         asked.source,

@@ -4,8 +4,8 @@ import dataclasses
 from typing import Any
 
 from infra.cli.changes import Shared, all_changes, dataset_record
-from pipeline.flows.builds import named_build
-from pipeline.flows.order import DatasetOrder
+from pipeline.builds.named import named_build
+from pipeline.making.order import DatasetOrder
 
 _LICENCES = "allowed_licences"
 

@@ -55,7 +55,7 @@ def registered(option: str, value: Any) -> Any:
     if not isinstance(value, str) or not is_reference(value):
         return value
     if option == "build":
-        from pipeline.flows.builds import typed_build
+        from pipeline.builds.named import typed_build
 
         return typed_build(value)
     if option == "run":

@@ -9,10 +9,10 @@ from infra.cli.generate_progress import watched
 from infra.cli.generate_report import report
 from infra.cli.options import Shown, command
 from pipeline.flows.executors import find_executor
-from pipeline.flows.order import DatasetOrder
+from pipeline.making.order import DatasetOrder
 from pipeline.renders.variant import choose_variant
-from storage.output import dataset_folder
-from storage.settings import checked
+from storage.dataset.output import dataset_folder
+from storage.settings.described import checked
 
 
 @checked()

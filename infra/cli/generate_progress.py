@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from rich.progress import Progress as Bars
 
 from infra.cli.console import progress_bars
-from storage.layout import DatasetFolder
-from storage.progress import Progress, read_progress
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.progress import Progress, read_progress
 
 _POLL_S = 0.5
 

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from infra.cli.console import next_step, note, print_json, print_rows
 from pipeline.objects.licences import USER_PROVIDED
-from storage.failures import count_by_reason, read_failures
-from storage.layout import DatasetFolder
-from storage.manifest import Manifest, read_manifest
-from storage.objects_lock import read_objects_lock
-from storage.statistics import Statistics
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, read_manifest
+from storage.dataset.statistics import Statistics
+from storage.records.failures import count_by_reason, read_failures
+from storage.records.objects_lock import read_objects_lock
 
 if TYPE_CHECKING:
-    from pipeline.flows.dataset_run import Outcome
+    from pipeline.making.dataset_run import Outcome
 
 _MAX_NOTES = 20
 """Most notes that are printed."""

@@ -15,15 +15,15 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import Shown, command
-from storage.dataset import Dataset, open_dataset
-from storage.dataset_files import RemoteDatasetFiles
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.files import RemoteDatasetFiles
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.errors import TrilightError
-from storage.failures import count_by_reason
-from storage.layout import DatasetFolder
-from storage.ranges import Within
-from storage.safe_url import safe_url
-from storage.settings import checked
-from storage.statistics import Statistics, dataset_statistics
+from storage.records.failures import count_by_reason
+from storage.remote.safe_url import safe_url
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 if TYPE_CHECKING:
     from pipeline.documents.distributions import Distributions
@@ -100,8 +100,8 @@ def _folder_of_documents(opened: Dataset, out: Path | None) -> DatasetFolder | N
 
 def _inspect_scene(source: str, turntable: Path | None, *, json: bool) -> None:
     first_words(f"Reading {source}", silent=json)
-    from pipeline.flows.inspect_scene import inspect_scene
-    from pipeline.flows.scene_source import scene_source
+    from pipeline.exchange.open_scene import scene_source
+    from pipeline.making.inspect_scene import inspect_scene
 
     found = inspect_scene(scene_source(source), turntable)
     if json:

@@ -4,9 +4,9 @@
     def generate(order: DatasetOrder, shown: Shown) -> None: ...
 
 makes the argument BUILD, and an option of every other field. Each parameter of the function is a
-class of settings (storage.settings) and a section of the help, with the class's first sentence as
-its title. Words only become values here (infra.cli.words): the class checks them, and what it says
-of a wrong one then names the option.
+class of settings (storage.settings.described) and a section of the help, with the class's first
+sentence as its title. Words only become values here (infra.cli.words): the class checks them, and
+what it says of a wrong one then names the option.
 """
 
 import inspect
@@ -22,8 +22,8 @@ from infra.cli.completion import NAMES
 from infra.cli.extending import registered
 from infra.cli.words import FileName, choices_of, is_repeated, kind_of, takes_names, value_of
 from storage.errors import TrilightError
-from storage.ranges import shown_number
-from storage.settings import Described, checked, described, option_of
+from storage.settings.described import Described, checked, described, option_of
+from storage.settings.ranges import shown_number
 
 ALIASES = {
     "allow_licences": "--allow-licence",

@@ -16,12 +16,12 @@ from infra.cli.dataset_changes import with_shared
 from infra.cli.extending import extend_words
 from infra.cli.leaving import temporary_folder
 from infra.cli.options import Shown, command
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.order_words import generate_words
-from pipeline.flows.price import CorePrice
+from pipeline.making.order import DatasetOrder
+from pipeline.making.order_words import generate_words
+from pipeline.making.price import CorePrice
 from storage.errors import TrilightError
-from storage.ranges import Within
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 
 @checked()

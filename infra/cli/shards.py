@@ -11,8 +11,8 @@ from infra.cli.options import Shown, command
 from pipeline.shards.derive import Derive
 from pipeline.shards.plans import Selection
 from storage.errors import TrilightError
-from storage.ranges import Within
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 app = App(name="shards", help_epilogue="")
 
@@ -90,7 +90,7 @@ def reshard(asked: Resharded, new: NewDataset, shown: Shown) -> None:
 
 def _run(datasets: Sequence[Path], derive: Derive, out: Path, *, as_json: bool) -> None:
     first_words(f"Making {out}", silent=as_json)
-    from pipeline.flows.derive_dataset import derive_dataset  # slow: matplotlib
+    from pipeline.making.derive_dataset import derive_dataset  # slow: matplotlib
 
     places = [str(path) for path in datasets]
     with progress_bars() as bars:

@@ -11,13 +11,13 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import Shown, command
-from storage.asked import read_asked, value_of
-from storage.dataset import open_dataset
-from storage.derived import derivation_of
+from storage.dataset.asked import read_asked, value_of
+from storage.dataset.dataset import open_dataset
+from storage.dataset.derived import derivation_of
+from storage.dataset.verify import Verification, verify_dataset
+from storage.remote.safe_url import safe_url
 from storage.remote.url import RemoteUrl, parse_url
-from storage.safe_url import safe_url
-from storage.settings import checked
-from storage.verify import Verification, verify_dataset
+from storage.settings.described import checked
 
 
 @checked()

@@ -4,11 +4,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from infra.rendering.tone_maps import ToneMap
+from pipeline.exchange.described_albedos import AlbedoOverOne
 from pipeline.renders.settings import NoiseFloor, Resolution, Samples
-from pipeline.scenes.described_albedos import AlbedoOverOne
 from storage.errors import TrilightError
-from storage.ranges import Seed, Within
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import Seed, Within
 
 EngineChoice = Literal["mitsuba", "neural", "both"]
 """Path traced, by a network, or by both side by side."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_source import SceneSource, scene_source
+from pipeline.exchange.open_scene import SceneSource, scene_source
+from pipeline.exchange.reader import SceneReader
 from storage.errors import TrilightError
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

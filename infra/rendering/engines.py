@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import HALF_FLOAT_MAX
-from storage.material import PUBLISHED_COLUMNS, unread_columns
-from storage.scene import Scene
+from storage.records.material import PUBLISHED_COLUMNS, unread_columns
+from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
-    from pipeline.flows.render_scene import PathTracer
+    from pipeline.making.render_scene import PathTracer
 
 Fact = str | int | float
 

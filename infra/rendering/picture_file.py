@@ -15,8 +15,8 @@ from infra.rendering.engines import Engine, Fact, Rendered
 from storage.atomic import write_atomically
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.exr import decode_exr, encode_exr
-from storage.lights import rounded_to_half
+from storage.records.exr import decode_exr, encode_exr
+from storage.records.lights import rounded_to_half
 
 Radiance = NDArray[np.float32]
 """[R, R, 3] linear radiance."""

@@ -20,12 +20,12 @@ from infra.rendering.picture_file import (
 )
 from infra.rendering.places import PicturePlaces
 from pipeline.documents.png import encode_png
-from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_formats import FORMATS, LoadedScene, SceneSource
+from pipeline.exchange.formats import FORMATS, LoadedScene, SceneSource
+from pipeline.exchange.reader import SceneReader
 from storage.atomic import write_atomically
-from storage.lights import num_lights
 from storage.metrics import psnr_log_db
-from storage.scene_file import scene_digest
+from storage.records.lights import num_lights
+from storage.records.scene_file import scene_digest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class SceneIdentity:
     name: str
     """Its file, without folders."""
     digest: str
-    """storage.scene_file.scene_digest."""
+    """storage.records.scene_file.scene_digest."""
     num_triangles: int
     """All of them, emitting ones too."""
     num_lights: int

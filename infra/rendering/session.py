@@ -17,8 +17,8 @@ from infra.rendering.sources import scene_sources
 from infra.rendering.tone_maps import require_tone_map
 from infra.rendering.video import write_video
 from infra.torch_library import require_torch
-from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_source import SceneSource, scene_source
+from pipeline.exchange.open_scene import SceneSource, scene_source
+from pipeline.exchange.reader import SceneReader
 from pipeline.renders.settings import FIRST_SPP, RenderSettings, one_picture
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
@@ -142,7 +142,7 @@ def _engine(
 
 
 def _mitsuba(asked: Asked, settings: RenderSettings, watcher: RenderWatcher) -> Engine:
-    from pipeline.flows.render_scene import PathTracer
+    from pipeline.making.render_scene import PathTracer
 
     tracer = PathTracer(
         settings,

@@ -3,11 +3,11 @@
 import re
 from pathlib import Path
 
-from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_formats import SceneSource, readable
-from pipeline.flows.scene_source import scene_source
+from pipeline.exchange.formats import SceneSource, readable
+from pipeline.exchange.open_scene import scene_source
+from pipeline.exchange.reader import SceneReader
+from storage.dataset.shard_places import expanded
 from storage.errors import TrilightError
-from storage.shard_places import expanded
 
 
 def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
@@ -20,7 +20,7 @@ def scene_sources(text: str, reader: SceneReader) -> list[SceneSource]:
         reader: opens files that may hold many.
 
     Raises:
-        TrilightError: as `pipeline.flows.scene_source.scene_source`, or there is no scene.
+        TrilightError: as `pipeline.exchange.open_scene.scene_source`, or there is no scene.
     """
     if "://" not in text and Path(text).is_dir():
         return [scene_source(str(path)) for path in _scene_files(Path(text))]

@@ -12,8 +12,8 @@ import os
 import sys
 from collections.abc import Mapping
 
-from pipeline.flows.machine import visible_gpus
-from pipeline.flows.served.limits import DISK_LIMIT, GPU_LIMIT
+from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
+from pipeline.making.machine import visible_gpus
 from storage.errors import TrilightError
 
 _DISK_SLOTS = 2

@@ -33,13 +33,13 @@ from pathlib import Path
 
 from infra.serving.access import ROOT, grant, next_command, revoke, settings_file, state_folder
 from pipeline.flows.guarded_server import NAMES
-from pipeline.flows.machine import cores_owned, visible_gpus
 from pipeline.flows.prefect_server import (
     SERVER,
     TOLD_BY_ITS_STARTER,
     quiet_prefect,
     wait_until_healthy,
 )
+from pipeline.making.machine import cores_owned, visible_gpus
 from storage.atomic import write_atomically
 from storage.cache import open_private
 from storage.errors import TrilightError

@@ -17,10 +17,10 @@ from cyclopts import Parameter
 from model.open import BUILTIN, BUILTIN_WEIGHTS
 from model.weights import decode_weights, network_digest
 from storage.atomic import write_atomically
-from storage.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.objects_lock import read_objects_lock
+from storage.records.objects_lock import read_objects_lock
 from train.evaluation.judged_view import NETWORK
 from train.folder import RunFolder
 

@@ -10,13 +10,13 @@ from typing import Any, get_args
 
 from infra.rendering.asked import Asked
 from infra.serving.train_model import TrainOrder
+from pipeline.builds.settings import BuildSettings
 from pipeline.documents.markdown import table
-from pipeline.flows.price import CorePrice
-from pipeline.flows.served.orders import DatasetInRuns
-from pipeline.flows.settings import BuildSettings
-from storage.ranges import declared_ranges, shown_number
-from storage.scene import Scene
-from storage.settings import described, field_sentences
+from pipeline.flows.orders import DatasetInRuns
+from pipeline.making.price import CorePrice
+from storage.records.scene import Scene
+from storage.settings.described import described, field_sentences
+from storage.settings.ranges import declared_ranges, shown_number
 from train.evaluation.evaluate import Contest
 from train.evaluation.order import EvaluationOrder
 from train.settings import TrainSettings
@@ -35,9 +35,9 @@ ROOTS: dict[str, tuple[type, ...]] = {
 
 _HEAD = """# Settings
 
-Made by `make settings` from the descriptions at the fields (`storage/settings.py`), which are also
-what is checked and what the command line and Prefect's forms show: a value outside is refused in
-one line that names the field. Tests go to both ends of every range and one step outside
+Made by `make settings` from the descriptions at the fields (`storage/settings/described.py`), which
+are also what is checked and what the command line and Prefect's forms show: a value outside is
+refused in one line that names the field. Tests go to both ends of every range and one step outside
 (`tests/extremes/test_ranges.py`), and run what both ends make where that is cheap. Laws between
 fields, such as `min_spp` of at most `max_spp`, are not here: the complaint about one says what it
 expects. Every setting of a build or a run can be changed with `--set NAME=VALUE`, by its dotted

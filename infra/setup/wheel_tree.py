@@ -50,8 +50,8 @@ def with_prefix(source: str, name: str = "<source>") -> str:
         name: of the file, for messages.
 
     Raises:
-        SyntaxError: the source is none, or a statement such as `import storage.scene`, which binds
-            the name `storage` and has no form with a prefix: write `from storage import scene`.
+        SyntaxError: the source is none, or a statement such as `import storage.errors`, which binds
+            the name `storage` and has no form with a prefix: write `from storage import errors`.
     """
     lines = source.splitlines(keepends=True)
     for line, column in sorted(_places(ast.parse(source, name), name), reverse=True):

@@ -10,7 +10,7 @@ from typing import Any
 
 from model.config import NUM_TAPS, ModelConfig
 from storage.errors import TrilightError
-from storage.material import PUBLISHED_COLUMNS
+from storage.records.material import PUBLISHED_COLUMNS
 
 REGISTER_EPS = 1e-5
 """In the published registers' mean position."""

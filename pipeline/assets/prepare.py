@@ -20,8 +20,8 @@ from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.recipe import RECIPE
 from pipeline.assets.settings import AssetSettings
-from storage.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 from storage.errors import Rejected
+from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -12,7 +12,7 @@ from pipeline.assets.outside_rays import first_faces
 from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
-from storage.asset import Level
+from storage.records.asset import Level
 
 _TOWARDS_CAMERA = np.array([0.62, -0.62, 0.48])
 _BACKGROUND = 1.0

@@ -4,8 +4,8 @@ import dataclasses
 from typing import Annotated, Literal
 
 from storage.errors import TrilightError
-from storage.ranges import Within
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 Profile = Literal["faithful", "uniform"]
 

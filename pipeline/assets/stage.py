@@ -12,10 +12,10 @@ from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.store import AssetStore
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
-from storage.asset import Asset, Level, decode_asset
 from storage.digests import sha256_hex
 from storage.errors import Rejected
-from storage.records import Failure, ObjectRecord
+from storage.records.asset import Asset, Level, decode_asset
+from storage.records.objects import Failure, ObjectRecord
 
 if TYPE_CHECKING:
     from pipeline.assets.prepare import AssetAttempt

@@ -18,10 +18,10 @@ from pathlib import Path
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.recipe import RECIPE, code_sha256
 from pipeline.assets.settings import AssetSettings
-from storage.asset import Asset, encode_asset
 from storage.atomic import TEMPORARY_SUFFIX, write_atomically, write_error
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import Rejected
+from storage.records.asset import Asset, encode_asset
 
 _FAN_OUT = 2
 """Letters of the name that choose a sub-folder, so that no folder holds every outcome."""

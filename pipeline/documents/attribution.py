@@ -5,7 +5,7 @@ import io
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
-from storage.derived import derivation_of
+from storage.dataset.derived import derivation_of
 
 _COLUMNS = ("uid", "title", "licence", "licence_source", "attribution", "source_url", "changes")
 _REMESHED = "cleaned, remeshed and given new materials"

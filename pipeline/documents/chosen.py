@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from storage.conventions import SPLITS
-from storage.dataset import Dataset
-from storage.manifest import Manifest, ShardEntry
-from storage.sample import Sample
+from storage.dataset.dataset import Dataset
+from storage.dataset.manifest import Manifest, ShardEntry
+from storage.records.sample import Sample
 
 _LEAST_SHARE = 8
 """A split with few scenes is given up to this part of the places."""

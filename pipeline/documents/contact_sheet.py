@@ -7,10 +7,10 @@ from PIL import Image, ImageDraw, ImageFont
 from pipeline.documents.chosen import choose_scenes, read_chosen
 from storage.atomic import write_atomically
 from storage.conventions import preview_srgb8
-from storage.dataset import Dataset
-from storage.layout import DatasetFolder
-from storage.sample import Sample
-from storage.statistics import Statistics
+from storage.dataset.dataset import Dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.statistics import Statistics
+from storage.records.sample import Sample
 
 _TILE_PX = 192
 _MARGIN_PX = 8

@@ -11,8 +11,8 @@ from typing import Any
 
 from pipeline.documents.rights import Rights
 from storage.conventions import SPLITS
+from storage.dataset.manifest import Manifest, ShardEntry
 from storage.licences import licence_url
-from storage.manifest import Manifest, ShardEntry
 
 _CONTEXT: Mapping[str, Any] = {
     "@language": "en",

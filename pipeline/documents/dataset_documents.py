@@ -8,9 +8,9 @@ from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.report import write_report
 from pipeline.documents.rights import encode_licences, rights_of
 from storage.atomic import write_atomically
-from storage.dataset import Dataset
-from storage.layout import DatasetFolder
-from storage.statistics import Statistics, dataset_statistics
+from storage.dataset.dataset import Dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.statistics import Statistics, dataset_statistics
 
 
 def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Statistics:

@@ -10,11 +10,11 @@ import numpy as np
 from pipeline.documents.quantities import QUANTITIES, summary
 from pipeline.documents.scene_facts import Values, scene_values, surfaces
 from storage.conventions import SPLITS
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
+from storage.dataset.manifest import Manifest
 from storage.errors import TrilightError
-from storage.manifest import Manifest
-from storage.records import Failure, LockedObject
-from storage.sample import SceneRecord
+from storage.records.objects import Failure, LockedObject
+from storage.records.sample import SceneRecord
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

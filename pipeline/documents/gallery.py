@@ -6,11 +6,11 @@ from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
 from pipeline.documents.html import Markup, element, image, joined, png_uri
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, preview
 from storage.atomic import write_atomically
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
+from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
-from storage.records import Failure
-from storage.sample import Sample
+from storage.records.objects import Failure
+from storage.records.sample import Sample
 
 MOST_SCENES = 1000
 """Pages that one folder may hold."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.documents.figures import drawing, encoded, histogram, panels
 from pipeline.documents.html import Markup, element, image, joined, page, png_uri, table
-from storage.asset_rows import AssetRow
-from storage.records import Failure
+from storage.records.asset_rows import AssetRow
+from storage.records.objects import Failure
 
 _STYLE = """
 .pair { display: inline-block; width: 530px; margin: 0 1.2rem 1.2rem 0; vertical-align: top }

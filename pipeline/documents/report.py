@@ -14,8 +14,8 @@ from pipeline.documents.gallery import write_gallery
 from pipeline.documents.html import Markup, element, joined, page, table
 from pipeline.documents.quantities import summary
 from storage.atomic import write_atomically
-from storage.dataset import Dataset
-from storage.layout import DatasetFolder
+from storage.dataset.dataset import Dataset
+from storage.dataset.layout import DatasetFolder
 
 _STYLE = """
 .pair { display: flex; gap: 2rem; align-items: flex-start }

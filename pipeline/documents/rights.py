@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pipeline.documents.markdown import code, table
 from storage.licences import DUTIES, duties_of, licence_url, union_of_duties
-from storage.records import LockedObject
+from storage.records.objects import LockedObject
 
 _HUB_LICENCES = frozenset(
     "0bsd apache-2.0 bsd-2-clause bsd-3-clause cc-by-2.0 cc-by-2.5 cc-by-3.0 cc-by-4.0 "

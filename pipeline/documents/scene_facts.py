@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
-from storage.sample import SceneRecord
-from storage.scene import Scene
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.records.sample import SceneRecord
+from storage.records.scene import Scene
 
 Values = NDArray[np.float32]
 

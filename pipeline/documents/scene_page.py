@@ -21,10 +21,10 @@ from pipeline.documents.html import (
 )
 from pipeline.documents.scene_facts import cameras, lights, surfaces
 from storage.conventions import preview_srgb8, srgb8
-from storage.material import DIFFUSE
-from storage.records import Failure
-from storage.sample import Sample
-from storage.scene import Scene
+from storage.records.material import DIFFUSE
+from storage.records.objects import Failure
+from storage.records.sample import Sample
+from storage.records.scene import Scene
 
 _PICTURE_PX = 384
 _MOST_SWATCHES = 128

@@ -7,9 +7,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from storage.atomic import write_atomically
 from storage.conventions import preview_srgb8
-from storage.dataset import Dataset
-from storage.layout import DatasetFolder
-from storage.manifest import ShardEntry
+from storage.dataset.dataset import Dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import ShardEntry
 
 _TILE_PX = 192
 _MARGIN_PX = 4

@@ -4,14 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipeline.flows.order import DatasetOrder
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
+from pipeline.making.order import DatasetOrder
 from storage.errors import TrilightError
 from storage.registry import Registry
 from storage.suggestion import expected_one_of
 
 if TYPE_CHECKING:
-    from pipeline.flows.dataset_run import Outcome
+    from pipeline.making.dataset_run import Outcome
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +27,8 @@ class Executor:
 
 
 def _on_threads(order: DatasetOrder, address: str | None) -> "Outcome":
-    from pipeline.flows.dataset_run import make_dataset  # slow, since it brings every stage
-    from pipeline.flows.runners import ThreadRunner
+    from pipeline.making.dataset_run import make_dataset  # slow, since it brings every stage
+    from pipeline.making.runners import ThreadRunner
 
     return make_dataset(order, ThreadRunner())
 
@@ -37,7 +37,7 @@ def _on_dask(order: DatasetOrder, address: str | None) -> "Outcome":
     assert address is not None
     quiet_prefect()
     with prefect_server():
-        from pipeline.flows.served.on_dask import make_on_dask
+        from pipeline.flows.on_dask import make_on_dask
 
         return make_on_dask(order, address)
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from pipeline.objects.builtin.families import FAMILIES
 from pipeline.objects.builtin.grids import Mesh
+from pipeline.objects.ply import encode_ply
 from storage.atomic import write_atomically
+from storage.dataset.layout import numbered
 from storage.errors import TrilightError
-from storage.layout import numbered
-from storage.ply import encode_ply
-from storage.records import ObjectRecord
+from storage.records.objects import ObjectRecord
 from storage.seeds import rng_for
 from storage.suggestion import expected_one_of
 

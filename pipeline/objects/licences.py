@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from pipeline.objects.listing import failure
 from storage.errors import TrilightError
-from storage.records import Failure, ObjectRecord
-from storage.safe_url import printable
+from storage.records.objects import Failure, ObjectRecord
+from storage.remote.safe_url import printable
 
 USER_PROVIDED = "LicenseRef-user-provided"
 """Of files that a user names without a catalogue: theirs to use, as far as we can know."""

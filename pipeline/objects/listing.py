@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from storage.records import Failure, ObjectRecord
+from storage.records.objects import Failure, ObjectRecord
 
 Fetched = tuple[list[ObjectRecord], list[Failure]]
 CountDone = Callable[[int, int], None]

@@ -17,8 +17,8 @@ from pipeline.objects.listing import Listing
 from pipeline.objects.registry import SourceQuery, source_of
 from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
-from storage.records import Failure, ObjectRecord
-from storage.safe_url import printable, safe_url
+from storage.records.objects import Failure, ObjectRecord
+from storage.remote.safe_url import printable, safe_url
 
 ENVIRONMENT = "env:"
 """Begins a source that names an environment variable: the way for URLs that hold a secret."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 
 from pipeline.objects.listing import CountDone, Fetched, failure
-from storage.records import Failure, ObjectRecord
+from storage.records.objects import Failure, ObjectRecord
 from storage.remote.tries import TransferFailed
 
 

@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 
 from pipeline.objects.listing import failure
-from storage.records import Failure
-from storage.safe_url import printable
+from storage.records.objects import Failure
+from storage.remote.safe_url import printable
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 """Of the files that are objects; compared in lower case."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import alpha_ggx
-from storage.material import DIFFUSE, ROUGHNESS, SPECULAR
+from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR
 
 MIN_ALPHA = 1e-4
 """Floor of the GGX width: a roughness of 0.01, the smoothest that scenes draw.

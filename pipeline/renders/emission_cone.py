@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 _MARGIN = 1.001
 """The sphere is too large by this: nothing lies on the rim of a cone, where roundings decide."""

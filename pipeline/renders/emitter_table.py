@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import own_floats
 from storage.errors import Rejected
-from storage.material import EMISSION
-from storage.scene import Scene
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
 
 _ONE_MINUS_EPSILON = 0.99999994
 

@@ -1,7 +1,7 @@
 """Chooses the tracer for the variant that runs."""
 
 from pipeline.renders.tracer import Tracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 
 def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> Tracer:

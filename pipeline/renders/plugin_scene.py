@@ -17,8 +17,8 @@ from pipeline.renders.compensated_texture import PLUGIN, register_plugin
 from pipeline.renders.multiscatter import scattered_again
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
-from storage.material import EMISSION
-from storage.scene import Scene
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
 
 _TWIN_OFFSET = 1e-4
 """World units between a twin and the emitter itself: ten times what shadow rays stop short."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.plugin_scene import plugin_feature_scene, plugin_scene
 from pipeline.renders.tracer import Features, HostSum
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 _BLOCK_SIZE = 8
 """Pixels; fixed, because the random numbers of `scalar_rgb` belong to blocks."""

@@ -30,8 +30,8 @@ from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features, Tracer
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected
-from storage.lights import MAX_LIGHTS, light_rows, rounded_to_half, sum_of_lights
-from storage.scene import Scene
+from storage.records.lights import MAX_LIGHTS, light_rows, rounded_to_half, sum_of_lights
+from storage.records.scene import Scene
 from storage.seeds import seed_for
 
 
@@ -55,7 +55,7 @@ class RenderedView:
     """[R, R] whether the ray through the pixel's centre meets geometry (emitters do not count)."""
     lights_rgb: NDArray[np.float32] | None = None
     """With `per_light`: [L, R, R, 3] radiance of each emitter object alone, rounded to half floats;
-    `radiance_rgb` is their storage.lights.sum_of_lights in every bit."""
+    `radiance_rgb` is their storage.records.lights.sum_of_lights in every bit."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB
-from storage.ranges import Within
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 PASS_SPP = (64, 16, 4)
 """Samples per pixel of one pass of a half, from best to cheapest: squares, as the sampler needs.
@@ -66,8 +66,8 @@ class RenderSettings:
     min_mean_radiance: Annotated[float, Within(0, HALF_FLOAT_MAX)] = 0.01
     """A view whose first samples are darker than this on average is rejected as black_view."""
     per_light: bool = False
-    """Render each emitter alone as well, and make the picture their sum (storage.lights). It takes
-    about as many times as long as there are emitters."""
+    """Render each emitter alone as well, and make the picture their sum (storage.records.lights).
+    It takes about as many times as long as there are emitters."""
 
     def __post_init__(self) -> None:
         _require(

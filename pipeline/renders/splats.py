@@ -11,8 +11,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from storage.material import EMISSION
-from storage.scene import Scene
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
 
 _STEPS = 34
 """A unit is the radiance of the brightest emitter over 2^33 to 2^34: what is dimmer is lost."""

@@ -16,7 +16,7 @@ from pipeline.renders.blend import lobes_of
 from pipeline.renders.device_memory import own_floats
 from pipeline.renders.ggx import KernelLobes
 from pipeline.renders.multiscatter import scattered_again
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 _GROUPS = 8
 """Groups of four floats per row."""

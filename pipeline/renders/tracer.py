@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

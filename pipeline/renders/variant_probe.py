@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.denoiser import DenoiserDevice, card_is_supported, set_denoiser_device
 from pipeline.renders.probe_picture import DEVIATION_RGB, MEAN_RGB
 from storage.conventions import look_at_c2w
-from storage.material import completed_rows
-from storage.scene import ObjectKind, Scene, SceneObject
+from storage.records.material import completed_rows
+from storage.records.scene import ObjectKind, Scene, SceneObject
 
 BLOCK = 4
 """Pixels each way whose mean is compared: of single ones, a few bright samples decide."""

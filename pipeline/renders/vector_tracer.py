@@ -25,7 +25,7 @@ from pipeline.renders.path_kernel import trace
 from pipeline.renders.splats import Splats, splat_unit
 from pipeline.renders.surface_table import SurfaceTable
 from pipeline.renders.tracer import Features, split_triangles
-from storage.scene import Scene
+from storage.records.scene import Scene
 from storage.seeds import seed_for
 
 LIGHT_PATHS = 0.25

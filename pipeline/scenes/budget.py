@@ -12,8 +12,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.asset import Asset, Level
 from storage.errors import Rejected
+from storage.records.asset import Asset, Level
 
 Entry = TypeVar("Entry")
 

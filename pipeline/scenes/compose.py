@@ -22,7 +22,7 @@ from scene_templates.layout_rand import layout_rand
 from scene_templates.plans import ScenePlan, scene_plan
 from scene_templates.settings import SceneSettings
 from storage.errors import TrilightError
-from storage.scene import Scene, SceneObject
+from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
 
 

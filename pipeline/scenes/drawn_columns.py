@@ -1,10 +1,10 @@
-"""Random values of material columns that were declared with a draw (storage.material)."""
+"""Random values of material columns that were declared with a draw (storage.records.material)."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
-from storage.material import EMISSION, laid_out
+from storage.records.material import EMISSION, laid_out
 from storage.seeds import rng_for
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected, TrilightError
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 
 def require_laws(scene: Scene, settings: SceneSettings) -> None:

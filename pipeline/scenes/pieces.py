@@ -10,8 +10,8 @@ from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.errors import Rejected
-from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
-from storage.scene import SceneObject
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
+from storage.records.scene import SceneObject
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -23,7 +23,7 @@ class ScenePiece:
     mesh: ShadedMesh
     """In world space."""
     materials: NDArray[np.float32]
-    """[M, 10 or more], every declared column (storage.material)."""
+    """[M, 10 or more], every declared column (storage.records.material)."""
     material_index: NDArray[np.int64]
     """[T] row of `materials`."""
 

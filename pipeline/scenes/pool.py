@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from storage.asset import Asset
 from storage.licences import share_alike_camp
-from storage.records import LockedObject
+from storage.records.asset import Asset
+from storage.records.objects import LockedObject
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -5,8 +5,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.contents.rotations import rotated
 from scene_templates.layout import Pose
+from scene_templates.rotations import rotated
 
 SMALLEST_DOUBLE_AREA = 1e-12
 """A triangle of a square micrometre: no ray meets it, and its normal is rounding."""

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scenes.posing import in_unit_sphere
-from scene_templates.contents.rotations import rotated
 from scene_templates.layout import Pose
-from storage.asset import Level
+from scene_templates.rotations import rotated
 from storage.errors import Rejected
+from storage.records.asset import Level
 
 
 class MeshShape:
-    """One level of an asset in the unit sphere; see scene_templates.contents.placement.Shape."""
+    """One level of an asset in the unit sphere; see scene_templates.placement.Shape."""
 
     def __init__(self, uid: str, level: Level, centring: Literal["vertex_mean", "box"]) -> None:
         """Bring a level of the object `uid` into the unit sphere.

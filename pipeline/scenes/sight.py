@@ -14,7 +14,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 SHADOW_OFFSET = 1e-4
 """Where shadow rays start above a surface; hits in single precision are good to about 1e-6."""

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.sight import Sight, ViewFacts
 from scene_templates.settings import SceneSettings, ViewLaws
-from scene_templates.templates.registry import TEMPLATES
+from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
-from storage.scene import Scene
+from storage.records.scene import Scene
 from storage.seeds import rng_for
 
 CAMERA_ATTEMPTS = 16

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from storage.dataset_settings import SplitSettings
-from storage.derived import derivation_of
+from storage.dataset.derived import derivation_of
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
+from storage.dataset.splits import shards_for
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
-from storage.manifest import Manifest, ShardEntry, index_shard, read_manifest
-from storage.objects_lock import read_objects_lock
-from storage.profiles import PACKED, PLAIN, unpack_arrays
-from storage.records import LockedObject
-from storage.safe_url import safe_url
-from storage.splits import shards_for
+from storage.records.objects import LockedObject
+from storage.records.objects_lock import read_objects_lock
+from storage.records.profiles import PACKED, PLAIN, unpack_arrays
+from storage.remote.safe_url import safe_url
+from storage.settings.dataset import SplitSettings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -19,14 +19,11 @@ from pathlib import Path
 from pipeline.shards.notes import note_of, note_shard, noted_shard
 from pipeline.shards.pack import rejections_of_shard
 from storage.atomic import write_atomically
-from storage.claims import claimed
-from storage.dataset import Dataset
-from storage.dataset_files import RemoteDatasetFiles
-from storage.digests import sha256_hex
-from storage.errors import TrilightError
-from storage.failures import decode_failures, read_failures, write_failures
-from storage.layout import DatasetFolder
-from storage.manifest import (
+from storage.dataset.claims import claimed
+from storage.dataset.dataset import Dataset
+from storage.dataset.files import RemoteDatasetFiles
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import (
     SHARD_NAME,
     Manifest,
     ShardEntry,
@@ -36,10 +33,13 @@ from storage.manifest import (
     shard_of_row,
     write_manifest,
 )
+from storage.dataset.scene_log import log_name
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.records.failures import decode_failures, read_failures, write_failures
 from storage.remote.bucket import Bucket
 from storage.remote.cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_url
-from storage.scene_log import log_name
 
 _PLANNED = ".staging/planned/"
 """Below it stands a file for each number of scenes that was asked for; the largest counts."""

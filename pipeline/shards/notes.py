@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 
 from storage.atomic import write_atomically
-from storage.layout import DatasetFolder
-from storage.manifest import ShardEntry, index_shard, shard_of_row, shard_row
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import ShardEntry, index_shard, shard_of_row, shard_row
 
 
 def note_shard(folder: DatasetFolder, shard: ShardEntry) -> None:

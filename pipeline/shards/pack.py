@@ -3,13 +3,13 @@
 import shutil
 from pathlib import Path
 
-from storage.failures import write_failures
-from storage.layout import DatasetFolder
-from storage.manifest import ShardEntry, index_shard
-from storage.records import Failure
-from storage.sample import sample_key
-from storage.shard_writer import write_shard
-from storage.staging import read_staged_scene
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import ShardEntry, index_shard
+from storage.dataset.shard_writer import write_shard
+from storage.dataset.staging import read_staged_scene
+from storage.records.failures import write_failures
+from storage.records.objects import Failure
+from storage.records.sample import sample_key
 
 
 def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardEntry:

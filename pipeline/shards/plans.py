@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pipeline.shards.finished import FinishedDataset, SceneFacts, read_facts
 from storage.conventions import SPLITS
 from storage.errors import TrilightError
-from storage.records import LockedObject
-from storage.sample import sample_key
+from storage.records.objects import LockedObject
+from storage.records.sample import sample_key
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.safe_url import printable, safe_text
+from storage.remote.safe_url import printable, safe_text
 
 if TYPE_CHECKING:
     from storage.remote.pace import Pace

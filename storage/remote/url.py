@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import parse_qsl, quote, unquote
 
 from storage.errors import TrilightError
-from storage.safe_url import printable, safe_text
+from storage.remote.safe_url import printable, safe_text
 
 PACKAGES = {
     "http": "aiohttp",

@@ -8,8 +8,8 @@ from typing import Any
 
 from infra.bench.catalogue import every_experiment
 from infra.cli.render import render
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.settings import BuildSettings
+from pipeline.builds.settings import BuildSettings
+from pipeline.making.order import DatasetOrder
 from train.settings import TrainSettings
 
 

@@ -23,8 +23,8 @@ def _loaded_by(statement: str) -> set[str]:
     "statement",
     [
         "import storage",
-        "import storage.dataset, storage.verify, storage.staging, storage.shard_writer",
-        "import scene_templates.templates.registry, scene_templates.settings",
+        "from storage.dataset import dataset, verify, staging, shard_writer",
+        "import scene_templates.templates, scene_templates.settings",
     ],
 )
 def test_the_waist_and_the_templates_are_light(statement: str) -> None:
@@ -32,7 +32,8 @@ def test_the_waist_and_the_templates_are_light(statement: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "statement", ["import storage.training_data, storage.sample", "import train.data.stream"]
+    "statement",
+    ["import storage.dataset.training_data, storage.records.sample", "import train.data.stream"],
 )
 def test_what_streams_shards_needs_no_checker_of_settings(statement: str) -> None:
     """Workers start often, and only read: nobody sets anything there."""
@@ -50,7 +51,7 @@ def test_the_face_is_light_until_it_is_used() -> None:
 
 
 def test_settings_are_light() -> None:
-    assert not _loaded_by("import pipeline.flows.builds") & set(HEAVY)
+    assert not _loaded_by("import pipeline.builds.named") & set(HEAVY)
 
 
 def test_help_needs_no_heavy_library() -> None:
@@ -58,4 +59,4 @@ def test_help_needs_no_heavy_library() -> None:
 
 
 def test_making_data_needs_no_torch() -> None:
-    assert "torch" not in _loaded_by("import pipeline.flows.served.generate_scenes")
+    assert "torch" not in _loaded_by("import pipeline.flows.generate_scenes")

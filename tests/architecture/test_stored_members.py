@@ -17,9 +17,9 @@ from pipeline.documents.scene_facts import scene_values
 from pipeline.documents.scene_page import Neighbours, encode_scene_page
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.exr import decode_exr, encode_exr
-from storage.lights import decode_lights_exr, encode_lights_exr, num_lights
-from storage.sample import Sample, decode_sample, decode_scene, encode_sample
+from storage.records.exr import decode_exr, encode_exr
+from storage.records.lights import decode_lights_exr, encode_lights_exr, num_lights
+from storage.records.sample import Sample, decode_sample, decode_scene, encode_sample
 from tests.scenes_by_hand import tiny_sample
 from train.data.scenes import TrainingScene, training_scene
 

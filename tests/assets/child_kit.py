@@ -20,7 +20,7 @@ from pipeline.assets.prepare import AssetAttempt, prepare_asset
 from pipeline.assets.settings import AssetSettings
 from pipeline.isolation import ChildLimits, IsolatedChild, preload
 from storage.errors import Rejected, TrilightError
-from storage.records import ObjectRecord
+from storage.records.objects import ObjectRecord
 from tests.assets.meshes_by_hand import record_of
 
 LIMITS = ChildLimits(memory_bytes=3 << 30, wall_s=60, cpu_s=20, calls_per_child=50)

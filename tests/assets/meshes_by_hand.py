@@ -15,9 +15,9 @@ from pipeline.assets.prepare import prepare_asset
 from pipeline.assets.settings import AssetSettings
 from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadric
 from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
-from storage.asset import Asset, Level
 from storage.errors import Rejected
-from storage.records import ObjectRecord
+from storage.records.asset import Asset, Level
+from storage.records.objects import ObjectRecord
 
 
 def record_of(path: Path, uid: str = "object") -> ObjectRecord:

@@ -3,8 +3,8 @@
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset, prepare_assets
 from pipeline.assets.store import AssetStore
-from storage.asset import Asset, decode_asset
-from storage.records import Failure
+from storage.records.asset import Asset, decode_asset
+from storage.records.objects import Failure
 from tests.assets.child_kit import Bench
 
 FIRST, SECOND, THIRD = "pymeshlab_collapse", "meshoptimizer", "meshoptimizer_sloppy"

@@ -7,8 +7,8 @@ import pytest
 
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings, GateSettings
-from storage.asset import Level
 from storage.errors import Rejected
+from storage.records.asset import Level
 from tests.assets.meshes_by_hand import cube, grid_faces, knot, moved, prepare, write_obj
 
 BUDGET = 1400

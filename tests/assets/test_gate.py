@@ -9,8 +9,8 @@ from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.gate import check_level
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.settings import GateSettings
-from storage.asset import LevelQuality
 from storage.errors import Rejected
+from storage.records.asset import LevelQuality
 from tests.assets.meshes_by_hand import cleaned, cube, grid_faces, joined, knot, moved, sphere
 
 Spoil = Callable[[TriangleMesh], TriangleMesh]

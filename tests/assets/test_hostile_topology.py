@@ -14,9 +14,9 @@ from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import prepare_assets
 from pipeline.assets.store import AssetStore
-from pipeline.flows.prepare_isolated import asset_child
 from pipeline.isolation import IsolatedChild
-from storage.asset import Asset, decode_asset
+from pipeline.making.prepare_isolated import asset_child
+from storage.records.asset import Asset, decode_asset
 from tests.assets.meshes_by_hand import (
     cube,
     joined,

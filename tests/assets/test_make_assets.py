@@ -15,11 +15,11 @@ import trimesh
 
 from infra.cli import assets
 from pipeline.assets.settings import AssetSettings
-from pipeline.flows.make_assets import AssetFolder, AssetReport, make_assets
+from pipeline.making.make_assets import AssetFolder, AssetReport, make_assets
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
-from storage.failures import read_failures
+from storage.records.failures import read_failures
 from tests.assets.meshes_by_hand import cube, sphere, write_obj
 from tests.conftest import ROOT
 

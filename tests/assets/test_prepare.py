@@ -16,8 +16,8 @@ from pipeline.assets.quality.distance import Surface
 from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings, GateSettings
-from storage.asset import Asset, decode_asset, encode_asset
 from storage.errors import TrilightError
+from storage.records.asset import Asset, decode_asset, encode_asset
 from tests.assets.meshes_by_hand import (
     WRITERS,
     cleaned,
@@ -175,7 +175,7 @@ def test_assets_survive_the_disk(asset: Asset) -> None:
 def test_two_processes_write_the_same_bytes(tmp_path: Path, asset: Asset) -> None:
     path = write_obj(tmp_path / "knot.obj", knot())
     code = (
-        "import hashlib, sys; from storage.asset import encode_asset;"
+        "import hashlib, sys; from storage.records.asset import encode_asset;"
         "from tests.assets.meshes_by_hand import prepare; from pathlib import Path;"
         "asset = prepare(Path(sys.argv[1]));"
         "print(hashlib.sha256(encode_asset(asset)).hexdigest())"

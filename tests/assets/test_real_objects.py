@@ -8,8 +8,8 @@ import pytest
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.objects.sources import find_objects
-from storage.asset import Asset
-from storage.records import ObjectRecord
+from storage.records.asset import Asset
+from storage.records.objects import ObjectRecord
 from tests.assets.meshes_by_hand import prepare
 
 SETTINGS = AssetSettings()

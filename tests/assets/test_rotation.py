@@ -12,7 +12,7 @@ from pipeline.assets.cleaning.clean import GRID
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.distance import Surface
 from pipeline.assets.settings import AssetSettings
-from storage.asset import Asset
+from storage.records.asset import Asset
 from tests.assets.meshes_by_hand import geometry, knot, mesh_of, moved, prepare, write_obj
 
 BUDGETS = (1000, 500)

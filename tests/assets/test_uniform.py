@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
-from storage.asset import LevelQuality
+from storage.records.asset import LevelQuality
 from tests.assets.meshes_by_hand import cube, knot, moved, prepare, sphere, write_obj
 
 UNIFORM = "pymeshlab_uniform"

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from storage.dataset import Dataset, open_dataset
-from storage.failures import write_failures
-from storage.layout import DatasetFolder
-from storage.manifest import Manifest, index_shard, write_manifest
-from storage.objects_lock import write_objects_lock
-from storage.records import Failure, LockedObject
-from storage.sample import Sample, encode_sample, sample_key
-from storage.scene import Scene, SceneObject
-from storage.shard_writer import write_shard
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.shard_writer import write_shard
+from storage.records.failures import write_failures
+from storage.records.objects import Failure, LockedObject
+from storage.records.objects_lock import write_objects_lock
+from storage.records.sample import Sample, encode_sample, sample_key
+from storage.records.scene import Scene, SceneObject
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 RED, GREEN = [0.6, 0, 0, 0.1, 0.1, 0.1, 0.3, 0, 0, 0], [0.2, 0.4, 0, 0.1, 0.1, 0.1, 0.3, 0, 0, 0]

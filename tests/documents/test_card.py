@@ -16,9 +16,9 @@ from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.markdown import code, front_matter, plain, text
 from pipeline.documents.rights import encode_licences, rights_of
-from storage.dataset import Dataset, open_dataset
-from storage.objects_lock import read_objects_lock, write_objects_lock
-from storage.profiles import Profile
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.records.objects_lock import read_objects_lock, write_objects_lock
+from storage.records.profiles import Profile
 from tests.documents.dataset_by_hand import edit_manifest, five_scenes, furnished, locked, sample
 from tests.flows.derive_kit import finished
 

@@ -5,8 +5,8 @@ import itertools
 import pytest
 
 from pipeline.documents.chosen import choose_scenes
-from storage.manifest import Manifest, ShardEntry
-from storage.member_table import MemberTable
+from storage.dataset.manifest import Manifest, ShardEntry
+from storage.dataset.member_table import MemberTable
 
 
 def manifest(**counts: int) -> Manifest:

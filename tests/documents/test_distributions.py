@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.documents.distributions import Distributions, dataset_distributions
 from pipeline.documents.quantities import QUANTITIES, STATISTICS, summary
-from storage.dataset import open_dataset
+from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
-from storage.sample import Sample
+from storage.records.sample import Sample
 from tests.documents.dataset_by_hand import five_scenes, furnished, sample, write_dataset
 
 FLOAT32 = 1e-6

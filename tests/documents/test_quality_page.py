@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.documents.quality_page import Pair, encode_quality_page
-from storage.asset_rows import AssetRow
-from storage.records import Failure
+from storage.records.asset_rows import AssetRow
+from storage.records.objects import Failure
 from tests.documents.pages_read import HARM, Tags, read
 from tests.documents.rows_by_hand import row
 

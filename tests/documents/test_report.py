@@ -9,11 +9,11 @@ import pytest
 from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.gallery import write_gallery
 from pipeline.documents.report import write_report
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
+from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
-from storage.records import Failure
-from storage.scene import SceneObject
+from storage.records.objects import Failure
+from storage.records.scene import SceneObject
 from tests.documents.dataset_by_hand import five_scenes, furnished, locked, sample, write_dataset
 from tests.documents.pages_read import HARM, Tags, read
 

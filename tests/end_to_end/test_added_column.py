@@ -17,18 +17,18 @@ from infra.rendering.engines import MitsubaEngine
 from model.neural_renderer import NeuralRenderer
 from model.open import open_network, save_published
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
-from pipeline.flows.convert_scene import write_scene
-from pipeline.flows.inspect_scene import _facts
-from pipeline.flows.render_scene import PathTracer
-from pipeline.flows.scene_source import load_source, scene_source
-from scene_templates.families.default_families import DEFAULT_FAMILIES
+from pipeline.exchange.convert import write_scene
+from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.making.inspect_scene import _facts
+from pipeline.making.render_scene import PathTracer
+from scene_templates.default_families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
+from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
-from storage.material import EMISSION, PUBLISHED_COLUMNS
-from storage.scene import Scene
-from storage.scene_file import scene_digest
-from storage.training_data import open_training_data
+from storage.records.material import EMISSION, PUBLISHED_COLUMNS
+from storage.records.scene import Scene
+from storage.records.scene_file import scene_digest
 from tests.columns_kit import COAT, TINT, WITH_COAT, declared
 from tests.model.kit import awake, tiny_config
 from tests.scenes.small_pool import first_scene, small_pool

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage.dataset import open_dataset
-from storage.manifest import shard_row
-from storage.verify import verify_dataset
+from storage.dataset.dataset import open_dataset
+from storage.dataset.manifest import shard_row
+from storage.dataset.verify import verify_dataset
 from tests.documents.dataset_by_hand import five_scenes
 from tests.end_to_end.conftest import kill_one, marked_environment, num_meshes, processes_with
 from tests.end_to_end.production_kit import call, postgres, served, start_served, stop_served

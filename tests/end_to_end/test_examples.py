@@ -13,15 +13,15 @@ import pytest
 
 from infra.cli.extending import extended
 from model.config import SIZES, ModelConfig
-from pipeline.flows.builds import BUILDS, named_build, typed_build
-from pipeline.flows.convert_scene import write_scene
+from pipeline.builds.named import BUILDS, named_build, typed_build
+from pipeline.exchange.convert import write_scene
+from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.flows.executors import EXECUTORS
-from pipeline.flows.scene_source import load_source, scene_source
 from pipeline.objects.sources import find_objects, look_at_source
-from storage.changes import changed
+from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
-from storage.manifest import read_manifest
-from storage.scene_file import decode_scene_file, encode_scene
+from storage.records.scene_file import decode_scene_file, encode_scene
+from storage.settings.changes import changed
 from tests.end_to_end.conftest import Trilight
 from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
 from tests.scene_templates.balls import one_drawn

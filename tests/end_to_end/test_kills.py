@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from pipeline.isolation import is_passing
-from storage.dataset import open_dataset
-from storage.verify import verify_dataset
+from storage.dataset.dataset import open_dataset
+from storage.dataset.verify import verify_dataset
 from tests.end_to_end.conftest import (
     command,
     kill_one,

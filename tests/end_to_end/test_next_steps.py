@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from storage.manifest import read_manifest
+from storage.dataset.manifest import read_manifest
 from tests.end_to_end.conftest import Trilight
 
 SMALL = ("--resolution", "64", "--noise-floor", "15")

@@ -12,8 +12,8 @@ import pytest
 
 from model.neural_renderer import NeuralRenderer
 from storage.cache import cache_folder
-from storage.dataset import open_dataset
-from storage.verify import verify_dataset
+from storage.dataset.dataset import open_dataset
+from storage.dataset.verify import verify_dataset
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import (
     START,

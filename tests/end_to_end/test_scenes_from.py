@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import open_dataset
-from storage.failures import read_failures
-from storage.layout import DatasetFolder
-from storage.staging import stage_scene
+from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.staging import stage_scene
+from storage.records.failures import read_failures
 from tests.end_to_end.conftest import Trilight
 
 SMALL = (

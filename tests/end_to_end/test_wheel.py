@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import open_dataset
-from storage.scene_file import encode_scene, read_scene_file
+from storage.dataset.dataset import open_dataset
+from storage.records.scene_file import encode_scene, read_scene_file
 from tests.conftest import ROOT
 from tests.scenes_by_hand import tiny_scene
 

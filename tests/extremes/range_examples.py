@@ -12,24 +12,24 @@ from infra.serving.train_model import TrainOrder
 from infra.setup.settings_page import ROOTS, reachable
 from model.config import ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings
-from pipeline.flows.builds import named_build
-from pipeline.flows.price import CorePrice
-from pipeline.flows.served.orders import DatasetInRuns
-from pipeline.flows.settings import BuildSettings
+from pipeline.builds.named import named_build
+from pipeline.builds.settings import BuildSettings
+from pipeline.flows.orders import DatasetInRuns
+from pipeline.making.price import CorePrice
 from pipeline.renders.settings import MAX_SPP, RenderSettings
-from scene_templates.contents.cameras import CameraSettings
-from scene_templates.contents.lights import LightSettings
-from scene_templates.contents.materials import MaterialSettings
-from scene_templates.contents.placement import PlacementSettings
-from scene_templates.families.excursions import Excursion
-from scene_templates.families.family import Family
-from scene_templates.families.frozen_v1 import ONE_FAMILY_EACH
+from scene_templates.cameras import CameraSettings
+from scene_templates.excursions import Excursion
+from scene_templates.family import Family
+from scene_templates.frozen_v1 import ONE_FAMILY_EACH
+from scene_templates.lights import LightSettings
+from scene_templates.materials import MaterialSettings
+from scene_templates.placement import PlacementSettings
+from scene_templates.rooms import SharedRoom
+from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import MAX_TRIANGLES, SceneSettings, ViewLaws
-from scene_templates.shell.rooms import SharedRoom
-from scene_templates.shell.separate_sides import SideRanges
-from storage.dataset_settings import SplitSettings
-from storage.ranges import Declared, declared_ranges
-from storage.scene import Scene
+from storage.records.scene import Scene
+from storage.settings.dataset import SplitSettings
+from storage.settings.ranges import Declared, declared_ranges
 from train.data.augmentation import AugmentationSettings
 from train.evaluation.evaluate import Contest
 from train.evaluation.order import EvaluationOrder

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
-from storage.asset import Asset
+from storage.records.asset import Asset
 from tests.assets.meshes_by_hand import (
     cube,
     geometry,

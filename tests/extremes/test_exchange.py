@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import ArrayLike
 
 from infra.bench.subjects.cost_scene import cost_scene
-from pipeline.scenes.renderformer_json_write import described_files
+from pipeline.exchange.renderformer_json_write import described_files
 from storage.errors import TrilightError
-from storage.material import EMISSION
-from storage.scene import MAX_POSITION_M, Scene, SceneObject
+from storage.records.material import EMISSION
+from storage.records.scene import MAX_POSITION_M, Scene, SceneObject
 from tests.renders.scene_kit import join, light, quad
 from tests.scenes.exchange_kit import (
     assert_h5_keeps_light,

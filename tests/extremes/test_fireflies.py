@@ -12,7 +12,7 @@ from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Tracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.path_strategies import CameraPathsOnly
 from tests.renders.sampling import camera_of
 from tests.renders.scene_kit import join, light, material, quad

@@ -20,7 +20,7 @@ from model.positions import TriangleRotary
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneBatch, batch_scenes, scene_tensors
 from storage.errors import TrilightError
-from storage.scene import MAX_POSITION_M
+from storage.records.scene import MAX_POSITION_M
 from tests.model.attention_reference import attend_reference
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 from tests.train.toy import toy_sample, toy_scene

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.dataset_run import make_dataset
-from pipeline.flows.make_task import ShardJob, TaskOutcome
-from pipeline.flows.pieces import MOST_TASKS, Piece, TaskSizes, cut_tasks
-from pipeline.flows.runners import in_window
-from pipeline.flows.served.generate_scenes import generate_scenes
-from pipeline.flows.served.orders import dataset_order
-from storage.dataset import open_dataset
-from storage.dataset_settings import MOST_SCENES, SplitSettings
+from pipeline.flows.generate_scenes import generate_scenes
+from pipeline.flows.orders import dataset_order
+from pipeline.making.dataset_run import make_dataset
+from pipeline.making.make_task import ShardJob, TaskOutcome
+from pipeline.making.pieces import MOST_TASKS, Piece, TaskSizes, cut_tasks
+from pipeline.making.runners import in_window
+from storage.dataset.dataset import open_dataset
+from storage.dataset.splits import shards_for
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.splits import shards_for
-from storage.verify import verify_dataset
+from storage.settings.dataset import MOST_SCENES, SplitSettings
 from tests.flows.test_served_schema import _defaults
 from tests.flows.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 

@@ -16,18 +16,18 @@ from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.contents.cameras import CameraSettings
-from scene_templates.contents.lights import LightSettings
-from scene_templates.contents.materials import MaterialSettings
-from scene_templates.contents.placement import PlacementSettings
-from scene_templates.families.family import Family
+from scene_templates.cameras import CameraSettings
+from scene_templates.family import Family
+from scene_templates.lights import LightSettings
+from scene_templates.materials import MaterialSettings
+from scene_templates.placement import PlacementSettings
+from scene_templates.rooms import SharedRoom
 from scene_templates.settings import SceneSettings, ViewLaws
-from scene_templates.shell.rooms import SharedRoom
-from storage.changes import changed
-from storage.dataset_settings import MOST_SCENES, SplitSettings
+from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.errors import Rejected, TrilightError
-from storage.ranges import Declared
-from storage.splits import scenes_of_shard, shard_name, shards_for
+from storage.settings.changes import changed
+from storage.settings.dataset import MOST_SCENES, SplitSettings
+from storage.settings.ranges import Declared
 from tests.extremes.range_examples import FIELDS, SCENE_REASONS, SMOKE, End
 from tests.model.kit import awake, random_scene, tiny_config
 from tests.renders.scene_kit import join, light, material, quad

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from infra.setup.settings_page import FILE, ROOTS, reachable, settings_page
 from storage.errors import TrilightError
-from storage.material import EMISSION
-from storage.ranges import Columns, Declared, Within, declared_ranges
-from storage.scene import Scene, SceneObject
-from storage.settings import checked
+from storage.records.material import EMISSION
+from storage.records.scene import Scene, SceneObject
+from storage.settings.described import checked
+from storage.settings.ranges import Columns, Declared, Within, declared_ranges
 from tests.conftest import ROOT
 from tests.extremes.range_examples import EXAMPLES, FIELDS, End, at_end
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene

@@ -11,8 +11,8 @@ from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected
-from storage.exr import decode_exr, encode_exr
-from storage.scene import Scene
+from storage.records.exr import decode_exr, encode_exr
+from storage.records.scene import Scene
 from tests.renders.scene_kit import Part, flat, furnace, join, light, material, quad, sphere
 
 SETTINGS = RenderSettings(

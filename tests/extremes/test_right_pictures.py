@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from storage.conventions import camera_rays
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.scene_kit import Part, flat, join, light, material, quad
 
 SETTINGS = RenderSettings(

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.flows.builds import BUILDS, named_build
+from pipeline.builds.named import BUILDS, named_build
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.families.default_families import DEFAULT_FAMILIES
+from scene_templates.default_families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
-from storage.changes import changed
 from storage.errors import Rejected
-from storage.scene import Scene
+from storage.records.scene import Scene
+from storage.settings.changes import changed
 from tests.extremes.range_examples import SCENE_REASONS
 from tests.scenes.scene_facts import counts_of, digest, rows_of
 from tests.scenes.small_pool import first_scene

@@ -12,16 +12,16 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.flows.builds import named_build
+from pipeline.builds.named import named_build
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
-from storage.exr import decode_exr, encode_exr
-from storage.material import EMISSION
-from storage.profiles import PROFILES, Profile, keeps_law, pack_picture
-from storage.renderformer_h5 import write_renderformer_h5
-from storage.renderformer_h5_read import read_renderformer_h5
-from storage.sample import decode_sample, encode_sample
-from storage.scene import MAX_POSITION_M, Scene, SceneObject
+from storage.records.exr import decode_exr, encode_exr
+from storage.records.material import EMISSION
+from storage.records.profiles import PROFILES, Profile, keeps_law, pack_picture
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.scene import MAX_POSITION_M, Scene, SceneObject
 from tests.scenes.exchange_kit import assert_usd_keeps_all
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
 

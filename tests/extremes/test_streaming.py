@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 
 from infra.bench.subjects.manifests import SAMPLES_PER_SHARD, write_manifest_of
-from pipeline.flows.derive_dataset import derive_dataset
+from pipeline.making.derive_dataset import derive_dataset
 from pipeline.shards.derive import Derive, derive_shards
 from pipeline.shards.finished import open_finished
 from pipeline.shards.plans import Selection
-from storage.dataset import open_dataset
+from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest, write_manifest
+from storage.dataset.training_data import open_training_data
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
-from storage.manifest import read_manifest, write_manifest
-from storage.training_data import open_training_data
-from storage.verify import verify_dataset
 from tests.flows.derive_kit import finished, scenes
 from tests.train.toy import write_toy_dataset
 from train.data.order import OrderSettings, RankShare, batches_from, windows_from

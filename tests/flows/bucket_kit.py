@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows.bucket_publication import begin_dataset, joined
-from pipeline.flows.builds import named_build
-from pipeline.flows.publication import Publication
-from storage.output import dataset_folder
+from pipeline.builds.named import named_build
+from pipeline.making.bucket_publication import begin_dataset, joined
+from pipeline.making.publication import Publication
+from storage.dataset.output import dataset_folder
 from storage.remote import tries
 from storage.remote import url as remote_url
 from tests.flows.test_publication import ENVIRONMENT, _build

@@ -4,16 +4,16 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.shard_writer import write_shard
 from storage.digests import sha256_hex
-from storage.failures import write_failures
-from storage.layout import DatasetFolder
-from storage.manifest import Manifest, index_shard, write_manifest
-from storage.objects_lock import encode_objects_lock, write_objects_lock
-from storage.profiles import Profile
-from storage.records import Failure, LockedObject
-from storage.sample import Sample, encode_sample
-from storage.scene import Scene
-from storage.shard_writer import write_shard
+from storage.records.failures import write_failures
+from storage.records.objects import Failure, LockedObject
+from storage.records.objects_lock import encode_objects_lock, write_objects_lock
+from storage.records.profiles import Profile
+from storage.records.sample import Sample, encode_sample
+from storage.records.scene import Scene
 from tests.documents.dataset_by_hand import furnished, locked, sample
 
 SETTINGS = {

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.scene_source import load_source, scene_source
+from pipeline.exchange.open_scene import load_source, scene_source
 from storage.errors import TrilightError
 
 

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.bucket_publication import joined
-from pipeline.flows.builds import named_build
-from pipeline.flows.dataset_run import make_dataset, prepare_dataset
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.publication import begin
-from pipeline.flows.runners import ThreadRunner
+from pipeline.builds.named import named_build
+from pipeline.making.bucket_publication import joined
+from pipeline.making.dataset_run import make_dataset, prepare_dataset
+from pipeline.making.order import DatasetOrder
+from pipeline.making.publication import begin
+from pipeline.making.runners import ThreadRunner
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
-from storage.manifest import read_manifest
 from tests.flows.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 

@@ -5,20 +5,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.flows.builds import BUILDS
-from pipeline.flows.make_shard import MAX_ATTEMPTS
-from pipeline.flows.prepare_isolated import prepare_isolated
-from pipeline.flows.settings import BuildSettings
+from pipeline.builds.named import BUILDS
+from pipeline.builds.settings import BuildSettings
+from pipeline.making.make_shard import MAX_ATTEMPTS
+from pipeline.making.prepare_isolated import prepare_isolated
 from pipeline.objects.generated import generate_objects
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
-from storage.asset import decode_asset
+from storage.dataset.statistics import digest_of_scenes
 from storage.digests import sha256_hex
 from storage.errors import Rejected
-from storage.records import LockedObject
-from storage.sample import Sample, encode_sample, sample_key
-from storage.scene import Scene
-from storage.statistics import digest_of_scenes
+from storage.records.asset import decode_asset
+from storage.records.objects import LockedObject
+from storage.records.sample import Sample, encode_sample, sample_key
+from storage.records.scene import Scene
 
 
 @pytest.mark.slow

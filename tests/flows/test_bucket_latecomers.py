@@ -6,16 +6,16 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows import publication as publications
-from pipeline.flows.publication import Publication
+from pipeline.making import publication as publications
+from pipeline.making.publication import Publication
 from pipeline.shards.pack import pack_shard
-from storage.dataset import open_dataset
+from storage.dataset.dataset import open_dataset
+from storage.dataset.staging import stage_scene
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.failures import decode_failures
-from storage.records import Failure
-from storage.sample import sample_key
-from storage.staging import stage_scene
-from storage.verify import verify_dataset
+from storage.records.failures import decode_failures
+from storage.records.objects import Failure
+from storage.records.sample import sample_key
 from tests.flows.bucket_kit import OUT, Machines
 from tests.flows.test_publication import _dataset, _locked, make_tiny_shard
 from tests.scenes_by_hand import tiny_sample

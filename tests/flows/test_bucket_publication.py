@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows.publication import Publication
+from pipeline.making.publication import Publication
 from pipeline.shards.mirror import Mirror
 from pipeline.shards.pack import pack_shard
-from storage.dataset import open_dataset
+from storage.dataset.dataset import open_dataset
+from storage.dataset.staging import is_staged, stage_scene
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from storage.records.sample import sample_key
 from storage.remote import bucket as remote_bucket
-from storage.sample import sample_key
-from storage.staging import is_staged, stage_scene
-from storage.verify import verify_dataset
 from tests.flows.bucket_kit import OUT, Machines
 from tests.flows.test_publication import _build, _dataset, _locked, make_tiny_shard
 from tests.s3_server import control

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.flows.builds import BUILDS, frozen_note, named_build, object_source
-from pipeline.flows.settings import BuildSettings, differences
+from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
+from pipeline.builds.settings import BuildSettings, differences
+from storage.dataset.splits import split_of_object, split_of_shard
+from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
-from storage.splits import split_of_object, split_of_shard
-from storage.statistics import Statistics
 from tests.scene_templates.published import STAGE_1, STAGE_2
 
 RENDERFORMER = [name for name in BUILDS if name.startswith("renderformer-v1")]

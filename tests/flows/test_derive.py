@@ -6,19 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.derive_dataset import derive_dataset
+from pipeline.making.derive_dataset import derive_dataset
 from pipeline.shards.derive import Derive, derive_shards
 from pipeline.shards.finished import open_finished
 from pipeline.shards.plans import Selection
-from storage import layout
-from storage.dataset import Dataset, open_dataset
-from storage.derived import derivation_of
-from storage.failures import read_failures
-from storage.layout import DatasetFolder
-from storage.objects_lock import read_objects_lock
-from storage.records import Failure
-from storage.sample import Sample, encode_sample, sample_key
-from storage.verify import verify_dataset
+from storage.dataset import layout
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.derived import derivation_of
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.verify import verify_dataset
+from storage.records.failures import read_failures
+from storage.records.objects import Failure
+from storage.records.objects_lock import read_objects_lock
+from storage.records.sample import Sample, encode_sample, sample_key
 from tests.flows.derive_kit import finished, scenes
 
 MERGE = Derive(operation="merge")

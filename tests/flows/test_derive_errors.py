@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows.derive_dataset import derive_dataset
-from pipeline.flows.publication import begin
+from pipeline.making.derive_dataset import derive_dataset
+from pipeline.making.publication import begin
 from pipeline.shards.derive import Derive
 from pipeline.shards.plans import Selection
-from storage.dataset import open_dataset
+from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import write_manifest
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
-from storage.manifest import write_manifest
-from storage.verify import verify_dataset
 from tests.flows.derive_kit import TEST_OBJECT, TRAIN_OBJECT, finished, scenes
 from tests.flows.test_publication import ENVIRONMENT, _build
 
@@ -151,7 +151,7 @@ def test_nothing_is_overwritten_and_nothing_grows(tmp_path: Path) -> None:
 KILLED = """
 import sys
 from pathlib import Path
-from pipeline.flows import derive_dataset as flow
+from pipeline.making import derive_dataset as flow
 from pipeline.shards.derive import Derive
 
 def stop(done, total):

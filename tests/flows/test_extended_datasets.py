@@ -8,18 +8,18 @@ import pytest
 from prefect.exceptions import ParameterTypeError
 
 from infra.repair import repair
-from pipeline.flows.builds import BUILDS, named_build, typed_build
-from pipeline.flows.file_child import file_child
-from pipeline.flows.make_task import ShardJob, make_task
-from pipeline.flows.publication import begin
+from pipeline.builds.named import BUILDS, named_build, typed_build
+from pipeline.exchange.file_child import file_child
+from pipeline.making.make_task import ShardJob, make_task
+from pipeline.making.publication import begin
 from pipeline.shards.derive import _extensions
-from scene_templates.families.default_families import FAMILIES
-from storage.asked import read_asked, write_asked
-from storage.dataset import open_dataset
+from scene_templates.default_families import FAMILIES
+from storage.dataset.asked import read_asked, write_asked
+from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest, write_manifest
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
-from storage.manifest import read_manifest, write_manifest
-from storage.verify import verify_dataset
 from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
 from tests.flows.test_publication import ENVIRONMENT, begin_tiny, make_tiny_shard
 
@@ -114,7 +114,7 @@ def test_a_dataset_never_causes_an_import(
 
 
 def test_a_form_cannot_name_a_file(tmp_path: Path) -> None:
-    from pipeline.flows.served.generate_scenes import generate_scenes
+    from pipeline.flows.generate_scenes import generate_scenes
 
     trap = written(tmp_path, TRAP)
     with pytest.raises(ParameterTypeError, match="build"):
@@ -141,7 +141,7 @@ def test_families_are_chosen_by_name() -> None:
 
 def test_a_build_of_ones_own_has_a_name_of_its_own(tmp_path: Path) -> None:
     text = """
-from pipeline.flows.training_builds import smoke
+from pipeline.builds.training import smoke
 import dataclasses
 
 def mine():

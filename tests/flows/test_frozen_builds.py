@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.flows.builds import BUILDS, named_build
-from pipeline.flows.judging_builds import JUDGING_BUILDS
-from pipeline.flows.renderformer_builds import RENDERFORMER_BUILDS
-from scene_templates.contents import lights, placement
-from scene_templates.contents.cameras import camera_rand
+from pipeline.builds.judging import JUDGING_BUILDS
+from pipeline.builds.named import BUILDS, named_build
+from pipeline.builds.renderformer import RENDERFORMER_BUILDS
+from scene_templates import lights, placement
+from scene_templates.cameras import camera_rand
+from scene_templates.patches import PATCH_FACES, QUADS, SIDES
 from scene_templates.settings import SceneSettings
-from scene_templates.shell.patches import PATCH_FACES, QUADS, SIDES
-from scene_templates.templates.registry import TEMPLATES
+from scene_templates.templates import TEMPLATES
 from storage.digests import sha256_hex
 from storage.seeds import rng_for
 from tests.scene_templates.balls import one_drawn
@@ -123,9 +123,9 @@ def test_a_layout_that_is_registered_later_changes_no_build() -> None:
         from storage.extensions import load_extension
         for name in ("template", "family", "object_source"):
             load_extension(f"examples/{name}.py")
-        from scene_templates.families.family import TEMPLATES, Family
+        from scene_templates.family import TEMPLATES, Family
         assert "corridor" in TEMPLATES and "crowd" in Family.PRESETS
-        from pipeline.flows.builds import BUILDS
+        from pipeline.builds.named import BUILDS
         """)
     assert found == {name: build.settings().digest for name, build in BUILDS.items()}
 
@@ -134,12 +134,14 @@ def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
     """They are made where no field of any group of settings has a default to fall back on."""
     found = _digests_after("""
         from pipeline.assets import settings as assets
-        from pipeline.flows import settings as builds
+        from pipeline.builds import settings as builds
         from pipeline.renders import settings as renders
         from scene_templates import settings as scenes
-        from scene_templates.families import excursions, family
-        from scene_templates.shell import rooms, separate_sides
-        from storage import dataset_settings
+        from scene_templates import excursions
+        from scene_templates import family
+        from scene_templates import rooms
+        from scene_templates import separate_sides
+        from storage.settings import dataset as dataset_settings
         modules = (assets, builds, renders, scenes, excursions, family, rooms, separate_sides)
         kinds = {kind for module in (*modules, dataset_settings) for kind in vars(module).values()
                  if hasattr(kind, "__pydantic_fields__")}
@@ -159,8 +161,8 @@ def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
             pass
         else:
             raise AssertionError("a default is still there")
-        from pipeline.flows.judging_builds import JUDGING_BUILDS
-        from pipeline.flows.renderformer_builds import RENDERFORMER_BUILDS
+        from pipeline.builds.judging import JUDGING_BUILDS
+        from pipeline.builds.renderformer import RENDERFORMER_BUILDS
         BUILDS = JUDGING_BUILDS | RENDERFORMER_BUILDS
         """)
     assert found == {name: BUILDS[name].settings().digest for name in FROZEN}

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.flows import inspect_scene as inspecting
-from pipeline.flows.convert_scene import convert_scene
-from pipeline.flows.inspect_scene import inspect_scene
-from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.render_scene import PathTracer
-from pipeline.flows.scene_source import SceneSource
+from pipeline.exchange.convert import convert_scene
+from pipeline.exchange.open_scene import SceneSource
+from pipeline.exchange.reader import SceneReader
+from pipeline.making import inspect_scene as inspecting
+from pipeline.making.inspect_scene import inspect_scene
+from pipeline.making.render_scene import PathTracer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, choose_variant
-from storage.profiles import PROFILES
-from storage.sample import encode_sample, sample_key
-from storage.scene_file import encode_scene
-from storage.shard_writer import write_shard
+from storage.dataset.shard_writer import write_shard
+from storage.records.profiles import PROFILES
+from storage.records.sample import encode_sample, sample_key
+from storage.records.scene_file import encode_scene
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from pipeline.flows.machine import cores_owned, visible_gpus
+from pipeline.making.machine import cores_owned, visible_gpus
 from storage.errors import TrilightError
 
 

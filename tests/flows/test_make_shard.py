@@ -10,20 +10,20 @@ from typing import Any, cast
 
 import pytest
 
-from pipeline.flows import make_shard
-from pipeline.flows.builds import named_build
-from pipeline.flows.make_scene import SceneAttempt
-from pipeline.flows.make_shard import is_free, make_piece
-from pipeline.flows.pieces import Piece
-from pipeline.flows.settings import BuildSettings
+from pipeline.builds.named import named_build
+from pipeline.builds.settings import BuildSettings
 from pipeline.isolation import ChildFailed, IsolatedChild
+from pipeline.making import make_shard
+from pipeline.making.make_scene import SceneAttempt
+from pipeline.making.make_shard import is_free, make_piece
+from pipeline.making.pieces import Piece
 from pipeline.shards.notes import note_shard, noted_shard
-from storage.claims import claimed
-from storage.layout import DatasetFolder
-from storage.manifest import ShardEntry, index_shard
-from storage.sample import sample_key
-from storage.shard_writer import write_shard
-from storage.staging import is_staged, read_staged_scene
+from storage.dataset.claims import claimed
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import ShardEntry, index_shard
+from storage.dataset.shard_writer import write_shard
+from storage.dataset.staging import is_staged, read_staged_scene
+from storage.records.sample import sample_key
 from tests.scenes_by_hand import tiny_sample
 
 NAME = "train-000000.tar"

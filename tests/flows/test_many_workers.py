@@ -8,17 +8,17 @@ from typing import Any, cast
 
 import pytest
 
-from pipeline.flows import make_task
-from pipeline.flows.children import ChildPool
+from pipeline.flows import build_dataset as building
+from pipeline.flows import on_dask, runner
 from pipeline.flows.executors import find_executor
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.served import build_dataset as building
-from pipeline.flows.served import on_dask, runner
-from pipeline.flows.served.limits import GPU_LIMIT
-from pipeline.flows.served.orders import DatasetInRuns, dataset_in_runs
+from pipeline.flows.limits import GPU_LIMIT
+from pipeline.flows.orders import DatasetInRuns, dataset_in_runs
 from pipeline.isolation import IsolatedChild
+from pipeline.making import make_task
+from pipeline.making.children import ChildPool
+from pipeline.making.order import DatasetOrder
+from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
 
 
 def _parameters(**given: Any) -> dict[str, Any]:

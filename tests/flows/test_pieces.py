@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.pieces import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
-from storage.dataset_settings import SplitSettings
+from pipeline.making.order import DatasetOrder
+from pipeline.making.pieces import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
+from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.splits import scenes_of_shard
+from storage.settings.dataset import SplitSettings
 
 
 def _scenes(tasks: list[tuple[Piece, ...]]) -> list[int]:

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows import make_shard
-from pipeline.flows.dataset_run import Outcome, make_dataset, prepare_dataset
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.runners import ThreadRunner
-from storage.dataset import open_dataset
+from pipeline.making import make_shard
+from pipeline.making.dataset_run import Outcome, make_dataset, prepare_dataset
+from pipeline.making.order import DatasetOrder
+from pipeline.making.runners import ThreadRunner
+from storage.dataset.dataset import open_dataset
+from storage.dataset.verify import verify_dataset
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.verify import verify_dataset
 from tests.assets.meshes_by_hand import knot, write_obj
 from tests.flows import poison
 from tests.flows.bucket_kit import OUT, empty_bucket

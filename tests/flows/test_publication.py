@@ -6,20 +6,20 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows import publication as publications
-from pipeline.flows.builds import BUILDS, named_build
-from pipeline.flows.publication import Publication, begin
-from pipeline.flows.settings import BuildSettings, differences
+from pipeline.builds.named import BUILDS, named_build
+from pipeline.builds.settings import BuildSettings, differences
+from pipeline.making import publication as publications
+from pipeline.making.publication import Publication, begin
 from pipeline.shards.pack import pack_shard
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest
+from storage.dataset.splits import scenes_of_shard, shard_name
+from storage.dataset.staging import stage_scene
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.failures import read_failures
-from storage.layout import DatasetFolder
-from storage.manifest import read_manifest
-from storage.records import Failure, LockedObject
-from storage.sample import Sample, sample_key
-from storage.splits import scenes_of_shard, shard_name
-from storage.staging import stage_scene
-from storage.verify import verify_dataset
+from storage.records.failures import read_failures
+from storage.records.objects import Failure, LockedObject
+from storage.records.sample import Sample, sample_key
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 ENVIRONMENT = {"mitsuba_variant": "llvm_ad_rgb", "libraries": {"mitsuba": "3.9.1"}}

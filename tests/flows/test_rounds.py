@@ -7,21 +7,21 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows import dataset_run
-from pipeline.flows.accept_objects import AcceptedObjects
-from pipeline.flows.dataset_run import Run, make_dataset
-from pipeline.flows.make_shard import is_free
-from pipeline.flows.make_task import ShardJob, TaskOutcome
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.pieces import Piece
+from pipeline.making import dataset_run
+from pipeline.making.accept_objects import AcceptedObjects
+from pipeline.making.dataset_run import Run, make_dataset
+from pipeline.making.make_shard import is_free
+from pipeline.making.make_task import ShardJob, TaskOutcome
+from pipeline.making.order import DatasetOrder
+from pipeline.making.pieces import Piece
 from pipeline.shards.pack import pack_shard
-from storage.claims import claimed
+from storage.dataset.claims import claimed
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.staging import stage_scene
+from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
-from storage.layout import DatasetFolder
-from storage.records import Failure
-from storage.sample import sample_key
-from storage.staging import stage_scene
-from storage.statistics import Statistics
+from storage.records.objects import Failure
+from storage.records.sample import sample_key
 from tests.flows.test_publication import _build, _sample, begin_tiny, make_tiny_shard
 
 FIRST = "train-000000.tar"

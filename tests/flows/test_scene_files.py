@@ -10,25 +10,25 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows.accept_scene_files import (
+from pipeline.builds.named import named_build
+from pipeline.builds.settings import BuildSettings
+from pipeline.exchange.scene_files import SceneFiles, build_scene
+from pipeline.exchange.scene_folder import find_scene_files
+from pipeline.isolation import IsolatedChild
+from pipeline.making.accept_scene_files import (
     accept_scene_files,
     build_once,
     settings_for_files,
 )
-from pipeline.flows.builds import named_build
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.prepare_isolated import asset_child
-from pipeline.flows.publication import begin
-from pipeline.flows.scene_files import SceneFiles, build_scene
-from pipeline.flows.scene_folder import find_scene_files
-from pipeline.flows.settings import BuildSettings
-from pipeline.isolation import IsolatedChild
+from pipeline.making.order import DatasetOrder
+from pipeline.making.prepare_isolated import asset_child
+from pipeline.making.publication import begin
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest
+from storage.dataset.splits import scenes_of_shard, shard_name
 from storage.errors import Rejected, TrilightError
-from storage.layout import DatasetFolder
-from storage.manifest import read_manifest
-from storage.objects_lock import read_objects_lock
-from storage.scene import Scene
-from storage.splits import scenes_of_shard, shard_name
+from storage.records.objects_lock import read_objects_lock
+from storage.records.scene import Scene
 
 CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
 

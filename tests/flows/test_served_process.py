@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.served.process import run_to_end
+from pipeline.flows.process import run_to_end
 
 SAVES = """
 import signal, sys, time

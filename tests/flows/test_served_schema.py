@@ -7,14 +7,14 @@ import pytest
 from prefect.exceptions import ParameterTypeError
 
 from infra.serving.train_model import train_model
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.served.build_dataset import build_dataset
-from pipeline.flows.served.generate_scenes import generate_scenes
-from pipeline.flows.served.orders import dataset_order
-from pipeline.flows.served.prepare_assets import prepare_assets
-from pipeline.flows.served.runner import may_pass
-from pipeline.flows.served.schema import BuildChanges, changed_values
-from pipeline.flows.settings import BuildSettings
+from pipeline.builds.settings import BuildSettings
+from pipeline.flows.build_dataset import build_dataset
+from pipeline.flows.forms import BuildChanges, changed_values
+from pipeline.flows.generate_scenes import generate_scenes
+from pipeline.flows.orders import dataset_order
+from pipeline.flows.prepare_assets import prepare_assets
+from pipeline.flows.runner import may_pass
+from pipeline.making.order import DatasetOrder
 from storage.errors import EnvironmentFailure, TrilightError
 
 CANARY = "CANARY-7f3a"

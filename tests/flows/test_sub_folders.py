@@ -5,18 +5,18 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.publication import Publication
+from pipeline.making.publication import Publication
 from pipeline.objects.generated import generate_objects
-from storage import layout
-from storage.dataset import open_dataset
-from storage.dataset_settings import SplitSettings
+from storage.dataset import layout
+from storage.dataset.dataset import open_dataset
+from storage.dataset.manifest import index_shard, read_manifest
+from storage.dataset.progress import read_progress
+from storage.dataset.splits import shard_name
+from storage.dataset.staging import is_staged, stage_scene
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.manifest import index_shard, read_manifest
-from storage.progress import read_progress
-from storage.sample import sample_key
-from storage.splits import shard_name
-from storage.staging import is_staged, stage_scene
-from storage.verify import verify_dataset
+from storage.records.sample import sample_key
+from storage.settings.dataset import SplitSettings
 from tests.documents.dataset_by_hand import edit_manifest
 from tests.flows.test_publication import _dataset, _sample
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows import view_progress
-from pipeline.flows.view_progress import ViewProgress
+from pipeline.making import view_progress
+from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.renderer import RenderedView, Sampling
-from storage.layout import DatasetFolder
+from storage.dataset.layout import DatasetFolder
 
 DONE: Any = object()
 

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.flows.make_task import TaskOutcome
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.served import generate_scenes, watching
-from pipeline.flows.served.runner import PrefectRunner
-from pipeline.flows.served.watching import Watched, report_url, small_picture, usd_per_core_hour
+from pipeline.flows import generate_scenes, watching
+from pipeline.flows.runner import PrefectRunner
+from pipeline.flows.watching import Watched, report_url, small_picture, usd_per_core_hour
+from pipeline.making.make_task import TaskOutcome
+from pipeline.making.order import DatasetOrder
 from storage.errors import TrilightError
 
 

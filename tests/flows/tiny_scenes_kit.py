@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows.accept_objects import AcceptedObjects
-from pipeline.flows.order import DatasetOrder
-from pipeline.flows.publication import Publication
-from pipeline.flows.runners import ThreadRunner
-from storage.records import Failure
-from storage.sample import Sample, sample_key
-from storage.statistics import Statistics
+from pipeline.making.accept_objects import AcceptedObjects
+from pipeline.making.order import DatasetOrder
+from pipeline.making.publication import Publication
+from pipeline.making.runners import ThreadRunner
+from storage.dataset.statistics import Statistics
+from storage.records.objects import Failure
+from storage.records.sample import Sample, sample_key
 from tests.flows.test_publication import _locked
 from tests.scenes_by_hand import tiny_sample
 
@@ -45,8 +45,8 @@ def without_rendering(
         made(scene)
         return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
 
-    monkeypatch.setattr("pipeline.flows.dataset_run.accept_objects", accept)
-    monkeypatch.setattr("pipeline.flows.make_shard._make_scene", make)
+    monkeypatch.setattr("pipeline.making.dataset_run.accept_objects", accept)
+    monkeypatch.setattr("pipeline.making.make_shard._make_scene", make)
     monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")  # needs no probe
     return scenes
 

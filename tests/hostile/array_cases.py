@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 from safetensors.numpy import load, save
 
-from storage.renderformer_h5 import write_renderformer_h5
-from storage.scene_file import encode_scene
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from storage.records.scene_file import encode_scene
 from tests.scenes_by_hand import tiny_scene
 
 Make = Callable[[Path], object]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from storage.sample import encode_sample
+from storage.records.sample import encode_sample
 from tests.scenes_by_hand import tiny_sample
 
 Make = Callable[[Path], object]

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.flows.scene_source import load_source, scene_source, source_keys
+from pipeline.exchange.open_scene import load_source, scene_source, source_keys
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from storage.errors import TrilightError
-from storage.renderformer_h5 import write_renderformer_h5
 from tests.hostile import array_cases, json_cases, tar_cases, usd_cases
 from tests.scenes_by_hand import tiny_scene
 
@@ -45,8 +45,9 @@ class Outcome:
 
 def smaller_limits() -> None:
     """Prepare a child."""
-    from pipeline.scenes.usd import placed, textures
-    from storage.usd import composition
+    from pipeline.exchange.usd import composition
+    from pipeline.exchange.usd import foreign_placed as placed
+    from pipeline.exchange.usd import foreign_textures as textures
 
     composition.MAX_PRIMS, composition.MAX_COMPOSITION_S = 2000, 0.3
     placed.MAX_PLACED, textures.MAX_PIXELS = 2000, 1 << 20

@@ -14,7 +14,7 @@ from infra.bench.sides.blender_environment import installed_python
 from infra.bench.sides.shots import fixed_samples, shots
 from pipeline.isolation import ChildLimits, IsolatedChild
 from pipeline.renders.variant import activate, choose_variant
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 
 def run_blender(process: str, folder: Path, request: dict[str, Any]) -> NDArray[np.float32]:

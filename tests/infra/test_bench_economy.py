@@ -18,9 +18,9 @@ from infra.bench.experiments.economy import (
 )
 from infra.bench.subjects.network_scenes import base_flops
 from infra.bench.subjects.scene_costs import SceneCosts, _costs, _error_within
-from storage.asset import Asset
 from storage.errors import TrilightError
-from storage.sample import SceneRecord, encode_sample
+from storage.records.asset import Asset
+from storage.records.sample import SceneRecord, encode_sample
 from tests.scenes.small_pool import QUALITY, small_pool, with_error
 from tests.train.toy import RESOLUTION, toy_sample
 

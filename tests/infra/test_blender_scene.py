@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.scenes.usd.read import UsdScene, read_usd
+from pipeline.exchange.usd.read import UsdScene, read_usd
 from storage.conventions import preview_srgb8
-from storage.material import EMISSION
 from storage.metrics import psnr_linear_db
+from storage.records.material import EMISSION
 from tests.infra.blender_kit import ours, run_blender
 
 pytestmark = pytest.mark.slow

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.scenes.usd.read import read_usd
+from pipeline.exchange.usd.read import read_usd
+from pipeline.exchange.usd.write import write_usd
 from storage.metrics import psnr_linear_db
-from storage.scene import Scene
-from storage.usd.export import write_usd
+from storage.records.scene import Scene
 from tests.infra.blender_kit import ours, run_blender
 from tests.scenes.example_scenes import example_scene
 

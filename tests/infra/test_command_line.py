@@ -11,7 +11,7 @@ import pytest
 from infra.cli.commands import COMMANDS
 from infra.cli.options import ALIASES
 from infra.setup.command_line_page import FILE, Command, command_line_page, every_command
-from storage.settings import option_of
+from storage.settings.described import option_of
 from tests.command_line import trilight
 from tests.conftest import ROOT
 

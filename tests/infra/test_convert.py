@@ -10,17 +10,17 @@ import h5py
 import numpy as np
 import pytest
 
-from pipeline.flows import convert_scene
-from pipeline.flows.scene_source import load_source, scene_source
-from pipeline.scenes.renderformer_json_write import described_files
+from pipeline.exchange import convert as convert_scene
+from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
+from pipeline.exchange.renderformer_json_write import described_files
+from storage.dataset.shard_writer import write_shard
 from storage.errors import TrilightError
-from storage.profiles import Profile
-from storage.renderformer_h5 import write_renderformer_h5
-from storage.renderformer_h5_read import read_renderformer_h5
-from storage.sample import encode_sample
-from storage.scene import Scene
-from storage.scene_file import encode_scene
-from storage.shard_writer import write_shard
+from storage.records.profiles import Profile
+from storage.records.sample import encode_sample
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
 from tests.scenes.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene

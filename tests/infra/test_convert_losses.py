@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.flows.convert_scene import write_scene
-from pipeline.flows.scene_source import load_source, scene_source
-from storage import carried
-from storage.carried import lost_members
+from pipeline.exchange.convert import write_scene
+from pipeline.exchange.open_scene import load_source, scene_source
 from storage.errors import TrilightError
-from storage.material import PUBLISHED_COLUMNS, columns_in_use, laid_out
-from storage.scene import Scene, SceneObject
+from storage.records import carried
+from storage.records.carried import lost_members
+from storage.records.material import PUBLISHED_COLUMNS, columns_in_use, laid_out
+from storage.records.scene import Scene, SceneObject
 from tests.columns_kit import COAT, TINT, WAVES, declared
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 
@@ -138,7 +138,7 @@ def test_what_emitters_reflect_is_lost_in_the_published_arrays(tmp_path: Path) -
 
 def test_the_names_of_members_are_those_of_a_scene() -> None:
     """A claim that is mistyped would claim nothing, and be noticed only as a note too many."""
-    from pipeline.flows.scene_formats import FORMATS
+    from pipeline.exchange.formats import FORMATS
 
     known = {f"objects.{field.name}" for field in dataclasses.fields(SceneObject)}
     known |= {f"materials.{name}" for name in PUBLISHED_COLUMNS}

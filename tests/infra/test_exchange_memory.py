@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from infra.bench.subjects.cost_scene import cost_scene
-from pipeline.flows.convert_scene import write_scene
-from pipeline.flows.scene_source import SceneSource, load_source
+from pipeline.exchange.convert import write_scene
+from pipeline.exchange.open_scene import SceneSource, load_source
 from pipeline.isolation import ChildLimits, IsolatedChild
 
 pytestmark = pytest.mark.slow

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.flows.served.orders import DatasetInRuns
+from pipeline.flows.orders import DatasetInRuns
 from tests.conftest import ROOT
 from tests.infra.manifests_kit import IMAGES, MANIFESTS, containers
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.flows.inspect_scene import ROWS, VIEWS, turntable_poses
+from pipeline.exchange.usd.write import write_usd
+from pipeline.making.inspect_scene import ROWS, VIEWS, turntable_poses
 from storage.errors import TrilightError
-from storage.usd.export import write_usd
 from tests.command_line import trilight
 from tests.scenes_by_hand import tiny_scene
 

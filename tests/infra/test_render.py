@@ -13,17 +13,17 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from pipeline.flows import render_scene
-from pipeline.flows.scene_source import load_source, scene_source
+from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from pipeline.making import render_scene
 from storage.conventions import preview_srgb8
+from storage.dataset.shard_writer import write_shard
 from storage.errors import TrilightError
-from storage.exr import decode_exr
-from storage.profiles import Profile
-from storage.renderformer_h5 import write_renderformer_h5
-from storage.sample import Sample, encode_sample
-from storage.scene import Scene
-from storage.scene_file import encode_scene, scene_digest
-from storage.shard_writer import write_shard
+from storage.records.exr import decode_exr
+from storage.records.profiles import Profile
+from storage.records.sample import Sample, encode_sample
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene, scene_digest
 from tests.command_line import trilight
 from tests.infra.render_kit import SMALL, mistake, render
 from tests.scenes_by_hand import tiny_sample, tiny_scene

@@ -10,14 +10,14 @@ import pytest
 from PIL import Image
 
 from model.neural_renderer import NeuralRenderer
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from pipeline.exchange.usd.write import write_usd
 from storage.conventions import look_at_c2w, preview_srgb8
-from storage.exr import decode_exr
+from storage.dataset.shard_writer import write_shard
 from storage.metrics import psnr_log_db
-from storage.renderformer_h5 import write_renderformer_h5
-from storage.sample import encode_sample
-from storage.scene_file import encode_scene, scene_digest
-from storage.shard_writer import write_shard
-from storage.usd.export import write_usd
+from storage.records.exr import decode_exr
+from storage.records.sample import encode_sample
+from storage.records.scene_file import encode_scene, scene_digest
 from tests.command_line import trilight
 from tests.infra.render_kit import SMALL, mistake, render, write_network
 from tests.model.test_neural_renderer import many_lights

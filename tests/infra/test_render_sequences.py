@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 from pxr import Usd, UsdGeom
 
-from storage.exr import decode_exr
-from storage.sample import encode_sample
-from storage.scene_file import encode_scene
-from storage.shard_writer import write_shard
+from storage.dataset.shard_writer import write_shard
+from storage.records.exr import decode_exr
+from storage.records.sample import encode_sample
+from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
 from tests.infra.render_kit import SMALL, mistake, render, write_network
 from tests.scenes.strangers_stage import write_stage

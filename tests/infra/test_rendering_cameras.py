@@ -10,14 +10,14 @@ import pytest
 
 from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, shots
 from infra.rendering.sources import scene_sources
-from pipeline.flows.read_scenes import SceneReader
-from pipeline.flows.scene_source import SceneSource
+from pipeline.exchange.open_scene import SceneSource
+from pipeline.exchange.reader import SceneReader
 from pipeline.isolation import Result
 from storage.conventions import look_at_c2w
+from storage.dataset.shard_writer import write_shard
 from storage.errors import TrilightError
-from storage.sample import encode_sample
-from storage.scene_file import encode_scene
-from storage.shard_writer import write_shard
+from storage.records.sample import encode_sample
+from storage.records.scene_file import encode_scene
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 

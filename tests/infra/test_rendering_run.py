@@ -17,12 +17,12 @@ from infra.rendering.places import PicturePlaces, place
 from infra.rendering.run import FinishedShot, ShotRun
 from infra.rendering.tone_maps import require_tone_map, tone_mapped
 from infra.rendering.video import write_video
-from pipeline.flows.scene_source import SceneSource
+from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
-from storage.exr import decode_exr
-from storage.scene import Scene
-from storage.scene_file import encode_scene
+from storage.records.exr import decode_exr
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene
 from tests.infra.test_rendering_cameras import HereReader
 from tests.scenes_by_hand import tiny_scene
 

@@ -18,8 +18,8 @@ import pytest
 from infra.serving import local
 from infra.serving.limits import limits
 from infra.serving.local import running, start, stop
+from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
 from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER, wait_until_healthy
-from pipeline.flows.served.limits import DISK_LIMIT, GPU_LIMIT
 from storage.errors import TrilightError
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(120)"]

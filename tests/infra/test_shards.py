@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from infra.repair import repair
-from storage.dataset import open_dataset
+from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
 from tests.command_line import trilight
 from tests.flows.derive_kit import finished, scenes

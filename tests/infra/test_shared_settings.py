@@ -9,12 +9,12 @@ import pytest
 from infra.cli.changes import Shared, all_changes
 from infra.cli.dataset_changes import with_shared
 from infra.cli.settings_file import read_settings_file
-from pipeline.flows.builds import BUILDS, named_build
-from pipeline.flows.order import DatasetOrder
-from storage.changes import changed
+from pipeline.builds.named import BUILDS, named_build
+from pipeline.making.order import DatasetOrder
+from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
-from storage.manifest import read_manifest
-from storage.settings import settings_record
+from storage.settings.changes import changed
+from storage.settings.described import settings_record
 from tests.command_line import trilight
 from tests.flows.test_publication import begin_tiny
 from train.runs import RUNS, named_run

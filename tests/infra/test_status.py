@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from storage.scene_log import log_scene
+from storage.dataset.scene_log import log_scene
 from tests.command_line import trilight
 from tests.flows.test_publication import begin_tiny, make_tiny_shard
 

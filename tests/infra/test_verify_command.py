@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from storage.asked import write_asked
+from storage.dataset.asked import write_asked
 from tests.command_line import trilight
 from tests.flows.test_publication import begin_tiny, make_tiny_shard
 

@@ -25,7 +25,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("source", "expected"),
     [
-        ("from storage.scene import Scene", "from trilight.storage.scene import Scene"),
+        ("from storage.errors import Rejected", "from trilight.storage.errors import Rejected"),
         ("from storage import scene", "from trilight.storage import scene"),
         ("if x:\n    from train import run", "if x:\n    from trilight.train import run"),
         ("import model.config as c, os", "import trilight.model.config as c, os"),
@@ -111,7 +111,7 @@ PROGRAM = """
 import sys
 
 import model
-import storage.scene
+import storage.errors
 import train
 import trilight
 from trilight import Material, SceneBuilder
@@ -124,7 +124,7 @@ trilight.write_scene(scene, "it.safetensors")
 scene = trilight.read_scene("it.safetensors")
 assert trilight.first_hits(scene, resolution=8).met.any()
 assert trilight.named_run("smoke").run == "smoke"
-assert [module.WHOSE for module in (model, train, storage.scene)] == ["the user's"] * 3
+assert [module.WHOSE for module in (model, train, storage.errors)] == ["the user's"] * 3
 ours = {"scene_templates", "pipeline", "infra"} & set(sys.modules)
 assert not ours, ours
 assert module_name("pipeline.flows") == "trilight.pipeline.flows"
@@ -134,7 +134,7 @@ assert (FILES_ROOT / "prefect.yaml").is_file()
 
 
 def test_a_program_keeps_its_own_model_train_and_storage(tree: Path, tmp_path: Path) -> None:
-    for place in ("model.py", "train/__init__.py", "storage/__init__.py", "storage/scene.py"):
+    for place in ("model.py", "train/__init__.py", "storage/__init__.py", "storage/errors.py"):
         (tmp_path / place).parent.mkdir(exist_ok=True)
         (tmp_path / place).write_text('WHOSE = "the user\'s"\n')
     (tmp_path / "program.py").write_text(textwrap.dedent(PROGRAM))

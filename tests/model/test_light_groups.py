@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from model.light_groups import LightGroup, light_groups
-from storage.material import EMISSION
-from storage.scene import Scene
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
 from tests.renders.scene_kit import Part, box, flat, join, light, material, quad
 
 FLOOR = quad(

@@ -20,8 +20,8 @@ from model.trained_range import RANGE_KEY, TrainedRange, trained_range
 from model.weights import encode_weights
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
-from storage.material import EMISSION
-from storage.scene import Scene
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
 from tests.model.kit import awake, tiny_config
 from tests.renders.scene_kit import flat, join, light, material, quad
 from tests.scenes_by_hand import tiny_scene

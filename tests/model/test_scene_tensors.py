@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from model.scene_tensors import batch_scenes, scene_tensors, tensors_of
-from storage.material import EMISSION, material_width
-from storage.scene import ARRAY_FIELDS
+from storage.records.material import EMISSION, material_width
+from storage.records.scene import ARRAY_FIELDS
 from tests.model.kit import random_scene
 from tests.train.toy import toy_scene
 

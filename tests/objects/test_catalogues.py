@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
-from storage.records import ObjectRecord
+from storage.records.objects import ObjectRecord
 
 ALLOWED = ["CC0-1.0", "MIT", "LicenseRef-unknown"]
 

@@ -7,7 +7,7 @@ import pytest
 from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED, refuse_licences
 from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
-from storage.records import ObjectRecord
+from storage.records.objects import ObjectRecord
 
 
 def record(uid: str, licence: str) -> ObjectRecord:

@@ -4,7 +4,7 @@ import csv
 import io
 
 from pipeline.documents.attribution import encode_attribution
-from storage.records import LockedObject
+from storage.records.objects import LockedObject
 
 
 def test_the_source_of_a_licence_is_published() -> None:

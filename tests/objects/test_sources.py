@@ -14,8 +14,8 @@ from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED
 from pipeline.objects.sources import FoundObjects, find_objects
 from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
-from storage.records import ObjectRecord
-from storage.safe_url import printable
+from storage.records.objects import ObjectRecord
+from storage.remote.safe_url import printable
 
 
 def touch(folder: Path, *names: str) -> None:

@@ -14,7 +14,7 @@ import pytest
 from pipeline.renders import ggx, multiscatter, plugin_scene
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.plugin_tracer import PluginTracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 _PLUGIN = "kernel_bsdf"
 _COLOURS, _NUMBERS = ("diffuse", "specular", "again"), ("alpha", "weight")

@@ -4,7 +4,7 @@ from typing import Any
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.vector_tracer import VectorTracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 _ALMOST_ALL = 2.0**40
 """Light paths for each camera path, of which weights leave a millionth to the other strategies."""

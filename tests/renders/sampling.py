@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.tracer import Tracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 SIGMAS = 5.0
 """How many standard errors an honest estimate may be off: 1 in 2 million for one value, so that a

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import look_at_c2w
-from storage.scene import ObjectKind, Scene, SceneObject
+from storage.records.scene import ObjectKind, Scene, SceneObject
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

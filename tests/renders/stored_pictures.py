@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.tracer import Tracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 from storage.seeds import seed_for
 from tests.renders.scene_kit import Part, box, join, light, material, quad, sphere
 

@@ -14,8 +14,8 @@ from infra.bench.sides.blender_environment import installed_python
 from infra.bench.sides.cycles import Request, cycles_picture
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
-from storage.exr import decode_exr
-from storage.scene import Scene
+from storage.records.exr import decode_exr
+from storage.records.scene import Scene
 from tests.renders.scene_kit import box, furnace, join, light, material, quad, sphere
 from tests.scenes.example_scenes import example_scene
 

@@ -8,7 +8,7 @@ import pytest
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.plugin_tracer import PluginTracer
 from storage.conventions import camera_rays
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.closed_forms import lambert_irradiance
 from tests.renders.sampling import assert_agree, exact, render_blocks
 from tests.renders.scene_kit import Part, flat, join, light, material, quad

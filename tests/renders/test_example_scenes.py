@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.flows.convert_scene import convert_scene
-from pipeline.flows.scene_source import load_source, scene_source
+from pipeline.exchange.convert import convert_scene
+from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
-from storage.exr import decode_exr
 from storage.metrics import psnr_linear_db
-from storage.scene import Scene
+from storage.records.exr import decode_exr
+from storage.records.scene import Scene
 from tests.scenes.example_scenes import example_scene
 
 BLOCK = 8

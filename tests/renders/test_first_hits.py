@@ -1,10 +1,10 @@
-"""What pixels see by storage.first_hits, beside the renderer's own answer."""
+"""What pixels see by storage.records.first_hits, beside the renderer's own answer."""
 
 import numpy as np
 import pytest
 
 from pipeline.renders.load_tracer import load_tracer
-from storage.first_hits import first_hits
+from storage.records.first_hits import first_hits
 from tests.renders.sampling import camera_of
 from tests.renders.scene_kit import sampled_like_scene
 

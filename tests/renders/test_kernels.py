@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from pipeline.flows.builds import named_build
-from pipeline.flows.make_scene import _render_sample
-from pipeline.flows.view_progress import ViewProgress
+from pipeline.builds.named import named_build
+from pipeline.making.make_scene import _render_sample
+from pipeline.making.view_progress import ViewProgress
 from pipeline.renders import vector_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
 
 SETTINGS = RenderSettings(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.plugin_tracer import PluginTracer
 from storage.conventions import camera_rays
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.closed_forms import lambert_irradiance
 from tests.renders.sampling import Estimate, assert_agree, camera_of, exact, render_blocks
 from tests.renders.scene_kit import Part, furnace, join, light, material, quad, sphere

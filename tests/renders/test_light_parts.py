@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.renders import ggx
 from storage.conventions import camera_rays
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.kernel_lobes import kernel_lobes, seen_at
 from tests.renders.sampling import camera_of
 from tests.renders.scene_kit import join, light, material, quad

@@ -9,7 +9,7 @@ from pipeline.renders import vector_tracer
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import set_threads
 from pipeline.renders.vector_tracer import VectorTracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.path_strategies import CameraPathsLeft, CameraPathsOnly, LightPathsOnly
 from tests.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
 from tests.renders.scene_kit import box, join, light, material, quad, sphere

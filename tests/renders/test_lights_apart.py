@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.flows.builds import named_build
-from pipeline.flows.make_scene import _render_sample
-from pipeline.flows.view_progress import ViewProgress
+from pipeline.builds.named import named_build
+from pipeline.making.make_scene import _render_sample
+from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
-from storage.check_sample import check_sample
+from storage.dataset.check_sample import check_sample
+from storage.dataset.manifest import Manifest
 from storage.errors import Rejected
-from storage.exr import decode_exr, encode_exr
-from storage.lights import MAX_LIGHTS, light_rows, rounded_to_half, sum_of_lights
-from storage.manifest import Manifest
 from storage.metrics import psnr_log_db
-from storage.sample import decode_sample, encode_sample
-from storage.scene import Scene, SceneObject
+from storage.records.exr import decode_exr, encode_exr
+from storage.records.lights import MAX_LIGHTS, light_rows, rounded_to_half, sum_of_lights
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.scene import Scene, SceneObject
 from storage.seeds import seed_for
 from tests.renders.sampling import SIGMAS, Estimate, camera_of
 from tests.renders.scene_kit import join, light, material, quad, sphere

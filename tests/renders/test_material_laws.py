@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.renders.blend import MIN_ALPHA, lobes_of, scaled_albedos
 from pipeline.renders.multiscatter import scattered_again
 from storage.conventions import alpha_ggx
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.closed_forms import lambert_irradiance
 from tests.renders.sampling import assert_agree, exact, render_blocks
 from tests.renders.scene_kit import Part, flat, furnace, join, light, material, quad, sphere

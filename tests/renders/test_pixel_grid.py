@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.load_tracer import load_tracer
 from storage.conventions import camera_rays
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.sampling import camera_of
 from tests.renders.scene_kit import flat, join, light, material, quad, sampled_like_scene
 

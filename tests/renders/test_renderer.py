@@ -14,7 +14,7 @@ from pipeline.renders.settings import RenderSettings
 from storage.conventions import look_at_c2w
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.conftest import ROOT
 from tests.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from pipeline.scenes.sight import Sight
-from scene_templates.contents.rotations import uniform_rotation
-from scene_templates.families.default_families import DEFAULT_FAMILIES
+from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.rotations import uniform_rotation
 from scene_templates.settings import SceneSettings
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.renders.sampling import assert_agree, render_blocks
 from tests.scenes.small_pool import first_scene, small_pool
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.plugin_tracer import PluginTracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.conftest import ROOT
 from tests.renders.kernel_bsdf import exact_twin
 from tests.renders.sampling import Estimate, assert_agree, camera_of, render_blocks

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.environment import environment
+from pipeline.making.environment import environment
 from pipeline.renders import denoiser
 from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts

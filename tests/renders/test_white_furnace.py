@@ -14,7 +14,7 @@ from pipeline.renders import plugin_scene, surface_table
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.plugin_tracer import PluginTracer
 from pipeline.renders.tracer import Tracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.conftest import ROOT
 from tests.renders.sampling import camera_of
 from tests.renders.scene_kit import furnace, join, material, quad, sphere

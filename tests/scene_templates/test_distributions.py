@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.flows.builds import named_build
+from pipeline.builds.named import named_build
 from scene_templates.settings import SceneSettings
-from storage.changes import changed
+from storage.settings.changes import changed
 from tests.scene_templates.balls import MANY, Drawn, drawn, drawn_once
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row
 from tests.scene_templates.sampled_facts import (

@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from scene_templates.contents.cameras import CameraSettings, camera_rand
-from scene_templates.contents.materials import MaterialSettings, surface_rand
-from scene_templates.contents.placement import TOUCHING
-from scene_templates.families.renderformer_v1 import stage_1_families
+from scene_templates.cameras import CameraSettings, camera_rand
 from scene_templates.layout import Layout, Pose
+from scene_templates.materials import MaterialSettings, surface_rand
+from scene_templates.placement import TOUCHING
+from scene_templates.renderformer_v1 import stage_1_families
+from scene_templates.rooms import plane_of
+from scene_templates.sectors import Sector
 from scene_templates.settings import SceneSettings
-from scene_templates.shell.rooms import plane_of
-from scene_templates.templates.registry import TEMPLATES
-from scene_templates.templates.sectors import Sector
+from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
 from tests.scene_templates.balls import Ball, Drawn, drawn, one_drawn, template_settings
 

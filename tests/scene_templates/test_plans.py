@@ -5,8 +5,8 @@ from collections import Counter
 
 import pytest
 
-from pipeline.flows.builds import named_build
-from scene_templates.families.frozen_v1 import ONE_FAMILY_EACH
+from pipeline.builds.named import named_build
+from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.plans import scene_plan
 from scene_templates.settings import SceneSettings
 from tests.scene_templates.balls import DEFAULTS

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from scene_templates.families.default_families import DEFAULT_FAMILIES
-from scene_templates.families.family import Family
-from scene_templates.families.renderformer_v1 import Policy, stage_1_families, stage_2_families
+from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.family import Family
 from scene_templates.layout import ShellPart
+from scene_templates.patches import SIDES, PatchPlacement, patch
+from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
+from scene_templates.rooms import plane_of
+from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
-from scene_templates.shell.patches import SIDES, PatchPlacement, patch
-from scene_templates.shell.rooms import plane_of
-from scene_templates.shell.separate_sides import SeparateSides
-from scene_templates.templates.registry import TEMPLATES
+from scene_templates.templates import TEMPLATES
 from tests.scene_templates.balls import one_drawn
 from tests.scene_templates.published import DEFAULT, STAGE_1, STAGE_2, Row, side_row
 

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from scene_templates.layout import ShellPart
-from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
-from scene_templates.shell.rooms import Room, SharedRoom, plane_of
-from scene_templates.templates.registry import TEMPLATES
+from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.rooms import Room, SharedRoom, plane_of
+from scene_templates.templates import TEMPLATES
 from tests.scene_templates.balls import drawn, template_settings
 
 ROUNDING = 1e-12

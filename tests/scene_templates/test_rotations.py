@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from scene_templates.contents.rotations import rotated, rotation_xyz, uniform_rotation
+from scene_templates.rotations import rotated, rotation_xyz, uniform_rotation
 
 
 def test_uniform_rotations_are_proper() -> None:

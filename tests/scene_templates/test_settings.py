@@ -7,19 +7,19 @@ from typing import Any
 
 import pytest
 
-from scene_templates.contents.cameras import CameraSettings
-from scene_templates.contents.lights import LightSettings
-from scene_templates.contents.materials import MaterialSettings
-from scene_templates.contents.placement import PlacementSettings
-from scene_templates.families.excursions import Excursion
-from scene_templates.families.family import Family
-from scene_templates.families.frozen_v1 import ONE_FAMILY_EACH
+from scene_templates.cameras import CameraSettings
+from scene_templates.excursions import Excursion
+from scene_templates.family import Family
+from scene_templates.frozen_v1 import ONE_FAMILY_EACH
+from scene_templates.lights import LightSettings
+from scene_templates.materials import MaterialSettings
+from scene_templates.placement import PlacementSettings
+from scene_templates.rooms import SharedRoom
+from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import SceneSettings, ViewLaws
-from scene_templates.shell.rooms import SharedRoom
-from scene_templates.shell.separate_sides import SideRanges
-from scene_templates.templates.registry import TEMPLATES
-from storage.changes import changed
+from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
+from storage.settings.changes import changed
 from tests.scene_templates.balls import DEFAULTS, template_settings
 
 GROUPS: dict[type, Any] = {

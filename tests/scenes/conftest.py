@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.families.default_families import DEFAULT_FAMILIES
+from scene_templates.default_families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.scenes.small_pool import first_scene, pooled, small_pool
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.flows.scene_files import build_scene
-from storage.scene import Scene
+from pipeline.exchange.scene_files import build_scene
+from storage.records.scene import Scene
 
 EXAMPLES = {
     "cbox": 4 * 128 + 2 * 2560 + 1,

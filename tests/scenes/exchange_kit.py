@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from pxr import Usd
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.flows.scene_files import build_scene
-from pipeline.scenes.renderformer_json_write import described_files
-from pipeline.scenes.usd.read import read_usd
-from storage.material import EMISSION
-from storage.renderformer_h5 import write_renderformer_h5
-from storage.renderformer_h5_read import read_renderformer_h5
-from storage.scene import Scene
-from storage.scene_file import encode_scene
-from storage.usd.export import write_usd
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
+from pipeline.exchange.renderformer_json_write import described_files
+from pipeline.exchange.scene_files import build_scene
+from pipeline.exchange.usd.read import read_usd
+from pipeline.exchange.usd.write import write_usd
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene
 from tests.storage.usd_validators import errors_of
 
 

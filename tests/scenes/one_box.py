@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from pipeline.scenes.described_albedos import AlbedoOverOne
-from pipeline.scenes.description import SceneDescription
-from pipeline.scenes.from_description import LoadedMesh, scene_from_description
-from pipeline.scenes.renderformer_json import read_description
-from storage.scene import Scene
+from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.description import SceneDescription
+from pipeline.exchange.from_description import LoadedMesh, scene_from_description
+from pipeline.exchange.renderformer_json import read_description
+from storage.records.scene import Scene
 
 OBJECT = {
     "mesh_path": "box.obj",

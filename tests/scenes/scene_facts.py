@@ -6,7 +6,7 @@ import json
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.scene import ARRAY_FIELDS, Scene
+from storage.records.scene import ARRAY_FIELDS, Scene
 
 
 def digest(scene: Scene) -> str:

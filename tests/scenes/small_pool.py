@@ -10,10 +10,10 @@ import trimesh
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.settings import SceneSettings
-from storage.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
 from storage.errors import Rejected
-from storage.records import LockedObject
-from storage.scene import Scene
+from storage.records.asset import Asset, Level, LevelQuality, LevelRecord, SourceFacts
+from storage.records.objects import LockedObject
+from storage.records.scene import Scene
 
 QUALITY = LevelQuality(
     error_mean=0.0,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
-from storage.asset import Asset, Level, LevelRecord
 from storage.errors import Rejected
+from storage.records.asset import Asset, Level, LevelRecord
 from tests.scenes.small_pool import QUALITY, SOURCE, with_error
 
 Rungs = list[tuple[int, float]]

@@ -6,16 +6,16 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.flows.builds import BUILDS, named_build
+from pipeline.builds.named import BUILDS, named_build
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.families.default_families import DEFAULT_FAMILIES
+from scene_templates.default_families import DEFAULT_FAMILIES
 from scene_templates.plans import scene_plan
 from scene_templates.settings import SceneSettings
-from scene_templates.templates.registry import TEMPLATES
-from storage.changes import changed
+from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected, TrilightError
-from storage.scene import Scene
+from storage.records.scene import Scene
+from storage.settings.changes import changed
 from tests.scene_templates.balls import template_settings
 from tests.scenes.scene_facts import counts_of, digest, planes_of, points_of, rows_of
 from tests.scenes.small_pool import first_scene

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from storage.material import DIFFUSE
+from storage.records.material import DIFFUSE
 from tests.scenes.example_scenes import corners_of, example_scene
 from tests.scenes.one_box import MATERIAL, built, described, loaded
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.flows.builds import named_build
+from pipeline.builds.named import named_build
 from pipeline.scenes.budget import drawn_within
 from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
 from scene_templates.layout import ShellPart, SurfaceLook
 from scene_templates.layout_rand import layout_rand
+from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
 from scene_templates.plans import scene_plan
-from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
-from storage.material import DIFFUSE
-from storage.scene import Scene, SceneObject
+from storage.records.material import DIFFUSE
+from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
 from tests.scene_templates.published import DEFAULT, STAGE_1
 from tests.scene_templates.statistics import (

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.builds import named_build
+from pipeline.builds.named import named_build
 from pipeline.scenes.pool import PooledAsset
 from tests.scenes.example_scenes import EXAMPLES, example_scene
 from tests.scenes.exchange_kit import (

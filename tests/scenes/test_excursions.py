@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from pipeline.flows.builds import named_build
-from pipeline.flows.settings import differences
+from pipeline.builds.named import named_build
+from pipeline.builds.settings import differences
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.families.out_of_range import median_settings
+from scene_templates.out_of_range import median_settings
 from scene_templates.plans import scene_plan
-from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
-from storage.scene import Scene
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.records.scene import Scene
 from tests.scenes.scene_facts import planes_of, points_of, rows_of, triangles_of
 from tests.scenes.small_pool import first_scene
 

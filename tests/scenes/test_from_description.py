@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.scenes.description import DescribedObject
-from pipeline.scenes.from_description import placed, scene_from_description
-from pipeline.scenes.renderformer_json import read_description
+from pipeline.exchange.description import DescribedObject
+from pipeline.exchange.from_description import placed, scene_from_description
+from pipeline.exchange.renderformer_json import read_description
 from storage.errors import TrilightError
-from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
-from storage.scene import Scene
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.records.scene import Scene
 from tests.scenes.example_scenes import EXAMPLES, PlainObj, corners_of, example_scene, plain_obj
 from tests.scenes.one_box import CAMERA, MATERIAL, TRANSFORM, built, changed, described, loaded
 

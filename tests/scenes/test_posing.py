@@ -6,8 +6,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from pipeline.scenes.posing import in_unit_sphere, posed, without_slivers
-from scene_templates.contents.rotations import uniform_rotation
 from scene_templates.layout import Pose
+from scene_templates.rotations import uniform_rotation
 from tests.scenes.small_pool import level, small_pool
 
 TOUCH = 1e-6

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from pipeline.flows.builds import named_build
+from pipeline.builds.named import named_build
 from tests.scenes.scene_facts import digest
 from tests.scenes.small_pool import first_scene, small_pool
 

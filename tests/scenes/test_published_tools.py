@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.flows.convert_scene import convert_scene
-from pipeline.flows.scene_source import scene_source
-from pipeline.scenes.renderformer_json_write import described_files
-from storage.scene import Scene, SceneObject
-from storage.scene_file import encode_scene
+from pipeline.exchange.convert import convert_scene
+from pipeline.exchange.open_scene import scene_source
+from pipeline.exchange.renderformer_json_write import described_files
+from storage.records.scene import Scene, SceneObject
+from storage.records.scene_file import encode_scene
 from tests.scenes.example_scenes import EXAMPLES, example_scene
 from tests.scenes_by_hand import LIGHT, tiny_scene
 

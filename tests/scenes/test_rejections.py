@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.flows.builds import named_build
+from pipeline.builds.named import named_build
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.laws import require_laws
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
-from storage.scene import Scene
+from storage.records.scene import Scene
 from tests.scene_templates.balls import template_settings
 
 BLIND = {

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.scenes.renderformer_json import MAX_BYTES, read_description
+from pipeline.exchange.renderformer_json import MAX_BYTES, read_description
 from storage.errors import TrilightError
 from tests.scenes.example_scenes import EXAMPLES
 from tests.scenes.one_box import BOX, CAMERA, MATERIAL, OBJECT, SCENE, TRANSFORM, changed

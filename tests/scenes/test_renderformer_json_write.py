@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.scenes.renderformer_json_write import described_files
+from pipeline.exchange.renderformer_json_write import described_files
 from storage.errors import TrilightError
-from storage.scene import SceneObject
+from storage.records.scene import SceneObject
 from tests.scenes.exchange_kit import assert_json_keeps_light, json_and_back
 from tests.scenes_by_hand import LIGHT, tiny_scene
 
@@ -56,6 +56,6 @@ def test_normals_that_no_reader_makes_are_said_to_be_lost(tmp_path: Path) -> Non
 
 
 def test_too_many_objects(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.scenes.renderformer_json_write.MAX_OBJECTS", 1)
+    monkeypatch.setattr("pipeline.exchange.renderformer_json_write.MAX_OBJECTS", 1)
     with pytest.raises(TrilightError, match="2 objects of one material; a scene file holds at"):
         described_files(tiny_scene(), "a")

@@ -11,7 +11,7 @@ from pipeline.scenes.shading import (
     shading_groups,
     smooth_shaded,
 )
-from scene_templates.contents.rotations import rotation_xyz
+from scene_templates.rotations import rotation_xyz
 
 ROUNDING = 1e-6
 """Unit vectors in float32 (6e-8 per entry) from positions in float32."""

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.posing import posed
 from pipeline.scenes.shapes import MeshShape
-from scene_templates.contents.rotations import uniform_rotation
-from scene_templates.families.default_families import DEFAULT_FAMILIES
+from scene_templates.default_families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose
 from scene_templates.plans import scene_plan
+from scene_templates.rotations import uniform_rotation
 from scene_templates.settings import SceneSettings
-from storage.changes import changed
-from storage.scene import Scene
+from storage.records.scene import Scene
+from storage.settings.changes import changed
 from tests.scenes.scene_facts import rows_of, triangles_of
 from tests.scenes.slow_crossings import cross, encloses
 from tests.scenes.small_pool import first_scene, level

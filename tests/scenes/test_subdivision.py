@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pipeline.scenes.pieces import ScenePiece, emitter_piece, object_piece, shell_piece
 from pipeline.scenes.subdivision import filled, subdivided
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
-from scene_templates.shell.patches import PATCH_FACES, SIDES, PatchPlacement, patch
-from storage.scene import SceneObject
+from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from storage.records.scene import SceneObject
 
 ROUNDING = 1e-6
 """Positions below 1 are float32, good to 6e-8; areas and distances are a few sums of them."""

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdUtils
 
+from pipeline.exchange.usd.read import read_usd, usd_keys
+from pipeline.exchange.usd.write import SUFFIXES, write_usd
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
-from pipeline.scenes.usd.read import read_usd, usd_keys
 from storage.errors import TrilightError
-from storage.usd.export import SUFFIXES, write_usd
 from tests.scenes.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_scene
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from pipeline.scenes.usd.polygons import triangulated
-from pipeline.scenes.usd.read import UsdScene, read_usd, usd_keys
+from pipeline.exchange.usd.polygons import triangulated
+from pipeline.exchange.usd.read import UsdScene, read_usd, usd_keys
+from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
 from storage.errors import TrilightError
-from storage.material import EMISSION
-from storage.scene import Scene
-from storage.scene_file import encode_scene
-from storage.usd.export import SUFFIXES, write_usd, write_usd_shard
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene
 from tests.scenes.strangers_stage import L_SHAPE, mesh, write_stage
 from tests.scenes_by_hand import tiny_scene
 

@@ -11,11 +11,11 @@ from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.sight import Sight
 from pipeline.scenes.views import CAMERA_ATTEMPTS, complaint, next_camera
-from scene_templates.families.default_families import DEFAULT_FAMILIES
+from scene_templates.default_families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings, ViewLaws
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import Rejected
-from storage.scene import ARRAY_FIELDS, Scene
+from storage.records.scene import ARRAY_FIELDS, Scene
 from tests.scenes.slow_rays import first_hits
 from tests.scenes_by_hand import tiny_scene
 

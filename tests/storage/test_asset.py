@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from storage.asset import Asset, Level, LevelRecord, decode_asset, encode_asset
+from pipeline.objects.ply import encode_ply
 from storage.errors import TrilightError
-from storage.ply import encode_ply
+from storage.records.asset import Asset, Level, LevelRecord, decode_asset, encode_asset
 from tests.scenes.small_pool import QUALITY, SOURCE
 
 

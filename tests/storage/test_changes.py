@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.changes import changed
 from storage.errors import TrilightError
-from storage.settings import checked
+from storage.settings.changes import changed
+from storage.settings.described import checked
 
 
 @checked()

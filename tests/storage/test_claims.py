@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 
 from storage.atomic import atomic_writer, write_error
-from storage.claims import claimed
+from storage.dataset.claims import claimed
+from storage.dataset.layout import DatasetFolder
 from storage.errors import EnvironmentFailure
-from storage.layout import DatasetFolder
 from tests.conftest import ROOT
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from storage.claims import claimed
+from storage.dataset.claims import claimed
 with claimed(Path(sys.argv[1])) as ours:
     print(ours, flush=True)
     time.sleep(60)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from storage.dataset import open_dataset
+from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
-from storage.sample import encode_sample
+from storage.records.sample import encode_sample
 from tests.documents.dataset_by_hand import edit_manifest, five_scenes
 
 

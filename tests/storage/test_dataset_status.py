@@ -4,11 +4,11 @@ import dataclasses
 import json
 from pathlib import Path
 
-from storage.asked import write_asked
-from storage.dataset_status import read_status
-from storage.layout import DatasetFolder
-from storage.manifest import read_manifest, write_manifest
-from storage.scene_log import log_scene, read_scene_logs
+from storage.dataset.asked import write_asked
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest, write_manifest
+from storage.dataset.scene_log import log_scene, read_scene_logs
+from storage.dataset.status import read_status
 from tests.flows.test_publication import begin_tiny, make_tiny_shard
 
 

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import TrilightError
-from storage.first_hits import MISS, first_hits
-from storage.scene import Scene
+from storage.records.first_hits import MISS, first_hits
+from storage.records.scene import Scene
 from tests.scenes_by_hand import tiny_scene
 
 RESOLUTION = 24

@@ -15,8 +15,8 @@ import OpenEXR
 import pytest
 
 from storage.errors import TrilightError
-from storage.exr import encode_channels
-from storage.lights import MAX_LIGHTS, decode_lights_exr, encode_lights_exr
+from storage.records.exr import encode_channels
+from storage.records.lights import MAX_LIGHTS, decode_lights_exr, encode_lights_exr
 from tests.conftest import ROOT
 
 _SIZE = 2048
@@ -29,8 +29,8 @@ _CHILD = """
 import resource, sys
 from pathlib import Path
 from storage.errors import TrilightError
-from storage.exr import decode_exr
-from storage.lights import decode_lights_exr
+from storage.records.exr import decode_exr
+from storage.records.lights import decode_lights_exr
 data = Path(sys.argv[1]).read_bytes()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 try:

@@ -11,21 +11,21 @@ import OpenEXR
 import pytest
 from numpy.typing import NDArray
 
-from storage.check_sample import check_sample
 from storage.conventions import HALF_FLOAT_MAX
+from storage.dataset.check_sample import check_sample
+from storage.dataset.manifest import Manifest
+from storage.dataset.shard_writer import write_shard
 from storage.errors import TrilightError
-from storage.exr import decode_exr, encode_exr
-from storage.lights import (
+from storage.records.exr import decode_exr, encode_exr
+from storage.records.lights import (
     MAX_LIGHTS,
     decode_lights_exr,
     encode_lights_exr,
     rounded_to_half,
     sum_of_lights,
 )
-from storage.manifest import Manifest
-from storage.sample import Sample, decode_sample, encode_sample
-from storage.scene import SceneObject
-from storage.shard_writer import write_shard
+from storage.records.sample import Sample, decode_sample, encode_sample
+from storage.records.scene import SceneObject
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from infra.bench.subjects.manifests import memory_of_opening, write_manifest_of
-from storage import json_pieces
-from storage.json_pieces import entries
-from storage.member_table import MemberTable
+from storage.dataset import json_pieces
+from storage.dataset.json_pieces import entries
+from storage.dataset.member_table import MemberTable
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

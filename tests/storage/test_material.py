@@ -9,7 +9,7 @@ import pytest
 from safetensors.numpy import load, save
 
 from storage.errors import TrilightError
-from storage.material import (
+from storage.records.material import (
     DIFFUSE,
     EMISSION,
     PUBLISHED_COLUMNS,
@@ -21,9 +21,9 @@ from storage.material import (
     laid_out,
     material_width,
 )
-from storage.ranges import Within
-from storage.sample import decode_sample, encode_sample
-from storage.scene_file import decode_arrays, encode_arrays, scene_digest
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.scene_file import decode_arrays, encode_arrays, scene_digest
+from storage.settings.ranges import Within
 from tests.columns_kit import COAT, TINT, WAVES, declared
 from tests.scenes_by_hand import FLOOR, tiny_sample, tiny_scene
 

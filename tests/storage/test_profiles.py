@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from storage.dataset import open_dataset
-from storage.dataset_settings import StorageSettings
+from storage.dataset.dataset import open_dataset
+from storage.dataset.manifest import index_shard, write_manifest
+from storage.dataset.shard_writer import write_shard
+from storage.dataset.statistics import dataset_statistics
 from storage.errors import TrilightError
-from storage.exr import ExrCodec, decode_exr, encode_exr
-from storage.manifest import index_shard, write_manifest
 from storage.metrics import psnr_log_db
-from storage.profiles import (
+from storage.records.exr import ExrCodec, decode_exr, encode_exr
+from storage.records.profiles import (
     DWA_LEVELS,
     LAW_DB,
     MAX_ARRAY_BYTES,
@@ -26,10 +27,9 @@ from storage.profiles import (
     pack_picture,
     unpack_arrays,
 )
-from storage.sample import decode_sample, encode_sample
-from storage.scene import ARRAY_FIELDS
-from storage.shard_writer import write_shard
-from storage.statistics import dataset_statistics
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.scene import ARRAY_FIELDS
+from storage.settings.dataset import StorageSettings
 from tests.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.scenes_by_hand import tiny_sample
 
@@ -157,7 +157,7 @@ def test_hostile_arrays_are_refused(members: dict[str, bytes], message: str) -> 
 
 def test_a_bomb_is_refused_before_it_goes_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a member that inflates beyond the limit nothing more than the limit is unpacked."""
-    monkeypatch.setattr("storage.profiles.MAX_ARRAY_BYTES", 1 << 20)
+    monkeypatch.setattr("storage.records.profiles.MAX_ARRAY_BYTES", 1 << 20)
     bomb = gzip.compress(bytes((1 << 20) + 1))
     assert len(bomb) < 2000
     with pytest.raises(TrilightError, match="holds more than 1048576"):

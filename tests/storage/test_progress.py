@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from storage import progress
-from storage.layout import DatasetFolder
-from storage.manifest import Manifest, read_manifest
-from storage.progress import (
+from storage.dataset import progress
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, read_manifest
+from storage.dataset.progress import (
     announce_downloads,
     announce_objects,
     count_object,

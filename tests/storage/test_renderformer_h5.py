@@ -7,11 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
+from pipeline.exchange.renderformer_h5 import FAR, NEAR, TextureType, write_renderformer_h5
+from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
 from storage.errors import TrilightError
-from storage.material import EMISSION
-from storage.renderformer_h5 import FAR, NEAR, TextureType, write_renderformer_h5
-from storage.renderformer_h5_read import read_renderformer_h5
-from storage.scene import Scene
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
 
 TYPES: tuple[TextureType, ...] = ("float16", "float32")
@@ -216,7 +216,7 @@ def test_other_packings_are_read(tmp_path: Path, packing: dict[str, object]) -> 
 def test_the_example_scenes_go_through_it(shared: Path, tmp_path: Path) -> None:
     """Real meshes, smooth shading and colours per triangle."""
     from pipeline.assets.settings import AssetSettings
-    from pipeline.flows.scene_files import build_scene
+    from pipeline.exchange.scene_files import build_scene
 
     for name in ("cbox-bunny.json", "tree.json"):
         scene, _ = build_scene(

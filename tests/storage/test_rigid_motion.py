@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scene_templates.contents.rotations import uniform_rotation
+from scene_templates.rotations import uniform_rotation
 from storage.errors import TrilightError
-from storage.sample import decode_sample, encode_sample
-from storage.scene import ARRAY_FIELDS, Scene
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.scene import ARRAY_FIELDS, Scene
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 ROUNDING = 1e-6

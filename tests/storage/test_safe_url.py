@@ -2,7 +2,7 @@
 
 import pytest
 
-from storage.safe_url import public_text, safe_text, safe_url
+from storage.remote.safe_url import public_text, safe_text, safe_url
 
 
 @pytest.mark.parametrize(

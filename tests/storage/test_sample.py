@@ -9,9 +9,9 @@ import pytest
 
 from storage.conventions import SCHEMA_VERSION
 from storage.errors import TrilightError
-from storage.exr import decode_exr, encode_exr
-from storage.sample import decode_sample, encode_sample
-from storage.scene import ARRAY_FIELDS
+from storage.records.exr import decode_exr, encode_exr
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.scene import ARRAY_FIELDS
 from tests.scenes_by_hand import tiny_sample
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from storage.errors import TrilightError
-from storage.scene import ARRAY_FIELDS, SceneObject
+from storage.records.scene import ARRAY_FIELDS, SceneObject
 from tests.scenes_by_hand import tiny_scene
 
 

@@ -11,9 +11,9 @@ from safetensors.numpy import save
 
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.sample import encode_sample
-from storage.scene import ARRAY_FIELDS, Scene, SceneObject
-from storage.scene_file import (
+from storage.records.sample import encode_sample
+from storage.records.scene import ARRAY_FIELDS, Scene, SceneObject
+from storage.records.scene_file import (
     MAX_FILE_BYTES,
     decode_scene_file,
     encode_scene,

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
+from storage.dataset.shard_places import expanded, listed_shards
+from storage.dataset.shard_writer import write_shard
+from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
-from storage.sample import encode_sample
-from storage.shard_places import expanded, listed_shards
-from storage.shard_writer import write_shard
-from storage.training_data import open_training_data
+from storage.records.sample import encode_sample
 from tests.documents.dataset_by_hand import five_scenes
 from tests.scenes_by_hand import tiny_sample
 

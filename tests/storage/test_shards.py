@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from storage.atomic import atomic_writer, remove_leftovers
+from storage.dataset.manifest import index_shard
+from storage.dataset.shard_reader import iterate_samples, scan_members
+from storage.dataset.shard_writer import write_shard
 from storage.digests import sha256_of_file
 from storage.errors import TrilightError
-from storage.manifest import index_shard
-from storage.profiles import PROFILES, Profile, keeps_law
-from storage.sample import encode_sample
-from storage.shard_reader import iterate_samples, scan_members
-from storage.shard_writer import write_shard
+from storage.records.profiles import PROFILES, Profile, keeps_law
+from storage.records.sample import encode_sample
 from tests.scenes_by_hand import tiny_sample
 
 MEMBERS = {"json": b"{}", "scene.safetensors": b"abc", "0.exr": b"x" * 1000}

@@ -7,10 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from storage.conventions import SPLITS
-from storage.dataset_settings import SplitSettings
-from storage.errors import TrilightError
-from storage.seeds import rng_for, seed_for
-from storage.splits import (
+from storage.dataset.splits import (
     require_objects,
     scenes_of_shard,
     shard_name,
@@ -18,6 +15,9 @@ from storage.splits import (
     split_of_object,
     split_of_shard,
 )
+from storage.errors import TrilightError
+from storage.seeds import rng_for, seed_for
+from storage.settings.dataset import SplitSettings
 
 SETTINGS = SplitSettings(scenes_per_shard=4)
 shard_indices = st.integers(0, 10_000)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.exchange.usd import composition
 from storage.errors import TrilightError
-from storage.usd import composition
 from tests.storage.test_usd_opening import HEAD, prims_of
 
 

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
+from pipeline.exchange.usd.read_ours import read_exact, scene_keys
+from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
-from storage.scene import Scene, SceneObject
-from storage.scene_file import encode_scene
-from storage.usd.exact import read_exact, scene_keys
-from storage.usd.export import SUFFIXES, write_usd, write_usd_shard
+from storage.records.scene import Scene, SceneObject
+from storage.records.scene_file import encode_scene
 from tests.scenes_by_hand import LIGHT, tiny_scene
 from tests.storage.usd_validators import errors_of
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.exchange.usd import stage as opening
+from pipeline.exchange.usd.diagnostics import quietly
+from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.exchange.usd.write import write_usd
 from storage.errors import TrilightError
-from storage.usd import opening
-from storage.usd.diagnostics import quietly
-from storage.usd.export import write_usd
-from storage.usd.opening import OpenedUsd
 from tests.scenes_by_hand import tiny_scene
 
 HEAD = "#usda 1.0\n"

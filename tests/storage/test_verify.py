@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.manifest import index_shard, write_manifest
+from storage.dataset.shard_writer import write_shard
+from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
-from storage.manifest import index_shard, write_manifest
-from storage.sample import encode_sample
-from storage.shard_writer import write_shard
-from storage.verify import verify_dataset
+from storage.records.sample import encode_sample
 from tests.documents.dataset_by_hand import edit_manifest, five_scenes
 
 

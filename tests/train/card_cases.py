@@ -14,7 +14,7 @@ from model.layers import Norm
 from model.neural_renderer import NeuralRenderer
 from model.open import save_published
 from model.renderformer import RenderFormer
-from storage.training_data import open_training_data
+from storage.dataset.training_data import open_training_data
 from tests.command_line import trilight
 from tests.train.fake_card import CARD, fake_card
 from tests.train.toy import toy_sample, toy_scene

@@ -17,8 +17,8 @@ from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import set_threads
 from pipeline.renders.variant import activate, choose_variant
 from storage.conventions import radiance_from_log10
-from storage.lights import light_rows
-from storage.scene import Scene
+from storage.records.lights import light_rows
+from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.renders.sampling import Estimate, assert_agree, camera_of, render_blocks
 from tests.renders.scene_kit import sampled_like_scene

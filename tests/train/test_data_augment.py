@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from model.scene_tensors import tensors_of
-from storage.scene import Scene
+from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.train.toy import toy_picture, toy_sample
 from train.data.augment import (

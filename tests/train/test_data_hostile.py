@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import load, save
 
+from storage.dataset.shard_set import OpenShard
+from storage.dataset.shard_writer import write_shard
+from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
-from storage.exr import encode_exr
-from storage.sample import encode_sample
-from storage.shard_set import OpenShard
-from storage.shard_writer import write_shard
-from storage.training_data import open_training_data
+from storage.records.exr import encode_exr
+from storage.records.sample import encode_sample
 from tests.train.toy import toy_sample
 from train.data.order import RankShare
 from train.data.stream import StreamSettings, stream_batches

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage.sample import Sample, encode_sample, sample_key
-from storage.shard_writer import write_shard
+from storage.dataset.shard_writer import write_shard
+from storage.records.sample import Sample, encode_sample, sample_key
 from tests.conftest import ROOT
 from tests.train.toy import toy_sample
 
@@ -19,7 +19,7 @@ SHARDS, PER_SHARD, RESOLUTION = 30, 8, 128
 CHILD = """
 import itertools, json, resource, sys
 from contextlib import closing
-from storage.training_data import open_training_data
+from storage.dataset.training_data import open_training_data
 from train.data.order import RankShare
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import pytest
 
+from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
-from storage.shard_set import OpenShard, ShardSet
 from train.data.open_shards import OpenShards
 
 

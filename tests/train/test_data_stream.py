@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from model.scene_tensors import tensors_of
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
+from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
-from storage.training_data import TrainingData, open_training_data
 from tests.train.toy import write_toy_dataset
 from train.data.augmentation import AugmentationSettings
 from train.data.order import RankShare

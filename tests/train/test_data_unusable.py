@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
+from storage.dataset.manifest import index_shard, write_manifest
+from storage.dataset.shard_writer import write_shard
+from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
-from storage.manifest import index_shard, write_manifest
-from storage.sample import encode_sample
-from storage.shard_writer import write_shard
-from storage.training_data import TrainingData, open_training_data
+from storage.records.sample import encode_sample
 from tests.train.toy import toy_sample, write_toy_dataset
 from train.data.order import RankShare
 from train.data.stream import StreamSettings, stream_batches

@@ -12,13 +12,13 @@ from PIL import Image
 from infra.excursion_plots import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
+from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
-from storage.material import ROUGHNESS
 from storage.metrics import psnr_log_db
-from storage.scene import Scene
+from storage.records.material import ROUGHNESS
+from storage.records.scene import Scene
 from storage.seeds import rng_for
-from storage.training_data import open_training_data
 from tests.command_line import trilight
 from tests.train.kit import tiny_run
 from tests.train.test_loss_lpips import small_weights

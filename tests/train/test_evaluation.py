@@ -8,7 +8,7 @@ from PIL import Image
 
 from storage.conventions import camera_rays, log10_radiance
 from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
-from storage.scene import Scene
+from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.train.toy import toy_sample, toy_scene
 from train.data.scenes import training_scene

@@ -13,8 +13,8 @@ import torch
 from model.config import ModelConfig
 from model.config import smoke as smoke_model
 from model.open import open_network
+from storage.dataset.training_data import open_training_data
 from storage.metrics import psnr_log_db
-from storage.training_data import open_training_data
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import toy_picture, toy_sample, toy_scene, write_toy_dataset
 from train.data.augment import with_views

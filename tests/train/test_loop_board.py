@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
 from train.loop.metrics_log import read_rows

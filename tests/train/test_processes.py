@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
 from tests.conftest import ROOT
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps

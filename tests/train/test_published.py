@@ -1,6 +1,6 @@
 """The paper's figures beside a network's: which set they are of, and never for another set."""
 
-from pipeline.flows.judging_builds import JUDGING_BUILDS
+from pipeline.builds.judging import JUDGING_BUILDS
 from tests.train.test_evaluate import row
 from train.evaluation.published import BENCHMARK
 from train.evaluation.report import markdown, record

@@ -14,9 +14,9 @@ from PIL import Image
 from model.layers import Norm
 from model.trained_range import TrainedRange, trained_range
 from model.weights import decode_weights
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
-from storage.safe_read import safetensors_header
+from storage.records.safe_read import safetensors_header
 from tests.command_line import trilight
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset

@@ -7,10 +7,10 @@ import pytest
 import torch
 from safetensors.torch import load
 
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
+from storage.dataset.training_data import NO_MANIFEST
 from storage.errors import TrilightError
 from storage.remote import tries
-from storage.training_data import NO_MANIFEST
 from tests.http_server import Fault, Site, serve
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from model.open import open_network
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import write_toy_dataset

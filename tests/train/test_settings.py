@@ -6,9 +6,9 @@ import json
 import pytest
 
 from model.config import SIZES, large
-from storage.changes import changed
 from storage.errors import TrilightError
-from storage.settings import settings_record
+from storage.settings.changes import changed
+from storage.settings.described import settings_record
 from tests.train.kit import tiny_run
 from train.runs import RUNS, changed_run, in_proportion, named_run
 

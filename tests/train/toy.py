@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import camera_rays, look_at_c2w
-from storage.dataset import Dataset, open_dataset
-from storage.layout import DatasetFolder
-from storage.manifest import Manifest, index_shard, write_manifest
-from storage.material import DIFFUSE, ROUGHNESS, SPECULAR, completed_rows
-from storage.material import EMISSION as EMITTED
-from storage.sample import Sample, ViewRecord, encode_sample, sample_key
-from storage.scene import Scene, SceneObject
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, index_shard, write_manifest
+from storage.dataset.shard_writer import write_shard
+from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR, completed_rows
+from storage.records.material import EMISSION as EMITTED
+from storage.records.sample import Sample, ViewRecord, encode_sample, sample_key
+from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
-from storage.shard_writer import write_shard
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 SIDES = np.array(

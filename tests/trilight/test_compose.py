@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
-from storage.ply import encode_ply
+from pipeline.objects.ply import encode_ply
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from trilight import Material, SceneBuilder, TrilightError, read_scene
 
 TETRAHEDRON = (

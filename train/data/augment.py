@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from storage.material import laid_out
+from storage.records.material import laid_out
 from train.data.relight import with_light_scaled, with_lights_mixed
 from train.data.scenes import TrainingScene
 

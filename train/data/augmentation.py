@@ -2,8 +2,8 @@
 
 from typing import Annotated, Literal
 
-from storage.ranges import Within
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 Rotation = Literal["none", "recipe", "uniform"]
 """`recipe`: a rotation vector of three normal numbers, which favours small turns; `uniform`: every

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
-from storage.shard_set import OpenShard, ShardSet
+from storage.dataset.shard_set import OpenShard, ShardSet
 
 OPENED_AT_ONCE = 4
 """Shards that are fetched and checked at the same time."""

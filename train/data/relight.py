@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from model.scene_tensors import SceneTensors
-from storage.material import laid_out
+from storage.records.material import laid_out
 from train.data.scenes import TrainingScene
 
 LN_10 = math.log(10.0)

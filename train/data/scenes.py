@@ -10,9 +10,9 @@ from torch import Tensor
 from model.scene_tensors import SceneTensors, scene_tensors
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
-from storage.lights import light_rows
-from storage.sample import Sample
-from storage.scene import Scene
+from storage.records.lights import light_rows
+from storage.records.sample import Sample
+from storage.records.scene import Scene
 from train.data.resolution import block_mean
 
 
@@ -30,7 +30,7 @@ class TrainingScene:
     """float32 root mean square noise of the stored pictures in the same space; fewer pixels have
     less."""
     light_T: Tensor
-    """int64: which light a triangle belongs to (storage.lights), -1 for none."""
+    """int64: which light a triangle belongs to (storage.records.lights), -1 for none."""
     lights_VLRR3: Tensor | None = None
     """float32 linear radiance of each light alone, where it was asked for; their sum is the
     picture."""

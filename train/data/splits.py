@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from contextlib import closing
 
+from storage.dataset.shard_set import ShardSet
 from storage.errors import TrilightError
-from storage.sample import Sample
-from storage.shard_set import ShardSet
+from storage.records.sample import Sample
 from train.data.unusable import Unusable
 
 

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
-from storage.sample import Sample
+from storage.records.sample import Sample
 from storage.seeds import rng_for
-from storage.shard_set import OpenShard, ShardSet
 from train.data.augment import augmented, with_views
 from train.data.open_shards import OpenShards
 from train.data.order import (

@@ -10,12 +10,12 @@ from pydantic import SkipValidation
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors
 from storage.conventions import radiance_from_log10
+from storage.dataset.shard_set import ShardSet
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
-from storage.sample import Sample
+from storage.records.sample import Sample
 from storage.seeds import rng_for
-from storage.settings import checked
-from storage.shard_set import ShardSet
+from storage.settings.described import checked
 from train.data.scenes import TrainingScene, training_scene
 from train.data.splits import first_samples
 from train.data.unusable import Unusable

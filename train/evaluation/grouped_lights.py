@@ -10,7 +10,7 @@ from model.light_groups import light_groups
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer
 from model.trained_range import MAX_LIGHTS
-from storage.scene import Scene
+from storage.records.scene import Scene
 from train.evaluation.groups import summary
 from train.evaluation.judged_view import NETWORK, JudgedView
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 CHUNK = 256
 """Triangles at a time, which bounds memory at R * R * CHUNK numbers a product."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from model.renderformer import RenderFormer, radiance
 from storage.conventions import radiance_from_log10
-from storage.sample import Sample
+from storage.records.sample import Sample
 from train.data.buckets import make_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.hits import hit_masks

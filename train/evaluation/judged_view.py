@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from storage.lights import num_lights
-from storage.material import ROUGHNESS
-from storage.sample import Sample
+from storage.records.lights import num_lights
+from storage.records.material import ROUGHNESS
+from storage.records.sample import Sample
 from train.evaluation.metrics import METRICS
 
 NETWORK = "network"

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from model.precision import tf32
 from storage.conventions import log10_radiance
+from storage.records.sample import ViewRecord
 from storage.registry import Registry
-from storage.sample import ViewRecord
 from train.evaluation.scores import ViewScore, score_view
 from train.loss.lpips import Lpips
 from train.loss.ms_ssim import ssim

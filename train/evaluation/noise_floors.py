@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import log10_radiance, radiance_from_log10
-from storage.sample import ViewRecord
+from storage.records.sample import ViewRecord
 from train.evaluation.metrics import METRICS, JudgedPicture, noise_rms
 from train.loss.lpips import Lpips
 

@@ -7,7 +7,7 @@ from train.evaluation.groups import summary
 from train.evaluation.judged_view import JudgedView
 
 BENCHMARK = "benchmark-v1"
-"""The public test set (pipeline.flows.judging_builds)."""
+"""The public test set (pipeline.builds.judging)."""
 
 PUBLISHED = {"psnr_linear_db": 29.77, "ssim": 0.9526, "lpips": 0.0551, "hdr_flip": 0.1751}
 """Zeng et al. 2025, Table 1: means over 400 scenes of four views each, 256 x 256."""

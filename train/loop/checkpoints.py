@@ -22,8 +22,8 @@ from model.weights import decode_config, encode_config, load_tensors
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
-from storage.safe_read import read_safetensors
-from storage.settings import from_record, settings_record
+from storage.records.safe_read import read_safetensors
+from storage.settings.described import from_record, settings_record
 from train.data.unusable import Unusable
 from train.loop.crew import Crew
 from train.loop.state import TrainState, new_state

@@ -2,8 +2,8 @@
 
 from typing import Annotated, Literal
 
-from storage.ranges import Within
-from storage.settings import checked
+from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 Perceptual = Literal["lpips", "ms_ssim", "none"]
 """`lpips` is the recipe's and needs published weights; `ms_ssim` needs none and is another term."""

@@ -21,10 +21,10 @@ from infra.bench.sides.plain_mitsuba import render_levels
 from infra.bench.sides.shots import SEED, shots
 from infra.bench.subjects.named_scenes import NUM_SAMPLED, sampled_names
 from infra.bench.workshop import Subject, Workshop
-from pipeline.flows.training_builds import pretrain_256
+from pipeline.builds.training import pretrain_256
 from pipeline.renders.settings import RenderSettings
 from storage.metrics import psnr_linear_db, psnr_log_db
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 TARGETS_DB = (38.0, 42.0, 46.0, 50.0)
 BROKEN_DB = 1.0

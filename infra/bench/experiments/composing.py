@@ -12,9 +12,9 @@ from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_on
 from infra.bench.subjects.named_scenes import first_sample
 from infra.bench.subjects.render_child import render_child
 from infra.bench.workshop import Workshop
-from pipeline.flows.builds import BUILDS
-from pipeline.flows.make_scene import MAX_ATTEMPTS, assets_of
-from pipeline.flows.training_builds import smoke
+from pipeline.builds.named import BUILDS
+from pipeline.builds.training import smoke
+from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of
 from pipeline.scenes.compose import compose_scene
 from storage.errors import Rejected
 

@@ -12,10 +12,10 @@ import numpy as np
 from infra.bench.experiment import Column, Experiment, Figures, Point
 from infra.bench.subjects.scene_costs import SceneCosts, hdf5_bytes, scene_costs
 from infra.bench.workshop import Workshop
-from storage.dataset import Dataset, open_dataset
+from pipeline.exchange.renderformer_h5 import CELLS, CHANNELS
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
-from storage.profiles import LAW_DB
-from storage.renderformer_h5 import CELLS, CHANNELS
+from storage.records.profiles import LAW_DB
 
 PASSES = {"colour": 3, "diffuse": 3, "glossy": 3, "normal": 3, "albedo": 3, "depth": 1}
 """Channels by pass: what the published pipeline writes for every view, of which its exporter for

@@ -21,7 +21,7 @@ from pipeline.objects.generated import BENCHMARK
 from storage.conventions import log10_radiance
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer

@@ -16,9 +16,9 @@ from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one
 from infra.bench.subjects.cost_scene import cost_scene
 from infra.bench.workshop import Workshop
-from pipeline.flows.convert_scene import write_scene
-from pipeline.flows.scene_source import SceneSource, load_source
-from storage.scene import ARRAY_FIELDS, Scene
+from pipeline.exchange.convert import write_scene
+from pipeline.exchange.open_scene import SceneSource, load_source
+from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.seeds import rng_for
 
 TRIANGLES, LIGHTS = 4096, 8

@@ -13,11 +13,11 @@ from infra.bench.workshop import Workshop
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import prepare_assets
 from pipeline.assets.store import AssetStore
-from pipeline.flows.children import ChildPool
-from pipeline.flows.prepare_isolated import asset_child
+from pipeline.making.children import ChildPool
+from pipeline.making.prepare_isolated import asset_child
 from pipeline.objects.builtin.torus_knot import TorusKnotParams, torus_knot
-from storage.asset import decode_asset
-from storage.ply import encode_ply
+from pipeline.objects.ply import encode_ply
+from storage.records.asset import decode_asset
 
 FIXED, EPSILON = 4096, 0.005
 

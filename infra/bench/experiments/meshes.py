@@ -11,7 +11,7 @@ from infra.bench.sides.shots import fixed_samples
 from infra.bench.subjects.mesh_pictures import coarser, picture_db
 from infra.bench.workshop import Workshop
 from pipeline.assets.settings import AssetSettings
-from pipeline.flows.training_builds import pretrain_256
+from pipeline.builds.training import pretrain_256
 from storage.errors import Rejected
 
 CURVE = (64, 128, 256, 512, 1024)

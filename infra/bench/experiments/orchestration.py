@@ -20,9 +20,9 @@ from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
 from infra.bench.sides import prefect_process
 from infra.bench.workshop import Workshop
-from pipeline.flows.pieces import MOST_TASKS
-from storage.layout import DatasetFolder
-from storage.scene_log import SceneLog, read_scene_logs
+from pipeline.making.pieces import MOST_TASKS
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.scene_log import SceneLog, read_scene_logs
 
 WINDOW = 8
 RENDERING, WAITING = (1, 2, 4), (1, 2, 4, 8, 16)

@@ -12,7 +12,7 @@ from infra.bench.experiments.sampling import CORE_S, DB, measure, scenes
 from infra.bench.sides.shots import fixed_samples, shots
 from infra.bench.subjects.named_scenes import sampled_names, sampled_scene
 from infra.bench.workshop import Workshop
-from pipeline.flows.training_builds import pretrain_256, smoke
+from pipeline.builds.training import pretrain_256, smoke
 from pipeline.renders.renderer import SceneRenderer
 from storage.metrics import psnr_log_db
 

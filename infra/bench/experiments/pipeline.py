@@ -10,12 +10,12 @@ from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_on
 from infra.bench.sides.shots import warm_up_denoiser, warm_up_kernels
 from infra.bench.subjects.named_scenes import first_sample, sampled_scene
 from infra.bench.workshop import Workshop
-from pipeline.flows.settings import BuildSettings
-from pipeline.flows.training_builds import pretrain_256
+from pipeline.builds.settings import BuildSettings
+from pipeline.builds.training import pretrain_256
 from pipeline.isolation import IsolatedChild
 from pipeline.renders.settings import RenderSettings
-from storage.changes import changed
-from storage.sample import encode_sample
+from storage.records.sample import encode_sample
+from storage.settings.changes import changed
 
 TARGETS_DB = (38.0, 42.0, 46.0)
 VIEWS = 2

@@ -14,13 +14,13 @@ from infra.bench.sides.shots import SEED, shots
 from infra.bench.subjects.cost_scene import cost_scene
 from infra.bench.subjects.named_scenes import NUM_SAMPLED, sampled, sampled_names
 from infra.bench.workshop import Workshop
-from pipeline.flows.price import USD_PER_CORE_HOUR
+from pipeline.making.price import USD_PER_CORE_HOUR
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import PASS_SPP, RenderSettings
 from storage.metrics import psnr_log_db
-from storage.scene import Scene
+from storage.records.scene import Scene
 
 MANY_VIEWS = 8_000_000
 _FIRM_DB = 6.0

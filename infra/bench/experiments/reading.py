@@ -21,10 +21,10 @@ from infra.bench.sides.stream_processes import seconds_of_processes
 from infra.bench.subjects.byte_server import serve_bytes
 from infra.bench.subjects.manifests import memory_of_opening, write_copies, write_manifest_of
 from infra.bench.workshop import Workshop
-from storage.sample import decode_sample, decode_scene, encode_sample, sample_key
+from storage.dataset.shard_set import ShardSet
+from storage.dataset.training_data import TrainingData, open_training_data
+from storage.records.sample import decode_sample, decode_scene, encode_sample, sample_key
 from storage.seeds import rng_for
-from storage.shard_set import ShardSet
-from storage.training_data import TrainingData, open_training_data
 
 if TYPE_CHECKING:
     from train.data.order import RankShare

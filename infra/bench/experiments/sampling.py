@@ -9,7 +9,7 @@ from infra.bench.experiment import Column, Experiment, Figures, Point
 from infra.bench.sides.shots import Shot, fixed_samples, shots
 from infra.bench.subjects.named_scenes import sampled_names
 from infra.bench.workshop import Subject, Workshop
-from pipeline.flows.training_builds import pretrain_256, smoke
+from pipeline.builds.training import pretrain_256, smoke
 from pipeline.renders.settings import RenderSettings
 from storage.metrics import psnr_log_db
 

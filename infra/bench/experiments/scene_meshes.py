@@ -11,7 +11,7 @@ from infra.bench.experiments.meshes import NETWORK
 from infra.bench.experiments.sampling import DB, WORST
 from infra.bench.subjects.scene_detail import ERRORS, Fit, picture_errors, scene_fits
 from infra.bench.workshop import Workshop
-from pipeline.flows.training_builds import pretrain_256
+from pipeline.builds.training import pretrain_256
 from storage.errors import Rejected
 
 SCENE_BUDGETS = (768, 1024, 1536, 2048, 4096)

@@ -13,11 +13,11 @@ from infra.bench.sides.codecs import codecs, picture_figures
 from infra.bench.sides.packed_arrays import ARRAYS, COLOURS, SAMPLES, array_figures, sample_figures
 from infra.bench.sides.shots import fixed_samples, shots
 from infra.bench.workshop import Workshop
-from storage.dataset_settings import StorageSettings
-from storage.material import DIFFUSE, SPECULAR
 from storage.metrics import psnr_log_db
-from storage.profiles import LAW_DB, pack_arrays
-from storage.scene import ARRAY_FIELDS, Scene
+from storage.records.material import DIFFUSE, SPECULAR
+from storage.records.profiles import LAW_DB, pack_arrays
+from storage.records.scene import ARRAY_FIELDS, Scene
+from storage.settings.dataset import StorageSettings
 
 
 def _half(values: NDArray[np.float32]) -> NDArray[np.float32]:

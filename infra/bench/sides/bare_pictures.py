@@ -17,7 +17,7 @@ from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import PASS_SPP, RenderSettings
 from pipeline.renders.tracer import Tracer
-from storage.scene import Scene
+from storage.records.scene import Scene
 from storage.seeds import seed_for
 
 _PASSES = (*PASS_SPP, 1)

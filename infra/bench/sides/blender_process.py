@@ -4,9 +4,9 @@ Run by path with the Python of infra.bench.sides.blender_environment, which has 
 
     python -I blender_process.py FOLDER
 
-FOLDER holds `scene.npz` (the arrays of storage.scene.Scene) and `request.json` (the fields of
-infra.bench.sides.cycles.Request, with the camera). It receives `picture.npy`, float32
-[R, R, 3] with the top row first, and `timing.json`.
+FOLDER holds `scene.npz` (the arrays of storage.records.scene.Scene) and `request.json` (the fields
+of infra.bench.sides.cycles.Request, with the camera). It receives `picture.npy`, float32 [R, R, 3]
+with the top row first, and `timing.json`.
 
 The material is what the published training pictures were rendered with: Add(Diffuse BSDF of
 roughness 0, Glossy BSDF "Multiscatter GGX"), no Fresnel term. Emission is two-sided and hidden from

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.exr import ExrCodec, decode_exr, encode_exr
 from storage.metrics import psnr_log_db
-from storage.profiles import LAW_DB, PROFILES, pack_picture
-from storage.sample import Sample
+from storage.records.exr import ExrCodec, decode_exr, encode_exr
+from storage.records.profiles import LAW_DB, PROFILES, pack_picture
+from storage.records.sample import Sample
 
 Picture = NDArray[np.float32]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from infra.bench.sides.blender_environment import blender_python
 from storage.errors import TrilightError
-from storage.scene import ARRAY_FIELDS, Scene
+from storage.records.scene import ARRAY_FIELDS, Scene
 
 _SCRIPT = Path(__file__).with_name("blender_process.py")
 _TIMEOUT_S = 4 * 3600

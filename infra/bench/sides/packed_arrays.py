@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load, save
 
-from storage.material import DIFFUSE, SPECULAR
-from storage.profiles import PROFILES, pack_arrays, unpack_arrays
-from storage.renderformer_h5 import TextureType, write_renderformer_h5
-from storage.sample import Sample, decode_sample, encode_sample
-from storage.scene import ARRAY_FIELDS, Scene
+from pipeline.exchange.renderformer_h5 import TextureType, write_renderformer_h5
+from storage.records.material import DIFFUSE, SPECULAR
+from storage.records.profiles import PROFILES, pack_arrays, unpack_arrays
+from storage.records.sample import Sample, decode_sample, encode_sample
+from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.seeds import rng_for
 
 TEXTURES: tuple[TextureType, ...] = ("float16", "float32")

@@ -19,7 +19,7 @@ from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features
-from storage.scene import Scene
+from storage.records.scene import Scene
 from storage.seeds import seed_for
 
 _RR_DEPTH = 5

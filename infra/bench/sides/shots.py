@@ -17,10 +17,10 @@ from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features
-from storage.lights import encode_lights_exr
 from storage.metrics import MAX_DB
-from storage.profiles import pack_picture
-from storage.scene import Scene
+from storage.records.lights import encode_lights_exr
+from storage.records.profiles import pack_picture
+from storage.records.scene import Scene
 
 SEED = 20_261_122
 """Of pictures and of scenes that are drawn here: no build and no run has it."""
@@ -135,7 +135,7 @@ def _alone(scene: Scene, settings: RenderSettings) -> Shot:
 def _shot(view: RenderedView, core_s: float, load_core_s: float) -> Shot:
     if view.lights_rgb is None:
         packed = len(pack_picture(view.radiance_rgb, view.noise_floor_db, "compact"))
-    else:  # as storage.sample packs them: pictures stay the exact sum of their lights
+    else:  # as storage.records.sample packs them: pictures stay the exact sum of their lights
         packed = len(pack_picture(view.radiance_rgb, view.noise_floor_db, "lossless"))
         packed += len(encode_lights_exr(view.lights_rgb))
     return Shot(view=view, core_s=core_s, load_core_s=load_core_s, packed_bytes=packed)

@@ -14,7 +14,7 @@ from pipeline.objects.builtin.superquadric import SuperquadricParams, superquadr
 from pipeline.scenes.pieces import ScenePiece, emitter_piece, joined, object_piece, shell_piece
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.conventions import look_at_c2w
-from storage.scene import Scene, SceneObject
+from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
 
 MAX_LIGHTS = 32

@@ -10,16 +10,16 @@ import dataclasses
 from dataclasses import dataclass
 
 from infra.bench.sides.shots import SEED
-from pipeline.flows.make_scene import MAX_ATTEMPTS, assets_of
-from pipeline.flows.settings import BuildSettings
-from pipeline.flows.training_builds import smoke
+from pipeline.builds.settings import BuildSettings
+from pipeline.builds.training import smoke
+from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.compose import compose_scene
-from storage.changes import changed
+from storage.dataset.splits import JUDGED_SPLIT
 from storage.errors import Rejected
-from storage.scene import Scene
-from storage.splits import JUDGED_SPLIT
+from storage.records.scene import Scene
+from storage.settings.changes import changed
 
 _REFERENCE_SEED = 1_000_003
 _LEAST_LEVEL = 24

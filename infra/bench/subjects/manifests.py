@@ -4,12 +4,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, ShardEntry, index_shard, write_manifest
+from storage.dataset.member_table import MemberTable
+from storage.dataset.shard_writer import write_shard
 from storage.installation import IMPORT_ROOT, module_name
-from storage.layout import DatasetFolder
-from storage.manifest import Manifest, ShardEntry, index_shard, write_manifest
-from storage.member_table import MemberTable
-from storage.sample import sample_key
-from storage.shard_writer import write_shard
+from storage.records.sample import sample_key
 
 SAMPLES_PER_SHARD = 256
 SUFFIXES = ("0.exr", "1.exr", "2.exr", "3.exr", "json", "scene.safetensors.gz")
@@ -78,7 +78,13 @@ def memory_of_opening(root: Path) -> dict[str, float]:
 
     `peak_bytes` is what the process grows by at most, `held_bytes` what of it stays.
     """
-    command = [sys.executable, "-c", _CHILD, str(root), module_name("storage.training_data")]
+    command = [
+        sys.executable,
+        "-c",
+        _CHILD,
+        str(root),
+        module_name("storage.dataset.training_data"),
+    ]
     ran = subprocess.run(command, cwd=IMPORT_ROOT, capture_output=True, text=True, check=True)
     peak, held, seconds = map(float, ran.stdout.split())
     return {"peak_bytes": peak, "held_bytes": held, "open_s": seconds}

@@ -15,7 +15,7 @@ from pipeline.assets.mesh import TriangleMesh
 from pipeline.renders.settings import RenderSettings
 from storage.conventions import look_at_c2w
 from storage.metrics import psnr_log_db
-from storage.scene import Scene, SceneObject
+from storage.records.scene import Scene, SceneObject
 
 _SMOOTH_ANGLE_DEG = 30.0
 _EYE, _FOV_DEG = (1.6, -1.6, 1.0), 35.0

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.flows.make_scene import MAX_ATTEMPTS, assets_of, attempt_scene
-from pipeline.flows.scene_files import build_scene
-from pipeline.flows.training_builds import smoke
+from pipeline.builds.training import smoke
+from pipeline.exchange.scene_files import build_scene
 from pipeline.isolation import IsolatedChild
+from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of, attempt_scene
 from pipeline.scenes.compose import compose_scene
 from storage.errors import Rejected, TrilightError
-from storage.sample import Sample
-from storage.scene import Scene
+from storage.records.sample import Sample
+from storage.records.scene import Scene
 
 NUM_SAMPLED = 20
 """Scenes of the build `smoke`, of built-in objects."""

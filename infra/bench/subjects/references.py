@@ -17,9 +17,9 @@ from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
-from storage.exr import decode_exr, encode_exr
-from storage.scene import Scene
-from storage.scene_file import scene_digest
+from storage.records.exr import decode_exr, encode_exr
+from storage.records.scene import Scene
+from storage.records.scene_file import scene_digest
 
 PUBLISHED = Path(__file__).parents[3] / "tests" / "references"
 RESOLUTION = 128

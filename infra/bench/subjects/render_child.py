@@ -5,15 +5,15 @@ import os
 from pathlib import Path
 
 from infra.bench.asked import Asked
-from pipeline.flows.accept_objects import accept_objects
-from pipeline.flows.environment import environment
-from pipeline.flows.make_scene import SceneRecipe, set_up_child
-from pipeline.flows.publication import begin
-from pipeline.flows.settings import BuildSettings
-from pipeline.flows.training_builds import smoke
+from pipeline.builds.settings import BuildSettings
+from pipeline.builds.training import smoke
 from pipeline.isolation import ChildLimits, IsolatedChild
+from pipeline.making.accept_objects import accept_objects
+from pipeline.making.environment import environment
+from pipeline.making.make_scene import SceneRecipe, set_up_child
+from pipeline.making.publication import begin
 from pipeline.renders.variant import choose_variant
-from storage.layout import DatasetFolder
+from storage.dataset.layout import DatasetFolder
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10_000)
 

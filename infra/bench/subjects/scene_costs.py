@@ -12,14 +12,14 @@ from model.config import base
 from model.empty_bundles import bundles_that_see
 from model.positions import token_places
 from model.scene_tensors import batch_scenes, scene_tensors
-from storage.asset import Asset, decode_asset
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from storage.cache import cache_folder
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.renderformer_h5 import write_renderformer_h5
-from storage.sample import SceneRecord
-from storage.scene import Scene
+from storage.records.asset import Asset, decode_asset
+from storage.records.sample import SceneRecord
+from storage.records.scene import Scene
 
 _HDF5_SCENES = 24
 """Written in the published form: half a second each."""

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.flows.make_scene import assets_of
-from pipeline.flows.training_builds import pretrain_256, smoke
+from pipeline.builds.training import pretrain_256, smoke
+from pipeline.making.make_scene import assets_of
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
@@ -24,7 +24,7 @@ from scene_templates.layout_rand import layout_rand
 from scene_templates.plans import scene_plan
 from scene_templates.settings import SceneSettings
 from storage.metrics import psnr_log_db
-from storage.scene import Scene
+from storage.records.scene import Scene
 from storage.seeds import rng_for
 
 ERRORS = (0.03, 0.02, 0.01, 0.005, 0.0025)

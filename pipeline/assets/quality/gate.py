@@ -6,8 +6,8 @@ from pipeline.assets.cleaning.clean import clean
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.settings import GateSettings
-from storage.asset import LevelQuality
 from storage.errors import Rejected
+from storage.records.asset import LevelQuality
 
 
 def check_level(

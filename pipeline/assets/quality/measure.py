@@ -11,7 +11,7 @@ from pipeline.assets.quality.triangles import (
     count_edges,
     smallest_angles_deg,
 )
-from storage.asset import LevelQuality
+from storage.records.asset import LevelQuality
 from storage.seeds import rng_for
 
 _NUM_POINTS = 8192

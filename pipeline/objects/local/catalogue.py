@@ -12,8 +12,8 @@ from typing import Any
 from pipeline.objects.licences import UNKNOWN
 from pipeline.objects.local.catalogue_rows import csv_rows, jsonl_rows
 from storage.errors import TrilightError
-from storage.records import ObjectRecord
-from storage.safe_url import printable, public_text
+from storage.records.objects import ObjectRecord
+from storage.remote.safe_url import printable, public_text
 
 CATALOGUE_NAMES = ("objects.jsonl", "objects.csv")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from storage.errors import TrilightError
-from storage.safe_url import printable
+from storage.remote.safe_url import printable
 
 
 def jsonl_rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:

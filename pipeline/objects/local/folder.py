@@ -7,8 +7,8 @@ from pipeline.objects.licences import StatedLicence
 from pipeline.objects.listing import Listing, failure
 from pipeline.objects.uids import assign_uids, is_object_file
 from storage.errors import TrilightError
-from storage.records import ObjectRecord
-from storage.safe_url import printable
+from storage.records.objects import ObjectRecord
+from storage.remote.safe_url import printable
 
 
 def scan_folder(folder: Path, licence: StatedLicence) -> Listing:

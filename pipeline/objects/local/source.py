@@ -8,7 +8,7 @@ from pipeline.objects.local.catalogue import only_catalogue, read_catalogue
 from pipeline.objects.local.folder import scan_folder
 from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
-from storage.safe_url import printable
+from storage.remote.safe_url import printable
 
 
 def list_folder(folder: Path, licence: str | None) -> Listing:

@@ -14,9 +14,9 @@ from pipeline.objects.listing import CountDone, Fetched, Listing, failure
 from pipeline.objects.objaverse.package import ObjaversePackage
 from pipeline.objects.transfer import fetch_all
 from storage.errors import TrilightError
-from storage.records import Failure, ObjectRecord
+from storage.records.objects import Failure, ObjectRecord
+from storage.remote.safe_url import printable
 from storage.remote.tries import TransferFailed
-from storage.safe_url import printable
 
 PREFIX = "objaverse:"
 _CATEGORY = "category/"

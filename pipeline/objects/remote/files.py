@@ -24,9 +24,9 @@ from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_atomically
 from storage.errors import TrilightError
 from storage.remote.fetch import version_of
 from storage.remote.pace import Pace
+from storage.remote.safe_url import printable
 from storage.remote.tries import Interrupted, TransferFailed, with_tries
 from storage.remote.url import transfer_timeout
-from storage.safe_url import printable
 
 _MAX_NAME_BYTES = 220
 """File systems allow 255; the rest is for the name of an unfinished file."""

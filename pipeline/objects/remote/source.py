@@ -15,10 +15,10 @@ from pipeline.objects.uids import assign_uids, is_object_file
 from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records import Failure, ObjectRecord
+from storage.records.objects import Failure, ObjectRecord
+from storage.remote.safe_url import printable, safe_url
 from storage.remote.tries import TransferFailed
 from storage.remote.url import RemoteUrl
-from storage.safe_url import printable, safe_url
 
 MAX_BYTES = 200_000_000
 """Largest object that is fetched, with its buffers: what the mesh stage reads at most."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.remote import tries, url
 from tests.documents.dataset_by_hand import edit_manifest, five_scenes

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.cache import ShardCache, shard_cache

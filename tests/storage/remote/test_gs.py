@@ -7,16 +7,16 @@ from typing import Any
 
 import pytest
 
-from pipeline.flows.bucket_publication import begin_dataset, joined
-from storage.dataset import Dataset, open_dataset
+from pipeline.making.bucket_publication import begin_dataset, joined
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.output import dataset_folder
+from storage.dataset.training_data import open_training_data
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.output import dataset_folder
+from storage.records.sample import encode_sample
 from storage.remote import fetch
 from storage.remote import url as remote_url
 from storage.remote.bucket import Bucket
-from storage.sample import encode_sample
-from storage.training_data import open_training_data
-from storage.verify import verify_dataset
 from tests.flows.test_publication import ENVIRONMENT, _build
 
 pytest.importorskip("gcsfs", reason="gs:// needs the package gcsfs")

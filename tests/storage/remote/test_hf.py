@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import Dataset
+from storage.dataset.dataset import Dataset
 from storage.digests import sha256_hex
-from storage.sample import encode_sample
+from storage.records.sample import encode_sample
 from tests.conftest import ROOT
 from tests.storage.remote.hub_server import REPOSITORY, serve_hub
 
@@ -24,10 +24,10 @@ SHARD = "train-000000.tar"
 DATASET = f"hf://datasets/{REPOSITORY}"
 
 READ = """
-from storage.dataset import open_dataset
+from storage.dataset.dataset import open_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.sample import encode_sample
+from storage.records.sample import encode_sample
 dataset = open_dataset(sys.argv[1])
 said = []
 for shard in dataset.manifest.shards:
@@ -39,13 +39,13 @@ for shard in dataset.manifest.shards:
 """
 
 VERIFY = """
-from storage.verify import verify_dataset
+from storage.dataset.verify import verify_dataset
 said = [verify_dataset(sys.argv[1], fast=fast).bad_shards for fast in (True, False)]
 """
 
 REPLACE = """
 import pathlib
-from storage.shard_places import listed_shards
+from storage.dataset.shard_places import listed_shards
 (place,) = listed_shards([sys.argv[1]])
 said = []
 for _ in range(2):

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.shard_places import listed_shards
 from storage.errors import TrilightError
+from storage.records.sample import Sample, encode_sample
 from storage.remote import pace
 from storage.remote.pace import Patience
-from storage.sample import Sample, encode_sample
-from storage.shard_places import listed_shards
 from tests.http_server import Fault, Site
 
 SHARD = "train-000000.tar"

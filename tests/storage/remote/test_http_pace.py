@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
 from storage.remote import pace
 from storage.remote.pace import Pace, Patience

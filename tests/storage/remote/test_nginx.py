@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from storage.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.verify import verify_dataset
+from storage.records.sample import encode_sample
 from storage.remote import tries
 from storage.remote import url as remote_url
-from storage.sample import encode_sample
-from storage.verify import verify_dataset
 from tests.storage.remote.waiting import until
 
 NGINX = shutil.which("nginx", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin")

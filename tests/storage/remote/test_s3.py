@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from storage.dataset import Dataset, open_dataset
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.training_data import open_training_data
+from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from storage.records.sample import encode_sample
 from storage.remote import fetch, tries
 from storage.remote import url as remote_url
-from storage.sample import encode_sample
-from storage.training_data import open_training_data
-from storage.verify import verify_dataset
 from tests.s3_server import CREDENTIALS, Line, control, s3_server
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")

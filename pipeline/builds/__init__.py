@@ -1,0 +1,1 @@
+"""The named builds as data; frozen ones are spelled out in full."""

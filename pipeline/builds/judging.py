@@ -1,0 +1,63 @@
+"""The builds that networks are judged on, and never trained: all of their scenes are of `test`.
+
+Their pictures are kept without loss: there are few, and all figures are measured against them.
+"""
+
+import dataclasses
+
+from pipeline.builds.frozen_v1 import BUILD_V1, JUDGING_SPLITS
+from pipeline.builds.settings import BuildSettings, NamedBuild
+from pipeline.objects.generated import BENCHMARK
+from scene_templates.out_of_range import out_of_range_settings
+from storage.settings.dataset import StorageSettings
+
+_EXACT = StorageSettings(profile="lossless")
+
+
+def out_of_range() -> BuildSettings:
+    """One axis at a time beyond the trained range: 37 values of nine axes in four layouts."""
+    return dataclasses.replace(
+        BUILD_V1,
+        build="out-of-range",
+        assets=dataclasses.replace(BUILD_V1.assets, budgets=(3900, 2600, 1700, 1100, 700, 400)),
+        scenes=out_of_range_settings(max_triangles=4096),
+        # Lights of a hundredth of the area: a view is black where it is a thousand times darker.
+        renders=dataclasses.replace(BUILD_V1.renders, max_spp=2048, min_mean_radiance=1e-5),
+        splits=dataclasses.replace(JUDGING_SPLITS, scenes_per_shard=37),
+        storage=_EXACT,
+    )
+
+
+def benchmark_v1() -> BuildSettings:
+    """200 frozen scenes, 50 of each layout, one view each, to 48 dB or 2048 samples.
+
+    The settings, the seed and the built-in objects are frozen: whoever runs it gets the same
+    scenes (their digest is below, and in docs/reference). For the second resolution use
+    `--resolution 512`.
+    """
+    return dataclasses.replace(
+        BUILD_V1,
+        build="benchmark-v1",
+        seed=20261121,
+        source=BENCHMARK,
+        renders=dataclasses.replace(BUILD_V1.renders, noise_floor_db=48.0, max_spp=2048),
+        splits=JUDGING_SPLITS,
+        storage=_EXACT,
+    )
+
+
+JUDGING_BUILDS = {
+    "out-of-range": NamedBuild(settings=out_of_range, num_scenes=148),
+    "benchmark-v1": NamedBuild(
+        settings=benchmark_v1,
+        num_scenes=200,
+        scene_digest="5c77fcc0c9a5cb2859a0433befce8ae15d7cd4ad6fd26b8775494fde4fd8c14f",
+    ),
+    "benchmark-v1-mini": NamedBuild(
+        settings=benchmark_v1,
+        num_scenes=20,
+        scene_digest="c2d2baa3de32b89bc0b1eca3588ffe9d841ec5881879cf97bc69340abb3ebc49",
+    ),
+}
+"""`out-of-range` counts 37 values times four layouts; the mini is the beginning of the other, and
+grows into it with more `--scenes`."""

@@ -1,0 +1,118 @@
+"""The named builds: each a function that returns the full settings of a dataset."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.builds.judging import JUDGING_BUILDS
+from pipeline.builds.renderformer import RENDERFORMER_BUILDS
+from pipeline.builds.settings import BuildSettings, NamedBuild
+from pipeline.builds.training import TRAINING_BUILDS
+from pipeline.objects.generated import BENCHMARK
+from pipeline.objects.generated import PREFIX as BUILTIN
+from storage.dataset.statistics import Statistics
+from storage.errors import TrilightError
+from storage.registry import Registry
+from storage.remote.safe_url import safe_url
+from storage.settings.changes import changed
+
+BUILDS: Registry[NamedBuild] = Registry(
+    "build",
+    NamedBuild,
+    {**TRAINING_BUILDS, **RENDERFORMER_BUILDS, **JUDGING_BUILDS},
+    decides=("data",),
+)
+"""By the name that the command line takes."""
+
+
+def typed_build(typed: str) -> str:
+    """Return the name of a build as a person typed it on a command line.
+
+    Of FILE.py:FUNCTION, a file of their own, it registers what the function returns: BuildSettings,
+    of which a cycle of shards is made unless said otherwise, or a NamedBuild. Names that come from
+    elsewhere, a dataset or a form, must not be brought here, since the file is run.
+
+    Raises:
+        TrilightError: as `Registry.typed`, or the function returns something else.
+    """
+    return BUILDS.typed(typed, _as_build)
+
+
+def _as_build(found: Any) -> NamedBuild:
+    if isinstance(found, BuildSettings):
+        splits = found.splits
+        num_scenes = splits.shards_per_cycle * splits.scenes_per_shard
+        return NamedBuild(settings=lambda: found, num_scenes=num_scenes)
+    if isinstance(found, NamedBuild):
+        return found
+    raise TrilightError(
+        f"it returned a {type(found).__name__}; expected BuildSettings or a NamedBuild."
+    )
+
+
+def named_build(
+    name: str,
+    *,
+    seed: int | None = None,
+    resolution: int | None = None,
+    noise_floor_db: float | None = None,
+    allow_licences: tuple[str, ...] = (),
+    changes: Mapping[str, Any] | None = None,
+) -> BuildSettings:
+    """Return the settings of a build with what the caller wants otherwise.
+
+    Args:
+        name: one of BUILDS.
+        seed, resolution, noise_floor_db: replace the build's value where not None.
+        allow_licences: allowed in addition to the build's.
+        changes: any other settings by dotted name, such as `scenes.lights.coloured_share`.
+
+    Raises:
+        TrilightError: an unknown name, or values that contradict each other.
+    """
+    build = BUILDS.find(name).settings()
+    if not BUILDS.is_ours(name) and BUILDS.is_ours(build.build):
+        raise TrilightError(
+            f"build {name!r}: its settings say build={build.build!r}, which is one of Trilight's "
+            f"own; expected another name, such as dataclasses.replace(..., "
+            f"build='my-{build.build}')."
+        )
+    named = {
+        "seed": seed,
+        "renders.resolution": resolution,
+        "renders.noise_floor_db": noise_floor_db,
+    }
+    build = changed(build, {key: value for key, value in named.items() if value is not None})
+    licences = tuple(sorted({*build.allowed_licences, *allow_licences}))
+    return changed(dataclasses.replace(build, allowed_licences=licences), changes or {})
+
+
+def object_source(settings: BuildSettings, objects: str | None) -> str:
+    """Return where objects come from.
+
+    Raises:
+        TrilightError: the build is frozen with another source than the one given.
+    """
+    if settings.source is None:
+        # Who is judged may have learnt from the built-in objects of everybody.
+        return objects or (BENCHMARK if settings.splits.one_split else BUILTIN)
+    if objects is not None and objects != settings.source:
+        raise TrilightError(
+            f"--objects is {safe_url(objects)!r}; expected {settings.source!r}, which "
+            f"{settings.build} is frozen with: leave --objects away, or choose another build."
+        )
+    return settings.source
+
+
+def frozen_note(build: str, statistics: Statistics) -> tuple[str, ...]:
+    """Return a note on whether the scenes of a frozen set are the published ones."""
+    named = BUILDS[build]
+    if named.scene_digest is None or statistics.num_scenes != named.num_scenes:
+        return ()
+    if statistics.scene_digest == named.scene_digest:
+        return (f"these are the published {named.num_scenes} scenes of {build}",)
+    return (
+        f"the scene digest is {statistics.scene_digest}; the published scenes of {build} have "
+        f"{named.scene_digest}. These are other scenes, so figures cannot be compared: install "
+        "the exact versions with make setup",
+    )

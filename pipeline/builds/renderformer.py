@@ -1,0 +1,97 @@
+"""RenderFormer V1's own distribution, as far as it is known and agrees with itself.
+
+Every number of the published recipes that is known stands in the settings (reference:
+renderformer.md, A.1 to A.9), and so in the manifest of every dataset. What is not known, or cannot
+be meant, with what is done here:
+
+- **Templates.** That 21 and 14 families map to four layouts, and their weights, is known; a few
+  object sizes, counts and lists are not (`scene_templates.renderformer_v1` names each).
+- **Triangles.** The recipes cap each object at 1188 and 3968 faces, while the loader pads scenes to
+  1572 and 4192: three objects do not fit, and the public loader fails on them. Here the whole scene
+  keeps within the padding; objects are drawn among those that fit, and take the finest levels that
+  do (`enough_error` 0), of at most 1188 and 3968 faces.
+- **Meshes.** Published objects were voxelised to be watertight and decimated by tools that are not
+  recoverable. Here they are cleaned and decimated by our own stage, which keeps open surfaces open.
+- **Light and camera shells.** The corner's light shell and the azimuths of most cameras are known;
+  the light shells of the other layouts are not: ours (`scene_templates.templates`).
+- **Colours** pass through 8-bit vertex colours there, truncated, and are decoded as sRGB by one of
+  two readers; here they are linear floats everywhere.
+- **Seeds**, lists of objects, and the number of scenes are lost.
+- **Pictures.** Cycles at 4096 samples with a denoiser; here Mitsuba, until the measured floor
+  is reached or at the same number of samples.
+
+The `-original` builds have the background policy from before the authors' repair: squares hardly
+turn in their plane, so that the diagonals of floor and walls run one way.
+"""
+
+import dataclasses
+import functools
+
+from pipeline.builds.frozen_v1 import BUILD_V1
+from pipeline.builds.settings import BuildSettings, NamedBuild
+from scene_templates.family import Family
+from scene_templates.frozen_v1 import SCENES_V1
+from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
+from scene_templates.settings import SceneSettings
+
+
+def renderformer_v1_256(policy: Policy = "de-biased") -> BuildSettings:
+    """The published first stage: 21 families, 256 pixels, at most 1572 triangles."""
+    return dataclasses.replace(
+        BUILD_V1,
+        build="renderformer-v1-256" + _suffix(policy),
+        assets=dataclasses.replace(BUILD_V1.assets, budgets=(1188, 840, 594, 396, 297, 198)),
+        scenes=_published(stage_1_families(policy), max_triangles=1572),
+    )
+
+
+def renderformer_v1_512(policy: Policy = "de-biased") -> BuildSettings:
+    """The published second stage: 14 families, 512 pixels, at most 4192 triangles."""
+    return dataclasses.replace(
+        BUILD_V1,
+        build="renderformer-v1-512" + _suffix(policy),
+        assets=dataclasses.replace(BUILD_V1.assets, budgets=(3968, 2380, 1188, 840, 594, 396)),
+        scenes=_published(stage_2_families(policy), max_triangles=4192),
+        renders=dataclasses.replace(BUILD_V1.renders, resolution=512),
+        splits=dataclasses.replace(BUILD_V1.splits, scenes_per_shard=64),
+    )
+
+
+def _published(families: tuple[Family, ...], *, max_triangles: int) -> SceneSettings:
+    return dataclasses.replace(
+        SCENES_V1,
+        families=families,
+        families_in_turn=False,
+        max_triangles=max_triangles,
+        enough_error=0.0,
+        centring="vertex_mean",
+        num_views=4,
+        placement=dataclasses.replace(
+            SCENES_V1.placement,
+            orientation="euler",
+            resting_share=0.0,
+            overlap_share=1.0,
+            inside=False,
+        ),
+        materials=dataclasses.replace(SCENES_V1.materials, triangle_colours_share=0.0),
+        lights=dataclasses.replace(SCENES_V1.lights, orientation="euler", reflectance=1.0),
+        views=dataclasses.replace(
+            SCENES_V1.views, min_coverage=0.0, min_lit=0.0, max_shell_back=1.0
+        ),
+    )
+
+
+def _suffix(policy: Policy) -> str:
+    return "-original" if policy == "original" else ""
+
+
+RENDERFORMER_BUILDS = {
+    "renderformer-v1-256": NamedBuild(settings=renderformer_v1_256, num_scenes=65_536),
+    "renderformer-v1-512": NamedBuild(settings=renderformer_v1_512, num_scenes=16_384),
+    "renderformer-v1-256-original": NamedBuild(
+        settings=functools.partial(renderformer_v1_256, "original"), num_scenes=65_536
+    ),
+    "renderformer-v1-512-original": NamedBuild(
+        settings=functools.partial(renderformer_v1_512, "original"), num_scenes=16_384
+    ),
+}

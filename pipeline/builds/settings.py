@@ -1,0 +1,77 @@
+"""`BuildSettings`: everything that decides what a dataset holds, except how many scenes."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.renders.settings import RenderSettings
+from scene_templates.settings import SceneSettings
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+from storage.settings.dataset import SplitSettings, StorageSettings
+from storage.settings.described import checked, settings_record
+from storage.settings.ranges import Seed
+
+
+@checked()
+class BuildSettings:
+    """The settings of one dataset. They stand in its manifest and never change."""
+
+    build: str
+    """Name of the build that they come from."""
+    seed: Seed
+    """Seed of every draw."""
+    source: str | None = None
+    """Where objects must come from; by default the user says."""
+    allowed_licences: tuple[str, ...]
+    """Licences of objects that may be used."""
+    assets: AssetSettings
+    """How objects become meshes."""
+    scenes: SceneSettings
+    """How meshes become scenes."""
+    renders: RenderSettings
+    """How scenes become pictures."""
+    splits: SplitSettings
+    """How objects and scenes are divided into splits and shards."""
+    storage: StorageSettings = dataclasses.field(default_factory=StorageSettings)
+    """How arrays and pictures are packed."""
+
+    def __post_init__(self) -> None:
+        if not self.allowed_licences:
+            raise TrilightError("allowed_licences is empty; expected at least one licence.")
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the settings as JSON values."""
+        return settings_record(self)
+
+    @property
+    def digest(self) -> str:
+        """sha256 of the settings."""
+        return sha256_hex(canonical_json(self.as_json()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedBuild:
+    """What a name on the command line stands for."""
+
+    settings: Callable[[], BuildSettings]
+    """Returns the settings."""
+    num_scenes: int
+    """How many scenes are made where the user does not say."""
+    scene_digest: str | None = None
+    """What the scenes of a frozen set must add up to (storage.dataset.statistics), if there are so
+    many."""
+
+
+def differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
+    """Yield (dotted name, value before, value now) for each setting that differs."""
+    for name in sorted({*before, *now}):
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            yield from differences(old, new, f"{prefix}{name}.")
+        elif old != new:
+            yield f"{prefix}{name}", old, new

@@ -1,0 +1,145 @@
+"""One scene, or all that a file holds, from one form to another; in a child process with limits.
+
+USD holds many scenes in one file. Forms that hold one: many become `NAME.KEY.SUFFIX`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.file_child import file_child
+from pipeline.exchange.formats import FORMATS, LoadedScene, SceneFormat, SceneSource, writable
+from pipeline.exchange.open_scene import load_source, source_keys
+from pipeline.isolation import ChildFailed, call_with_retries
+from storage.errors import TrilightError
+from storage.records.carried import lost_members
+from storage.records.scene import Scene
+
+
+@dataclass(frozen=True, kw_only=True)
+class Converted:
+    """What came of a conversion."""
+
+    files: tuple[Path, ...]
+    """What was written, without the meshes beside a scene JSON."""
+    triangles: int
+    """Of all scenes."""
+    notes: tuple[str, ...]
+    """What could not be carried over, for people."""
+
+
+def convert_scene(
+    source: SceneSource, target: Path, *, budget: int | None, done: Callable[[int, int], None]
+) -> Converted:
+    """Read a source and write it in the form that the target's name says.
+
+    Args:
+        source: one scene, or a file of many.
+        target: the file to write.
+        budget: most triangles of each scene, or None for all of them.
+        done: called with (finished, all) files.
+
+    Raises:
+        TrilightError: the source is unusable, the target's form cannot hold it, or it cannot be
+            written.
+    """
+    form = _form_of(target)
+    child = file_child()
+    try:
+        keys = call_with_retries(child, source_keys, source)
+        if not keys:
+            raise TrilightError(f"{source.name}: holds no scene.")
+        if form.write_many and len(keys) > 1:
+            found = [call_with_retries(child, _many, source, keys, target, budget)]
+            done(1, 1)
+        else:
+            found = []
+            for key in keys:
+                wanted = source if key is None else dataclasses.replace(source, key=key)
+                out = target if len(keys) == 1 else target.with_suffix(f".{key}{target.suffix}")
+                found.append(call_with_retries(child, _one, wanted, out, budget))
+                done(len(found), len(keys))
+    except ChildFailed as failure:
+        raise TrilightError(f"{source.name}: could not be converted ({failure}).") from failure
+    finally:
+        child.close()
+    return Converted(
+        files=tuple(path for each in found for path in each.files),
+        triangles=sum(each.triangles for each in found),
+        notes=tuple(dict.fromkeys(note for each in found for note in each.notes)),
+    )
+
+
+def write_scene(
+    target: Path, scene: Scene, radiance_rgb: NDArray[np.float32] | None = None
+) -> tuple[str, ...]:
+    """Write a scene in the form that the target's name says; return what that cannot hold.
+
+    Args:
+        target: the file to write.
+        scene: that passes `Scene.check`.
+        radiance_rgb: [V, R, R, 3] pictures of its views, which HDF5 alone holds.
+
+    Raises:
+        TrilightError: the form cannot hold it, or it cannot be written.
+    """
+    form = _form_of(target)
+    assert form.write is not None
+    return (*lost_members(scene, form.carried), *form.write(target, scene, radiance_rgb))
+
+
+def _form_of(target: Path) -> SceneFormat:
+    form = FORMATS.get(target.suffix.lower())
+    if form is None or form.write is None or target.is_dir():
+        raise TrilightError(
+            f"{target}: cannot be written as a scene; expected the name of a file: "
+            f"{' '.join(writable())}."
+        )
+    return form
+
+
+def _one(source: SceneSource, target: Path, budget: int | None) -> Converted:
+    loaded = _loaded(source, budget, pictures=_form_of(target).holds_pictures)
+    lost = write_scene(target, loaded.scene, loaded.radiance_rgb)
+    notes = (*loaded.notes, *_said(target, lost))
+    return Converted(files=(target,), triangles=loaded.scene.num_triangles, notes=notes)
+
+
+def _said(target: Path, lost: Iterable[str]) -> Iterator[str]:
+    return (f"{target.name}: cannot hold {text}" for text in lost)
+
+
+def _many(
+    source: SceneSource, keys: Sequence[str | None], target: Path, budget: int | None
+) -> Converted:
+    form = _form_of(target)
+    assert form.write_many is not None
+    triangles, notes = 0, list[str]()
+
+    def scenes() -> Iterator[tuple[str, Scene]]:
+        nonlocal triangles
+        for key in keys:
+            loaded = _loaded(dataclasses.replace(source, key=key), budget)
+            triangles += loaded.scene.num_triangles
+            lost = lost_members(loaded.scene, form.carried)
+            notes.extend((*loaded.notes, *_said(target, lost)))
+            yield str(key), loaded.scene
+
+    form.write_many(target, scenes())
+    return Converted(files=(target,), triangles=triangles, notes=tuple(notes))
+
+
+def _loaded(source: SceneSource, budget: int | None, *, pictures: bool = False) -> LoadedScene:
+    loaded = load_source(source, pictures=pictures)
+    if budget is None or loaded.scene.num_triangles <= budget:
+        return loaded
+    from pipeline.exchange.scene_budget import within_budget  # loads mesh libraries
+
+    scene, notes = within_budget(loaded.scene, budget)
+    if loaded.radiance_rgb is not None:
+        notes = (*notes, "pictures left out: they show the scene before that")
+    return LoadedScene(scene=scene, notes=(*loaded.notes, *notes))

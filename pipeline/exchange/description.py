@@ -1,0 +1,105 @@
+"""What a scene file describes: objects by the paths of their meshes, materials, and cameras.
+
+Values are as the file states them; `pipeline.exchange.from_description` says what they mean.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Vector = tuple[float, float, float]
+
+ColourGroups = Literal["per-triangle", "per-shading-group"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedTransform:
+    """How a mesh comes to its place."""
+
+    translation: Vector
+    """World units, the last step."""
+    rotation_deg: Vector
+    """Angles about the world's X, then Y, then Z."""
+    scale: Vector
+    """Factors along the world's axes, after the rotation; a negative one mirrors."""
+    normalize: bool
+    """Whether the mesh is first brought into a sphere of diameter 1 around the origin."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedMaterial:
+    """How an object reflects or emits; colours are linear."""
+
+    diffuse: Vector
+    """Diffuse albedo, unless the object has random colours."""
+    specular: Vector
+    """Specular albedo."""
+    roughness: float
+    """In [0, 1]; the GGX width is its square."""
+    emissive: Vector
+    """Radiance of every triangle, to both sides; the object is an emitter where one is above 0."""
+    smooth_shading: bool
+    """Whether normals are interpolated across edges of up to 30 degrees; flat otherwise."""
+    random_diffuse_max: float
+    """Bound of the random colours."""
+    random_diffuse_type: ColourGroups
+    """What shares one random colour."""
+    rand_tri_diffuse_seed: int | None
+    """Seed of random colours that replace `diffuse`; None for none."""
+
+    @property
+    def emits(self) -> bool:
+        """Whether the object is an emitter."""
+        return max(self.emissive) > 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedObject:
+    """One entry of `objects`."""
+
+    name: str
+    """Its key."""
+    mesh_path: str
+    """Relative to the scene file."""
+    transform: DescribedTransform
+    """Where it stands."""
+    material: DescribedMaterial
+    """What it is made of."""
+    remesh: bool
+    """Whether the mesh is replaced by one of even triangles."""
+    remesh_target_face_num: int
+    """Most triangles of that mesh."""
+
+    @property
+    def remesh_faces(self) -> int | None:
+        """Most triangles of the remeshed mesh, or None where it stays as it is."""
+        return self.remesh_target_face_num if self.remesh else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedCamera:
+    """One entry of `cameras`."""
+
+    position: Vector
+    """World units."""
+    look_at: Vector
+    """The point in the middle of the picture."""
+    up: Vector
+    """Roughly upwards in the picture; neither unit nor orthogonal."""
+    fov_deg: float
+    """Full field of view, horizontal and vertical."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneDescription:
+    """One scene file."""
+
+    file: str
+    """Name of the file, for messages and provenance."""
+    scene_name: str
+    """What its author calls it."""
+    objects: tuple[DescribedObject, ...]
+    """In the order of the file."""
+    cameras: tuple[DescribedCamera, ...]
+    """In the order of the file."""
+    unknown_fields: tuple[str, ...]
+    """Dotted names of fields that mean nothing to us and were left out."""

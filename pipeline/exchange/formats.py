@@ -1,0 +1,238 @@
+"""The forms in which a file holds scenes, by the suffix that chooses each: one table for all.
+
+Reading happens in child processes only (pipeline.exchange.file_child), since a file may come from
+anybody; a child loads the extensions that have added a form.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.exchange import renderformer_h5, renderformer_json_write
+from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.from_description import scaled_albedo_notes
+from pipeline.exchange.renderformer_h5 import reflecting_emitters, write_renderformer_h5
+from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
+from pipeline.exchange.renderformer_json_write import described_files
+from pipeline.exchange.scene_files import build_scene, cameras_by, described_by
+from pipeline.exchange.usd import write as usd
+from pipeline.exchange.usd.read import read_usd, usd_keys
+from pipeline.exchange.usd.write import write_usd, write_usd_shard
+from pipeline.objects.licences import USER_PROVIDED
+from storage.atomic import write_atomically
+from storage.dataset.shard_reader import iterate_samples, read_members
+from storage.errors import TrilightError
+from storage.records import scene_file
+from storage.records.profiles import PACKED, PLAIN
+from storage.records.sample import decode_sample, decode_scene
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene, read_scene_file
+from storage.registry import Registry
+
+SEPARATOR = "::"
+"""Between a file of many scenes and the key of one."""
+
+_MEMBERS = ("json", PLAIN, PACKED)
+
+Pictures = NDArray[np.float32] | None
+"""[V, R, R, 3] linear radiance of all views, or None."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSource:
+    """Where one scene is."""
+
+    path: Path
+    """The file."""
+    key: str | None
+    """Which scene of it, where it holds many."""
+    usd_folder: Path | None = None
+    """A USD file may name files below it; below its own folder by default."""
+    albedo_over_one: AlbedoOverOne = "scale"
+    """Of RenderFormer's JSON: what to do where albedos add up to more than 1."""
+
+    @property
+    def name(self) -> str:
+        """What may be published: the file without its folders, and the key."""
+        return self.path.name if self.key is None else f"{self.path.name}{SEPARATOR}{self.key}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoadedScene:
+    """A scene as it was read."""
+
+    scene: Scene
+    """It passes `Scene.check`."""
+    notes: tuple[str, ...]
+    """What a person should know: what of a file means nothing, or could not be carried over."""
+    radiance_rgb: Pictures = None
+    """Of all views, where they were asked for and the source has them."""
+
+
+Cameras = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Poses [C, 4, 4] and angles [C] in degrees."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFormat:
+    """One form; what it leaves out it cannot do."""
+
+    read: Callable[[SceneSource, bool], LoadedScene] | None = None
+    """Reads a scene, and its pictures where the second argument says so; raises TrilightError."""
+    keys: Callable[[SceneSource], Sequence[str | None]] | None = None
+    """Of a form that may hold many scenes: the key of each, None for a file of one."""
+    always_many: bool = False
+    """Whether a file is no scene without a key."""
+    cameras: Callable[[SceneSource], Cameras] | None = None
+    """Reads the cameras alone, where that asks for less than a whole scene."""
+    write: Callable[[Path, Scene, Pictures], Iterable[str]] | None = None
+    """Writes a scene that passes `Scene.check`, and returns what of `carried` got lost."""
+    write_many: Callable[[Path, Iterable[tuple[str, Scene]]], None] | None = None
+    """Writes scenes with their keys into one file."""
+    carried: Collection[str] = frozenset()
+    """Members of a scene that it holds (storage.records.carried); of others in use the loss is
+    noted."""
+    holds_pictures: bool = False
+    """Whether `write` makes use of pictures."""
+
+
+def readable() -> list[str]:
+    """Return the suffixes of files that are scenes."""
+    return [suffix for suffix, form in FORMATS.items() if form.read and not form.always_many]
+
+
+def writable() -> list[str]:
+    """Return the suffixes of files that can be written."""
+    return [suffix for suffix, form in FORMATS.items() if form.write]
+
+
+def _read_usd(source: SceneSource, pictures: bool) -> LoadedScene:
+    found = read_usd(source.path, source.key, source.usd_folder, USER_PROVIDED)
+    return LoadedScene(
+        scene=found.scene, notes=tuple(f"{source.name}: {text}" for text in found.lost)
+    )
+
+
+def _usd_keys(source: SceneSource) -> list[str | None]:
+    return [key or None for key in usd_keys(source.path, source.usd_folder)]
+
+
+def _write_usd(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
+    write_usd(target, scene)
+    return ()
+
+
+def _write_many_usd(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
+    # a variant of USD may not be called what a time code is: it has a point, or a minus
+    write_usd_shard(
+        target, ((key.replace(".", "_").replace("-", "m"), scene) for key, scene in scenes)
+    )
+
+
+def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
+    root, name = source.path.parent.resolve(), source.path.name
+    unknown = described_by(root, name).unknown_fields
+    scene, _ = build_scene(
+        root,
+        name,
+        AssetSettings(),
+        licence=USER_PROVIDED,
+        num_views=None,
+        scene_index=0,
+        seed=0,
+        albedo_over_one=source.albedo_over_one,
+    )
+    texts = (*(f"unknown field {field}" for field in unknown), *scaled_albedo_notes(scene))
+    return LoadedScene(scene=scene, notes=tuple(f"{name}: {text}" for text in texts))
+
+
+def _json_cameras(source: SceneSource) -> Cameras:
+    return cameras_by(source.path.parent.resolve(), source.path.name)
+
+
+def _write_json(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
+    described = described_files(scene, target.stem)
+    for path, data in described.meshes.items():
+        write_atomically(target.parent / path, data)
+    write_atomically(target, described.json)  # last: what it names is there
+    return described.lost
+
+
+def _read_h5(source: SceneSource, pictures: bool) -> LoadedScene:
+    found = read_renderformer_h5(source.path)
+    return LoadedScene(
+        scene=found.scene,
+        notes=tuple(f"{source.path.name}: {text}" for text in found.lost),
+        radiance_rgb=found.radiance_rgb if pictures else None,
+    )
+
+
+def _write_h5(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
+    write_renderformer_h5(target, scene, pictures)
+    return reflecting_emitters(scene)
+
+
+def _read_scene_file(source: SceneSource, pictures: bool) -> LoadedScene:
+    return LoadedScene(scene=read_scene_file(source.path), notes=())
+
+
+def _write_scene_file(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
+    write_atomically(target, encode_scene(scene))
+    return ()
+
+
+def _shard_keys(source: SceneSource) -> list[str | None]:
+    return [key for key, _ in iterate_samples(source.path)]
+
+
+def _read_sample(source: SceneSource, pictures: bool) -> LoadedScene:
+    path, key = source.path, str(source.key)
+    record = decode_scene(key, read_members(path, key, _MEMBERS))
+    try:
+        record.scene.check()
+    except TrilightError as error:
+        raise TrilightError(f"sample {key}: {error}") from error
+    if not pictures:
+        return LoadedScene(scene=record.scene, notes=())
+    names = (*_MEMBERS, *(f"{view}.exr" for view in range(len(record.views))))
+    sample = decode_sample(key, read_members(path, key, names))
+    return LoadedScene(scene=sample.scene, notes=(), radiance_rgb=sample.radiance_rgb)
+
+
+_USD = SceneFormat(
+    read=_read_usd,
+    keys=_usd_keys,
+    write=_write_usd,
+    write_many=_write_many_usd,
+    carried=usd.CARRIED,
+)
+
+FORMATS: Registry[SceneFormat] = Registry(
+    "scene format",
+    SceneFormat,
+    {
+        **dict.fromkeys(usd.SUFFIXES, _USD),
+        ".usd": SceneFormat(read=_read_usd, keys=_usd_keys),
+        ".json": SceneFormat(
+            read=_read_json,
+            cameras=_json_cameras,
+            write=_write_json,
+            carried=renderformer_json_write.CARRIED,
+        ),
+        ".h5": SceneFormat(
+            read=_read_h5,
+            write=_write_h5,
+            carried=renderformer_h5.CARRIED,
+            holds_pictures=True,
+        ),
+        ".safetensors": SceneFormat(
+            read=_read_scene_file, write=_write_scene_file, carried=scene_file.CARRIED
+        ),
+        ".tar": SceneFormat(read=_read_sample, keys=_shard_keys, always_many=True),
+    },
+)
+"""By suffix, in small letters and with its point."""

@@ -1,0 +1,253 @@
+"""From a description and its meshes to a `Scene`: what the values of a scene file mean.
+
+A mesh is brought into a sphere of diameter 1 where the file says `normalize` (the mean of the
+vertices as the file has them becomes the origin, the farthest lies at 0.5), turned about the
+world's X, then Y, then Z, scaled along the world's axes, and moved: the order of the published
+converter. Vertices are not joined first, so that smooth shading stops where the mesh file splits
+its vertices. Template files, whose scales and translations are meant to be halved, are not known.
+
+An emitter's triangles become emitters each. They reflect by the albedos that the file gives them,
+since the published renderer's emitters have a white surface, as its files say. Materials whose
+albedos add up to more than 1 are scaled or refused (pipeline.exchange.described_albedos); what was
+scaled stands in the provenance, by object.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.described_albedos import AlbedoOverOne, lawful_albedos
+from pipeline.exchange.described_colours import colour_groups, random_diffuse
+from pipeline.exchange.description import (
+    DescribedCamera,
+    DescribedMaterial,
+    DescribedObject,
+    SceneDescription,
+)
+from pipeline.scenes.pieces import ScenePiece, joined
+from pipeline.scenes.posing import without_slivers
+from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
+from scene_templates.rotations import rotated, rotation_xyz
+from storage.conventions import look_at_c2w
+from storage.errors import TrilightError
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
+from storage.records.scene import ObjectKind, Scene, SceneObject
+
+SHELL_FOLDER = "templates/backgrounds/"
+"""Meshes below it are floors and walls; the published scene files keep them there."""
+
+SMOOTH_ANGLE_DEG = 30.0
+"""As published."""
+
+MAX_TRIANGLES = 1_000_000
+MAX_EMITTERS = 4096
+MAX_MATERIALS = 1 << 16
+"""Most triangles, emitting triangles and material rows of one scene."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoadedMesh:
+    """The mesh of an object, as its file has it or remeshed."""
+
+    uid: str
+    """Path of the file below the folder of the scenes, with slashes."""
+    licence: str
+    """SPDX identifier, or `LicenseRef-...`."""
+    positions: NDArray[np.float64]
+    """[V, 3] in the units of the file."""
+    faces: NDArray[np.int64]
+    """[F, 3]."""
+    centre: NDArray[np.float64]
+    """[3] mean of the vertices of the file."""
+    reach: float
+    """Distance of the farthest of them from the centre."""
+
+
+def scene_from_description(
+    description: SceneDescription,
+    meshes: Sequence[LoadedMesh],
+    *,
+    num_views: int,
+    provenance: Mapping[str, Any],
+    albedo_over_one: AlbedoOverOne = "scale",
+) -> Scene:
+    """Return the scene that a file describes.
+
+    Args:
+        description: the file.
+        meshes: one per object, in its order.
+        num_views: how many of the file's cameras to take, from the first.
+        provenance: of the scene; `albedo_scale` is added where materials were scaled.
+        albedo_over_one: what to do where albedos add up to more than 1.
+
+    Returns:
+        A checked scene; objects in the order of the file, an emitting object as one object per
+        triangle.
+
+    Raises:
+        TrilightError: an object or a camera that means nothing, named; or too much of something.
+    """
+    pieces: list[ScenePiece] = []
+    scales: dict[str, float] = {}
+    for described, mesh in zip(description.objects, meshes, strict=True):
+        try:
+            found, scale = _pieces(described, mesh, albedo_over_one)
+            pieces += found
+            if scale < 1:
+                scales[described.name] = round(scale, 6)
+        except TrilightError as error:
+            raise TrilightError(f"{description.file}: objects.{described.name}: {error}") from error
+    try:
+        _check_counts(pieces)
+        c2w, fov_deg = described_cameras(description.cameras[:num_views])
+        scene = Scene(
+            **joined(pieces),
+            c2w=c2w,
+            fov_deg=fov_deg,
+            objects=tuple(piece.entry for piece in pieces),
+            provenance={**provenance, "albedo_scale": scales} if scales else provenance,
+        )
+        scene.check()
+    except TrilightError as error:
+        raise TrilightError(f"{description.file}: {error}") from error
+    return scene
+
+
+def placed(mesh: LoadedMesh, described: DescribedObject) -> NDArray[np.float32]:
+    """Return the vertices [V, 3] of a mesh in world space."""
+    transform = described.transform
+    points = mesh.positions
+    if transform.normalize:
+        points = (points - mesh.centre) / (2 * mesh.reach)
+    turned = rotated(points, rotation_xyz(transform.rotation_deg))
+    world = turned * np.array(transform.scale) + np.array(transform.translation)
+    return world.astype(np.float32)
+
+
+def scaled_albedo_notes(scene: Scene) -> tuple[str, ...]:
+    """Return, for people, which objects of a described scene are darker than their file says."""
+    return tuple(
+        f"objects.{name}: diffuse + specular is {1 / scale:.4f}, which is more than 1; both were "
+        f"multiplied by {scale:.4f}"
+        for name, scale in scene.provenance.get("albedo_scale", {}).items()
+    )
+
+
+def _pieces(
+    described: DescribedObject, mesh: LoadedMesh, over_one: AlbedoOverOne
+) -> tuple[list[ScenePiece], float]:
+    """Return the pieces of an object, and by what the darkest of its materials was multiplied."""
+    positions = placed(mesh, described)
+    mirrored = np.prod(described.transform.scale) < 0
+    faces = (mesh.faces[:, ::-1] if mirrored else mesh.faces).astype(np.uint32)
+    faces = without_slivers(positions, faces)
+    if len(faces) == 0:
+        raise TrilightError(
+            f"no triangle of {mesh.uid} has an area after its transform; expected at least one."
+        )
+    if described.material.emits:
+        return _emitters(described, mesh, positions, faces, over_one)
+    smooth = described.material.smooth_shading
+    shaded = (
+        smooth_shaded(positions, faces, SMOOTH_ANGLE_DEG)
+        if smooth
+        else flat_shaded(positions, faces)
+    )
+    piece, scale = _surface(described, mesh, shaded, over_one)
+    return [piece], scale
+
+
+def _surface(
+    described: DescribedObject, mesh: LoadedMesh, shaded: ShadedMesh, over_one: AlbedoOverOne
+) -> tuple[ScenePiece, float]:
+    material = described.material
+    rows = np.zeros(len(shaded.faces), np.int64)
+    diffuse = np.array([material.diffuse])
+    if material.rand_tri_diffuse_seed is not None:
+        rows = colour_groups(shaded, material)
+        count = int(rows.max()) + 1
+        diffuse = random_diffuse(material.rand_tri_diffuse_seed, material.random_diffuse_max, count)
+    materials, scale = _reflecting(diffuse, material, over_one)
+    kind: ObjectKind = "shell" if mesh.uid.startswith(SHELL_FOLDER) else "object"
+    entry = _entry(described.name, kind, mesh)
+    return ScenePiece(entry=entry, mesh=shaded, materials=materials, material_index=rows), scale
+
+
+def _reflecting(
+    diffuse: NDArray[np.float64], material: DescribedMaterial, over_one: AlbedoOverOne
+) -> tuple[NDArray[np.float32], float]:
+    """Return rows that do not emit, for diffuse albedos [M, 3], and the least factor."""
+    diffuse, specular, scale = lawful_albedos(diffuse, np.array(material.specular), over_one)
+    materials = default_rows(len(diffuse))
+    materials[:, DIFFUSE] = diffuse
+    materials[:, SPECULAR] = specular
+    materials[:, ROUGHNESS] = material.roughness
+    return materials, scale
+
+
+def _emitters(
+    described: DescribedObject,
+    mesh: LoadedMesh,
+    positions: NDArray[np.float32],
+    faces: NDArray[np.uint32],
+    over_one: AlbedoOverOne,
+) -> tuple[list[ScenePiece], float]:
+    if len(faces) > MAX_EMITTERS:
+        _too_many("emitting triangles", len(faces), MAX_EMITTERS)
+    diffuse = np.array([described.material.diffuse])
+    materials, scale = _reflecting(diffuse, described.material, over_one)
+    materials[:, EMISSION] = described.material.emissive
+    single = len(faces) == 1
+    pieces = [
+        ScenePiece(
+            entry=_entry(described.name if single else f"{described.name}.{row}", "emitter", mesh),
+            mesh=flat_shaded(positions, faces[row : row + 1]),
+            materials=materials,
+            material_index=np.zeros(1, np.int64),
+        )
+        for row in range(len(faces))
+    ]
+    return pieces, scale
+
+
+def _entry(name: str, kind: ObjectKind, mesh: LoadedMesh) -> SceneObject:
+    uid = mesh.uid if kind == "object" else ""
+    return SceneObject(name=name, kind=kind, uid=uid, licence=mesh.licence)
+
+
+def described_cameras(
+    cameras: Sequence[DescribedCamera],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return poses [C, 4, 4] and full angles [C] in degrees; raises TrilightError."""
+    poses = [_pose(camera, at) for at, camera in enumerate(cameras)]
+    angles = np.array([camera.fov_deg for camera in cameras], np.float32)
+    return np.array(poses, np.float32).reshape(-1, 4, 4), angles
+
+
+def _pose(camera: DescribedCamera, row: int) -> NDArray[np.float64]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        c2w = look_at_c2w(eye=camera.position, target=camera.look_at, up=camera.up)
+    if not np.isfinite(c2w).all():
+        raise TrilightError(
+            f"cameras[{row}] looks from {camera.position} at {camera.look_at} with up "
+            f"{camera.up}; expected a distance, and an up that is not along the view."
+        )
+    return c2w
+
+
+def _check_counts(pieces: Sequence[ScenePiece]) -> None:
+    emitters = sum(piece.entry.kind == "emitter" for piece in pieces)
+    for what, count, most in (
+        ("triangles", sum(len(piece.mesh.faces) for piece in pieces), MAX_TRIANGLES),
+        ("emitting triangles", emitters, MAX_EMITTERS),
+        ("materials", sum(len(piece.materials) for piece in pieces), MAX_MATERIALS),
+    ):
+        if count > most:
+            _too_many(what, count, most)
+
+
+def _too_many(what: str, count: int, most: int) -> NoReturn:
+    raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")

@@ -1,0 +1,117 @@
+"""What `SRC` means where a command wants one scene: a file of its own, or a sample of a shard.
+
+    scene.json                 RenderFormer scene; its meshes lie in the folder of the file
+    scene.safetensors          storage.records.scene_file
+    scene.h5                   the published layout (pipeline.exchange.renderformer_h5)
+    scene.usda .usdc .usdz .usd   a USD stage (pipeline.scenes.usd)
+    train-000000.tar::KEY      the sample KEY of a shard
+    scenes.usdc::KEY           a scene of a shard in USD, or a time code of a stage that moves
+
+The last form is taken apart here and nowhere else: no library that knows URLs ever sees it.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.formats import (
+    FORMATS,
+    SEPARATOR,
+    Cameras,
+    LoadedScene,
+    SceneFormat,
+    SceneSource,
+    readable,
+)
+from storage.errors import TrilightError
+from storage.remote.safe_url import safe_url
+
+_KEY = re.compile(r"[0-9A-Za-z_.\-]+")
+
+
+def scene_source(
+    text: str,
+    *,
+    many: bool = False,
+    usd_folder: Path | None = None,
+    albedo_over_one: AlbedoOverOne = "scale",
+) -> SceneSource:
+    """Return what the user's `SRC` names; the file is not opened yet.
+
+    Args:
+        text: what the user typed.
+        many: whether a shard without a key will do.
+        usd_folder, albedo_over_one: see `SceneSource`.
+
+    Raises:
+        TrilightError: a URL, no such file, or a name that is none of the forms.
+    """
+    expected = f"expected a scene {' '.join(readable())}, or SHARD.tar{SEPARATOR}KEY"
+    if "://" in text:
+        raise TrilightError(f"{safe_url(text)}: only files of this machine are read; {expected}.")
+    name, separator, key = text.rpartition(SEPARATOR)
+    path = Path(name if separator else text)
+    form = FORMATS.get(path.suffix.lower())
+    if separator and (form is None or form.keys is None or not _KEY.fullmatch(key)):
+        raise TrilightError(f"{text}: no shard and key; {expected}.")
+    if path.is_dir():
+        raise TrilightError(f"{text}: a folder; {expected}.")
+    if not path.exists():
+        raise TrilightError(f"{text}: no such file; {expected}.")
+    if form is None or form.read is None:
+        raise TrilightError(f"{text}: cannot be read as a scene; {expected}.")
+    if not separator and form.always_many and not many:
+        raise TrilightError(f"{text}: a shard holds many scenes; expected {text}{SEPARATOR}KEY.")
+    return SceneSource(
+        path=path,
+        key=key if separator else None,
+        usd_folder=usd_folder,
+        albedo_over_one=albedo_over_one,
+    )
+
+
+def source_keys(source: SceneSource) -> Sequence[str | None]:
+    """Return the key of every scene that a source names; [None] where it is one scene.
+
+    Only children come here, since a stage may be read.
+    """
+    keys = _form_of(source).keys
+    return [source.key] if source.key is not None or keys is None else keys(source)
+
+
+def load_cameras(source: SceneSource) -> Cameras:
+    """Read the cameras alone, poses [C, 4, 4] and angles [C]; only children come here.
+
+    A JSON file needs nothing but its list `cameras`.
+
+    Raises:
+        TrilightError: as `load_source`.
+    """
+    form = _form_of(source)
+    if form.cameras:
+        return form.cameras(source)
+    scene = load_source(source).scene
+    return scene.c2w, scene.fov_deg
+
+
+def load_source(source: SceneSource, *, pictures: bool = False) -> LoadedScene:
+    """Read a scene, with all of its cameras; only children come here, since meshes may be read.
+
+    Args:
+        source: which.
+        pictures: whether to read those of a shard's sample or an HDF5 file too.
+
+    Raises:
+        TrilightError: anything in the file is unusable, or breaks a law of scenes.
+    """
+    read = _form_of(source).read
+    assert read is not None, source
+    loaded = read(source, pictures)
+    if not FORMATS.is_ours(source.path.suffix.lower()):
+        loaded.scene.check()
+    return loaded
+
+
+def _form_of(source: SceneSource) -> SceneFormat:
+    return FORMATS[source.path.suffix.lower()]

@@ -1,0 +1,84 @@
+"""Scenes of a user's files, read in a child process with limits; only checked scenes come out."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.file_child import file_child
+from pipeline.exchange.formats import Cameras, LoadedScene, SceneSource
+from pipeline.exchange.from_description import LoadedMesh
+from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
+from pipeline.exchange.scene_files import load_mesh_file
+from pipeline.isolation import ChildFailed, Result, call_with_retries
+from storage.errors import TrilightError
+from storage.records.scene import Scene
+
+
+class SceneReader:
+    """One child for any number of sources; close it, or use it in a `with` block."""
+
+    def __init__(self, albedo_over_one: AlbedoOverOne = "scale") -> None:
+        """Start nothing yet.
+
+        Args:
+            albedo_over_one: of RenderFormer's JSON, where albedos add up to more than 1.
+        """
+        self._child = file_child()
+        self._over_one = albedo_over_one
+
+    def scenes_of(self, source: SceneSource) -> list[SceneSource]:
+        """Return each scene that a file holds as a source of its own, in the order of the file.
+
+        Raises:
+            TrilightError: the file is unusable, or holds no scene.
+        """
+        keys = self._call(source.name, source_keys, source)
+        if not keys:
+            raise TrilightError(f"{source.name}: holds no scene.")
+        return [dataclasses.replace(source, key=key) for key in keys]
+
+    def load(self, source: SceneSource) -> LoadedScene:
+        """Read one scene; raises TrilightError as `scene_source.load_source`."""
+        source = dataclasses.replace(source, albedo_over_one=self._over_one)
+        return self._call(source.name, load_source, source)
+
+    def cameras(self, source: SceneSource) -> Cameras:
+        """Return poses and angles; raises TrilightError as `scene_source.load_cameras`."""
+        return self._call(source.name, load_cameras, source)
+
+    def mesh(self, path: Path, licence: str) -> LoadedMesh:
+        """Read a file of an object, as it is; raises TrilightError as `load_mesh_file`."""
+        wanted = (path, path.name, path.name, AssetSettings(), licence)
+        return self._call(path.name, load_mesh_file, *wanted)[0]
+
+    def within_budget(self, scene: Scene, max_triangles: int) -> LoadedScene:
+        """Return a scene of fewer triangles; raises TrilightError as `within_budget`."""
+        return self._call("scene", _within_budget, scene, max_triangles)
+
+    def __enter__(self) -> "SceneReader":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._child.close()
+
+    def _call(self, name: str, function: Callable[..., Result], *args: Any) -> Result:
+        try:
+            return call_with_retries(self._child, function, *args)
+        except ChildFailed as failure:
+            raise TrilightError(f"{name}: could not be read ({failure}).") from failure
+
+
+def _within_budget(scene: Scene, max_triangles: int) -> LoadedScene:
+    from pipeline.exchange.scene_budget import within_budget  # loads mesh libraries
+
+    reduced, notes = within_budget(scene, max_triangles)
+    return LoadedScene(scene=reduced, notes=notes)

@@ -1,0 +1,238 @@
+"""Reading HDF5 arrays from outside: what a file claims is checked before memory is taken.
+
+An HDF5 file can point out of itself (external links, external storage, virtual datasets), have a
+filter loaded as a plug-in, claim shapes that nothing backs, and hold chunks that inflate without
+end. So only plain arrays are read, and chunks are unpacked here and not by the library's filters.
+The library still parses the structure of the file: whoever opens files of strangers does so in a
+child process with limits (pipeline.isolation).
+"""
+
+import contextlib
+import itertools
+import math
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import TrilightError
+from storage.records.safe_read import open_plain
+
+MAX_BLOCK_BYTES = 64 << 20
+"""Most memory that one block of an array may take."""
+
+MAX_CHUNKS = 1 << 22
+"""Most chunks of one array; 4096 triangles with textures, written as published, take 22528."""
+
+_FLOATS = ("<f2", "<f4", "<f8")
+_DEFLATE, _SHUFFLE = 1, 2
+"""Numbers of the only filters that are undone here."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class H5Array:
+    """A plain array of a file, not yet read."""
+
+    name: str
+    """For messages."""
+    shape: tuple[int, ...]
+    """What it claims; its blocks are counted against it."""
+    dtype: np.dtype
+    """Of its elements in the file."""
+    dataset: Any
+    """The h5py dataset."""
+
+
+@contextlib.contextmanager
+def opened_h5(path: Path) -> Iterator[Any]:
+    """Open a file for reading and yield its root group.
+
+    Raises:
+        TrilightError: not an HDF5 file, or damaged where it is read; errors of the block get the
+            name of the file.
+    """
+    import h5py  # not at the top: few need it
+
+    try:
+        open_plain(path).close()
+        with h5py.File(path, "r", locking=False) as file:
+            yield file
+    except TrilightError as error:
+        raise TrilightError(f"{path.name}: {error}") from error
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        why = str(error).replace(str(path), path.name)
+        raise TrilightError(f"{path.name}: not a readable HDF5 file ({why}).") from error
+
+
+def names_in(group: Any) -> list[str]:
+    """Return what a group holds, by name; no link is followed."""
+    return sorted(group)
+
+
+def plain_array(group: Any, name: str, shape: Sequence[int | None], longest: int) -> H5Array:
+    """Return an array of little-endian floats that the file itself holds.
+
+    Args:
+        group: of an open file.
+        name: of the array.
+        shape: what it must have; None is any length from 1 to `longest`.
+        longest: the greatest length.
+
+    Raises:
+        TrilightError: missing, behind a link, outside of the file, of another type or shape.
+    """
+    import h5py
+
+    if name not in names_in(group):
+        raise TrilightError(f"{name}: missing; expected an array {_shown(shape)}.")
+    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        raise TrilightError(f"{name}: is a link; expected an array in the file itself.")
+    dataset = group[name]
+    if not isinstance(dataset, h5py.Dataset):
+        raise TrilightError(f"{name}: is no array; expected one {_shown(shape)}.")
+    claimed = dataset.shape or ()
+    fits = len(claimed) == len(shape) and all(
+        1 <= got <= longest if wanted is None else got == wanted
+        for got, wanted in zip(claimed, shape, strict=True)
+    )
+    if not fits:
+        raise TrilightError(
+            f"{name}: has shape {list(claimed)}; expected {_shown(shape)} with lengths of at most "
+            f"{longest}."
+        )
+    dtype = _float_type(dataset, name)
+    return H5Array(name=name, shape=claimed, dtype=dtype, dataset=dataset)
+
+
+def iterate_blocks(array: H5Array) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
+    """Yield (where, values) for blocks that cover the array once; memory is that of one block.
+
+    Raises:
+        TrilightError: bytes are missing, stored outside of the file, packed in another way than
+            deflate and shuffle, or other than they must be.
+    """
+    from h5py import h5d
+
+    plan = array.dataset.id.get_create_plist()
+    if plan.get_external_count() or plan.get_layout() == h5d.VIRTUAL:
+        raise TrilightError(f"{array.name}: its bytes are elsewhere; expected them in the file.")
+    if plan.get_layout() == h5d.CHUNKED:
+        yield from _chunks(array, plan)
+        return
+    num_bytes = math.prod(array.shape) * array.dtype.itemsize
+    if array.dataset.id.get_storage_size() != num_bytes:
+        raise TrilightError(f"{array.name}: holds other bytes than its shape needs.")
+    row_bytes = num_bytes // array.shape[0]
+    _require_memory(array, row_bytes, MAX_BLOCK_BYTES)
+    rows = MAX_BLOCK_BYTES // row_bytes
+    for start in range(0, array.shape[0], rows):
+        where = (slice(start, min(start + rows, array.shape[0])),)
+        yield where, array.dataset[where]
+
+
+def read_whole(array: H5Array, most_bytes: int = MAX_BLOCK_BYTES) -> NDArray[np.float32]:
+    """Return an array whole, as float32.
+
+    Raises:
+        TrilightError: as `iterate_blocks`, or it would take more than `most_bytes`, or not finite.
+    """
+    _require_memory(array, math.prod(array.shape) * 4, most_bytes)
+    values = np.zeros(array.shape, np.float32)
+    for where, block in iterate_blocks(array):
+        require_finite(array, block)
+        values[where] = block
+    return values
+
+
+def require_finite(array: H5Array, values: NDArray) -> None:
+    """Raise TrilightError where a value is NaN or infinite, or is so as float32."""
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(values.astype(np.float32))
+    if not finite.all():
+        raise TrilightError(f"{array.name}: holds {values[~finite][0]}; expected finite values.")
+
+
+def _chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDArray]]:
+    size = array.dataset.chunks
+    filters = [plan.get_filter(at)[0] for at in range(plan.get_nfilters())]
+    if filters not in ([], [_DEFLATE], [_SHUFFLE], [_SHUFFLE, _DEFLATE]):
+        raise TrilightError(
+            f"{array.name}: is packed with filters {filters}; expected deflate, shuffle or none."
+        )
+    _require_memory(array, math.prod(size) * array.dtype.itemsize, MAX_BLOCK_BYTES)
+    counts = [-(-length // chunk) for length, chunk in zip(array.shape, size, strict=True)]
+    if math.prod(counts) > MAX_CHUNKS:
+        raise TrilightError(f"{array.name}: has {math.prod(counts)} chunks, over {MAX_CHUNKS}.")
+    stored = _stored(array)
+    for at in itertools.product(*(range(count) for count in counts)):
+        offset = tuple(i * chunk for i, chunk in zip(at, size, strict=True))
+        if offset not in stored:
+            raise TrilightError(f"{array.name}: the chunk at {list(offset)} is missing.")
+        _, packed = array.dataset.id.read_direct_chunk(offset)
+        values = np.frombuffer(_unpacked(array, packed, filters), array.dtype).reshape(size)
+        where = tuple(
+            slice(start, min(start + chunk, length))
+            for start, chunk, length in zip(offset, size, array.shape, strict=True)
+        )
+        yield where, values[tuple(slice(0, part.stop - part.start) for part in where)]
+
+
+def _stored(array: H5Array) -> set[tuple[int, ...]]:
+    """Return the offsets of the chunks that the file has, none larger than a block or the file."""
+    most = min(MAX_BLOCK_BYTES, array.dataset.file.id.get_filesize())
+    found: set[tuple[int, ...]] = set()
+
+    def look(chunk: Any) -> bool | None:
+        if chunk.filter_mask or chunk.size > most or len(found) >= MAX_CHUNKS:
+            return True  # ends the walk; the chunk then counts as missing
+        found.add(chunk.chunk_offset)
+        return None
+
+    array.dataset.id.chunk_iter(look)
+    return found
+
+
+def _unpacked(array: H5Array, packed: bytes, filters: list[int]) -> bytes:
+    num_bytes = math.prod(array.dataset.chunks) * array.dtype.itemsize
+    if _DEFLATE in filters:
+        inflater = zlib.decompressobj()
+        try:
+            packed = inflater.decompress(packed, num_bytes + 1)  # never more, whatever it claims
+        except zlib.error as error:
+            raise TrilightError(f"{array.name}: a chunk is damaged ({error}).") from error
+        if not inflater.eof:
+            raise TrilightError(f"{array.name}: a chunk ends too early or too late.")
+    if len(packed) != num_bytes:
+        raise TrilightError(f"{array.name}: a chunk holds other bytes than its shape needs.")
+    if _SHUFFLE in filters:
+        planes = np.frombuffer(packed, np.uint8).reshape(array.dtype.itemsize, -1)
+        packed = planes.T.tobytes()
+    return packed
+
+
+def _float_type(dataset: Any, name: str) -> np.dtype:
+    from h5py import h5t
+
+    stored = dataset.id.get_type()
+    known = (h5t.IEEE_F16LE, h5t.IEEE_F32LE, h5t.IEEE_F64LE)
+    for code, kind in zip(_FLOATS, known, strict=True):
+        if stored.equal(kind):
+            return np.dtype(code)
+    raise TrilightError(
+        f"{name}: has another type of elements; expected little-endian floats of 16, 32 or 64 bits."
+    )
+
+
+def _require_memory(array: H5Array, num_bytes: int, most: int) -> None:
+    if num_bytes > most:
+        raise TrilightError(
+            f"{array.name}: would take {num_bytes} bytes at once; expected at most {most}."
+        )
+
+
+def _shown(shape: Sequence[int | None]) -> str:
+    return "[" + ", ".join("any" if length is None else str(length) for length in shape) + "]"

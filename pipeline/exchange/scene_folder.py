@@ -1,0 +1,112 @@
+"""A folder of scene files: which there are, in which order, and what each of them describes.
+
+Scene k is the k-th `*.json` of the folder by name. A file of which no scene can be made keeps its
+number: that scene is given up, and a row of failures.jsonl says why.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.description import SceneDescription
+from pipeline.exchange.scene_files import described_by
+from storage.errors import EnvironmentFailure, TrilightError
+
+MAX_SCENES = 100_000
+"""Most scene files of one folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFolder:
+    """The scene files of one folder."""
+
+    root: Path
+    """The folder, without links; nothing outside of it is read."""
+    names: tuple[str, ...]
+    """Every scene file, sorted; the position is the index of the scene, usable or not."""
+    descriptions: tuple[SceneDescription, ...]
+    """What each usable file describes, in the same order."""
+    unusable: Mapping[str, str]
+    """What is wrong with each of the others, by its name."""
+    albedo_over_one: AlbedoOverOne
+    """What to do where albedos add up to more than 1."""
+
+    def views(self, wanted: int | None) -> int:
+        """Return how many views every scene gets: `wanted`, or as many as every file has.
+
+        No camera is ever invented: the pictures show what the files say.
+
+        Raises:
+            TrilightError: a file has fewer cameras than wanted.
+        """
+        fewest = min(self.descriptions, key=lambda description: len(description.cameras))
+        if wanted is None:
+            return len(fewest.cameras)
+        if not 1 <= wanted <= len(fewest.cameras):
+            raise TrilightError(
+                f"--views is {wanted}; expected 1 to {len(fewest.cameras)}, the number of cameras "
+                f"in {fewest.file}: choose fewer views, or add cameras to the file."
+            )
+        return wanted
+
+    def notes(self, num_views: int) -> tuple[str, ...]:
+        """Return what a person should know: fields without meaning, and cameras not used."""
+        found = []
+        for description in self.descriptions:
+            found += [
+                f"{description.file}: unknown field {name}" for name in description.unknown_fields
+            ]
+            if (unused := len(description.cameras) - num_views) > 0:
+                found.append(
+                    f"{description.file}: {unused} of {len(description.cameras)} cameras not used, "
+                    f"from cameras[{num_views}] on"
+                )
+        return tuple(found)
+
+
+def find_scene_files(folder: str, albedo_over_one: AlbedoOverOne = "scale") -> SceneFolder:
+    """Read every `*.json` of a local folder, not of those below it.
+
+    Raises:
+        TrilightError: no such folder, no scene file in it or too many, or none that is usable.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise TrilightError(f"--scenes-from {folder}: no such folder; expected one of *.json.")
+    root = root.resolve()
+    names = sorted(path.name for path in root.glob("*.json"))
+    if not 1 <= len(names) <= MAX_SCENES:
+        raise TrilightError(
+            f"--scenes-from {folder}: {len(names)} files *.json; expected 1 to {MAX_SCENES}."
+        )
+    for name in names:
+        if not name.isprintable():
+            raise TrilightError(
+                f"--scenes-from {folder}: rename {name!r}; expected printable text."
+            )
+    descriptions, unusable = [], {}
+    for name in names:
+        try:
+            descriptions.append(described_by(root, name))
+        except EnvironmentFailure:
+            raise
+        except TrilightError as mistake:
+            unusable[name] = str(mistake)
+    require_usable(names, unusable)
+    return SceneFolder(
+        root=root,
+        names=tuple(names),
+        descriptions=tuple(descriptions),
+        unusable=unusable,
+        albedo_over_one=albedo_over_one,
+    )
+
+
+def require_usable(names: Sequence[str], unusable: Mapping[str, str]) -> None:
+    """Raise TrilightError where no scene can be made of any file; the first says why."""
+    if len(unusable) == len(names):
+        raise TrilightError(
+            f"--scenes-from: none of the {len(names)} scene files is usable; the first: "
+            f"{unusable[names[0]]}"
+        )

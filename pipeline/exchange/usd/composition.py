@@ -1,0 +1,72 @@
+"""How large a stage becomes: its prims are composed one by one, and counted, before it is opened.
+
+References, payloads, inherits and variants multiply prims without end, in more ways than a walk
+over the arcs of single prims sees: a reference to `</A/B>` brings the arcs of `</A>` along, and a
+class is inherited again wherever its heir is referenced. So nothing is foretold here. USD's own
+composition engine makes the prims, in the order of the tree, and is left as soon as there are too
+many or they take too long. No composed prim can hold more than 32,767 sites, which is its limit.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from storage.errors import TrilightError
+
+MAX_PRIMS = 500_000
+"""That composition may make; instances of one prototype count once."""
+MAX_DEPTH = 150
+"""Of prims within prims."""
+MAX_COMPOSITION_S = 20.0
+"""Processor seconds for all prims: 500,000 of few arcs each take 4 to 10, chains of thousands of
+references or prims of thousands of sites take hours."""
+
+
+def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
+    """Compose all prims below a root layer, payloads too, and return USD's errors.
+
+    Args:
+        root: the layer; whatever it names must have been looked at (pipeline.exchange.usd.stage).
+        context: resolver context of the stage that will be opened.
+        name: of the file, for messages.
+
+    Raises:
+        TrilightError: too many prims, nested too deep, or not composed in time.
+    """
+    from pxr import Pcp, Sdf
+
+    cache = Pcp.Cache(Pcp.LayerStackIdentifier(root, None, context), "usd", True)
+    _, errors = cache.ComputeLayerStack(cache.GetLayerStackIdentifier())
+    waiting, prototypes, made = [Sdf.Path.absoluteRootPath], set(), 0
+    begun_s = time.process_time()
+    while waiting:
+        path = waiting.pop()
+        made += 1
+        _require_bounds(name, path, made, time.process_time() - begun_s)
+        index, found = cache.ComputePrimIndex(path)
+        if index.hasAnyPayloads:
+            cache.RequestPayloads([path], [])
+            index, found = cache.ComputePrimIndex(path)
+        errors += found
+        if index.IsInstanceable():
+            prototype = Pcp.InstanceKey(index)
+            if prototype in prototypes:
+                continue
+            prototypes.add(prototype)
+        children, _ = index.ComputePrimChildNames()
+        waiting += [path.AppendChild(child) for child in children]
+    return errors
+
+
+def _require_bounds(name: str, path: Any, made: int, took_s: float) -> None:
+    if made > MAX_PRIMS:
+        raise TrilightError(f"{name}: composes more than {MAX_PRIMS} prims, the most that is read.")
+    if path.pathElementCount > MAX_DEPTH:
+        raise TrilightError(
+            f"{name}: prims are nested more than {MAX_DEPTH} deep ({str(path)[:60]}...)."
+        )
+    if took_s > MAX_COMPOSITION_S:
+        raise TrilightError(
+            f"{name}: {made} prims took {took_s:.0f} processor seconds to compose and more follow; "
+            f"expected all within {MAX_COMPOSITION_S:.0f}. Flatten the stage."
+        )

@@ -1,0 +1,76 @@
+"""Cameras of a USD stage as poses and angles of square pictures."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.usd.foreign_placed import Placed
+from storage.conventions import look_at_c2w
+
+_FOV_DEG = 40.0
+"""Of the camera that is made where a stage has none."""
+
+
+def cameras(
+    placed: Sequence[Placed], time: Any, lost: list[str]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return poses [C, 4, 4] and full angles [C] in degrees; C is 0 where none can be used."""
+    poses, angles = [], []
+    for each in placed:
+        found = _camera(each, time, lost)
+        if found is not None:
+            poses.append(found[0])
+            angles.append(found[1])
+    return np.array(poses, np.float32).reshape(-1, 4, 4), np.array(angles, np.float32)
+
+
+def camera_that_sees_all(
+    points: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return one camera that sees all points [N, 3], from above and from the side."""
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    away = np.array([0.6, -1.0, 0.6]) / np.linalg.norm([0.6, -1.0, 0.6])
+    eye = middle + away * reach / math.sin(math.radians(_FOV_DEG) / 2)
+    pose = look_at_c2w(eye=eye, target=middle, up=[0, 0, 1])
+    return pose[None].astype(np.float32), np.array([_FOV_DEG], np.float32)
+
+
+def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.float64], float] | None:
+    from pxr import UsdGeom
+
+    camera, where = UsdGeom.Camera(placed.prim), placed.prim.GetPath()
+    focal = camera.GetFocalLengthAttr().Get(time)
+    wide, high = (
+        camera.GetHorizontalApertureAttr().Get(time),
+        camera.GetVerticalApertureAttr().Get(time),
+    )
+    pose = _rigid(placed.to_world)
+    if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
+        lost.append(f"{where}: no perspective camera with a focal length")
+        return None
+    if not math.isclose(wide, high, rel_tol=1e-4):
+        lost.append(f"{where}: pictures are square here; its horizontal angle was taken")
+    if any(a.Get(time) for a in (camera.GetHorizontalApertureOffsetAttr(),
+                                 camera.GetVerticalApertureOffsetAttr())):  # fmt: skip
+        lost.append(f"{where}: its shift has no place here")
+    if camera.GetFStopAttr().Get(time):
+        lost.append(f"{where}: depth of field has no place here")
+    angle = math.degrees(2 * math.atan(wide / (2 * focal)))
+    return (pose, angle) if 0 < angle < 180 else None
+
+
+def _rigid(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return a place without its scale; None where it has no direction."""
+    backward, right = matrix[:3, 2], matrix[:3, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        backward = backward / np.linalg.norm(backward)
+        right = right - backward * np.einsum("i,i->", right, backward)
+        right = right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(backward, right), backward], axis=1)
+    pose[:3, 3] = matrix[:3, 3]
+    return pose if np.isfinite(pose).all() else None

@@ -1,0 +1,167 @@
+"""A USD mesh as triangles in our world, with the normals that it states or that its faces have."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.usd.foreign_placed import Placed
+from pipeline.exchange.usd.polygons import triangulated
+from pipeline.scenes.shading import smooth_shaded
+from storage.errors import TrilightError
+
+SMOOTH_ANGLE_DEG = 30.0
+"""Edges up to this angle are smooth where a subdivision surface states no normals."""
+
+_SMALLEST_DOUBLE_AREA = 1e-12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TriangleSoup:
+    """Triangles with three corners of their own each."""
+
+    positions: NDArray[np.float32]
+    """[T, 3, 3] world."""
+    normals: NDArray[np.float32]
+    """[T, 3, 3] unit."""
+    corners: NDArray[np.int64]
+    """[T, 3] which corner of the mesh each was: where values per corner are found."""
+    polygons: NDArray[np.int64]
+    """[T] which polygon of the mesh."""
+
+
+def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
+    """Return the triangles of a mesh that have an area.
+
+    Raises:
+        TrilightError: its arrays contradict each other, or are not finite.
+    """
+    from pxr import UsdGeom
+
+    prim = placed.prim
+    mesh = UsdGeom.Mesh(prim)
+    points = _array(mesh.GetPointsAttr().Get(time), np.float64, (-1, 3))
+    counts = _array(mesh.GetFaceVertexCountsAttr().Get(time), np.int64, (-1,))
+    indices = _array(mesh.GetFaceVertexIndicesAttr().Get(time), np.int64, (-1,))
+    _check(prim, points, counts, indices)
+    corners, polygons = triangulated(points, counts, indices)
+    holes = _array(mesh.GetHoleIndicesAttr().Get(time), np.int64, (-1,))
+    kept = ~np.isin(polygons, holes)
+    corners, polygons = corners[kept], polygons[kept]
+    world = np.einsum("ij,vj->vi", placed.to_world[:3, :3], points) + placed.to_world[:3, 3]
+    mirrored = np.linalg.det(placed.to_world[:3, :3]) < 0
+    if mirrored != (mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
+        corners = corners[:, ::-1]
+    positions = world[indices[corners]].astype(np.float32)
+    cross = _cross(positions)
+    solid = np.sqrt(np.square(cross).sum(axis=1)) > _SMALLEST_DOUBLE_AREA
+    if not solid.all():
+        lost.append(f"{prim.GetPath()}: {int((~solid).sum())} triangles without an area")
+    corners, polygons, positions = corners[solid], polygons[solid], positions[solid]
+    normals = _normals(placed, mesh, time, indices, corners, polygons, positions, lost)
+    return TriangleSoup(positions=positions, normals=normals, corners=corners, polygons=polygons)
+
+
+def per_corner(
+    values: NDArray, interpolation: str, indices: NDArray[np.int64], soup: TriangleSoup
+) -> NDArray | None:
+    """Return values at the corners [T, 3, ...] of triangles; None where their number is wrong.
+
+    Args:
+        values: [N, ...].
+        interpolation: constant, uniform, vertex, varying or faceVarying.
+        indices: point of each corner of the mesh.
+        soup: the triangles.
+    """
+    where = {
+        "constant": np.zeros_like(soup.corners),
+        "uniform": np.repeat(soup.polygons[:, None], 3, axis=1),
+        "vertex": indices[soup.corners],
+        "varying": indices[soup.corners],
+        "faceVarying": soup.corners,
+    }.get(interpolation)
+    if where is None or (where.size and where.max() >= len(values)):
+        return None
+    return values[where]
+
+
+def _normals(
+    placed: Placed,
+    mesh: Any,
+    time: Any,
+    indices: NDArray[np.int64],
+    corners: NDArray[np.int64],
+    polygons: NDArray[np.int64],
+    positions: NDArray[np.float32],
+    lost: list[str],
+) -> NDArray[np.float32]:
+    cross = _cross(positions)
+    flat = cross / np.linalg.norm(cross, axis=1, keepdims=True)
+    stated = _stated_normals(mesh, time)
+    if stated is None:
+        if mesh.GetSubdivisionSchemeAttr().Get() == "none" or not len(positions):
+            return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
+        lost.append(f"{placed.prim.GetPath()}: subdivision; its cage was read, with smooth normals")
+        return _smooth(positions, indices, corners)
+    soup = TriangleSoup(positions=positions, normals=positions, corners=corners, polygons=polygons)
+    found = per_corner(*stated, indices, soup)
+    if found is None:
+        lost.append(f"{placed.prim.GetPath()}: normals whose number does not fit")
+        return np.repeat(flat[:, None], 3, axis=1).astype(np.float32)
+    turn = np.linalg.inv(placed.to_world[:3, :3]).T
+    turned = np.einsum("ij,tcj->tci", turn, found)
+    length = np.linalg.norm(turned, axis=2, keepdims=True)
+    usable = np.isfinite(length) & (length > 0)
+    unit = np.where(usable, turned / np.where(usable, length, 1), flat[:, None])
+    return np.asarray(unit, np.float32)
+
+
+def _smooth(
+    positions: NDArray[np.float32], indices: NDArray[np.int64], corners: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    _, first, inverse = np.unique(indices[corners], return_index=True, return_inverse=True)
+    faces = inverse.reshape(-1, 3).astype(np.uint32)
+    shaded = smooth_shaded(positions.reshape(-1, 3)[first], faces, SMOOTH_ANGLE_DEG)
+    return shaded.normals[shaded.faces]
+
+
+def _stated_normals(mesh: Any, time: Any) -> tuple[NDArray[np.float64], str] | None:
+    from pxr import UsdGeom
+
+    primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
+    if primvar and primvar.HasValue():
+        values, interpolation = primvar.ComputeFlattened(time), str(primvar.GetInterpolation())
+    else:
+        values, interpolation = mesh.GetNormalsAttr().Get(time), str(mesh.GetNormalsInterpolation())
+    if values is None or len(values) == 0:
+        return None
+    return _array(values, np.float64, (-1, 3)), interpolation
+
+
+def _check(
+    prim: Any, points: NDArray[np.float64], counts: NDArray[np.int64], indices: NDArray[np.int64]
+) -> None:
+    where = prim.GetPath()
+    if (counts < 0).any() or counts.sum() != len(indices):
+        raise TrilightError(
+            f"{where}: faceVertexCounts add up to {counts.sum()}; expected {len(indices)}, the "
+            "number of faceVertexIndices."
+        )
+    if len(indices) and not (0 <= indices.min() and indices.max() < len(points)):
+        raise TrilightError(
+            f"{where}: faceVertexIndices go from {indices.min()} to {indices.max()}; expected 0 to "
+            f"{len(points) - 1}."
+        )
+    if not np.isfinite(points).all():
+        raise TrilightError(f"{where}: points are not finite.")
+
+
+def _cross(positions: NDArray[np.float32]) -> NDArray[np.float64]:
+    wide = positions.astype(np.float64)
+    return np.cross(wide[:, 1] - wide[:, 0], wide[:, 2] - wide[:, 0])
+
+
+def _array(values: Any, dtype: type, shape: tuple[int, ...]) -> NDArray:
+    found = np.zeros(0, dtype) if values is None else np.array(values)
+    return found.astype(dtype, casting="same_kind").reshape(shape)

@@ -1,0 +1,180 @@
+"""From the placed prims of a stage to a `Scene`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all, cameras
+from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
+from pipeline.exchange.usd.foreign_materials import MeshToShade, material_rows
+from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
+from pipeline.exchange.usd.foreign_placed import Placed, placed_prims
+from pipeline.exchange.usd.names import OBJECT_TEXTS
+from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.scenes.pieces import ScenePiece, joined
+from pipeline.scenes.shading import ShadedMesh, flat_shaded
+from storage.errors import TrilightError
+from storage.records.material import EMISSION, ROUGHNESS, default_rows
+from storage.records.rows import distinct_rows
+from storage.records.scene import ObjectKind, Scene, SceneObject
+
+MAX_TRIANGLES = 1_000_000
+MAX_ROWS = 1 << 16
+"""Most objects and most materials of a scene."""
+
+
+def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Scene:
+    """Return the scene that a stage shows at a time; what is lost goes to `opened.lost`.
+
+    Raises:
+        TrilightError: too much of something, arrays that contradict each other, or no triangle or
+            no light at all.
+    """
+    placed = placed_prims(stage, time, opened.lost)
+    pieces: list[ScenePiece] = []
+    names: set[str] = set()
+    triangles = 0
+    for each in placed:
+        if each.prim.GetTypeName() == "Camera":
+            continue
+        found = _pieces(each, time, opened, licence, names)
+        triangles += sum(len(piece.mesh.faces) for piece in found)
+        if triangles > MAX_TRIANGLES:
+            raise TrilightError(f"more than {MAX_TRIANGLES} triangles.")
+        pieces += found
+        if len(pieces) > MAX_ROWS:
+            raise TrilightError(f"more than {MAX_ROWS} objects.")
+    if not any(piece.entry.kind == "emitter" for piece in pieces):
+        raise TrilightError(
+            "no light that can be carried over; expected an emissive material, or a rectangle, "
+            "disk, sphere or mesh light."
+        )
+    materials = sum(len(piece.materials) for piece in pieces)
+    if materials > MAX_ROWS:
+        raise TrilightError(f"{materials} materials; expected at most {MAX_ROWS}.")
+    return _scene(pieces, placed, time, opened)
+
+
+def _scene(
+    pieces: Sequence[ScenePiece], placed: Sequence[Placed], time: Any, opened: OpenedUsd
+) -> Scene:
+    arrays = joined(pieces)
+    seen = [each for each in placed if each.prim.GetTypeName() == "Camera"]
+    c2w, fov_deg = cameras(seen, time, opened.lost)
+    if not len(c2w):
+        opened.lost.append("no camera: one was added that sees everything")
+        c2w, fov_deg = camera_that_sees_all(arrays["vertex_positions"])
+    code = time.GetValue() if time.IsNumeric() and not time.IsEarliestTime() else None
+    scene = Scene(
+        **arrays,
+        c2w=c2w,
+        fov_deg=fov_deg,
+        objects=tuple(piece.entry for piece in pieces),
+        provenance={"template": "usd", "file": opened.path.name, "time_code": code},
+    )
+    scene.check()
+    return scene
+
+
+def _pieces(
+    each: Placed, time: Any, opened: OpenedUsd, licence: str, names: set[str]
+) -> list[ScenePiece]:
+    prim = each.prim
+    if prim.GetTypeName() != "Mesh":
+        triangles = light_triangles(each, time, opened.lost)
+        if triangles is None:
+            return []
+        rows = default_rows(len(triangles))
+        rows[:, ROUGHNESS] = 1
+        rows[:, EMISSION] = radiance(prim, triangles, time)
+        corners = triangles.reshape(-1, 3)
+        faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+        flat = flat_shaded(corners, faces)
+        return _split(each, flat.normals.reshape(-1, 3, 3), triangles, rows, licence, names)
+    soup = read_mesh(each, time, opened.lost)
+    if not len(soup.positions):
+        opened.lost.append(f"{prim.GetPath()}: no triangle with an area")
+        return []
+    rows = _mesh_rows(prim, soup, time, opened)
+    return _split(each, soup.normals, soup.positions, rows, licence, names)
+
+
+def _mesh_rows(prim: Any, soup: TriangleSoup, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:
+    from pxr import UsdGeom
+
+    indices = np.array(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get(time), np.int64)
+    rows = material_rows(MeshToShade(prim=prim, soup=soup, indices=indices), time, opened)
+    if prim.HasAPI("MeshLightAPI"):
+        light = radiance(prim, soup.positions, time)
+        mode = prim.GetAttribute("light:materialSyncMode").Get(time)
+        glows = rows[:, EMISSION].any()
+        tints = mode == "materialGlowTintsLight" and glows
+        rows[:, EMISSION] = rows[:, EMISSION] * light if tints else light
+        if mode == "materialGlowTintsLight" and not glows:
+            opened.lost.append(
+                f"{prim.GetPath()}: its material does not glow; the light's own taken"
+            )
+    return rows
+
+
+def _split(
+    each: Placed,
+    normals: NDArray[np.float32],
+    positions: NDArray[np.float32],
+    rows: NDArray[np.float32],
+    licence: str,
+    names: set[str],
+) -> list[ScenePiece]:
+    """Return the part of a mesh that reflects, and the part that emits, where there are both."""
+    emits = (rows[:, EMISSION] > 0).any(axis=1)
+    found = []
+    for part, kind in ((~emits, "object"), (emits, "emitter")):
+        if part.any():
+            entry = _entry(each.prim, "emitter" if kind == "emitter" else "object", licence, names)
+            found.append(_piece(entry, positions[part], normals[part], rows[part]))
+    return found
+
+
+def _piece(
+    entry: SceneObject,
+    positions: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    rows: NDArray[np.float32],
+) -> ScenePiece:
+    corners = np.concatenate([positions, normals], axis=2).reshape(-1, 6)
+    first, index = distinct_rows(corners)
+    kept, faces = corners[first], index.reshape(-1, 3).astype(np.uint32)
+    palette, material_index = distinct_rows(rows)
+    mesh = ShadedMesh(
+        positions=kept[:, :3].copy(),
+        normals=kept[:, 3:].copy(),
+        faces=faces,
+        groups=np.zeros(len(faces), np.int64),
+    )
+    return ScenePiece(
+        entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
+    )
+
+
+def _entry(prim: Any, kind: ObjectKind, licence: str, names: set[str]) -> SceneObject:
+    """Return what is known of a prim: what Trilight once wrote on it, or its name."""
+    texts = {field: prim.GetAttribute(name).Get() for field, name in OBJECT_TEXTS.items()}
+    known = {field: text for field, text in texts.items() if isinstance(text, str)}
+    base = known.get("name") or prim.GetName()
+    name, count = base, 1
+    while name in names:
+        count += 1
+        name = f"{base}.{count}"
+    names.add(name)
+    if kind == "object" and known.get("kind") == "shell":
+        kind = "shell"
+    return SceneObject(
+        name=name,
+        kind=kind,
+        uid=known.get("uid", ""),
+        licence=known.get("licence") or licence,
+        attribution=known.get("attribution", ""),
+        source_url=known.get("source_url", ""),
+    )

@@ -1,0 +1,77 @@
+"""Where a scene stands in a USD stage: paths, and attributes for what USD has no word for.
+
+    /Scene                        Xform, the default prim: provenance and digest
+    /Scene/Materials/material_<m> one per material row: UsdPreviewSurface and OpenPBR
+    /Scene/Objects/<name>         one Mesh per object, with a GeomSubset per material
+    /Scene/Cameras/camera_<c>     one per camera
+
+A shard is `/Scenes` with a variant set `scene`: one variant per sample, named by its key, each with
+a `/Scenes/Scene` as above. Everything under the namespace `trilight:` is exact; the rest of a prim
+says the same as well as USD can.
+"""
+
+NAMESPACE = "trilight:"
+ROOT = "/Scene"
+SHARD_ROOT = "/Scenes"
+VARIANT_SET = "scene"
+
+VERSION = NAMESPACE + "schemaVersion"
+DIGEST = NAMESPACE + "sceneSha256"
+PROVENANCE = NAMESPACE + "provenance"
+UNUSED_ROWS = NAMESPACE + "unusedVertexRows"
+UNUSED_POSITIONS = NAMESPACE + "unusedPositions"
+UNUSED_NORMALS = NAMESPACE + "unusedNormals"
+"""On `/Scene`. Vertices without a triangle belong to no mesh, and stand there."""
+
+INDEX = NAMESPACE + "index"
+VERTEX_ROWS = NAMESPACE + "vertexRows"
+FACE_ROWS = NAMESPACE + "faceRows"
+VISIBLE_TO_CAMERA = NAMESPACE + "visibleToCamera"
+OBJECT_TEXTS = {
+    "name": NAMESPACE + "name",
+    "kind": NAMESPACE + "kind",
+    "uid": NAMESPACE + "uid",
+    "licence": NAMESPACE + "licence",
+    "attribution": NAMESPACE + "attribution",
+    "source_url": NAMESPACE + "sourceUrl",
+}
+"""On a mesh: row of the object, rows of its vertices and faces, and the fields of SceneObject."""
+
+DIFFUSE_ALBEDO = NAMESPACE + "diffuseAlbedo"
+SPECULAR_ALBEDO = NAMESPACE + "specularAlbedo"
+ROUGHNESS_VALUE = NAMESPACE + "roughness"
+EMITTED_RADIANCE = NAMESPACE + "emittedRadiance"
+MATERIAL_ATTRIBUTES = {
+    "diffuse": DIFFUSE_ALBEDO,
+    "specular": SPECULAR_ALBEDO,
+    "roughness": ROUGHNESS_VALUE,
+    "emission": EMITTED_RADIANCE,
+}
+"""On a material, by the names of its columns (storage.records.material)."""
+
+_ADDED_COLUMN = NAMESPACE + "column:"
+"""Begins the attribute of a column that was added to the published ones."""
+
+FOV_DEG = NAMESPACE + "fovDeg"
+"""On a camera; its pose is the transform, in doubles that hold single precision exactly."""
+
+
+def column_attribute(column: str) -> str:
+    """Return the attribute of a material column; of an added one it ends in the column's name."""
+    return MATERIAL_ATTRIBUTES.get(column, _ADDED_COLUMN + column)
+
+
+def added_column(attribute: str) -> str | None:
+    """Return the column beyond the published ones whose attribute this is; None for any other."""
+    column = attribute.removeprefix(_ADDED_COLUMN)
+    return None if column == attribute else column
+
+
+def material_name(row: int) -> str:
+    """Return the name of the prim of a material row."""
+    return f"material_{row}"
+
+
+def camera_name(row: int) -> str:
+    """Return the name of the prim of a camera."""
+    return f"camera_{row}"

@@ -1,0 +1,141 @@
+"""A USD file as scenes: our own bit for bit, others as far as a `Scene` can hold them.
+
+Only children with limits come here (pipeline.isolation): native code reads the file.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.exchange.usd.diagnostics import quietly
+from pipeline.exchange.usd.foreign_scene import scene_of_stage
+from pipeline.exchange.usd.read_ours import is_marked, read_exact, scene_keys
+from pipeline.exchange.usd.stage import OpenedUsd
+from storage.errors import TrilightError
+from storage.records.scene import Scene
+
+MAX_FRAMES = 10_000
+"""Most scenes of a stage with time samples."""
+MAX_NOTES = 40
+"""Most notes on one scene; what follows is counted."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UsdScene:
+    """A scene and what could not be carried over."""
+
+    key: str
+    """Of a shard's sample, or the time code of a frame; empty where the file has one scene."""
+    scene: Scene
+    """It passes `Scene.check`."""
+    lost: tuple[str, ...]
+    """For people."""
+    exact: bool
+    """Whether Trilight wrote the file, and nothing has been changed since."""
+
+
+def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
+    """Return the keys of the scenes of a file; one empty key where it has one scene.
+
+    Raises:
+        TrilightError: the file is unusable (pipeline.exchange.usd.stage).
+    """
+    return quietly(path, lambda: _keys(OpenedUsd(path, folder)))
+
+
+def read_usd(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
+    """Return one scene of a file.
+
+    Args:
+        path: the file.
+        key: which, where it has several: a key of a shard, or a time code; the first by default.
+        folder: files below it may be read; that of `path` by default.
+        licence: of objects that state none.
+
+    Raises:
+        TrilightError: the file is unusable, has no such scene, or is none that a `Scene` can hold.
+    """
+    return quietly(path, lambda: _read(path, key, folder, licence))
+
+
+def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> UsdScene:
+    opened = OpenedUsd(path, folder)
+    shard = scene_keys(opened.root)
+    if shard is not None:
+        return _of_shard(opened, shard, key or shard[0])
+    if key is None:
+        scene = read_exact(opened.root)
+        if scene is not None:
+            return UsdScene(key="", scene=scene, lost=(), exact=True)
+    stage = opened.compose()
+    frames = list(_frames(stage))
+    if is_marked(opened.root):
+        opened.lost.append("changed since Trilight wrote it: read as any other file")
+    if key is not None and key not in frames:
+        shown = f"{frames[0]} to {frames[-1]}" if frames else "none: it does not move"
+        raise TrilightError(f"{path.name}: no time code {key}; expected one of {shown}.")
+    chosen = key or (frames[0] if frames else "")
+    if frames and key is None:
+        opened.lost.append(f"time codes other than {chosen} of {len(frames)}")
+    try:
+        scene = scene_of_stage(stage, _time(chosen), opened, licence)
+    except TrilightError as error:
+        text = str(error).removeprefix(f"{path.name}: ")
+        raise TrilightError(f"{path.name}: {text}") from error
+    return UsdScene(key=chosen, scene=scene, lost=_limited(opened.lost), exact=False)
+
+
+def _of_shard(opened: OpenedUsd, keys: list[str], key: str) -> UsdScene:
+    name = opened.path.name
+    if key not in keys:
+        raise TrilightError(f"{name}: no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
+    scene = read_exact(opened.root, key)
+    if scene is None:
+        raise TrilightError(
+            f"{name}: scene {key} has been changed since Trilight wrote it; save it as a file of "
+            "its own and read that."
+        )
+    return UsdScene(key=key, scene=scene, lost=(), exact=True)
+
+
+def _keys(opened: OpenedUsd) -> list[str]:
+    shard = scene_keys(opened.root)
+    if shard is not None:
+        return shard
+    if read_exact(opened.root) is not None:
+        return [""]
+    return list(_frames(opened.compose())) or [""]
+
+
+def _frames(stage: Any) -> Iterator[str]:
+    """Yield the time codes of a stage that moves: its frames, or else its samples."""
+    sampled = sorted({t for layer in stage.GetUsedLayers() for t in layer.ListAllTimeSamples()})
+    if len(sampled) < 2:
+        return
+    times = np.array(sampled)
+    if stage.HasAuthoredTimeCodeRange():
+        first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+        if not last - first < MAX_FRAMES:  # not a number neither
+            raise TrilightError(
+                f"time codes from {first:g} to {last:g}; expected at most {MAX_FRAMES}."
+            )
+        times = np.arange(first, last + 1)
+    if len(times) > MAX_FRAMES:
+        raise TrilightError(f"{len(times)} time codes; expected at most {MAX_FRAMES}.")
+    for time in times:
+        yield f"{time:g}"
+
+
+def _time(code: str) -> Any:
+    from pxr import Usd
+
+    return Usd.TimeCode(float(code)) if code else Usd.TimeCode.EarliestTime()
+
+
+def _limited(lost: list[str]) -> tuple[str, ...]:
+    distinct = list(dict.fromkeys(lost))
+    more = len(distinct) - MAX_NOTES
+    return tuple(distinct if more <= 0 else [*distinct[:MAX_NOTES], f"and {more} more"])

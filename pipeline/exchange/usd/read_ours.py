@@ -1,0 +1,270 @@
+"""A scene that Trilight wrote, read back from its layer bit for bit, without composing a stage.
+
+A file that somebody has changed - a mesh moved, a colour picked, a light added - is no longer what
+its exact attributes say. So everything that export writes is compared with what is there, and the
+geometry with its digest; where anything differs, this reader gives the file up and it is read like
+a stranger's (pipeline.scenes.usd).
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.usd import names
+from pipeline.exchange.usd.authoring import as_expected
+from pipeline.exchange.usd.write_cameras import camera_attributes
+from pipeline.exchange.usd.write_materials import OPENPBR, PREVIEW, material_tables
+from pipeline.exchange.usd.write_meshes import MESH, SUBSET, object_attributes
+from storage.conventions import require_readable
+from storage.errors import TrilightError
+from storage.records.material import (
+    PUBLISHED_COLUMNS,
+    UndeclaredColumn,
+    declared_column,
+    default_rows,
+    laid_out,
+)
+from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
+from storage.records.scene_file import scene_digest, scene_provenance
+
+_PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
+"""What may stand on a prim without changing what it shows."""
+_ARRAYS = {"points", "normals", "extent", "faceVertexCounts", "faceVertexIndices"}
+
+_OUTPUTS: Mapping[str, Mapping[str, str | None]] = {
+    "": {
+        "outputs:surface": f"{PREVIEW}.outputs:surface",
+        "outputs:mtlx:surface": f"{OPENPBR}.outputs:out",
+    },
+    f"/{PREVIEW}": {"outputs:surface": None},
+    f"/{OPENPBR}": {"outputs:out": None},
+}
+"""Outputs of the prims of a material, and what each is connected to."""
+
+
+class _Changed(Exception):
+    """The layer is not as export wrote it."""
+
+
+def scene_keys(layer: Any) -> list[str] | None:
+    """Return the keys of the scenes of a shard that Trilight wrote; None for any other layer."""
+    root = layer.GetPrimAtPath(names.SHARD_ROOT)
+    if layer.defaultPrim != names.SHARD_ROOT.removeprefix("/") or root is None:
+        return None
+    if names.VARIANT_SET not in root.variantSets or len(root.nameChildren):
+        return None
+    keys: list[str] = list(root.variantSets[names.VARIANT_SET].variants.keys())
+    ours = all(_root_of(layer, key) is not None for key in keys)
+    return keys if ours and keys else None
+
+
+def is_marked(layer: Any, key: str | None = None) -> bool:
+    """Return whether a layer claims to be of Trilight's making."""
+    return _root_of(layer, key) is not None
+
+
+def read_exact(layer: Any, key: str | None = None) -> Scene | None:
+    """Return the scene of a layer, or that under `key` of a shard; None where it is not as written.
+
+    Raises:
+        TrilightError: it was written by a Trilight that this one cannot read, has a material column
+            that is not declared here, or the scene breaks a law.
+    """
+    root = _root_of(layer, key)
+    if root is None or len(layer.subLayerPaths) or len(layer.rootPrims) != 1:
+        return None
+    name = layer.GetDisplayName()
+    require_readable(root.attributes[names.VERSION].default, name)
+    try:
+        scene = _scene(root)
+    except UndeclaredColumn as error:
+        raise TrilightError(f"{name}: {error}") from error
+    except (_Changed, LookupError, TypeError, ValueError, AttributeError):
+        return None
+    if scene_digest(scene) != root.attributes[names.DIGEST].default:
+        return None
+    try:
+        scene.check()
+    except TrilightError as error:
+        raise TrilightError(f"{name}: {error}") from error
+    return scene
+
+
+def _root_of(layer: Any, key: str | None) -> Any:
+    path = names.ROOT
+    if key is not None:
+        path = f"{names.SHARD_ROOT}{{{names.VARIANT_SET}={key}}}{path.removeprefix('/')}"
+    root = layer.GetPrimAtPath(path)
+    marks = (names.VERSION, names.DIGEST)
+    return root if root and all(mark in root.attributes for mark in marks) else None
+
+
+def _scene(root: Any) -> Scene:
+    folders = _children(root, {"Materials", "Objects", "Cameras"})
+    for folder in folders:
+        _plain(folder, set())
+    materials = _materials(folders["Materials"])
+    prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
+    objects = tuple(_object(prim) for prim in prims)
+    meshes = [prim for prim in prims if prim.typeName == "Mesh"]
+    vertices, normals = _vertices(root, meshes)
+    faces, material_index, object_index = _faces(meshes, len(materials))
+    c2w, fov_deg = _cameras(folders["Cameras"])
+    scene = Scene(
+        vertex_positions=vertices,
+        vertex_normals=normals,
+        faces=faces,
+        material_index=material_index,
+        materials=materials,
+        object_index=object_index,
+        c2w=c2w,
+        fov_deg=fov_deg,
+        objects=objects,
+        provenance=scene_provenance(json.loads(root.attributes[names.PROVENANCE].default)),
+    )
+    for row, prim in enumerate(prims):
+        _require(as_expected(prim, object_attributes(scene, row)))
+        expected = {*object_attributes(scene, row)}
+        if prim.typeName == "Mesh":
+            expected |= {*MESH, *_ARRAYS, names.VERTEX_ROWS, names.FACE_ROWS, "material:binding"}
+            _require(as_expected(prim, MESH))
+        _plain(prim, expected)
+    return scene
+
+
+def _materials(folder: Any) -> NDArray[np.float32]:
+    prims = _numbered(folder, names.material_name)
+    rows = default_rows(len(prims))
+    columns = _columns(prims[0])
+    for row, prim in enumerate(prims):
+        for column, part in laid_out():
+            if column.name in columns:
+                rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
+        _children(prim, {PREVIEW, OPENPBR})
+        for place, table in material_tables(rows[row], columns).items():
+            part = prim.nameChildren[place.removeprefix("/")] if place else prim
+            _require(as_expected(part, table))
+            outputs = _OUTPUTS[place]
+            _plain(part, {*table, *outputs})
+            for output, source in outputs.items():
+                found = [str(p) for p in part.attributes[output].connectionPathList.explicitItems]
+                own = prim.path.StripAllVariantSelections()
+                _require(found == ([] if source is None else [f"{own}/{source}"]))
+    return rows
+
+
+def _columns(prim: Any) -> tuple[str, ...]:
+    """Return the columns that a material has; raises UndeclaredColumn."""
+    found = (names.added_column(attribute.name) for attribute in prim.attributes)
+    added = [name for name in found if name is not None]
+    return (*PUBLISHED_COLUMNS, *(declared_column(name).name for name in added))
+
+
+def _object(prim: Any) -> SceneObject:
+    texts = {field: prim.attributes[name].default for field, name in names.OBJECT_TEXTS.items()}
+    _require(texts["kind"] in OBJECT_KINDS)
+    return SceneObject(**texts)
+
+
+def _vertices(root: Any, meshes: list[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return positions and normals [V, 3] from the rows that meshes and root say are theirs."""
+    own = {names.VERSION, names.DIGEST, names.PROVENANCE}
+    own |= {names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS}
+    _plain(root, own)
+    kinds = [(root, names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS)]
+    kinds += [(mesh, names.VERTEX_ROWS, "points", "normals") for mesh in meshes]
+    rows = np.concatenate([_whole(prim, name) for prim, name, _, _ in kinds])
+    _require(len(rows) > 0 and rows.min() >= 0)
+    count = int(rows.max()) + 1
+    _require(count <= len(rows) and len(np.unique(rows)) == count)
+    arrays = []
+    for column in (2, 3):
+        values = np.zeros((count, 3), np.float32)
+        values[rows] = np.concatenate([_vectors(kind[0], kind[column]) for kind in kinds])
+        arrays.append(values)
+    return arrays[0], arrays[1]
+
+
+def _faces(
+    meshes: list[Any], num_materials: int
+) -> tuple[NDArray[np.uint32], NDArray[np.uint16], NDArray[np.uint16]]:
+    rows = np.concatenate([_whole(mesh, names.FACE_ROWS) for mesh in meshes])
+    count = len(rows)
+    _require(np.array_equal(np.sort(rows), np.arange(count)))
+    faces = np.zeros((count, 3), np.uint32)
+    material_index, object_index = np.zeros(count, np.uint16), np.zeros(count, np.uint16)
+    for mesh in meshes:
+        own, vertices = _whole(mesh, names.FACE_ROWS), _whole(mesh, names.VERTEX_ROWS)
+        _require(np.array_equal(_whole(mesh, "faceVertexCounts"), np.full(len(own), 3)))
+        faces[own] = vertices[_whole(mesh, "faceVertexIndices").reshape(-1, 3)]
+        object_index[own] = mesh.attributes[names.INDEX].default
+        index = np.full(len(own), -1)
+        for subset in mesh.nameChildren:
+            _require(as_expected(subset, SUBSET))
+            _plain(subset, {*SUBSET, "indices", "material:binding"})
+            material = _bound(subset)
+            _require(material < num_materials)
+            index[_whole(subset, "indices")] = material
+        _require(len(index) > 0 and index.min() >= 0 and _bound(mesh) == index.min())
+        material_index[own] = index
+    return faces, material_index, object_index
+
+
+def _bound(prim: Any) -> int:
+    """Return the row of the material that is bound to a prim, if it is one of the same scene."""
+    (target,) = prim.relationships["material:binding"].targetPathList.explicitItems
+    own = str(prim.path.StripAllVariantSelections()).partition("/Objects/")[0]
+    row = int(target.name.rpartition("_")[2])
+    _require(str(target) == f"{own}/Materials/{names.material_name(row)}")
+    return row
+
+
+def _cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    prims = _numbered(folder, names.camera_name)
+    c2w, fov_deg = np.zeros((len(prims), 4, 4), np.float32), np.zeros(len(prims), np.float32)
+    for row, prim in enumerate(prims):
+        c2w[row] = np.array(prim.attributes["xformOp:transform"].default).T
+        fov_deg[row] = prim.attributes[names.FOV_DEG].default
+        expected = camera_attributes(c2w[row], float(fov_deg[row]))
+        _require(as_expected(prim, expected))
+        _plain(prim, set(expected))
+    return c2w, fov_deg
+
+
+def _numbered(folder: Any, name: Callable[[int], str]) -> list[Any]:
+    """Return the children of a folder by their rows; asking it for each by name is quadratic."""
+    prims = {prim.name: prim for prim in folder.nameChildren}
+    return [prims[name(row)] for row in range(len(prims))]
+
+
+def _children(prim: Any, expected: set[str]) -> Any:
+    _require(set(prim.nameChildren.keys()) == expected)
+    return prim.nameChildren
+
+
+def _plain(prim: Any, properties: set[str]) -> None:
+    """Require that a prim has exactly these properties, and nothing that composes or hides."""
+    _require(set(prim.properties.keys()) == properties)
+    _require(set(prim.ListInfoKeys()) <= _PLAIN_INFO)
+
+
+def _whole(prim: Any, name: str) -> NDArray[np.int64]:
+    attribute = prim.attributes[name]
+    values = np.array(attribute.default, np.int64)
+    _require(values.ndim == 1 and not attribute.HasInfo("timeSamples"))
+    return values
+
+
+def _vectors(prim: Any, name: str) -> NDArray[np.float32]:
+    attribute = prim.attributes[name]
+    values = np.array(attribute.default, np.float32).reshape(-1, 3)
+    _require(not attribute.HasInfo("timeSamples"))
+    return values
+
+
+def _require(law: Any) -> None:
+    if not law:
+        raise _Changed

@@ -1,0 +1,212 @@
+"""Opening a USD file of a stranger: which files may be read.
+
+A USD file can name other files, and the network. Which of them composition opens depends on all of
+them together; so nothing is foretold. Every file that any layer names for composition, used or
+not, is looked at by the path that USD's own resolver gives, is refused outside of the folder, and
+is opened here first: the closure of all names holds whatever composition can ask for. The layers of
+the stage are compared with the folder once more when it stands, and before anything of it is used.
+How large the stage may be is for `pipeline.exchange.usd.composition` to say. The bytes are still
+parsed by native code: whoever opens files of strangers does so in a child process with limits
+(pipeline.isolation).
+"""
+
+import re
+import zipfile
+from pathlib import Path
+from typing import Any, NoReturn
+
+from pipeline.exchange.usd.composition import composition_errors
+from pipeline.exchange.usd.diagnostics import said
+from storage.errors import TrilightError
+
+SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+MAX_FILE_BYTES = 1 << 30
+"""Of one file; a million triangles take about 70 MB."""
+MAX_LAYERS = 1000
+MAX_MEMBERS = 10_000
+"""Of a usdz archive."""
+
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
+
+
+class OpenedUsd:
+    """A root layer, and the only way to the files that it names."""
+
+    def __init__(self, path: Path, folder: Path | None = None) -> None:
+        """Open the root layer alone.
+
+        Args:
+            path: the file.
+            folder: files below it may be read; the folder of `path` by default.
+
+        Raises:
+            TrilightError: not a readable USD file, or larger than it may be.
+        """
+        from pxr import Ar
+
+        self.path = path.resolve()
+        self.folder = (folder or self.path.parent).resolve()
+        self.lost: list[str] = []
+        self._layers: dict[str, Any] = {}
+        self._context = Ar.GetResolver().CreateDefaultContextForAsset(str(self.path))
+        self.root = self._open(str(self.path))
+
+    def inside(self, layer: Any, asset_path: str) -> str | None:
+        """Return where USD finds a file that a layer names, or None where there is none.
+
+        Raises:
+            TrilightError: it is on the network, outside of the folder, no plain file, or named by a
+                variable expression.
+        """
+        from pxr import Ar, Sdf
+
+        plain, arguments = Sdf.Layer.SplitIdentifier(asset_path)
+        if arguments:
+            self._refuse(plain, " with arguments for its file format; expected a name alone")
+        if _SCHEME.match(plain):
+            self._refuse(plain, "; expected files below its own folder: nothing is fetched")
+        if plain.startswith("`"):
+            self._refuse(plain, ", a variable expression; expected a name. Write it out")
+        with Ar.ResolverContextBinder(self._context):
+            identifier = Sdf.ComputeAssetPathRelativeToLayer(layer, plain)
+            found = str(Ar.GetResolver().Resolve(identifier))
+        outer = Path((found or identifier).partition("[")[0])
+        if not found and not outer.is_absolute():
+            return None  # looked for in several folders
+        try:
+            target = outer.resolve()
+        except (OSError, RuntimeError):
+            self._refuse(plain, ", which is a link without an end")
+        if not target.is_relative_to(self.folder) or ".." in Path(plain.partition("[")[2]).parts:
+            self._refuse(plain, ", which is outside of its folder; copy it there")
+        if found and not target.is_file():  # opening a FIFO would wait for ever
+            self._refuse(plain, ", which is no plain file")
+        return found or None
+
+    def compose(self) -> Any:
+        """Return the composed stage, of files that have all been looked at.
+
+        Raises:
+            TrilightError: a file outside, the network, value clips, a circle, or too much of
+                something.
+        """
+        from pxr import Usd
+
+        self._open_all()
+        for error in composition_errors(self.root, self._context, self.path.name):
+            self._take(error)
+        stage = Usd.Stage.Open(self.root, self._context, Usd.Stage.LoadAll)
+        for layer in stage.GetUsedLayers():
+            real = Path(layer.realPath.partition("[")[0]).resolve()
+            if not layer.anonymous and not real.is_relative_to(self.folder):
+                raise TrilightError(f"{self.path.name}: uses {real.name!r:.100} of another folder.")
+        return stage
+
+    def _open_all(self) -> None:
+        """Open every layer that any layer names: more than composition opens, and never less."""
+        waiting = [self.root]
+        while waiting:
+            layer = waiting.pop()
+            self._refuse_clips(layer)
+            for asset_path in sorted(layer.GetCompositionAssetDependencies()):
+                if not asset_path:
+                    continue  # within the layer itself
+                known = len(self._layers)
+                below = self._named_layer(layer, asset_path)
+                if len(self._layers) > known:
+                    waiting.append(below)
+
+    def _refuse_clips(self, layer: Any) -> None:
+        def look(path: Any) -> None:
+            if path.IsPrimPath() or path.IsPrimVariantSelectionPath():
+                prim = layer.GetPrimAtPath(path)  # none for a set of variants
+                if prim and any(key.startswith("clip") for key in prim.ListInfoKeys()):
+                    clipped.append(path)
+
+        clipped: list[Any] = []
+        layer.Traverse("/", look)
+        if clipped:
+            raise TrilightError(
+                f"{self.path.name}: {clipped[0]} uses value clips, which are not read; bake them."
+            )
+
+    def _take(self, error: Any) -> None:
+        """Note what composition could not do; raises TrilightError where nothing can be read."""
+        from pxr import Pcp
+
+        if isinstance(error, Pcp.ErrorInvalidAssetPath | Pcp.ErrorInvalidSublayerPath):
+            return  # noted when its file was looked for
+        text = " ".join(str(error).replace(f"{self.folder}/", "").split())
+        if isinstance(error, Pcp.ErrorArcCycle | Pcp.ErrorSublayerCycle):
+            raise TrilightError(f"{self.path.name}: refers to itself in a circle ({text:.160}).")
+        if isinstance(error, Pcp.ErrorCapacityExceeded):
+            raise TrilightError(f"{self.path.name}: too many arcs meet in one prim ({text:.160}).")
+        self.lost.append(f"composition: {text:.160}")
+
+    def _named_layer(self, anchor: Any, asset_path: str) -> Any:
+        """Return the layer that another one names, or None where it is missing (it is noted)."""
+        from pxr import Sdf
+
+        found = self.inside(anchor, asset_path)
+        if found is None or Sdf.FileFormat.FindByExtension(found) is None:
+            why = "is missing" if found is None else "is no USD file"
+            self.lost.append(f"file {asset_path!r:.100} {why}")
+            return None
+        return self._open(found)
+
+    def _refuse(self, named: str, why: str) -> NoReturn:
+        raise TrilightError(f"{self.path.name}: names {named!r:.100}{why}.")
+
+    def _open(self, resolved: str) -> Any:
+        from pxr import Sdf, Tf
+
+        if resolved in self._layers:
+            return self._layers[resolved]
+        if len(self._layers) >= MAX_LAYERS:
+            raise TrilightError(f"{self.path.name}: names more than {MAX_LAYERS} layers.")
+        outer = Path(resolved.partition("[")[0])
+        _check_file(outer)
+        try:
+            layer = Sdf.Layer.FindOrOpen(resolved)
+        except Tf.ErrorException as error:
+            why = said(error, outer)
+            raise TrilightError(f"{outer.name}: not readable as USD ({why}).") from error
+        if layer is None:
+            raise TrilightError(f"{outer.name}: not readable as USD.")
+        self._layers[resolved] = layer
+        return layer
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what is too large; and an archive that is compressed, or names what is not in it."""
+    try:
+        size = path.stat().st_size
+        if not path.is_file() or not 0 < size <= MAX_FILE_BYTES:
+            raise TrilightError(
+                f"{path.name}: {size} bytes; expected a file of 1 to {MAX_FILE_BYTES}."
+            )
+        if path.suffix.lower() == ".usdz":
+            _check_package(path, size)
+    except OSError as error:
+        raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
+
+
+def _check_package(path: Path, size: int) -> None:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+    except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
+        raise TrilightError(f"{path.name}: not a readable usdz archive ({error}).") from error
+    if not 1 <= len(members) <= MAX_MEMBERS:
+        raise TrilightError(f"{path.name}: {len(members)} members; expected 1 to {MAX_MEMBERS}.")
+    total = 0
+    for member in members:
+        total += member.file_size
+        packed = member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1
+        if packed or member.file_size != member.compress_size or total > size:
+            raise TrilightError(
+                f"{path.name}: member {member.filename!r:.80} is compressed or claims more bytes "
+                "than the archive has; usdz stores members as they are."
+            )
+        if member.filename.startswith("/") or ".." in Path(member.filename).parts:
+            raise TrilightError(f"{path.name}: member {member.filename!r:.80} leads outside.")

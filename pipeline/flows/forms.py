@@ -1,0 +1,109 @@
+"""Typed parameters of flows, made of our frozen settings: Prefect's forms show names and docs.
+
+A flow takes the fields of a class of settings as its parameters: what is described there
+(storage.settings.described) becomes the schema that Prefect checks before a run exists, and of
+which it draws a form. The groups of a build's settings become forms within the form, where every
+field may stay empty.
+"""
+
+import dataclasses
+import inspect
+import re
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING
+from typing import Annotated, Any, TypeVar, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from pipeline.builds.named import BUILDS
+from pipeline.builds.settings import BuildSettings
+from pipeline.objects.registry import SOURCES
+from storage.settings.described import described
+
+Returned = TypeVar("Returned")
+
+
+def parameters_of(settings: type, **annotations: Any) -> Callable[[Any], Any]:
+    """Give a function that takes keywords the signature of a class of settings; for flows.
+
+    Args:
+        settings: the class.
+        annotations: types that take the place of those of some fields.
+    """
+
+    def with_signature(function: Callable[..., Returned]) -> Callable[..., Returned]:
+        parameters = [
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=inspect.Parameter.empty if field.default is MISSING else field.default,
+                annotation=annotations.get(field.name, _form_type(field.hint)),
+            )
+            for field in described(settings)
+        ]
+        lines = [f"    {field.name}: {field.sentence}" for field in described(settings)]
+        function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        text = inspect.getdoc(function) or ""
+        function.__doc__ = "\n".join([text, "", "Args:", *lines])
+        return function
+
+    return with_signature
+
+
+def changes_form(settings: type, example: Any) -> type[BaseModel]:
+    """Return a form of all settings of a class in which every field may stay empty.
+
+    Args:
+        settings: the class, whose fields may be groups, or tuples of groups.
+        example: an instance, which says what the groups within tuples are.
+    """
+    fields: dict[str, Any] = {}
+    for field in described(settings):
+        value, kind = getattr(example, field.name), _form_type(field.hint)
+        first = value[0] if isinstance(value, tuple) and value else value
+        if dataclasses.is_dataclass(first) and not isinstance(first, type):
+            kind = changes_form(type(first), first)
+        fields[field.name] = (kind | None, Field(default=None, description=field.sentence))
+    return create_model(
+        f"{settings.__name__}Changes", __config__=ConfigDict(extra="forbid"), **fields
+    )
+
+
+def changed_values(form: BaseModel | None) -> dict[str, Any]:
+    """Return what was filled in, by dotted name, as `storage.settings.changes` takes it."""
+    values: dict[str, Any] = {}
+    fields = type(form).model_fields if form else {}  # in order, which the set of those given lacks
+    for name in fields:
+        value = getattr(form, name)
+        if isinstance(value, BaseModel):
+            values |= {f"{name}.{below}": entry for below, entry in changed_values(value).items()}
+        elif value is not None:
+            values[name] = value
+    return values
+
+
+def _form_type(hint: Any) -> Any:
+    """Return a type as forms know it: mappings are objects with any values."""
+    return dict[str, Any] if get_origin(hint) in (Mapping, dict) else hint
+
+
+_NAMED = "|".join(re.escape(name) for name, source in SOURCES.items() if not source.is_place)
+_NO_SECRET = (
+    rf"^(?:env:TRILIGHT_SOURCE_\w*|(?:{_NAMED}):[^@?]*"
+    r"|[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|[^:]*)$"
+)
+"""URLs without a user, a password or a query: whoever may see the server would see them too. The
+same holds for variables that are not for sources (pipeline.objects.sources)."""
+
+PublicUrl = Annotated[str, Field(pattern=_NO_SECRET)]
+"""A path or URL that may be seen by everybody who sees the server."""
+PublicPlace = Annotated[
+    str,
+    Field(pattern=r"^(?:[A-Za-z][A-Za-z0-9+.\-]*://[^@?#]*|(?:[^:]|:+[^:/]|:+/[^:/])*:*/?)$"),
+]
+"""The same for a place to write to: a folder of any name, or a URL."""
+BuildName = typing.Literal[tuple(BUILDS)]  # type: ignore[valid-type]
+"""A list to choose from."""
+BuildChanges = changes_form(BuildSettings, BUILDS["smoke"].settings())
+"""Every setting of a build."""

@@ -1,0 +1,105 @@
+"""The tasks of a dataset on a Dask cluster, whose workers see the same folder and cache.
+
+Each worker process runs its tasks with a render child of its own, so it must be allowed to have
+children: `dask worker ADDRESS --nthreads 1 --no-nanny`, one for each graphics card or for each
+share of the cores (TRILIGHT_CORES says how many cores a worker owns).
+"""
+
+import contextlib
+import os
+import uuid
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from pipeline.making.dataset_run import Outcome
+from pipeline.making.make_task import close_idle_children
+from pipeline.making.order import DatasetOrder
+from storage.atomic import write_atomically
+from storage.dataset.output import dataset_folder
+from storage.errors import TrilightError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_AHEAD = 2
+"""Tasks handed out for each thread of the cluster, so that none waits for the next one."""
+
+
+def make_on_dask(order: DatasetOrder, address: str) -> Outcome:
+    """Make a dataset with the workers of a Dask cluster; needs a Prefect API (PREFECT_API_URL).
+
+    Raises:
+        TrilightError: prefect-dask is not installed, the cluster does not answer, has no worker or
+            one that sees another folder; or as `make_dataset`.
+    """
+    try:
+        from prefect_dask import DaskTaskRunner
+    except ImportError as error:
+        raise TrilightError(
+            "--runner dask needs prefect-dask; expected it to be installed. Run pip install "
+            "--requirement requirements/served.txt."
+        ) from error
+    from prefect import flow
+
+    from pipeline.flows.generate_scenes import make_watched
+    from pipeline.flows.runner import PrefectRunner
+
+    with _client(address) as client:
+        threads = _threads(client, address)
+        _require_shared(client, order)
+    runner = PrefectRunner(window=_AHEAD * sum(threads), num_at_once=max(threads))
+
+    def on_dask() -> Outcome:
+        return make_watched(order, runner)
+
+    # its declared type lacks the results' own, which Prefect's signature names
+    cluster: Any = DaskTaskRunner(address=address)
+    try:
+        return flow(name="generate-scenes", persist_result=False, task_runner=cluster)(on_dask)()
+    finally:
+        # the workers outlive the run; where the cluster is gone, so are its children
+        with contextlib.suppress(TrilightError, OSError), _client(address) as client:
+            client.run(close_idle_children, on_error="ignore")
+
+
+@contextlib.contextmanager
+def _client(address: str) -> Iterator["Client"]:
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=20, set_as_default=False)
+    except (OSError, ValueError) as error:  # a ValueError is an address that is none
+        raise TrilightError(
+            f"--address {address}: no Dask scheduler answers there ({type(error).__name__}); "
+            "expected the address of one, such as tcp://host:8786, as `dask scheduler` starts it."
+        ) from error
+    with client:
+        yield client
+
+
+def _threads(client: "Client", address: str) -> list[int]:
+    """Return how many threads each worker of a cluster has."""
+    workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
+    if not workers:
+        raise TrilightError(
+            f"--address {address}: the scheduler has no worker; expected some. Start them with "
+            "`dask worker ADDRESS --nthreads 1 --no-nanny`."
+        )
+    return [int(worker["nthreads"]) for worker in workers.values()]
+
+
+def _require_shared(client: "Client", order: DatasetOrder) -> None:
+    """Refuse a cluster of whose workers one would make its scenes where nobody finds them."""
+    folder = dataset_folder(order.place)
+    seen_by_all = folder.staging.resolve() / f"met-{uuid.uuid4().hex}"
+    write_atomically(seen_by_all, b"")
+    try:
+        seen: Mapping[str, bool] = client.run(os.path.exists, str(seen_by_all))
+    finally:
+        seen_by_all.unlink(missing_ok=True)
+    if blind := sorted(worker for worker, sees in seen.items() if not sees):
+        raise TrilightError(
+            f"{folder.shown}: {len(blind)} of {len(seen)} Dask workers do not see this folder, "
+            f"such as {blind[0]}; expected all to see the same --out at the same place (for a "
+            "bucket, the same TRILIGHT_CACHE). Share it."
+        )

@@ -1,0 +1,49 @@
+"""A program that a flow runs, told to end when the flow is: it may save, and then both are done."""
+
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Sequence
+
+from pipeline.flows.prefect_server import TOLD_BY_ITS_STARTER
+from pipeline.isolation import die_with_parent
+from storage.remote.safe_url import safe_text
+
+
+def run_to_end(command: Sequence[str], say: Callable[[str], None]) -> tuple[int, str]:
+    """Run a program and pass on what it says.
+
+    Whatever ends this call early (a flow that is cancelled gets SIGTERM, which Prefect raises as an
+    exception) is passed on as one SIGTERM; then the program is waited for. It has a session of its
+    own, so that no signal to the group of this process reaches it beside ours: training takes a
+    second one as an order to end at once. If this process is killed, the program is too.
+
+    Args:
+        command: program and arguments.
+        say: called with each line of its output, without secrets.
+
+    Returns:
+        Its status, and its last line.
+    """
+    last = ""
+    with subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, TOLD_BY_ITS_STARTER: "1"},
+        start_new_session=True,
+        preexec_fn=die_with_parent,
+    ) as process:
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                if line.strip():
+                    last = safe_text(line.strip())
+                    say(last)
+        except BaseException:
+            process.send_signal(signal.SIGTERM)
+            process.communicate()  # a full pipe would stop it before it has saved
+            raise
+    return process.returncode, last

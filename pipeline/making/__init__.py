@@ -1,0 +1,1 @@
+"""The engine that makes datasets, without Prefect: files are the truth."""

@@ -1,0 +1,154 @@
+"""From a source of objects to the frozen list that scenes draw from."""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.assets.stage import PreparedAsset
+from pipeline.builds.settings import BuildSettings
+from pipeline.exchange.scene_files import SceneFiles
+from pipeline.isolation import is_passing
+from pipeline.making.prepare_isolated import prepare_isolated
+from pipeline.making.publication import Publication
+from pipeline.objects.sources import find_objects
+from storage.conventions import SPLITS
+from storage.dataset.progress import announce_downloads, announce_objects, count_object
+from storage.dataset.splits import require_objects, split_of_object, split_of_shard
+from storage.errors import EnvironmentFailure, TrilightError
+from storage.records.failures import count_by_reason
+from storage.records.objects import Failure, LockedObject
+from storage.records.objects_lock import read_objects_lock
+from storage.remote.safe_url import safe_url
+
+log = logging.getLogger("trilight.objects")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptedObjects:
+    """What scenes may use."""
+
+    objects: tuple[tuple[LockedObject, Path], ...]
+    """Every locked object with its asset file in the store."""
+    num_found: int
+    """Objects in the source, refused ones included."""
+    files: SceneFiles | None = None
+    """Where scenes come from files: those, and `objects` are the files themselves."""
+
+
+def accept_objects(
+    source: str,
+    licence: str | None,
+    settings: BuildSettings,
+    publication: Publication,
+    workers: int,
+) -> AcceptedObjects:
+    """List, filter and prepare the objects, and freeze them at the first time.
+
+    Raises:
+        TrilightError: the source is unusable, no object is accepted, a split has none, or the
+            objects are not those that the dataset was begun with.
+        EnvironmentFailure: one of those could not be prepared this time.
+    """
+    folder = publication.folder
+    found = find_objects(
+        source,
+        work_dir=folder.staged_objects,
+        allowed_licences=settings.allowed_licences,
+        licence=licence,
+        downloaded=lambda done, total: announce_downloads(folder, done, total),
+    )
+    allowed = list(found.records)
+    shown = safe_url(source)
+    frozen = frozen_objects(publication)
+    if frozen is not None:
+        allowed = [record for record in allowed if record.uid in frozen]
+    announce_objects(folder, len(allowed))
+    prepared, rejected = prepare_isolated(
+        allowed, settings.assets, workers=workers, done=lambda: count_object(folder)
+    )
+    passing = [failure for failure in rejected if is_passing(failure.reason)]
+    if frozen is not None:
+        _require_tried(shown, passing)
+    publication.add_failures([*found.failures, *rejected])
+    locked = [_locked(asset, settings) for asset in prepared]
+    if frozen is None:
+        _require_enough(locked, settings, publication, shown)
+        _warn_of(shown, passing)
+        publication.lock_objects(locked)
+    else:
+        _require_same_objects(shown, frozen, locked)
+    paths = [asset.path for asset in prepared]
+    return AcceptedObjects(
+        objects=tuple(zip(locked, paths, strict=True)), num_found=found.num_found
+    )
+
+
+def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
+    """Return what the dataset was begun with by uid, or None where nothing is frozen yet."""
+    if not publication.manifest.objects_lock_sha256:
+        return None
+    return {entry.uid: entry for entry in read_objects_lock(publication.folder.objects_lock)}
+
+
+def _locked(asset: PreparedAsset, settings: BuildSettings) -> LockedObject:
+    record = asset.record
+    return LockedObject(
+        uid=record.uid,
+        asset_sha256=asset.asset_sha256,
+        split=split_of_object(asset.geometry_sha256, settings.splits),
+        licence=record.licence,
+        licence_source=record.licence_source,
+        title=record.title,
+        attribution=record.attribution,
+        source_url=record.source_url,
+    )
+
+
+def _require_enough(
+    locked: list[LockedObject], settings: BuildSettings, publication: Publication, source: str
+) -> None:
+    if not locked:
+        raise TrilightError(
+            f"objects {source!r}: none was accepted; expected at least one usable object with an "
+            f"allowed licence. The reasons are in {publication.folder.failures}."
+        )
+    needed = {split_of_shard(i, settings.splits) for i in range(publication.num_shards)}
+    require_objects(
+        {split: sum(entry.split == split for entry in locked) for split in SPLITS}, needed
+    )
+
+
+def _require_tried(source: str, passing: list[Failure]) -> None:
+    """Refuse to judge an object of the dataset where the environment has kept it from us."""
+    for failure in passing:
+        raise EnvironmentFailure(
+            f"objects {source!r}: {failure.item!r}, of which the dataset was begun, could not be "
+            f"prepared this time ({failure.reason}: {failure.message}). Nothing has changed; run "
+            "the same command again."
+        )
+
+
+def _warn_of(source: str, passing: list[Failure]) -> None:
+    if passing:
+        counts = ", ".join(f"{count} x {why}" for _, why, count in count_by_reason(passing))
+        log.warning(
+            "objects %r: %d could not be prepared this time (%s), each after several tries, and "
+            "the dataset is begun without them; failures.jsonl names them. A dataset begun later "
+            "tries them again.",
+            source,
+            len(passing),
+            counts,
+        )
+
+
+def _require_same_objects(
+    source: str, frozen: dict[str, LockedObject], now: list[LockedObject]
+) -> None:
+    by_uid = {entry.uid: entry for entry in now}
+    for uid, entry in frozen.items():
+        if by_uid.get(uid) != entry:
+            state = "has changed" if uid in by_uid else "is missing or no longer usable"
+            raise TrilightError(
+                f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was "
+                "begun with (objects.lock.jsonl). Restore it, or choose another --out."
+            )

@@ -1,0 +1,195 @@
+"""From a folder of scene files to the frozen list of files that its dataset is made of."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.builds.settings import BuildSettings
+from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.from_description import scaled_albedo_notes
+from pipeline.exchange.scene_files import SceneFiles, build_scene
+from pipeline.exchange.scene_folder import SceneFolder, require_usable
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
+from pipeline.making.accept_objects import AcceptedObjects, frozen_objects
+from pipeline.making.prepare_isolated import asset_child
+from pipeline.making.publication import Publication
+from pipeline.objects.licences import StatedLicence, stated_licence
+from storage.dataset.progress import announce_objects, count_object
+from storage.dataset.splits import JUDGED_SPLIT
+from storage.errors import EnvironmentFailure, TrilightError
+from storage.records.objects import LockedObject
+
+
+def settings_for_files(
+    settings: BuildSettings, folder: SceneFolder | None, views: int | None
+) -> BuildSettings:
+    """Return the build's settings for the scenes of a folder: how many they are, and their views.
+
+    Without a folder, the settings stay as they are.
+
+    Raises:
+        TrilightError: a file has fewer cameras than `views`, or there are no files.
+    """
+    if folder is None:
+        return settings
+    return dataclasses.replace(
+        settings,
+        scenes=dataclasses.replace(settings.scenes, num_views=folder.views(views)),
+        splits=dataclasses.replace(
+            settings.splits, one_split=True, listed_scenes=len(folder.names)
+        ),
+    )
+
+
+def accept_scene_files(
+    folder: SceneFolder,
+    licence: str | None,
+    settings: BuildSettings,
+    publication: Publication,
+) -> AcceptedObjects:
+    """Build every scene once, without a picture, and freeze their files at the first time.
+
+    A file of which no scene can be made is noted, and none of what it names is frozen for it.
+
+    Raises:
+        TrilightError: no scene at all can be built, the licence is not allowed, or the files are
+            not those that the dataset was begun with.
+    """
+    stated = _allowed(stated_licence(licence), settings)
+    files = _built_once(folder, stated, settings, publication)
+    locked = [_locked(uid, digest, stated) for uid, digest in sorted(files.sha256.items())]
+    frozen = frozen_objects(publication)
+    if frozen is None:
+        publication.lock_objects(locked)
+    else:
+        _require_same_files(frozen, locked)
+    return AcceptedObjects(
+        objects=tuple((entry, folder.root / entry.uid) for entry in locked),
+        num_found=len(locked),
+        files=files,
+    )
+
+
+def _built_once(
+    folder: SceneFolder, stated: StatedLicence, settings: BuildSettings, publication: Publication
+) -> SceneFiles:
+    """Return the digests of all files that scenes can be made of, and what is wrong with others."""
+    announce_objects(publication.folder, len(folder.names))
+    sha256: dict[str, str] = {}
+    notes: list[str] = []
+    unusable = dict(folder.unusable)
+    child = asset_child()
+    try:
+        for name in folder.names:
+            if name not in unusable:
+                try:
+                    built = _built(child, folder, name, settings)
+                    sha256 |= built.sha256
+                    notes += built.notes
+                except EnvironmentFailure:
+                    raise
+                except TrilightError as mistake:
+                    unusable[name] = str(mistake)
+            count_object(publication.folder)
+    finally:
+        child.close()
+    require_usable(folder.names, unusable)
+    return SceneFiles(
+        root=folder.root,
+        names=folder.names,
+        sha256=sha256,
+        unusable=unusable,
+        licence=stated.licence,
+        albedo_over_one=folder.albedo_over_one,
+        notes=(*notes, *(f"{name} is left out: {unusable[name].rstrip('.')}" for name in unusable)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuiltScene:
+    """What is kept of a scene that was built once, to see whether it can be."""
+
+    sha256: Mapping[str, str]
+    """Digest of every file that it is made of by path below the folder."""
+    notes: tuple[str, ...]
+    """What a person should know of it."""
+
+
+def build_once(
+    root: Path, name: str, settings: AssetSettings, num_views: int, over_one: AlbedoOverOne
+) -> BuiltScene:
+    """Build a scene; only children come here. Raises TrilightError as `build_scene`."""
+    scene, sha256 = build_scene(
+        root,
+        name,
+        settings,
+        licence="",
+        num_views=num_views,
+        scene_index=0,
+        seed=0,
+        albedo_over_one=over_one,
+    )
+    notes = tuple(f"{name}: {text}" for text in scaled_albedo_notes(scene))
+    return BuiltScene(sha256=sha256, notes=notes)
+
+
+def _built(
+    child: IsolatedChild, folder: SceneFolder, name: str, settings: BuildSettings
+) -> BuiltScene:
+    """Build a scene in a child; raises TrilightError, of the environment where that is at fault."""
+    num_views = settings.scenes.num_views
+    try:
+        return call_with_retries(
+            child,
+            build_once,
+            folder.root,
+            name,
+            settings.assets,
+            num_views,
+            folder.albedo_over_one,
+        )
+    except ChildFailed as failure:
+        if failure.is_verdict:
+            raise TrilightError(
+                f"{name}: its meshes cannot be read ({failure}); mend or remove the file."
+            ) from failure
+        raise EnvironmentFailure(
+            f"{name}: its meshes could not be read this time ({failure}). Run the same command "
+            "again; if that does not help, see `trilight doctor`."
+        ) from failure
+
+
+def _allowed(stated: StatedLicence, settings: BuildSettings) -> StatedLicence:
+    if stated.licence.casefold() not in {name.casefold() for name in settings.allowed_licences}:
+        raise TrilightError(
+            f"--licence is {stated.licence}, which is not on the allow-list; if you may use the "
+            f"scenes, add --allow-licence '{stated.licence}'."
+        )
+    return stated
+
+
+def _locked(uid: str, sha256: str, stated: StatedLicence) -> LockedObject:
+    return LockedObject(
+        uid=uid,
+        asset_sha256=sha256,
+        split=JUDGED_SPLIT,
+        licence=stated.licence,
+        licence_source=stated.licence_source,
+        title=uid,
+        attribution="",
+        source_url="",
+    )
+
+
+def _require_same_files(frozen: Mapping[str, LockedObject], now: list[LockedObject]) -> None:
+    by_uid = {entry.uid: entry for entry in now}
+    for uid in sorted({*frozen, *by_uid}):
+        if frozen.get(uid) != by_uid.get(uid):
+            state = "has changed" if uid in frozen and uid in by_uid else "is new"
+            raise TrilightError(
+                f"scene file {uid}: {'is missing' if uid not in by_uid else state}; expected the "
+                "files that the dataset was begun with (objects.lock.jsonl). Restore them, or "
+                "choose another --out."
+            )

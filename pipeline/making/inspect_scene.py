@@ -1,0 +1,133 @@
+"""What one scene holds, and a sheet of it from all sides; in a child process with limits."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.file_child import file_child
+from pipeline.exchange.open_scene import SceneSource, load_source
+from pipeline.isolation import ChildFailed, call_with_retries
+from pipeline.renders.settings import RenderSettings
+from pipeline.renders.variant import Variant, activate, choose_variant
+from storage.atomic import write_atomically
+from storage.conventions import look_at_c2w, preview_srgb8
+from storage.errors import Rejected, TrilightError
+from storage.records.lights import num_lights
+from storage.records.material import EMISSION, PUBLISHED_COLUMNS, unread_columns
+from storage.records.scene import Scene
+from storage.records.scene_file import scene_digest
+
+VIEWS, ROWS = 8, 2
+"""Pictures of a turntable, and the rows in which they stand."""
+
+_RESOLUTION, _SPP = 192, 64
+_FOV_DEG, _ELEVATION_DEG = 40.0, 25.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectedScene:
+    """What there is to say of a scene."""
+
+    facts: Mapping[str, Any]
+    """JSON values by name."""
+    notes: tuple[str, ...]
+    """What of the file could not be carried over."""
+
+
+def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene:
+    """Return what a scene holds, and write its turntable where one is asked for.
+
+    Raises:
+        TrilightError: the source is unusable, or the sheet cannot be rendered or written.
+    """
+    if turntable is not None and turntable.suffix.lower() != ".png":
+        raise TrilightError(f"--turntable is {turntable}; expected the name of a file X.png.")
+    child = file_child()
+    try:
+        found = call_with_retries(child, _facts, source)
+        if turntable is not None:
+            from pipeline.documents.png import encode_png
+
+            sheet = call_with_retries(child, _turntable, source, choose_variant())
+            write_atomically(turntable, encode_png(sheet))
+    except ChildFailed as failure:
+        raise TrilightError(f"{source.name}: cannot be looked at ({failure}).") from failure
+    except Rejected as rejection:
+        raise TrilightError(f"{source.name}: cannot be rendered ({rejection}).") from rejection
+    finally:
+        child.close()
+    return found
+
+
+def _facts(source: SceneSource) -> InspectedScene:
+    loaded = load_source(source)
+    scene = loaded.scene
+    low, high = scene.vertex_positions.min(axis=0), scene.vertex_positions.max(axis=0)
+    kinds = Counter(entry.kind for entry in scene.objects)
+    licences = Counter(entry.licence for entry in scene.objects)
+    added = unread_columns(scene.materials, PUBLISHED_COLUMNS)
+    facts = {
+        "triangles": scene.num_triangles,
+        "vertices": len(scene.vertex_positions),
+        "objects": ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
+        "materials": len(scene.materials),
+        **({"added_columns": ", ".join(added)} if added else {}),
+        "lights": num_lights(scene),
+        "cameras": ", ".join(f"{angle:.1f} deg" for angle in scene.fov_deg[:8]),
+        "views": scene.num_views,
+        "extent_m": " x ".join(f"{size:.3g}" for size in (high - low)),
+        "greatest_radiance": float(scene.materials[:, EMISSION].max()),
+        "licences": ", ".join(f"{count} {name}" for name, count in sorted(licences.items())),
+        "made_by": str(scene.provenance.get("template", "unknown")),
+        "scene_digest": scene_digest(scene),
+    }
+    return InspectedScene(facts=facts, notes=loaded.notes)
+
+
+def _turntable(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
+    """Return a sheet [H, W, 3] of the scene from all sides, lit by its own lights."""
+    from pipeline.renders.renderer import SceneRenderer
+
+    activate(variant)
+    scene = load_source(source).scene
+    settings = RenderSettings(
+        resolution=_RESOLUTION,
+        noise_floor_db=99.0,
+        min_spp=_SPP,
+        max_spp=_SPP,
+        min_mean_radiance=0.0,
+    )
+    renderer = SceneRenderer(scene, settings)
+    pictures = [
+        preview_srgb8(renderer.render_view(pose, _FOV_DEG, 0).radiance_rgb)
+        for pose in turntable_poses(scene)
+    ]
+    rows = [
+        np.concatenate(pictures[at * VIEWS // ROWS : (at + 1) * VIEWS // ROWS], axis=1)
+        for at in range(ROWS)
+    ]
+    return np.concatenate(rows, axis=0)
+
+
+def turntable_poses(scene: Scene) -> list[NDArray[np.float32]]:
+    """Return poses [4, 4] around what reflects, so that each sees all of it."""
+    points = scene.vertex_positions[np.unique(scene.faces[~scene.triangle_emits])]
+    if not len(points):
+        points = scene.vertex_positions
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    middle, reach = (low + high) / 2, max(float(np.sqrt(np.square(high - low).sum())) / 2, 1e-3)
+    distance = reach / math.sin(math.radians(_FOV_DEG) / 2)
+    poses = []
+    for turn in 2 * np.pi * np.arange(VIEWS) / VIEWS:
+        up = math.sin(math.radians(_ELEVATION_DEG))
+        flat = math.cos(math.radians(_ELEVATION_DEG))
+        away = np.array([flat * math.sin(turn), -flat * math.cos(turn), up])
+        pose = look_at_c2w(eye=middle + distance * away, target=middle, up=[0, 0, 1])
+        poses.append(pose.astype(np.float32))
+    return poses

@@ -1,0 +1,269 @@
+"""Just the mesh stage: a source of objects to a folder of clean meshes with a quality report."""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.assets.cleaning.clean import clean, geometry_sha256, normalise
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.recipe import RECIPE
+from pipeline.assets.settings import AssetSettings
+from pipeline.assets.stage import PreparedAsset
+from pipeline.documents.attribution import encode_attribution
+from pipeline.documents.quality_page import Pair, encode_quality_page
+from pipeline.isolation import ChildFailed, call_with_retries
+from pipeline.making.prepare_isolated import asset_child, prepare_isolated
+from pipeline.objects.ply import encode_ply
+from pipeline.objects.sources import find_objects
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
+from storage.digests import canonical_json
+from storage.errors import TrilightError
+from storage.records.asset import Level, decode_asset
+from storage.records.asset_rows import AssetRow
+from storage.records.failures import write_failures
+from storage.records.objects import Failure
+
+_PICTURES = 4
+"""Objects in each of the groups worst, median and best."""
+_WIDTH_PX = 256
+
+
+@dataclass(frozen=True)
+class AssetFolder:
+    """The paths of what `trilight assets` writes."""
+
+    root: Path
+    """The folder that users name."""
+
+    @property
+    def summary(self) -> Path:
+        return self.root / "assets.json"
+
+    @property
+    def catalogue(self) -> Path:
+        return self.root / "objects.jsonl"
+
+    @property
+    def failures(self) -> Path:
+        return self.root / "failures.jsonl"
+
+    @property
+    def attribution(self) -> Path:
+        return self.root / "attribution.csv"
+
+    @property
+    def page(self) -> Path:
+        return self.root / "quality.html"
+
+    @property
+    def meshes(self) -> Path:
+        return self.root / "meshes"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssetReport:
+    """What became of the objects of a source."""
+
+    rows: tuple[AssetRow, ...]
+    """The accepted ones, in the order of their uids."""
+    failures: tuple[Failure, ...]
+    """The rejected ones."""
+    geometry_sha256: tuple[str, ...]
+    """Digest of the geometry of each written mesh, by which `generate` deals it to a split."""
+
+    @property
+    def num_repaired(self) -> int:
+        """How many of the accepted ones had triangles dropped or turned."""
+        return sum(row.source.repaired for row in self.rows)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return counts and one row per object."""
+        return {
+            "accepted": len(self.rows),
+            "repaired": self.num_repaired,
+            "rejected": len(self.failures),
+            "objects": [row.as_json() for row in self.rows],
+            "failures": [dataclasses.asdict(failure) for failure in self.failures],
+        }
+
+
+def make_assets(
+    source: str,
+    folder: AssetFolder,
+    settings: AssetSettings,
+    *,
+    allowed_licences: Sequence[str],
+    licence: str | None,
+    workers: int,
+    downloaded: Callable[[int, int], None],
+    planned: Callable[[int], None],
+    done: Callable[[], None],
+) -> AssetReport:
+    """Prepare the objects of a source and write the folder; again is quick, by the asset store.
+
+    Args:
+        source: as `find_objects` takes it.
+        folder: empty, or made by this function before: then it is replaced.
+        settings: with one budget, since the folder has one mesh per object.
+        allowed_licences: objects under others are refused.
+        licence: of files that come without any statement.
+        workers: objects at a time.
+        downloaded: called with how many downloads are done and how many there are.
+        planned: called with the number of objects, once they are known.
+        done: called after each object, from any thread.
+
+    Raises:
+        TrilightError: the source is unusable, or the folder holds something else or cannot be
+            written.
+    """
+    if workers < 1:
+        raise TrilightError(f"workers is {workers}; expected at least 1.")
+    _require_ours(folder)
+    found = find_objects(
+        source,
+        work_dir=cache_folder("objects"),
+        allowed_licences=allowed_licences,
+        licence=licence,
+        downloaded=downloaded,
+    )
+    write_atomically(folder.summary, b"{}")  # from here on the folder is ours
+    planned(len(found.records))
+    prepared, rejected = prepare_isolated(list(found.records), settings, workers=workers, done=done)
+    levels = [_only_level(asset) for asset in prepared]
+    rows = [_row(asset, level) for asset, level in zip(prepared, levels, strict=True)]
+    report = AssetReport(
+        rows=tuple(rows),
+        failures=tuple(sorted([*found.failures, *rejected], key=lambda row: row.item)),
+        geometry_sha256=tuple(map(_geometry_sha256, levels)),
+    )
+    _write(folder, settings, report, levels)
+    pairs = _pairs(prepared, rows, levels, settings)
+    page = encode_quality_page(
+        rows, report.failures, pairs, budget=settings.budgets[0], target=_target(settings)
+    )
+    write_atomically(folder.page, page)
+    return report
+
+
+def _require_ours(folder: AssetFolder) -> None:
+    if folder.root.exists() and not folder.root.is_dir():
+        raise TrilightError(f"{folder.root}: is a file; expected a folder. Choose another --out.")
+    if folder.root.is_dir() and any(folder.root.iterdir()) and not folder.summary.exists():
+        raise TrilightError(
+            f"{folder.root}: holds files that are not of `trilight assets`; expected a new or "
+            "empty folder. Choose another --out."
+        )
+
+
+def _target(settings: AssetSettings) -> str:
+    within = "" if settings.epsilon is None else f"fewest within {settings.epsilon:.2%}, "
+    return f"{settings.profile}, {within}at most {settings.budgets[0]} triangles"
+
+
+def _only_level(asset: PreparedAsset) -> Level:
+    (level,) = decode_asset(asset.path.read_bytes()).levels
+    return level
+
+
+def _geometry_sha256(level: Level) -> str:
+    """Return the digest that the mesh stage finds in the file of a level."""
+    positions, faces = level.positions.astype(np.float64), level.faces.astype(np.int64)
+    return geometry_sha256(clean(normalise(TriangleMesh(positions=positions, faces=faces))))
+
+
+def _row(prepared: PreparedAsset, level: Level) -> AssetRow:
+    record = prepared.record
+    return AssetRow(
+        uid=record.uid,
+        path=f"meshes/{_file_name(record.uid)}",
+        title=record.title,
+        licence=record.licence,
+        licence_source=record.licence_source,
+        attribution=record.attribution,
+        source_url=record.source_url,
+        num_faces=len(level.faces),
+        method=level.record.method,
+        quality=level.record.quality,
+        source=decode_asset(prepared.path.read_bytes()).source,
+    )
+
+
+def _file_name(uid: str) -> str:
+    """Return a name that is safe everywhere: a uid is text from outside."""
+    readable = re.sub(r"[^A-Za-z0-9]+", "-", uid).strip("-")[-60:]
+    return f"{readable}-{hashlib.sha256(uid.encode()).hexdigest()[:8]}.ply"
+
+
+def _write(
+    folder: AssetFolder, settings: AssetSettings, report: AssetReport, levels: list[Level]
+) -> None:
+    for row, level in zip(report.rows, levels, strict=True):
+        write_atomically(folder.root / row.path, encode_ply(level.positions, level.faces))
+    wanted = {folder.root / row.path for row in report.rows}
+    for path in folder.meshes.glob("*.ply"):
+        if path not in wanted:
+            path.unlink()
+    lines = [canonical_json(row.as_json()) + b"\n" for row in report.rows]
+    write_atomically(folder.catalogue, b"".join(lines))
+    write_failures(folder.failures, report.failures)
+    write_atomically(folder.attribution, encode_attribution(report.rows))
+    summary = {
+        "accepted": len(report.rows),
+        "repaired": report.num_repaired,
+        "rejected": len(report.failures),
+        "recipe": RECIPE,
+        "settings": dataclasses.asdict(settings),
+    }
+    write_atomically(folder.summary, json.dumps(summary, indent=1, sort_keys=True).encode())
+
+
+def _pairs(
+    prepared: list[PreparedAsset],
+    rows: list[AssetRow],
+    levels: list[Level],
+    settings: AssetSettings,
+) -> dict[str, list[Pair]]:
+    """Return pictures of source and result for the worst, the median and the best objects."""
+    changed = sorted(
+        (index for index, row in enumerate(rows) if row.method != "source"),
+        key=lambda index: (-rows[index].quality.error_p99, rows[index].uid),
+    )
+    middle = max(0, len(changed) // 2 - _PICTURES // 2)
+    groups = {
+        "Worst": changed[:_PICTURES],
+        "Median": changed[middle : middle + _PICTURES],
+        "Best": changed[-_PICTURES:],
+    }
+    pairs: dict[str, list[Pair]] = {name: [] for name in groups}
+    child = asset_child()
+    try:
+        for name, indices in groups.items():
+            for i in indices:
+                path = prepared[i].record.path
+                with contextlib.suppress(ChildFailed):  # a picture less is no reason to stop
+                    pair = call_with_retries(
+                        child, _pair_in_child, path, settings, levels[i], rows[i]
+                    )
+                    pairs[name].append(pair)
+    finally:
+        child.close()
+    return pairs
+
+
+def _pair_in_child(path: str, settings: AssetSettings, level: Level, row: AssetRow) -> Pair:
+    from pipeline.assets.preview import preview_level, preview_source
+
+    return Pair(
+        row=row,
+        source=preview_source(Path(path), settings, _WIDTH_PX),
+        result=preview_level(level, _WIDTH_PX),
+    )

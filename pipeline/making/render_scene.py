@@ -1,0 +1,151 @@
+"""Pictures of scenes by path tracing, in a child process with limits.
+
+This process asks the child for one pass of samples after another, so that it can say how far a
+picture is.
+"""
+
+import dataclasses
+from collections.abc import Callable, Generator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
+from pipeline.making.environment import environment
+from pipeline.renders.renderer import RenderedView, Sampling, SceneRenderer, set_threads
+from pipeline.renders.settings import RenderSettings
+from pipeline.renders.variant import Variant, activate
+from storage.errors import Rejected, TrilightError
+from storage.records.scene import Scene
+
+_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=1 << 30)
+"""One call takes the scene, each of the others is one pass of samples; the child keeps its state,
+so it is replaced only where it died."""
+
+
+class PathTracer:
+    """Renders one scene after another; equal arguments give equal pictures."""
+
+    def __init__(
+        self,
+        settings: RenderSettings,
+        *,
+        seed: int,
+        variant: Variant,
+        threads: int,
+        sampled: Callable[[Sampling], None],
+    ) -> None:
+        """Remember how to render.
+
+        Args:
+            settings: how well.
+            seed: of the samples of every picture, from 0.
+            variant: what Mitsuba runs on.
+            threads: how many of them.
+            sampled: called after each pass of samples.
+        """
+        self._settings, self._seed, self._sampled = settings, seed, sampled
+        self.identity: Mapping[str, Any] = {
+            "seed": str(seed),  # the integers of an EXR header end at 2^31
+            "settings": dataclasses.asdict(settings),
+            "environment": environment(variant),
+        }
+        """All that decides a picture beside scene and camera, as JSON values."""
+        self._is_open = False
+        self._child = IsolatedChild(
+            limits=_LIMITS, setup=_set_up_child, setup_args=(variant, threads)
+        )
+
+    def open(self, scene: Scene, name: str) -> None:
+        """Take the scene that is rendered from now on.
+
+        Args:
+            scene: passes `Scene.check`.
+            name: for messages.
+
+        Raises:
+            TrilightError: it cannot be rendered.
+        """
+        self._scene = scene
+        self._call(name, self._open)
+
+    def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> RenderedView:
+        """Return the picture of one camera.
+
+        Args:
+            c2w: [4, 4] camera to world.
+            fov_deg: full field of view in degrees.
+            name: of the picture, for messages.
+
+        Raises:
+            TrilightError: there is none.
+        """
+        return self._call(name, lambda: self._picture(c2w, fov_deg))
+
+    def close(self) -> None:
+        """End the child."""
+        self._child.close()
+
+    def _open(self) -> None:
+        self._is_open = False
+        self._child.call(_open_scene, self._scene, self._settings)
+        self._is_open = True
+
+    def _picture(self, c2w: NDArray[np.float32], fov_deg: float) -> RenderedView:
+        if not self._is_open:  # a child that died took the scene and the samples with it
+            self._open()
+        try:
+            self._child.call(_begin_view, c2w, fov_deg, self._seed)
+            while isinstance(step := self._child.call(_advance), Sampling):
+                self._sampled(step)
+        except ChildFailed:
+            self._is_open = False
+            raise
+        rendered: RenderedView = step
+        return rendered
+
+    def _call(self, name: str, step: Callable[[], Result]) -> Result:
+        try:
+            return with_retries(step)
+        except Rejected as rejection:
+            raise TrilightError(
+                f"{name} cannot be rendered ({rejection}); expected a scene with surfaces, "
+                "lights with an area, and radiance that half floats can hold."
+            ) from rejection
+        except ChildFailed as failure:
+            raise TrilightError(
+                f"{name}: rendering failed ({failure}); try a smaller --resolution, and see "
+                "`trilight doctor`."
+            ) from failure
+
+
+class _ChildState:
+    """What the child holds between two calls."""
+
+    renderer: SceneRenderer
+    steps: Generator[Sampling, None, RenderedView]
+
+
+_state = _ChildState()
+
+
+def _set_up_child(variant: Variant, threads: int) -> None:
+    activate(variant)
+    set_threads(threads)
+
+
+def _open_scene(scene: Scene, settings: RenderSettings) -> None:
+    _state.renderer = SceneRenderer(scene, settings)
+
+
+def _begin_view(c2w: NDArray[np.float32], fov_deg: float, seed: int) -> None:
+    _state.steps = _state.renderer.view_steps(c2w, fov_deg, seed)
+
+
+def _advance() -> Sampling | RenderedView:
+    try:
+        return next(_state.steps)
+    except StopIteration as end:
+        rendered: RenderedView = end.value
+        return rendered

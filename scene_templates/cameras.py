@@ -1,0 +1,37 @@
+"""Cameras: they look near the origin from the open side of a layout."""
+
+from typing import Annotated
+
+import numpy as np
+
+from scene_templates.checks import OFFSET, SIZE, Range
+from scene_templates.layout import CameraPose
+from scene_templates.sectors import Sector
+from storage.conventions import look_at_c2w
+from storage.settings.described import checked
+from storage.settings.ranges import Within
+
+
+@checked("scene settings")
+class CameraSettings:
+    """What cameras are drawn from, as published."""
+
+    distance: Annotated[Range, SIZE] = (1.5, 2.0)
+    """From the camera to the point it looks at, world units."""
+    target_jitter: Annotated[float, OFFSET] = 0.2
+    """Most offset per axis from the origin of the point it looks at."""
+    up_jitter: Annotated[float, Within(0, 1)] = 0.1
+    """Most offset per axis of a camera's up vector from +Z."""
+    fov_deg: Annotated[Range, Within(1, 170, unit="degrees")] = (30.0, 60.0)
+    """Full field of view, horizontal and vertical."""
+
+
+def camera_rand(rng: np.random.Generator, settings: CameraSettings, sector: Sector) -> CameraPose:
+    """Draw one camera. Whether it sees anything is for the caller to find out."""
+    target = rng.uniform(-settings.target_jitter, settings.target_jitter, size=3)
+    eye = target + rng.uniform(*settings.distance) * sector.direction_rand(rng)
+    up = np.array([0, 0, 1]) + rng.uniform(-settings.up_jitter, settings.up_jitter, size=3)
+    return CameraPose(
+        c2w=look_at_c2w(eye=eye, target=target, up=up),
+        fov_deg=float(rng.uniform(*settings.fov_deg)),
+    )

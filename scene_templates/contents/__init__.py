@@ -1,1 +1,0 @@
-"""What is in a room and around it: objects, surfaces, lights, cameras."""

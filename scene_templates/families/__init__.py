@@ -1,1 +1,0 @@
-"""Which kinds of scenes a build draws from."""

@@ -1,0 +1,44 @@
+"""A family: one layout with how many objects of which size it holds, and how often it is drawn."""
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, ClassVar
+
+from scene_templates.checks import SIZE, Counts, Range, require
+from scene_templates.rooms import SharedRoom
+from scene_templates.separate_sides import SeparateSides
+from scene_templates.templates import TEMPLATES
+from storage.settings.described import checked
+from storage.settings.ranges import Share, Within
+
+
+@checked("scene settings")
+class Family:
+    """One row of the table that scenes are drawn from."""
+
+    PRESETS: ClassVar[Mapping[str, Callable[[], "Family"]]] = {}
+    """Functions by name that return one (families.default_families), for
+    `storage.settings.changes`."""
+    name: str
+    """Unique, such as `corner-multi`."""
+    template: str
+    """The layout: a name of scene_templates.templates."""
+    weight: Annotated[float, Within(1e-9, 1e9)] = 1.0
+    """How often it is drawn, relative to the others."""
+    shell: SharedRoom | SeparateSides
+    """How floor and walls are placed."""
+    num_objects: Annotated[Counts, Within(0, 64, unit="objects")]
+    """Fewest and most objects, each count equally likely."""
+    object_scale: Annotated[Range, SIZE]
+    """Diameter of an object's bounding sphere, before halving. Where no free place is found, the
+    sizes of all objects are drawn again."""
+    smooth_share: Share = 0.5
+    """Share of objects and shell parts with interpolated normals; the others are flat."""
+
+    def __post_init__(self) -> None:
+        known = ", ".join(TEMPLATES)
+        require(self.template in TEMPLATES, "template", self.template, f"one of {known}")
+
+    @property
+    def shell_triangles(self) -> int:
+        """Triangles of floor and walls: 128 each."""
+        return TEMPLATES[self.template].shell_triangles

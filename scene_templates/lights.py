@@ -1,0 +1,119 @@
+"""Emitters: a few small bright triangles outside the room, on its open side."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_templates.checks import OFFSET, SIZE, Counts, Range
+from scene_templates.layout import Emitter
+from scene_templates.rotations import Orientation, rotated, rotation_rand
+from scene_templates.sectors import Sector
+from storage.settings.described import checked
+from storage.settings.ranges import Share, Within
+
+TRIANGLE = 0.025 * np.array([[-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])
+"""The published emitter before scaling: equilateral, edge 0.0707."""
+
+SPACING_RADIUS = 0.75**0.5
+"""Radius of the sphere on which the spacing of emitters is measured."""
+
+SPACING_TRIES = 256
+"""Eight emitters 0.3 apart claim four tenths of the narrowest sector, so that this is hardly ever
+used up; the candidate farthest from the others is taken if it is."""
+
+MOST_LIGHTS = 64
+"""As many as may be kept apart (storage.records.lights); the published scenes have up to 8."""
+
+PALEST = 0.2
+"""Least channel of a coloured light before its mean is made 1: no light is quite monochrome."""
+
+
+@checked("scene settings")
+class LightSettings:
+    """What emitters are drawn from."""
+
+    count: Annotated[Counts, Within(1, MOST_LIGHTS, unit="emitters")] = (1, 8)
+    """Fewest and most emitters, each count equally likely."""
+    total_emission: Annotated[Range, Within(1e-3, 1e9)] = (2500.0, 5000.0)
+    """Radiance summed over the emitters: one of n emits a number from this range divided by n."""
+    scale: Annotated[Range, SIZE] = (2.0, 2.5)
+    """Scale per axis of the emitter triangle (edge 0.0707), which is not halved."""
+    distance: Annotated[Range, SIZE] = (2.1, 2.7)
+    """Distance of an emitter from a point near the origin (see `target_jitter`), world units."""
+    target_jitter: Annotated[float, OFFSET] = 0.2
+    """Most offset per axis from the origin of the point that an emitter hangs around."""
+    spacing: Annotated[float, Within(0, 2 * SPACING_RADIUS)] = 0.3
+    """Least distance between two emitters as seen from the origin, on a sphere of radius 0.866."""
+    orientation: Orientation = "uniform"
+    """How emitters are turned; see `PlacementSettings.orientation`."""
+    coloured_share: Share = 0.0
+    """Share of emitters that are coloured at the same mean radiance. An option: published lights
+    are white, and a network trained on white ones alone has never seen another."""
+    reflectance: Share = 0.0
+    """Diffuse albedo of an emitter. What shines at 300 need not reflect; the published ones do,
+    with an albedo of 1."""
+    num_inside: Annotated[int, Within(0, MOST_LIGHTS, unit="emitters")] = 0
+    """How many of the emitters hang in the middle of objects instead, for tests out of range."""
+
+
+def emitters_rand(
+    rng: np.random.Generator,
+    settings: LightSettings,
+    sector: Sector,
+    count: int,
+    object_centres: Sequence[NDArray[np.float64]],
+) -> tuple[Emitter, ...]:
+    """Draw `count` emitters of a scene; the first `num_inside` go into objects, as far as any."""
+    directions: list[NDArray[np.float64]] = []
+    for _ in range(count):
+        directions.append(_spaced_direction(rng, sector, directions, settings.spacing))
+    inside = list(object_centres)[: settings.num_inside]
+    outside = [_centre_rand(rng, settings, towards) for towards in directions[len(inside) :]]
+    return tuple(_emitter_rand(rng, settings, centre, count) for centre in [*inside, *outside])
+
+
+def _spaced_direction(
+    rng: np.random.Generator,
+    sector: Sector,
+    others: list[NDArray[np.float64]],
+    spacing: float,
+) -> NDArray[np.float64]:
+    best, best_gap = sector.direction_rand(rng), -1.0
+    for _ in range(SPACING_TRIES):
+        candidate = sector.direction_rand(rng)
+        away = [float(np.sqrt(np.sum(np.square(candidate - other)))) for other in others]
+        gap = SPACING_RADIUS * min(away, default=np.inf)
+        if gap > best_gap:
+            best, best_gap = candidate, gap
+        if gap > spacing:
+            break
+    return best
+
+
+def _centre_rand(
+    rng: np.random.Generator, settings: LightSettings, towards: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    target = rng.uniform(-settings.target_jitter, settings.target_jitter, size=3)
+    return target + rng.uniform(*settings.distance) * towards
+
+
+def _emitter_rand(
+    rng: np.random.Generator, settings: LightSettings, centre: NDArray[np.float64], count: int
+) -> Emitter:
+    # About its own middle, so that its distance is the one drawn.
+    turned = rotated(TRIANGLE - TRIANGLE.mean(axis=0), rotation_rand(rng, settings.orientation))
+    triangle = turned * rng.uniform(*settings.scale, size=3) + centre
+    radiance = rng.uniform(*settings.total_emission) / count
+    red, green, blue = radiance * _tint_rand(rng, settings.coloured_share)
+    return Emitter(
+        triangle=triangle, radiance_rgb=(red, green, blue), reflectance=settings.reflectance
+    )
+
+
+def _tint_rand(rng: np.random.Generator, coloured_share: float) -> NDArray[np.float64]:
+    if rng.random() >= coloured_share:
+        return np.ones(3)
+    channels = rng.uniform(PALEST, 1, size=3)
+    return channels / channels.mean()

@@ -1,0 +1,83 @@
+"""Surfaces: the published sampling, in linear colour throughout.
+
+The published pipeline passes colours through 8-bit vertex colours whose transfer curve differs
+between its renderer and its tokens (reference: renderformer.md, G.3); a number here means the same
+albedo everywhere.
+"""
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+
+from scene_templates.checks import Range, require
+from scene_templates.layout import SurfaceLook
+from storage.settings.described import checked
+from storage.settings.ranges import Share, Within
+
+
+@checked("scene settings")
+class MaterialSettings:
+    """What surfaces are drawn from."""
+
+    albedo_sum: Annotated[Range, Within(0, 1)] = (0.9, 1.0)
+    """Diffuse scale plus specular of a surface."""
+    specular_ratio: Annotated[Range, Within(0, 1)] = (0.0, 1.0)
+    """Share of that sum which is specular."""
+    roughness_log: Annotated[Range, Within(1e-6, 2)] = (0.06, 1.055)
+    """Range whose logarithm is drawn evenly; `roughness_bias` is then taken off."""
+    roughness_bias: Annotated[float, Within(0, 1)] = 0.05
+    """See `roughness_log`; makes smooth surfaces common without a pile at the smallest value."""
+    roughness_clip: Annotated[Range, Within(0, 1)] = (0.01, 1.0)
+    """Least and greatest roughness."""
+    coloured_share: Share = 0.5
+    """Share of the surfaces with interpolated normals that have many colours: floors and walls one
+    for each triangle, objects one for each shading group or triangle."""
+    triangle_colours_share: Share = 0.5
+    """Share of the many-coloured objects with a colour for each triangle instead of each shading
+    group: one half as the paper says; the published code makes none."""
+    coloured_specular_share: Share = 0.0
+    """Share of surfaces whose specular albedo is tinted: each channel uniform between 0 and what it
+    would be. An option: the published scenes have none, and so no metal but grey ones."""
+    smooth_angle_deg: Annotated[float, Within(0, 180, unit="degrees")] = 30.0
+    """An edge sharper than this separates shading groups."""
+
+    def __post_init__(self) -> None:
+        low, bias = self.roughness_log[0], self.roughness_bias
+        require(low >= bias, "roughness_bias", bias, "at most roughness_log's low")
+
+
+def surface_rand(
+    rng: np.random.Generator,
+    settings: MaterialSettings,
+    *,
+    smooth_share: float,
+    kind: Literal["shell", "object"],
+) -> SurfaceLook:
+    """Draw a surface: mostly white energy split between a coloured diffuse and a specular.
+
+    Args:
+        rng: where the numbers come from.
+        settings: the ranges.
+        smooth_share: probability of interpolated normals.
+        kind: whether the triangles or the shading groups get the colours where there are many.
+    """
+    albedo_sum = rng.uniform(*settings.albedo_sum)
+    specular = albedo_sum * rng.uniform(*settings.specular_ratio)
+    diffuse_scale = albedo_sum - specular
+    red, green, blue = diffuse_scale * rng.random(3)
+    low, high = (math.log(bound) for bound in settings.roughness_log)
+    roughness = math.exp(rng.uniform(low, high)) - settings.roughness_bias
+    smooth = bool(rng.random() < smooth_share)
+    coloured = smooth and rng.random() < settings.coloured_share
+    by_triangle = kind == "shell" or rng.random() < settings.triangle_colours_share
+    tint = rng.random(3) if rng.random() < settings.coloured_specular_share else np.ones(3)
+    specular_red, specular_green, specular_blue = specular * tint
+    return SurfaceLook(
+        diffuse_scale=diffuse_scale,
+        diffuse_rgb=(red, green, blue),
+        specular_rgb=(specular_red, specular_green, specular_blue),
+        roughness=float(np.clip(roughness, *settings.roughness_clip)),
+        smooth=smooth,
+        colours=("triangles" if by_triangle else "groups") if coloured else "one",
+    )

@@ -1,0 +1,175 @@
+"""Where objects go: in the room, on the floor or over it, and clear of each other.
+
+Sizes and rotations are drawn first, then places, the largest object first and each several times
+over, before sizes are given up and drawn anew. Drawing whole arrangements until one fits would be
+exactly uniform, but takes ten times as long and prefers small objects; here sizes stay near their
+stated range. What an object looks like is asked of its `PlaceableShape`; a template knows no
+meshes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_templates.checks import Range
+from scene_templates.layout import Plane, Pose
+from scene_templates.patches import SIDES
+from scene_templates.rooms import Room
+from scene_templates.rotations import Orientation, rotated, rotation_rand
+from storage.errors import Rejected
+from storage.settings.described import checked
+from storage.settings.ranges import Share
+
+ARRANGEMENT_TRIES = 100
+"""Draws of all sizes before the scene is given up."""
+
+PLACE_TRIES = 16
+"""Draws of one place before the sizes are drawn anew."""
+
+TOUCHING = 1e-9
+"""World units below which a resting object still counts as inside: rounding of float64 sums."""
+
+
+@checked("scene settings")
+class PlacementSettings:
+    """How objects are put into the room."""
+
+    orientation: Orientation = "uniform"
+    """How objects are turned: uniformly on SO(3), where the published Euler angles prefer poles."""
+    resting_share: Share = 0.5
+    """Share of objects that rest on the floor; the others float. The published ones all float."""
+    overlap_share: Share = 0.1
+    """Share of scenes whose objects may run into each other, so that contact and penetration are
+    not unknown to a network. In the others no two meshes meet; in the published ones all may."""
+    inside: bool = True
+    """Objects stay on the room's side of the floor and walls. Otherwise, as published, their
+    centres are uniform in the cube [-0.5, 0.5]^3 and they may stick through."""
+
+
+class PlaceableShape(Protocol):
+    """An object's mesh, scaled into the unit sphere around the origin."""
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """Vertices [V, 3] whose hull holds the mesh."""
+        ...
+
+    def meets(self, pose: Pose, other: Self, its_pose: Pose) -> bool:
+        """Return whether two meshes in their places share a point, or one holds the other."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectSpace:
+    """Where objects may be."""
+
+    room: Room
+    """The space between the shell parts."""
+    parts: tuple[str, ...]
+    """The shell parts that exist, the floor first."""
+    planes: tuple[Plane, ...]
+    """Their planes."""
+
+    @property
+    def floor(self) -> Plane:
+        """The plane that objects rest on."""
+        return self.planes[0]
+
+    def centre_range(
+        self, points: NDArray[np.float64], radius: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and greatest centre [3] of an object with `points` [V, 3] around it.
+
+        It keeps clear of walls; through an open side it may stick out by half its radius.
+        """
+        low = np.clip(self.room.low, -0.5, 0.5) + radius / 2
+        high = np.clip(self.room.high, -0.5, 0.5) - radius / 2
+        for name in self.parts:
+            axis, lean = SIDES[name].axis, self.room.lean
+            if SIDES[name].sign > 0:
+                high[axis] = self.room.high[axis] - lean - points[:, axis].max()
+            else:
+                low[axis] = self.room.low[axis] + lean - points[:, axis].min()
+        return low, high
+
+    def holds(self, points: NDArray[np.float64]) -> bool:
+        """Return whether all points [V, 3] are on the room's side of every part."""
+        return all(bool((plane.height(points) >= -TOUCHING).all()) for plane in self.planes)
+
+
+def poses_rand(
+    rng: np.random.Generator,
+    settings: PlacementSettings,
+    space: ObjectSpace,
+    shapes: Sequence[PlaceableShape],
+    *,
+    object_scale: Range,
+    overlaps: bool,
+) -> tuple[Pose, ...]:
+    """Draw a pose for each shape.
+
+    Args:
+        rng: where the numbers come from.
+        settings: how objects are put.
+        space: where.
+        shapes: what they look like.
+        object_scale: range of the bounding spheres' diameters, before halving.
+        overlaps: whether objects may meet.
+
+    Raises:
+        Rejected: "no_room" if no arrangement was found.
+    """
+    for _ in range(ARRANGEMENT_TRIES):
+        # A recipe's size is a diameter in a room of side 2: half of it here, and half again.
+        radii = rng.uniform(*object_scale, size=len(shapes)) / 4
+        poses: dict[int, Pose] = {}
+        for row in np.argsort(-radii, kind="stable").tolist():
+            others = [] if overlaps else [(shapes[other], at) for other, at in poses.items()]
+            pose = _pose_rand(rng, settings, space, shapes[row], float(radii[row]), others)
+            if pose is None:
+                break
+            poses[row] = pose
+        if len(poses) == len(shapes):
+            return tuple(poses[row] for row in range(len(shapes)))
+    raise Rejected("no_room", f"{len(shapes)} objects met in {ARRANGEMENT_TRIES} arrangements")
+
+
+def _pose_rand(
+    rng: np.random.Generator,
+    settings: PlacementSettings,
+    space: ObjectSpace,
+    shape: PlaceableShape,
+    radius: float,
+    others: Sequence[tuple[PlaceableShape, Pose]],
+) -> Pose | None:
+    """Draw a place for an object clear of others, or None where none was found."""
+    rotation = rotation_rand(rng, settings.orientation)
+    rests = bool(rng.random() < settings.resting_share)
+    points = radius * rotated(shape.points, rotation)
+    low, high = np.full(3, -0.5), np.full(3, 0.5)
+    if settings.inside:
+        low, high = space.centre_range(points, radius)
+        if rests:
+            low[2], high[2] = 0.0, 0.0  # it is set down below
+    if (low > high).any():
+        return None
+    for _ in range(PLACE_TRIES):
+        centre = rng.uniform(low, high)
+        if rests:
+            centre = _set_down(centre, points, space.floor)
+        if settings.inside and not space.holds(points + centre):
+            continue
+        pose = Pose(centre=centre, radius=radius, rotation=rotation)
+        if not any(shape.meets(pose, other, at) for other, at in others):
+            return pose
+    return None
+
+
+def _set_down(
+    centre: NDArray[np.float64], points: NDArray[np.float64], floor: Plane
+) -> NDArray[np.float64]:
+    """Return the centre from which the lowest point touches; it need not be in balance."""
+    return centre - floor.height(points + centre).min() / floor.normal[2] * np.array([0, 0, 1.0])

@@ -1,0 +1,99 @@
+"""Shells whose seams are always closed: the floor and walls of one room.
+
+The published shells place each square by itself (`separate_sides`): walls then hang over gaps. Here
+the parts share one room. In square rooms a spin is a multiple of 90 degrees, which still swaps the
+diagonals, and edges meet exactly. In the others the spin is free, parts tilt a little, and every
+square is made just large enough to cover its side of the room: parts cross instead of gaping, at
+the price of some hidden triangles.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_templates.checks import OFFSET, SHIFT, SIZE, Range
+from scene_templates.layout import Plane
+from scene_templates.patches import SIDES, PatchPlacement
+from storage.settings.described import checked
+from storage.settings.ranges import Share, Within
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Room:
+    """Where the shell parts stand, and the space between them."""
+
+    patches: tuple[PatchPlacement, ...]
+    """One per shell part."""
+    low: NDArray[np.float64]
+    """[3] the lower corner of the upright room, world units."""
+    high: NDArray[np.float64]
+    """[3] the upper corner."""
+    lean: float
+    """How far a tilted wall may stand inside of these bounds at most."""
+
+
+@checked("scene settings")
+class SharedRoom:
+    """Ranges of rooms whose parts meet."""
+
+    square_share: Share = 0.5
+    """Share of scenes whose floor and walls are exact rectangles of one room, edge to edge."""
+    scale: Annotated[Range, SIZE] = (1.0, 1.35)
+    """Size of the room per axis, before halving; shared by its parts, so that they meet."""
+    shift: Annotated[float, OFFSET] = 0.05
+    """How far the room is moved sideways at most, before halving."""
+    raise_z: Annotated[Range, SHIFT] = (-0.05, 0.25)
+    """How far the room is raised, before halving: no fixed height of the floor to learn."""
+    tilt_deg: Annotated[float, Within(0, 10, unit="degrees")] = 3.0
+    """Most tilt of a floor or wall out of its plane, in rooms that are not square. The recipes
+    allow 10 for open layouts and 3 for the box; parts tilted by 10 must be half as large again
+    for their seams to stay closed."""
+
+    def room_rand(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
+        """Draw a room with the parts `names`."""
+        scale = rng.uniform(*self.scale, size=3)
+        shift = rng.uniform(-self.shift, self.shift, size=2)
+        translation = np.array([*shift, rng.uniform(*self.raise_z)])
+        square = rng.random() < self.square_share
+        tilt_deg = 0.0 if square else self.tilt_deg
+        patches = []
+        for name in names:
+            spin_deg = 90.0 * rng.integers(4) if square else rng.uniform(-180, 180)
+            angles_deg = rng.uniform(-tilt_deg, tilt_deg, size=3)
+            angles_deg[SIDES[name].axis] = spin_deg
+            patches.append(
+                PatchPlacement(
+                    rotation_deg=tuple(angles_deg),
+                    reach=1.0 if square else _covering_reach(spin_deg, tilt_deg),
+                    scale=tuple(scale),
+                    translation=tuple(translation),
+                )
+            )
+        return Room(
+            patches=tuple(patches),
+            low=(translation - scale) / 2,
+            high=(translation + scale) / 2,
+            lean=math.tan(math.radians(tilt_deg)) * float(scale.max()),
+        )
+
+
+def _covering_reach(spin_deg: float, tilt_deg: float) -> float:
+    """Half the side of a spun square that covers its side of the room and the seams there.
+
+    A square of half side c covers the unit square if c = |cos| + |sin| of its spin. Two parts that
+    are both tilted about two axes meet up to 2 tan(tilt) beyond the edge of an upright room, and
+    the tilt shortens a part by its cosine: 3 tan(tilt) covers both.
+    """
+    spin = math.radians(spin_deg)
+    return (abs(math.cos(spin)) + abs(math.sin(spin))) * (1 + 3 * math.tan(math.radians(tilt_deg)))
+
+
+def plane_of(positions: NDArray[np.float64]) -> Plane:
+    """Return the plane of a floor or wall from its patch, vertices [81, 3]."""
+    origin, along, across = positions[0], positions[-9], positions[8]
+    normal = np.cross(along - origin, across - origin)
+    return Plane(point=positions.mean(axis=0), normal=normal / np.sqrt(np.sum(np.square(normal))))

@@ -1,1 +1,0 @@
-"""Floor and walls: where they stand."""

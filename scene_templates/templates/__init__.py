@@ -1,1 +1,0 @@
-"""The four templates, and what they have in common."""

@@ -1,0 +1,209 @@
+"""Where things are in a dataset folder, and how several makers of it stay out of each other's way.
+
+What stands beside the shards is the dataset. `.staging` holds what is not finished; it may be
+deleted at any time, and then it is made again.
+
+No folder holds more than 5,000 entries: of files that are numbered, the first 4,096 stand in their
+folder, and each following 4,096 in one of its `part-0001`, `part-0002`, ... Where a file stands
+follows from its number alone, so nothing moves when a dataset grows.
+"""
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from storage.atomic import remove_leftovers, write_error
+from storage.dataset.claims import claimed
+from storage.errors import TrilightError
+
+_LEFT_S = 3600.0
+"""What nobody has written to for so long was left by a kill. Not all file systems carry locks
+between machines, so who seems to be alone may not be; no file is an hour in the writing."""
+
+FILES_PER_FOLDER = 4096
+"""Numbered files of one folder; with their sub-folders and what else lies there, below 5,000."""
+
+
+def numbered(number: int, name: str) -> str:
+    """Return the relative path of the file `name`, which is the `number`-th of its folder."""
+    part = number // FILES_PER_FOLDER
+    return f"part-{part:04d}/{name}" if part else name
+
+
+@dataclass(frozen=True)
+class DatasetFolder:
+    """The paths of one dataset, or of this machine's part of one that is made in a bucket."""
+
+    root: Path
+    """The folder that users name; for a bucket, one in the cache (storage.dataset.output)."""
+    bucket: str = ""
+    """URL of the bucket that the dataset is made in, where it is; without secrets."""
+
+    @property
+    def shown(self) -> str:
+        """What people call the dataset."""
+        return self.bucket or str(self.root)
+
+    @property
+    def manifest(self) -> Path:
+        return self.root / "manifest.json"
+
+    @property
+    def objects_lock(self) -> Path:
+        return self.root / "objects.lock.jsonl"
+
+    @property
+    def failures(self) -> Path:
+        return self.root / "failures.jsonl"
+
+    @property
+    def attribution(self) -> Path:
+        return self.root / "attribution.csv"
+
+    @property
+    def card(self) -> Path:
+        """The dataset card, which is what hubs and people open first."""
+        return self.root / "README.md"
+
+    @property
+    def licences(self) -> Path:
+        return self.root / "LICENSE.md"
+
+    @property
+    def croissant(self) -> Path:
+        return self.root / "croissant.json"
+
+    @property
+    def contact_sheet(self) -> Path:
+        return self.root / "contact_sheet.png"
+
+    @property
+    def template_sheet(self) -> Path:
+        return self.root / "templates.png"
+
+    @property
+    def report(self) -> Path:
+        return self.root / "report.html"
+
+    @property
+    def report_pages(self) -> Path:
+        """Folder of the report's pages, one per scene that it shows."""
+        return self.root / "report"
+
+    @property
+    def logs(self) -> Path:
+        return self.root / "logs"
+
+    @property
+    def staging(self) -> Path:
+        return self.root / ".staging"
+
+    @property
+    def staged_objects(self) -> Path:
+        """Built-in objects, written out as files."""
+        return self.staging / "objects"
+
+    @property
+    def staged_failures(self) -> Path:
+        """Rejections of shards that are packed but not yet in the manifest."""
+        return self.staging / "failures"
+
+    @property
+    def staged_entries(self) -> Path:
+        """What the manifest will say of shards that are packed but not yet in it."""
+        return self.staging / "entries"
+
+    @property
+    def staged_samples(self) -> Path:
+        """Finished samples of unfinished shards, in a folder for each shard."""
+        return self.staging / "samples"
+
+    @property
+    def staged_sent(self) -> Path:
+        """An empty file for each shard that is known to be in the bucket."""
+        return self.staging / "sent"
+
+    def staged_shard(self, name: str) -> Path:
+        """Folder of the finished samples of an unfinished shard."""
+        return self.staged_samples / name
+
+    def shard(self, name: str) -> Path:
+        """Path of a shard; its name is relative to the folder and may begin with a part of it."""
+        return self.root / name
+
+    def has_shard(self, name: str) -> bool:
+        """Return whether a shard is finished: it is here, or in the bucket."""
+        return self.shard(name).exists() or self.is_sent(name)
+
+    def is_sent(self, name: str) -> bool:
+        """Return whether a shard is known to be in the bucket; its bytes need not be here."""
+        return bool(self.bucket) and (self.staged_sent / name).exists()
+
+    def shard_files(self) -> list[Path]:
+        """Return every file that is called like a shard, listed in the manifest or not."""
+        return sorted([*self.root.glob("*.tar"), *self.root.glob("part-*/*.tar")])
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder for one maker; the lock dies with the process that holds it.
+
+        Raises:
+            TrilightError: the folder cannot be written, or another process is at work in it.
+        """
+        descriptor = self._open_lock()
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise TrilightError(
+                f"{self.root}: another process is making this dataset. Wait for it, or choose "
+                "another --out."
+            ) from error
+        else:
+            yield
+        finally:
+            os.close(descriptor)
+
+    @contextlib.contextmanager
+    def joined(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
+        """Take part in the making, with any number of others.
+
+        Whoever is alone at first clears away what killed writers have left for an hour.
+
+        Args:
+            when_alone: called by whoever is alone at first, before anybody else can join.
+
+        Raises:
+            TrilightError: the folder cannot be written; or as `when_alone`.
+        """
+        descriptor = self._open_lock()
+        try:
+            if _lock_alone(descriptor):
+                remove_leftovers(self.root, older_than_s=_LEFT_S)
+                when_alone()
+            fcntl.flock(descriptor, fcntl.LOCK_SH)
+            yield
+        finally:
+            os.close(descriptor)
+
+    def turn(self, what: str) -> "contextlib.AbstractContextManager[bool]":
+        """Wait for one's turn at what one maker does at a time, such as `manifest`."""
+        return claimed(self.staging / "turns" / what, wait=True)
+
+    def _open_lock(self) -> int:
+        lock = self.staging / "lock"
+        try:
+            self.staging.mkdir(parents=True, exist_ok=True)
+            return os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise write_error(lock, error) from error
+
+
+def _lock_alone(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

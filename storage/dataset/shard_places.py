@@ -1,0 +1,121 @@
+"""Where single shards are: paths and URLs, one by one or as brace patterns."""
+
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from storage.conventions import SPLITS
+from storage.errors import TrilightError
+from storage.records.safe_read import open_plain
+from storage.remote.cache import shard_cache
+from storage.remote.safe_url import printable, safe_text
+from storage.remote.url import RemoteUrl, parse_url
+
+MAX_SHARDS = 100_000
+"""Of one list; a pattern may not name more either, however few characters it has."""
+
+_GROUP = re.compile(r"\{([^{}]*)\}")
+_RANGE = re.compile(r"(\d+)\.\.(\d+)")
+_WHAT = "shard"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardPlace:
+    """Where one shard is."""
+
+    place: Path | RemoteUrl
+    """A file of this machine, or one on a server."""
+
+    @property
+    def shown(self) -> str:
+        """The place for people, without secrets."""
+        return self.place.shown if isinstance(self.place, RemoteUrl) else printable(str(self.place))
+
+    @property
+    def split(self) -> str:
+        """What its name begins with, if that is a split, and else train."""
+        name = self.shown.rpartition("/")[2]
+        return next((split for split in SPLITS if name.startswith(f"{split}-")), "train")
+
+    def open(self) -> BinaryIO:
+        """Open the shard; raises TrilightError where it cannot be had."""
+        if isinstance(self.place, RemoteUrl):
+            return shard_cache().open(self.place, num_bytes=None, sha256=None)
+        try:
+            return open_plain(self.place)
+        except OSError as error:
+            raise TrilightError(
+                f"shard {self.shown!r}: cannot be read ({error.strerror}); expected a file. Check "
+                "the list."
+            ) from error
+
+
+def listed_shards(patterns: Sequence[str]) -> list[ShardPlace]:
+    """Return the shards that patterns name, in their order.
+
+    Args:
+        patterns: paths or URLs; `{000000..000007}` stands for each number of a range, as wide as
+            its first end, and `{a,b}` for each of several texts.
+
+    Raises:
+        TrilightError: a URL is refused (storage.remote.url), a pattern is not closed or names more
+            than MAX_SHARDS, a range runs backwards, or a shard is named twice.
+    """
+    texts = list(itertools.chain.from_iterable(expanded(pattern) for pattern in patterns))
+    places = [ShardPlace(place=parse_url(text, what=_WHAT)) for text in texts]
+    if len(places) > MAX_SHARDS:
+        raise TrilightError(f"the list names {len(places)} shards; expected at most {MAX_SHARDS}.")
+    seen: set[Path | RemoteUrl] = set()
+    for place in places:
+        if place.place in seen:
+            raise TrilightError(f"shard {place.shown!r} is named twice; expected each once.")
+        seen.add(place.place)
+    return places
+
+
+def expanded(pattern: str, what: str = "shards") -> list[str]:
+    """Return what a brace pattern of `what` stands for; raises as `listed_shards`."""
+    named = f"{what} {_shown(pattern)}"
+    groups = [_alternatives(group[1], named) for group in _GROUP.finditer(pattern)]
+    fixed = _GROUP.split(pattern)[::2]
+    if any("{" in text or "}" in text for text in fixed):
+        raise TrilightError(
+            f"{named}: a brace is not closed, or stands within another; expected such as "
+            "train-{000000..000007}.tar."
+        )
+    count = 1
+    for group in groups:
+        count *= len(group)
+        if count > MAX_SHARDS:
+            raise TrilightError(
+                f"{named}: stands for more than {MAX_SHARDS} names; expected at most that many."
+            )
+    return [_joined(fixed, chosen) for chosen in itertools.product(*groups)]
+
+
+def _joined(fixed: Sequence[str], chosen: Sequence[str]) -> str:
+    return "".join(text for pair in zip(fixed, [*chosen, ""], strict=True) for text in pair)
+
+
+def _alternatives(group: str, named: str) -> Sequence[str]:
+    match = _RANGE.fullmatch(group)
+    if match is None:
+        return group.split(",")
+    first, last = int(match[1]), int(match[2])
+    if not first <= last <= first + MAX_SHARDS:
+        raise TrilightError(
+            f"{named}: the range {group} is backwards or longer than {MAX_SHARDS}; expected such "
+            "as 000000..000007."
+        )
+    return list(_numbers(first, last, len(match[1])))
+
+
+def _numbers(first: int, last: int, width: int) -> Iterator[str]:
+    return (f"{number:0{width}d}" for number in range(first, last + 1))
+
+
+def _shown(pattern: str) -> str:
+    return repr(printable(safe_text(pattern)))

@@ -1,0 +1,88 @@
+"""Which split an object and a scene belong to, from nothing but themselves.
+
+An object's split is a hash of its cleaned geometry: copies under other names stay together, and
+adding objects moves none. A scene's split is that of its shard, by the shard's number, so a longer
+dataset begins with exactly the scenes of a shorter one.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from storage.conventions import SPLITS
+from storage.dataset.layout import numbered
+from storage.errors import TrilightError
+
+if TYPE_CHECKING:
+    from storage.settings.dataset import SplitSettings
+
+JUDGED_SPLIT = "test"
+"""Split of whole sets that are judged by, never learnt from."""
+
+VALIDATION_SLOT, TEST_SLOT = 2, 5
+"""Places in a cycle of shards: early, so that a small dataset has all three splits."""
+
+
+def split_of_object(geometry_sha256: str, settings: "SplitSettings") -> str:
+    """Return the split of an object from the digest of its cleaned geometry (64 hex digits)."""
+    if settings.one_split:
+        return JUDGED_SPLIT
+    position = int(geometry_sha256[:16], 16) / 2**64
+    if position < settings.held_out_objects:
+        return "validation"
+    return "test" if position < 2 * settings.held_out_objects else "train"
+
+
+def split_of_shard(shard_index: int, settings: "SplitSettings") -> str:
+    """Return the split of a shard from its number."""
+    if settings.one_split:
+        return JUDGED_SPLIT
+    slot = shard_index % settings.shards_per_cycle
+    return {VALIDATION_SLOT: "validation", TEST_SLOT: "test"}.get(slot, "train")
+
+
+def shard_name(shard_index: int, settings: "SplitSettings") -> str:
+    """Return the name of a shard, such as `train-000003.tar`, relative to the dataset."""
+    return named_shard(shard_index, split_of_shard(shard_index, settings))
+
+
+def named_shard(shard_index: int, split: str) -> str:
+    """Return the name of a shard of a split, relative to the dataset."""
+    return numbered(shard_index, f"{split}-{shard_index:06d}.tar")
+
+
+def scenes_of_shard(shard_index: int, settings: "SplitSettings") -> range:
+    """Return the indices of the scenes of a shard."""
+    first = shard_index * settings.scenes_per_shard
+    last = first + settings.scenes_per_shard
+    if settings.listed_scenes is not None:
+        last = min(last, settings.listed_scenes)
+    return range(first, last)
+
+
+def shard_of_scene(scene_index: int, settings: "SplitSettings") -> str:
+    """Return the name of the shard of a scene."""
+    return shard_name(scene_index // settings.scenes_per_shard, settings)
+
+
+def planned_scenes(num_scenes: int, settings: "SplitSettings") -> int:
+    """Return how many scenes are made when `num_scenes` are wanted: those of whole shards."""
+    if settings.listed_scenes is not None:
+        return settings.listed_scenes
+    return shards_for(num_scenes, settings) * settings.scenes_per_shard
+
+
+def shards_for(num_scenes: int, settings: "SplitSettings") -> int:
+    """Return how many shards hold at least `num_scenes` scenes."""
+    return -(-num_scenes // settings.scenes_per_shard)
+
+
+def require_objects(num_by_split: Mapping[str, int], needed: set[str]) -> None:
+    """Raise TrilightError where a split that is needed has no object to draw from."""
+    empty = [split for split in SPLITS if split in needed and not num_by_split.get(split)]
+    if empty:
+        total = sum(num_by_split.values())
+        raise TrilightError(
+            f"split {empty[0]!r}: none of the {total} accepted objects falls into it; expected at "
+            "least 1, for which about 30 different objects are enough. Add objects (for example "
+            "mix in `builtin:`), or make fewer scenes."
+        )

@@ -1,0 +1,62 @@
+"""Finished scenes that wait for their shard, each in one file that appears whole.
+
+A staged file is a small tar with the members of the sample and, as `failures`, the attempts that
+were rejected on the way. A scene that no attempt could save has failures only.
+"""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+from storage.atomic import write_atomically
+from storage.dataset.layout import numbered
+from storage.dataset.shard_reader import iterate_samples
+from storage.dataset.shard_writer import write_tar
+from storage.records.failures import decode_failures, encode_failures
+from storage.records.objects import Failure
+from storage.records.profiles import Profile
+from storage.records.sample import Sample, encode_sample, sample_key
+
+_FAILURES = "failures"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StagedScene:
+    """What became of one scene."""
+
+    members: dict[str, bytes]
+    """The members of its sample; empty where the scene was given up."""
+    failures: list[Failure]
+    """The rejected attempts."""
+
+
+def stage_scene(
+    folder: Path,
+    scene_index: int,
+    sample: Sample | None,
+    failures: list[Failure],
+    profile: Profile,
+) -> None:
+    """Write what became of a scene into the staging folder of its shard, packed as it will stay."""
+    members = encode_sample(sample, profile) if sample else {}
+    stream = io.BytesIO()
+    write_tar(
+        stream, [(sample_key(scene_index), {**members, _FAILURES: encode_failures(failures)})]
+    )
+    write_atomically(_path(folder, scene_index), stream.getvalue())
+
+
+def is_staged(folder: Path, scene_index: int) -> bool:
+    """Return whether a scene is finished."""
+    return _path(folder, scene_index).exists()
+
+
+def read_staged_scene(folder: Path, scene_index: int) -> StagedScene:
+    """Return what became of a finished scene."""
+    ((_, members),) = iterate_samples(_path(folder, scene_index))
+    failures = decode_failures(members.pop(_FAILURES))
+    return StagedScene(members=members, failures=failures)
+
+
+def _path(folder: Path, scene_index: int) -> Path:
+    return folder / numbered(scene_index, f"{sample_key(scene_index)}.tar")

@@ -1,0 +1,138 @@
+"""What a dataset holds, without its pictures."""
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.dataset.damage import reading
+from storage.dataset.dataset import Dataset
+from storage.dataset.manifest import ShardEntry
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.records.profiles import PACKED, PLAIN, unpack_arrays
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Statistics:
+    """Counts and distributions of a dataset."""
+
+    num_scenes: int
+    """Scenes in all shards."""
+    scenes_by_split: Mapping[str, int]
+    """Scenes per split."""
+    scenes_by_template: Mapping[str, int]
+    """Scenes per layout template."""
+    scenes_by_excursion: Mapping[str, int]
+    """Scenes per axis along which they leave the usual range; empty where none does."""
+    scene_digest: str
+    """sha256 over the keys and arrays of all scenes, without pictures: equal for equal scenes,
+    whatever they were rendered and packed with."""
+    num_bytes: int
+    """Bytes of all shards."""
+    spp: NDArray[np.int64]
+    """[views] samples per pixel."""
+    noise_floor_db: NDArray[np.float64]
+    """[views] psnr_log_db."""
+    at_cap: NDArray[np.bool_]
+    """[views] whether sampling ended at the cap."""
+
+    @property
+    def num_views(self) -> int:
+        return len(self.spp)
+
+    def lines(self) -> Sequence[tuple[str, str]]:
+        """Return (name, value) rows for people."""
+        if not self.num_views:
+            return [("scenes", "0")]
+        excursions = _counts(self.scenes_by_excursion)
+        beyond = [("beyond the range", excursions)] if excursions else []
+        median, low = np.percentile(self.noise_floor_db, [50, 5])
+        return [
+            ("scenes", f"{self.num_scenes} ({_counts(self.scenes_by_split)})"),
+            ("templates", _counts(self.scenes_by_template)),
+            *beyond,
+            ("views", f"{self.num_views}"),
+            ("noise floor", f"median {median:.1f} dB, 5th percentile {low:.1f} dB (psnr_log_db)"),
+            ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),
+            ("samples per pixel", f"median {np.median(self.spp):.0f}, most {self.spp.max()}"),
+            ("scene digest", self.scene_digest),
+            ("size", f"{self.num_bytes / 1e6:.1f} MB, {self.bytes_per_scene / 1e3:.0f} kB a scene"),
+        ]
+
+    @property
+    def bytes_per_scene(self) -> float:
+        return self.num_bytes / max(self.num_scenes, 1)
+
+
+def dataset_statistics(dataset: Dataset) -> Statistics:
+    """Read every sample but its pictures through the manifest's index.
+
+    Raises:
+        TrilightError: a shard is missing or damaged.
+    """
+    tally = _Tally()
+    for shard in dataset.manifest.shards:
+        with dataset.files.open(shard, checked=False) as stream, reading(dataset.shown, shard.name):
+            _require_whole(dataset, shard)
+            _count_shard(stream, shard, tally)
+    return Statistics(
+        num_scenes=dataset.manifest.num_samples,
+        scenes_by_split=tally.splits,
+        scenes_by_template=tally.templates,
+        scenes_by_excursion=tally.excursions,
+        scene_digest=digest_of_scenes(tally.scene_members),
+        num_bytes=dataset.manifest.num_bytes,
+        spp=np.array([view["spp"] for view in tally.views], np.int64),
+        noise_floor_db=np.array([view["noise_floor_db"] for view in tally.views], np.float64),
+        at_cap=np.array([view["at_cap"] for view in tally.views], np.bool_),
+    )
+
+
+@dataclass(kw_only=True, eq=False)
+class _Tally:
+    """Counts in the making."""
+
+    splits: Counter[str] = field(default_factory=Counter)
+    templates: Counter[str] = field(default_factory=Counter)
+    excursions: Counter[str] = field(default_factory=Counter)
+    views: list[Any] = field(default_factory=list)
+    scene_members: dict[str, str] = field(default_factory=dict)
+
+
+def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
+    for name, offset, num_bytes in shard.members:
+        key, _, suffix = name.partition(".")
+        if suffix not in ("json", PLAIN, PACKED):
+            continue
+        stream.seek(offset)
+        member = stream.read(num_bytes)
+        if suffix != "json":
+            tally.scene_members[f"{key}.{PLAIN}"] = sha256_hex(unpack_arrays({suffix: member}))
+            continue
+        record = json.loads(member)
+        tally.splits[shard.split] += 1
+        tally.templates[record["provenance"]["template"]] += 1
+        if excursion := record["provenance"].get("excursion"):
+            tally.excursions[excursion["axis"]] += 1
+        tally.views.extend(record["views"])
+
+
+def _require_whole(dataset: Dataset, shard: ShardEntry) -> None:
+    num_bytes = dataset.files.num_bytes(shard)
+    if num_bytes is not None and num_bytes != shard.num_bytes:
+        raise TrilightError(f"{num_bytes} bytes; expected {shard.num_bytes}")
+
+
+def digest_of_scenes(members: Mapping[str, str]) -> str:
+    """Return the digest of scenes from the sha256 of each unpacked `KEY.scene.safetensors`."""
+    lines = (f"{name} {digest}" for name, digest in sorted(members.items()))
+    return sha256_hex("\n".join(lines).encode())
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))

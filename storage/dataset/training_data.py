@@ -1,0 +1,153 @@
+"""What `--data` means: a dataset by its root, or shards by a list."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.conventions import SPLITS
+from storage.dataset.dataset import open_dataset
+from storage.dataset.manifest import Manifest, ShardEntry
+from storage.dataset.member_table import MemberTable
+from storage.dataset.shard_places import listed_shards
+from storage.dataset.shard_set import (
+    KeysSeen,
+    ListedShards,
+    ManifestShards,
+    ShardSet,
+    hashes_of,
+    key_twice,
+)
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+
+NO_MANIFEST = (
+    "the shards come from a list, without a manifest: no hash is checked, sample counts are found "
+    "as shards are read, and a resumed run reads again what it has passed"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingData:
+    """The shards of every split that holds a sample."""
+
+    shown: str
+    """Where they are, for people."""
+    digest: str
+    """What a checkpoint remembers: the dataset digest; of a list, a digest of its names only."""
+    splits: Mapping[str, ShardSet]
+    """By split; those without a shard are left out."""
+    num_views: int | None
+    """Pictures per scene, where a manifest says it."""
+    build: str | None = None
+    """Name of the build, where a manifest says it."""
+    max_triangles: int | None = None
+    """Most triangles of a scene, where a manifest says it."""
+    notes: tuple[str, ...] = ()
+    """What the user should know, once."""
+
+    def split(self, name: str) -> ShardSet:
+        """Return the shards of a split; raises TrilightError where it holds no scene."""
+        if name not in self.splits:
+            raise TrilightError(
+                f"{self.shown}: the {name} split holds no scene; expected at least one. Generate "
+                f"the dataset with more scenes; in a list, name shards {name}-....tar too."
+            )
+        return self.splits[name]
+
+
+def open_training_data(data: Sequence[str]) -> TrainingData:
+    """Open what `--data` names.
+
+    Args:
+        data: one root of a dataset, or any number of paths, URLs and brace patterns that end in
+            `.tar`.
+
+    Raises:
+        TrilightError: nothing is named, roots and shards are mixed, a URL is refused, there is no
+            readable manifest, or a key is in two shards of it.
+    """
+    shards = [text for text in data if text.partition("?")[0].endswith((".tar", "}"))]
+    if shards and len(shards) == len(data):
+        return _of_list(shards)
+    if len(data) != 1:
+        raise TrilightError(
+            f"data: {len(data)} places of which {len(shards)} are shards; expected one dataset, or "
+            "shards only (each ends in .tar)."
+        )
+    return _of_dataset(data[0])
+
+
+def _of_dataset(root: str) -> TrainingData:
+    hashes: list[NDArray[np.uint64]] = []
+
+    def without_members(shard: ShardEntry) -> ShardEntry:
+        hashes.append(_hashes_of_keys(shard))
+        return dataclasses.replace(shard, members=MemberTable())
+
+    # without the members, a set takes the same few bytes a shard however large shards are
+    dataset = open_dataset(root, shard_read=without_members)
+    if twice := _found_twice(hashes):
+        _name_key_twice(open_dataset(root).manifest, twice)
+    splits: dict[str, ShardSet] = {}
+    for split in SPLITS:
+        entries = [shard for shard in dataset.shards_of(split) if shard.num_samples]
+        if entries:
+            splits[split] = ManifestShards(dataset, entries)
+    return TrainingData(
+        shown=dataset.shown,
+        digest=dataset.digest,
+        splits=splits,
+        num_views=dataset.manifest.num_views,
+        build=dataset.manifest.build,
+        max_triangles=_max_triangles(dataset.manifest),
+    )
+
+
+def _max_triangles(manifest: Manifest) -> int | None:
+    scenes = manifest.settings.get("scenes")
+    found = scenes.get("max_triangles") if isinstance(scenes, Mapping) else None
+    return found if isinstance(found, int) else None
+
+
+def _of_list(patterns: Sequence[str]) -> TrainingData:
+    places, seen = listed_shards(patterns), KeysSeen()
+    splits: dict[str, ShardSet] = {}
+    for split in SPLITS:
+        chosen = [place for place in places if place.split == split]
+        if chosen:
+            splits[split] = ListedShards(chosen, seen)
+    names = sorted(place.shown for place in places)
+    return TrainingData(
+        shown=f"the list of {len(places)} shards",
+        digest=f"list:{sha256_hex(canonical_json(names))}",
+        splits=splits,
+        num_views=None,
+        notes=(NO_MANIFEST,),
+    )
+
+
+def _hashes_of_keys(shard: ShardEntry) -> NDArray[np.uint64]:
+    keys = shard.keys
+    if len(keys) != shard.num_samples:
+        raise TrilightError(
+            f"{shard.name}: the manifest counts {shard.num_samples} samples and names "
+            f"{len(keys)}; expected the same. Run `trilight verify`."
+        )
+    return hashes_of(keys)
+
+
+def _found_twice(hashes: Sequence[NDArray[np.uint64]]) -> set[int]:
+    every = np.concatenate([np.zeros(0, np.uint64), *hashes])
+    every.sort()
+    return set(every[1:][every[1:] == every[:-1]].tolist())
+
+
+def _name_key_twice(manifest: Manifest, twice: set[int]) -> NoReturn:
+    shards = ((shard.name, shard.keys) for shard in manifest.shards)
+    every = ((name, key) for name, keys in shards for key in keys)
+    name, key = next(at for at in every if int(hashes_of([at[1]])[0]) in twice)
+    raise key_twice(name, key)

@@ -1,0 +1,222 @@
+"""Is a dataset what its manifest says? Every hash, member and law, and a list of what is wrong."""
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import BinaryIO
+
+from storage.dataset.check_sample import check_sample
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.files import LocalFiles, RemoteDatasetFiles
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import Manifest, ShardEntry, index_stream
+from storage.dataset.member_table import MemberTable
+from storage.dataset.progress import planned_shards
+from storage.dataset.shard_reader import samples_of, scan_members
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.records.objects import LockedObject
+from storage.records.objects_lock import decode_objects_lock
+from storage.records.sample import decode_sample
+from storage.remote.fetch import download
+from storage.remote.tries import TransferFailed
+
+REMOTE_THREADS = 8
+"""Shards of a server that are fetched, or asked for, at the same time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verification:
+    """What a check of a dataset found."""
+
+    manifest: Manifest
+    """The manifest that was checked."""
+    problems: Sequence[str]
+    """One line per fault, naming shard and sample; empty where the dataset is whole."""
+    num_samples: int
+    """Samples that were looked at."""
+    bad_shards: Sequence[str]
+    """Names of the shards that are missing or not what they should be."""
+    num_shards_planned: int
+    """Shards of the finished dataset."""
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether every shard is listed."""
+        return len(self.manifest.shards) >= self.num_shards_planned
+
+
+@dataclass(kw_only=True)
+class _Found:
+    """What was found in one shard."""
+
+    faults: list[str] = field(default_factory=list)
+    keys: list[str] = field(default_factory=list)
+
+
+def verify_dataset(
+    root: str | Path | Dataset,
+    *,
+    fast: bool = False,
+    shard_done: Callable[[str], None] = lambda name: None,
+) -> Verification:
+    """Check a dataset, in a folder or on a server, against its manifest.
+
+    Several shards are looked at side by side in threads: hashing and unpacking leave Python's lock.
+    Shards of a server are fetched anew, past the cache, and not kept.
+
+    Args:
+        root: the dataset, opened, or its path or URL.
+        fast: compare only sizes, and in a folder also the members' names and places; reads no
+            picture. A changed byte is not seen.
+        shard_done: called with the name of each shard that was looked at.
+
+    Raises:
+        TrilightError: there is no readable manifest, so there is nothing to check against, or the
+            disk is full.
+    """
+    dataset = root if isinstance(root, Dataset) else open_dataset(str(root))
+    manifest = dataset.manifest
+    lock = dataset.files.read("objects.lock.jsonl")
+    problems = list(_check_lock(lock, manifest))
+    locked = {} if problems or lock is None else _by_uid(lock)
+    problems += [f"{name}: not in the manifest" for name in _strangers(dataset)]
+    where: dict[str, str] = {}
+    bad: list[str] = []
+    threads = os.cpu_count() or 1 if isinstance(dataset.files, LocalFiles) else REMOTE_THREADS
+    with ThreadPoolExecutor(threads) as pool:
+        checks = [
+            pool.submit(_check_shard, dataset, shard, locked, fast=fast)
+            for shard in manifest.shards
+        ]
+        try:
+            for shard, check in zip(manifest.shards, checks, strict=True):
+                found = check.result()
+                faults = [*found.faults, *_twice(found.keys, shard, where)]
+                bad += [shard.name] if faults else []
+                problems += [
+                    f"{shard.name}: {fault.removeprefix(f'{shard.name}: ')}" for fault in faults
+                ]
+                shard_done(shard.name)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return Verification(
+        manifest=manifest,
+        problems=problems,
+        num_samples=manifest.num_samples,
+        bad_shards=bad,
+        num_shards_planned=_num_planned(manifest),
+    )
+
+
+def _num_planned(manifest: Manifest) -> int:
+    """Return how many shards there will be; of settings that do not say, those that are there."""
+    try:
+        return len(planned_shards(manifest))
+    except (KeyError, TypeError, TrilightError):
+        return len(manifest.shards)
+
+
+def _strangers(dataset: Dataset) -> list[str]:
+    """Return shards in the folder that nobody lists; a server's folder is not listed."""
+    if isinstance(dataset.files, RemoteDatasetFiles):
+        return []
+    listed = {shard.name for shard in dataset.manifest.shards}
+    root = dataset.files.root
+    found = [path.relative_to(root).as_posix() for path in DatasetFolder(root).shard_files()]
+    return [name for name in found if name not in listed]
+
+
+def _by_uid(lock: bytes) -> dict[str, LockedObject]:
+    return {entry.uid: entry for entry in decode_objects_lock(lock, "objects.lock.jsonl")}
+
+
+def _check_lock(lock: bytes | None, manifest: Manifest) -> Iterator[str]:
+    if not manifest.objects_lock_sha256:
+        if manifest.shards:
+            yield "objects.lock.jsonl: the manifest has shards but no digest of the lock"
+    elif lock is None:
+        yield "objects.lock.jsonl: missing"
+    elif sha256_hex(lock) != manifest.objects_lock_sha256:
+        yield "objects.lock.jsonl: sha256 differs from the manifest"
+
+
+def _twice(keys: Sequence[str], shard: ShardEntry, where: dict[str, str]) -> Iterator[str]:
+    for key in keys:
+        if (other := where.setdefault(key, shard.name)) != shard.name:
+            yield f"sample {key} occurs twice in the dataset, first in {other}"
+
+
+def _check_shard(
+    dataset: Dataset, shard: ShardEntry, locked: Mapping[str, LockedObject], *, fast: bool
+) -> _Found:
+    found = _Found()
+    try:
+        found.faults += _check_size(dataset, shard)
+        if found.faults or (fast and isinstance(dataset.files, RemoteDatasetFiles)):
+            return found
+        with _opened(dataset, shard) as stream:
+            if fast:
+                found.faults += _check_members(stream, shard)
+            else:
+                _check_content(stream, shard, dataset.manifest, locked, found)
+    except TrilightError as error:
+        found.faults.append(str(error))
+    except TransferFailed as error:
+        found.faults.append(f"cannot be read ({error.message})")
+    return found
+
+
+def _check_size(dataset: Dataset, shard: ShardEntry) -> Iterator[str]:
+    num_bytes = dataset.files.num_bytes(shard)
+    if num_bytes is None:
+        yield "missing"
+    elif num_bytes != shard.num_bytes:
+        yield f"{num_bytes} bytes; expected {shard.num_bytes}"
+    if len(shard.index) != shard.num_samples:
+        yield f"the manifest counts {shard.num_samples} samples and names {len(shard.index)}"
+
+
+def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
+    if isinstance(dataset.files, LocalFiles):
+        return dataset.files.open(shard, checked=False)
+    stream: BinaryIO = TemporaryFile()
+    try:
+        url = dataset.files.url.child(shard.name)
+        download(url, stream, num_bytes=shard.num_bytes, max_bytes=shard.num_bytes)
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def _check_members(stream: BinaryIO, shard: ShardEntry) -> Iterator[str]:
+    found = MemberTable(
+        (f"{member.key}.{member.suffix}", member.offset, member.num_bytes)
+        for member in scan_members(stream, shard.name)
+    )
+    if found != shard.members:
+        yield "the member index differs from the manifest"
+
+
+def _check_content(
+    stream: BinaryIO,
+    shard: ShardEntry,
+    manifest: Manifest,
+    locked: Mapping[str, LockedObject],
+    found: _Found,
+) -> None:
+    if index_stream(stream, shard.name) != shard:
+        found.faults.append("sha256 or member index differs from the manifest")
+    for key, members in samples_of(stream, shard.name):
+        found.keys.append(key)
+        try:
+            sample = decode_sample(key, members)
+        except TrilightError as error:
+            found.faults.append(str(error))
+            continue
+        found.faults += check_sample(sample, shard.split, manifest, locked)

@@ -1,0 +1,157 @@
+"""`Asset`: one object as clean triangle meshes at several budgets, in one safetensors file.
+
+The file holds, per level, `positions_<budget>` f32 [V, 3] and `faces_<budget>` u32 [F, 3], and in
+its metadata what is known of the source and of each level. Positions are in the unit box: the
+bounding box of the cleaned source is centred on the origin and its longest side is 1.
+"""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from storage.records.safe_read import read_safetensors
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceFacts:
+    """What was found in the source file, and what cleaning did to it."""
+
+    num_faces_read: int
+    """Triangles as the file has them, instances counted."""
+    num_faces: int
+    """Triangles after cleaning: without degenerate and repeated ones."""
+    num_faces_turned: int
+    """Triangles whose winding was reversed to face outward."""
+    num_parts: int
+    """Connected pieces."""
+    open_edges: int
+    """Edges with one face; 0 for a surface without border."""
+    nonmanifold_edges: int
+    """Edges with three faces or more."""
+    front_share: float
+    """Share of rays from outside that meet a front: near 1 where there is an outside."""
+
+    @property
+    def watertight(self) -> bool:
+        """Whether every edge has exactly two faces."""
+        return self.open_edges == 0 and self.nonmanifold_edges == 0
+
+    @property
+    def repaired(self) -> bool:
+        """Whether triangles had to be dropped or turned around."""
+        return self.num_faces < self.num_faces_read or self.num_faces_turned > 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelQuality:
+    """How a level compares with the cleaned source, and how good its triangles are.
+
+    Distances are shares of the diagonal of the source's bounding box, and the larger of the two
+    directions.
+    """
+
+    error_mean: float
+    """Mean distance."""
+    error_p99: float
+    """99th percentile of the distance: what bounds refer to."""
+    error_max: float
+    """Largest distance of any sample point."""
+    normal_error_deg: float
+    """Mean angle between the normals of the source and of the level, 0 to 90."""
+    area_ratio: float
+    """Area as a multiple of the source's."""
+    silhouette_iou: float
+    """Agreement of the outlines over several directions, 0 to 1."""
+    lost_area: float
+    """Share of the source's area in parts that have vanished."""
+    area_variation: float
+    """Standard deviation of the triangles' areas over their mean."""
+    min_angle_p5_deg: float
+    """5th percentile of the triangles' smallest angles."""
+    open_edges: int
+    """Edges with one face."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelRecord:
+    """How one level was made, and how far it is from the source."""
+
+    budget: int
+    """The most triangles that the level was allowed."""
+    method: str
+    """`source` (within budget as it was), or the name of the decimation."""
+    quality: LevelQuality
+    """Its measures."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Level:
+    """One mesh of an asset."""
+
+    record: LevelRecord
+    """How it was made."""
+    positions: NDArray[np.float32]
+    """[V, 3] in the unit box."""
+    faces: NDArray[np.uint32]
+    """[F, 3], counter-clockwise from outside where the source has an outside."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Asset:
+    """A clean object at falling budgets."""
+
+    geometry_sha256: str
+    """Digest of the cleaned source geometry: equal for copies, whatever their names."""
+    source_sha256: str
+    """Digest of the source file."""
+    recipe: str
+    """Name and version of the recipe and of the libraries that made it."""
+    source: SourceFacts
+    """What the file held."""
+    levels: tuple[Level, ...]
+    """From the largest budget to the smallest."""
+
+    def finest_within(self, num_triangles: int) -> Level | None:
+        """Return the finest level of at most `num_triangles` faces, or None."""
+        fitting = [level for level in self.levels if len(level.faces) <= num_triangles]
+        return max(fitting, key=lambda level: len(level.faces), default=None)
+
+
+def encode_asset(asset: Asset) -> bytes:
+    """Return the file of an asset; equal assets give equal bytes."""
+    arrays: dict[str, NDArray] = {}
+    for level in asset.levels:
+        arrays[f"positions_{level.record.budget}"] = np.ascontiguousarray(level.positions)
+        arrays[f"faces_{level.record.budget}"] = np.ascontiguousarray(level.faces)
+    header = {
+        "geometry_sha256": asset.geometry_sha256,
+        "source_sha256": asset.source_sha256,
+        "recipe": asset.recipe,
+        "source": dataclasses.asdict(asset.source),
+        "levels": [dataclasses.asdict(level.record) for level in asset.levels],
+    }
+    return save(arrays, metadata={"asset": json.dumps(header, sort_keys=True)})
+
+
+def decode_asset(data: bytes) -> Asset:
+    """Return the asset of a file; raises TrilightError where it is not one."""
+    arrays, metadata = read_safetensors(data)
+    header = json.loads(metadata["asset"])
+    records: Sequence[LevelRecord] = [
+        LevelRecord(**{**row, "quality": LevelQuality(**row["quality"])})
+        for row in header.pop("levels")
+    ]
+    levels = tuple(
+        Level(
+            record=record,
+            positions=arrays[f"positions_{record.budget}"],
+            faces=arrays[f"faces_{record.budget}"],
+        )
+        for record in records
+    )
+    return Asset(levels=levels, source=SourceFacts(**header.pop("source")), **header)

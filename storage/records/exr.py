@@ -1,0 +1,219 @@
+"""Half-float RGB OpenEXR in memory: what a stored picture is.
+
+The file itself says how it is packed, so a reader need not be told. Which codecs are used is
+`storage.records.profiles`. Equal pictures give equal bytes: the header holds nothing of the clock.
+"""
+
+import io
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from storage.conventions import HALF_FLOAT_MAX
+from storage.errors import TrilightError
+from storage.settings.ranges import FLOAT32_MAX, Within
+
+MAX_RESOLUTION = 8192
+"""A larger window in a file from outside is refused before any memory is taken."""
+
+_MAX_BYTES = 3 << 30
+"""And so are more bytes of pixels: 64 lights of 2048 x 2048, the most that is ever written, take
+this much at the 4 bytes which a value has at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExrCodec:
+    """How an OpenEXR file is packed."""
+
+    compression: str
+    """OpenEXR's name, such as ZIP or DWAB; of what the library offers, this is all that can be
+    chosen but for DWA's level: deflate, zstd and lossy JPEG 2000 have their default levels."""
+    dwa_level: float | None = None
+    """Of DWAA and DWAB: greater is coarser; None is the library's 45."""
+
+
+INT32 = Within(-(2**31), 2**31 - 1)
+FLOAT32 = Within(-FLOAT32_MAX, FLOAT32_MAX)
+"""What numbers of a header are."""
+
+ZIP = ExrCodec(compression="ZIP")
+"""Exact on half floats, and known to every reader of OpenEXR."""
+
+_LOSSY = frozenset(
+    getattr(OpenEXR, f"{name}_COMPRESSION") for name in ("B44", "B44A", "DWAA", "DWAB", "LJ2K")
+)
+
+_MOST_LISTED = 6
+"""Names of channels in a message."""
+
+_HALF = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
+_NOT_NEGATIVE = np.where(_HALF < 0, np.float32(0), _HALF)
+"""Every half float by its bits: looking them up takes half of the time of numpy's conversion."""
+
+
+Attributes = Mapping[str, str | int | float]
+"""Entries of a header beyond what every file has."""
+
+Header = Mapping[str, Any]
+"""The header of a file as the library gives it."""
+
+
+def encode_exr(
+    radiance_rgb: NDArray[np.float32],
+    codec: ExrCodec = ZIP,
+    *,
+    attributes: Attributes | None = None,
+) -> bytes:
+    """Return the OpenEXR file of a picture, rounded to half floats; one thread.
+
+    Args:
+        radiance_rgb: [R, R, 3] linear radiance, finite, in [0, 65504].
+        codec: how to pack it. A lossy one may leave values below 0, or infinite ones where the
+            brightest rounds up: callers look at what comes back.
+        attributes: more entries of the header, by name.
+
+    Raises:
+        TrilightError: a value is not finite, negative, or too large for a half float.
+    """
+    return encode_channels({"RGB": to_half(radiance_rgb)}, codec, attributes=attributes)
+
+
+def to_half(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
+    """Return radiance as a picture stores it; raises TrilightError as `encode_exr`."""
+    legal = np.isfinite(radiance_rgb) & (radiance_rgb >= 0) & (radiance_rgb <= HALF_FLOAT_MAX)
+    if not legal.all():
+        index = tuple(int(i) for i in np.argwhere(~legal)[0])
+        raise TrilightError(
+            f"picture: radiance{list(index)} is {radiance_rgb[index]}; expected a finite value in "
+            f"[0, {HALF_FLOAT_MAX:.0f}]."
+        )
+    return np.ascontiguousarray(radiance_rgb, np.float16)
+
+
+def encode_channels(
+    channels: Mapping[str, NDArray[np.float16]],
+    codec: ExrCodec = ZIP,
+    *,
+    attributes: Attributes | None = None,
+) -> bytes:
+    """Return the OpenEXR file of named channels, [H, W] each or [H, W, 3] under the name RGB.
+
+    Raises:
+        TrilightError: a number among the attributes that a header cannot hold: integers end at
+            2^31 - 1, and floats with float32.
+    """
+    for name, value in (attributes or {}).items():
+        _require_held(name, value)
+    header: dict[str, object] = {
+        "compression": getattr(OpenEXR, f"{codec.compression}_COMPRESSION"),
+        "type": OpenEXR.scanlineimage,
+    }
+    if codec.dwa_level is not None:
+        header["dwaCompressionLevel"] = float(codec.dwa_level)  # an int would be another type
+    stream = io.BytesIO()
+    OpenEXR.File({**header, **(attributes or {})}, dict(channels), num_threads=0).write(stream)
+    return stream.getvalue()
+
+
+def _require_held(name: str, value: str | int | float) -> None:
+    """Raise TrilightError for a number that OpenEXR would wrap around, or make infinite."""
+    if isinstance(value, str):
+        return
+    within = INT32 if isinstance(value, int) else FLOAT32
+    if not within.holds(value):
+        raise TrilightError(
+            f"picture: attribute {name} is {value!r}; expected a number {within}, or text."
+        )
+
+
+def decode_exr(data: bytes) -> NDArray[np.float32]:
+    """Return the picture of an OpenEXR file as float32 [H, W, 3].
+
+    Where the file is packed with losses, what they took below 0 is 0 again.
+
+    Raises:
+        TrilightError: not an EXR file, truncated, larger than MAX_RESOLUTION, or with other
+            channels than R, G and B.
+    """
+    header: dict[str, Any] = {}
+    pixels = decode_channels(data, "RGB", header.update)["RGB"]
+    lossy = header["compression"] in _LOSSY
+    if pixels.dtype != np.float16:  # other tools write float32
+        return np.asarray(np.maximum(pixels, 0) if lossy else pixels, np.float32)
+    table = _NOT_NEGATIVE if lossy else _HALF
+    picture: NDArray[np.float32] = np.take(table, pixels.view(np.uint16))
+    return picture
+
+
+def decode_channels(
+    data: bytes,
+    names: Collection[str],
+    check: Callable[[Header], None],
+    *,
+    separate: bool = False,
+) -> dict[str, NDArray]:
+    """Return the channels of an OpenEXR file by name, R, G and B as one unless `separate`.
+
+    The library takes memory for all that a file's headers speak of, and small files can speak of
+    much: no pixel is read before the headers are what is expected.
+
+    Args:
+        data: the file.
+        names: of the channels that it must have.
+        check: called with the header before any pixel is read; raises TrilightError.
+        separate: keep R, G and B apart.
+
+    Raises:
+        TrilightError: not an EXR file, truncated, of several parts, with other channels, larger
+            than MAX_RESOLUTION, of more than 3 GiB, or refused by `check`.
+    """
+    try:
+        parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
+        if len(parts) != 1:
+            raise TrilightError(f"picture: the file has {len(parts)} parts; expected one.")
+        check(parts[0].header)
+        _check_pixels(parts[0].header, names)
+        file = OpenEXR.File(io.BytesIO(data), num_threads=0, separate_channels=separate)
+        return {name: channel.pixels for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError, KeyError) as error:
+        if isinstance(error, TrilightError):
+            raise
+        raise TrilightError(f"picture: not a readable OpenEXR file ({error}).") from error
+
+
+def window_size(header: Header) -> tuple[int, int]:
+    """Return height and width of the data window of a header."""
+    (left, top), (right, bottom) = np.asarray(header["dataWindow"]).tolist()
+    return bottom - top + 1, right - left + 1
+
+
+def _check_pixels(header: Header, names: Collection[str]) -> None:
+    """Refuse pixels that are not expected, or that take too much memory."""
+    found, wanted = sorted(channel.name for channel in header["channels"]), sorted(names)
+    if found != wanted:
+        raise TrilightError(f"picture: channels are {_listed(found)}; expected {_listed(wanted)}.")
+    if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
+        raise TrilightError(f"picture: its storage is {header['type']}; expected lines or tiles.")
+    size = window_size(header)
+    if max(size) > MAX_RESOLUTION:
+        raise TrilightError(
+            f"picture: the data window spans {list(size)} pixels; expected at most "
+            f"{MAX_RESOLUTION} each way."
+        )
+    most_bytes = 4 * len(found) * math.prod(size)
+    if most_bytes > _MAX_BYTES:
+        raise TrilightError(
+            f"picture: {len(found)} channels of {list(size)} pixels may take {most_bytes} bytes; "
+            f"expected at most {_MAX_BYTES}."
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    if len(names) <= _MOST_LISTED:
+        return ", ".join(names) or "none"
+    return f"{', '.join(names[:_MOST_LISTED])} and {len(names) - _MOST_LISTED} more"

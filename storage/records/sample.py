@@ -1,0 +1,244 @@
+"""A sample: one scene with its pictures, as the members that it takes in a shard.
+
+    000000123.scene.safetensors   the arrays of the scene; with `.gz` in the profile `compact`
+    000000123.json                schema version, objects, provenance, one record per view
+    000000123.0.exr ...           linear radiance of each view, half-float RGB OpenEXR
+    000000123.0.lights.exr ...    optional: each emitter's part of it (storage.records.lights)
+
+How both are packed is `storage.records.profiles`. The key is everything before the first dot, as
+WebDataset reads names.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.conventions import SCHEMA_VERSION, require_readable
+from storage.digests import canonical_json
+from storage.errors import TrilightError
+from storage.records.exr import decode_exr
+from storage.records.lights import decode_lights_exr, encode_lights_exr, num_lights
+from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
+from storage.records.scene import Scene
+from storage.records.scene_file import (
+    decode_arrays,
+    encode_arrays,
+    scene_objects,
+    scene_provenance,
+    scene_record,
+)
+
+_FAR = 1000.0
+"""Beyond any noise floor in dB and any share."""
+
+_EXPECTED: Mapping[Any, str] = {
+    int: "a whole number",
+    bool: "true or false",
+    float: f"a number between {-_FAR:.0f} and {_FAR:.0f}",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRecord:
+    """How one picture was made, and how far to trust it."""
+
+    spp: int
+    """Samples per pixel that were spent; on each light where they are apart."""
+    noise_floor_db: float
+    """Measured error of the picture as psnr_log_db (storage.metrics), before it was packed; the
+    profile `compact` adds at most a tenth to its mean square (storage.records.profiles)."""
+    noise_floor_linear_db: float
+    """The same error as psnr_linear_db."""
+    object_noise_floor_db: float
+    """The same error as object_psnr_log_db: over pixels that show geometry."""
+    coverage: float
+    """Share of the picture in which an object is seen first, from a coarse grid of rays."""
+    at_cap: bool
+    """Whether sampling ended at the cap before the target was reached."""
+    seed: int
+    """Seed of the view's samples."""
+    camera_attempt: int
+    """How many cameras were rejected before this one."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneRecord:
+    """A sample without its pictures: all that counting and plotting need."""
+
+    key: str
+    """The scene's index, nine digits."""
+    scene: Scene
+    """What the pictures show."""
+    views: tuple[ViewRecord, ...]
+    """One record per camera."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sample:
+    """One scene with its views."""
+
+    key: str
+    """The scene's index, nine digits."""
+    scene: Scene
+    """What the pictures show."""
+    radiance_rgb: NDArray[np.float32]
+    """[C, R, R, 3] linear radiance, one picture per camera of the scene."""
+    views: tuple[ViewRecord, ...]
+    """One record per camera."""
+    lights_rgb: NDArray[np.float32] | None = None
+    """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`; their
+    sum is the picture (storage.records.lights). None where the build keeps lights together."""
+
+    def check(self) -> None:
+        """Raise TrilightError at the first broken law of what can be learnt from, named by key.
+
+        Scene.check, as many square pictures and records as cameras, and radiance that is finite
+        and not negative: one value that is not would reach every weight in one step.
+        """
+        try:
+            self.scene.check()
+        except TrilightError as error:
+            raise TrilightError(f"sample {self.key}: {error}") from error
+        count, height, width = self.radiance_rgb.shape[:3]
+        views = self.scene.num_views
+        if not (count == len(self.views) == views and height == width > 0):
+            raise TrilightError(
+                f"sample {self.key}: {count} pictures of {height} x {width} pixels and "
+                f"{len(self.views)} records; expected {views} of both, as many as cameras, square."
+            )
+        _check_radiance(self.key, "", self.radiance_rgb)
+        apart = () if self.lights_rgb is None else np.moveaxis(self.lights_rgb, 1, 0)
+        for light, radiance_rgb in enumerate(apart):
+            _check_radiance(self.key, f" light {light}", radiance_rgb)
+
+
+def sample_key(scene_index: int) -> str:
+    """Return the key of a scene: its index in nine digits, so that names sort as numbers."""
+    return f"{scene_index:09d}"
+
+
+def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, bytes]:
+    """Return the members of a sample by suffix; equal samples give equal bytes.
+
+    A sample that was read from the profile `compact` and is packed so again loses once more: copy
+    members where they are to stay. Where lights are apart, pictures stay exact in every profile:
+    they are the sum of their lights.
+
+    Raises:
+        TrilightError: a picture holds what half floats cannot (storage.records.exr).
+        ValueError: pictures and view records differ in number.
+    """
+    record = {
+        "schema_version": SCHEMA_VERSION,
+        **scene_record(sample.scene),
+        "views": [dataclasses.asdict(view) for view in sample.views],
+    }
+    members = pack_arrays(encode_arrays(sample.scene), profile) | {"json": canonical_json(record)}
+    of_pictures = profile if sample.lights_rgb is None else "lossless"
+    for view, (picture, made) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
+        members[f"{view}.exr"] = pack_picture(picture, made.noise_floor_db, of_pictures)
+    if sample.lights_rgb is not None:
+        for view, lights in enumerate(sample.lights_rgb):
+            members[f"{view}.lights.exr"] = encode_lights_exr(lights)
+    return members
+
+
+def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
+    """Return the sample of its members (suffix to bytes).
+
+    Raises:
+        TrilightError: a member is missing, unreadable or of another schema version. Laws are not
+            checked here; `Sample.check` does that for whoever learns from a sample.
+    """
+    record = decode_scene(key, members)
+    try:
+        pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(record.views))]
+        radiance_rgb = np.stack(pictures)
+        lights_rgb = _decode_lights(record.scene, radiance_rgb, members)
+    except KeyError as error:
+        raise TrilightError(f"sample {key}: {error} is missing.") from error
+    except ValueError as error:
+        raise TrilightError(f"sample {key}: {error}") from error
+    return Sample(
+        key=key,
+        scene=record.scene,
+        radiance_rgb=radiance_rgb,
+        views=record.views,
+        lights_rgb=lights_rgb,
+    )
+
+
+def _decode_lights(
+    scene: Scene, radiance_rgb: NDArray[np.float32], members: Mapping[str, bytes]
+) -> NDArray[np.float32] | None:
+    if not any(suffix.endswith(".lights.exr") for suffix in members):
+        return None
+    views, height, width, _ = radiance_rgb.shape
+    shape = (num_lights(scene), height, width)
+    return np.stack(
+        [decode_lights_exr(members[f"{view}.lights.exr"], shape) for view in range(views)]
+    )
+
+
+def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
+    """Return a sample without its pictures, whose members may be absent.
+
+    Raises:
+        TrilightError: as `decode_sample`.
+    """
+    if "json" not in members:
+        raise TrilightError(f"sample {key}: member {key}.json is missing.")
+    record = _decode_record(key, members["json"])
+    try:
+        views = tuple(_view(view, row) for row, view in enumerate(record["views"]))
+        objects = scene_objects(record["objects"])
+        fields = decode_arrays(unpack_arrays(members))
+        provenance = scene_provenance(record["provenance"])
+        scene = Scene(objects=objects, provenance=provenance, **fields)
+    except KeyError as error:
+        raise TrilightError(f"sample {key}: {error} is missing.") from error
+    except (TypeError, ValueError) as error:
+        raise TrilightError(f"sample {key}: {error}") from error
+    return SceneRecord(key=key, scene=scene, views=views)
+
+
+def _decode_record(key: str, data: bytes) -> dict[str, Any]:
+    try:
+        record = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise TrilightError(f"sample {key}: member {key}.json is not JSON ({error}).") from error
+    version = record.get("schema_version") if isinstance(record, dict) else None
+    require_readable(version, f"sample {key}")
+    return record
+
+
+def _view(value: Mapping[str, Any], row: int) -> ViewRecord:
+    """Return the record of a view; raises ValueError for a field that is no usable number."""
+    record = ViewRecord(**value)
+    for field in dataclasses.fields(ViewRecord):
+        number = getattr(record, field.name)
+        if type(number) is field.type and field.type is not float:
+            continue
+        if field.type is not float or type(number) not in (int, float) or not -_FAR < number < _FAR:
+            raise ValueError(
+                f"views[{row}].{field.name} is {number!r:.40}; expected {_EXPECTED[field.type]}."
+            )
+    return record
+
+
+def _check_radiance(key: str, which: str, radiance_rgb: NDArray[np.float32]) -> None:
+    if radiance_rgb.min() >= 0 and radiance_rgb.max() < math.inf:  # NaN is neither
+        return
+    wrong = np.argwhere(~(np.isfinite(radiance_rgb) & (radiance_rgb >= 0)))
+    view, row, column, channel = (int(index) for index in wrong[0])
+    value = radiance_rgb[view, row, column, channel]
+    raise TrilightError(
+        f"sample {key}: view {view}{which} has radiance {value} at pixel ({row}, {column}); "
+        "expected finite values from 0. Run `trilight verify` on the dataset."
+    )

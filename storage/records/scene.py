@@ -1,0 +1,281 @@
+"""`Scene`: all that a picture requires, and nothing that a modelling program could add.
+
+A scene is a handful of plain arrays. Every stage after composition reads this record and no
+other; `check` states its laws, and names the first place where one is broken.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from storage.errors import TrilightError
+from storage.records.material import (
+    DIFFUSE,
+    EMISSION,
+    PUBLISHED_COLUMNS,
+    SPECULAR,
+    laid_out,
+    material_columns,
+    material_width,
+)
+from storage.settings.ranges import FLOAT32_MAX, Columns, Within, declared_ranges
+
+ObjectKind = Literal["object", "shell", "emitter"]
+OBJECT_KINDS: tuple[ObjectKind, ...] = ("object", "shell", "emitter")
+
+ALBEDO_SUM_TOLERANCE = 1e-5
+"""Two float32 albedos that are meant to add up to 1 may exceed it by their rounding."""
+
+UNIT_NORMAL_TOLERANCE = 1e-4
+"""A float32 unit vector is exact to 1e-7; 1e-4 admits normals that passed through half floats."""
+
+POSE_TOLERANCE = 1e-4
+"""How far the rotation of a float32 pose may be from orthonormal."""
+
+FINITE = Within(-FLOAT32_MAX, FLOAT32_MAX)
+"""Any float32 but NaN and infinity."""
+
+MAX_POSITION_M = 1000.0
+"""Farthest coordinate of a vertex. At 11 radians per metre, float32 knows the rotary angles of the
+network for positions so far out to half a thousandth of a radian, and path tracers know such points
+to 0.06 mm. Far beyond, both make wrong pictures without a word."""
+
+POSITION = Within(-MAX_POSITION_M, MAX_POSITION_M, unit="m")
+"""Of a vertex along an axis."""
+
+COMPONENT = Within(-1 - UNIT_NORMAL_TOLERANCE, 1 + UNIT_NORMAL_TOLERANCE)
+"""Of a unit vector."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneObject:
+    """What one row of `object_index` points to: identity and rights, no geometry."""
+
+    name: str
+    """Unique within the scene, for people and for exported files."""
+    kind: ObjectKind
+    """`object` for an asset, `shell` for a floor or wall, `emitter` for a light."""
+    uid: str = ""
+    """The asset's uid; empty for shells and emitters."""
+    licence: str = "CC0-1.0"
+    """SPDX identifier, or `LicenseRef-...`; shells and emitters are ours, hence CC0."""
+    attribution: str = ""
+    """Whom to name, as the source states it."""
+    source_url: str = ""
+    """Where the object came from."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """A triangle scene with palette materials, emitters and cameras, in world space."""
+
+    vertex_positions: Annotated[NDArray[np.float32], POSITION]
+    """[V, 3] world units, metres."""
+    vertex_normals: Annotated[NDArray[np.float32], COMPONENT]
+    """[V, 3] unit shading normals; a flat face has three vertices of its own."""
+    faces: Annotated[NDArray[np.uint32], Within(0, 2**32 - 1)]
+    """[T, 3] rows of `vertex_positions`, counter-clockwise seen from outside."""
+    material_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
+    """[T] row of `materials`."""
+    materials: Annotated[
+        NDArray[np.float32],
+        *(Columns(each.name, part, each.within) for each, part in laid_out(PUBLISHED_COLUMNS)),
+    ]
+    """[M, 10 or more] the declared columns: diffuse rgb, specular rgb, roughness, emission rgb, and
+    those that were added (storage.records.material)."""
+    object_index: Annotated[NDArray[np.uint16], Within(0, 2**16 - 1)]
+    """[T] row of `objects`."""
+    c2w: Annotated[NDArray[np.float32], FINITE]
+    """[C, 4, 4] camera to world."""
+    fov_deg: Annotated[
+        NDArray[np.float32], Within(0, 180, low_open=True, high_open=True, unit="degrees")
+    ]
+    """[C] full field of view in degrees."""
+    objects: tuple[SceneObject, ...]
+    """Names, kinds and rights; shell parts and emitters are objects too."""
+    provenance: Mapping[str, Any]
+    """template, scene index, attempt, seed, settings digest: JSON values only."""
+
+    @property
+    def num_triangles(self) -> int:
+        return len(self.faces)
+
+    @property
+    def num_views(self) -> int:
+        return len(self.c2w)
+
+    @property
+    def triangle_emits(self) -> NDArray[np.bool_]:
+        """[T] whether the triangle emits light; its albedos say what it reflects."""
+        material_emits: NDArray[np.bool_] = np.any(self.materials[:, EMISSION] > 0, axis=1)
+        return material_emits[self.material_index]
+
+    def with_cameras(self, c2w: NDArray[np.float32], fov_deg: NDArray[np.float32]) -> "Scene":
+        """Return the same scene seen by other cameras ([C, 4, 4] and [C])."""
+        return dataclasses.replace(self, c2w=c2w, fov_deg=fov_deg)
+
+    def with_provenance(self, provenance: Mapping[str, Any]) -> "Scene":
+        """Return the same scene with another record of its origin."""
+        return dataclasses.replace(self, provenance=provenance)
+
+    def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> "Scene":
+        """Return the same scene and cameras after a rigid motion x -> R x + t.
+
+        It looks the same from its cameras. Sums are taken in float64 and rounded once.
+
+        Args:
+            rotation: [3, 3] R.
+            translation: [3] t, world units.
+
+        Raises:
+            TrilightError: where R is no rotation: not orthonormal within POSE_TOLERANCE, or
+                mirroring.
+        """
+        turn, shift = np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
+        if turn.shape != (3, 3) or shift.shape != (3,):
+            _broken(f"the motion has shapes {turn.shape} and {shift.shape}", "(3, 3) and (3,)")
+        off = np.abs(np.einsum("ji,jk->ik", turn, turn) - np.eye(3)).max()
+        if not off <= POSE_TOLERANCE or np.linalg.det(turn) < 0:
+            _broken(f"rotation is {turn.tolist()}", "an orthonormal matrix without mirroring")
+        pose = self.c2w.astype(np.float64)
+        pose[:, :3] = np.einsum("ij,cjk->cik", turn, pose[:, :3])
+        pose[:, :3, 3] += shift
+        positions = np.einsum("ij,vj->vi", turn, self.vertex_positions.astype(np.float64)) + shift
+        normals = np.einsum("ij,vj->vi", turn, self.vertex_normals.astype(np.float64))
+        return dataclasses.replace(
+            self,
+            vertex_positions=positions.astype(np.float32),
+            vertex_normals=normals.astype(np.float32),
+            c2w=pose.astype(np.float32),
+        )
+
+    def check(self) -> None:
+        """Raise TrilightError at the first broken law.
+
+        The message names the field, the value found, the range expected and the first offending
+        index. Not checked here, because it needs ray casting: whether cameras lie outside the
+        meshes and whether light reaches what they see (pipeline.scenes does that).
+        """
+        _check_arrays(self)
+        _check_geometry(self)
+        _check_materials(self)
+        _check_objects(self)
+        _check_cameras(self)
+
+
+ARRAY_FIELDS: Mapping[str, tuple[type, tuple[int | None, ...]]] = {
+    "vertex_positions": (np.float32, (None, 3)),
+    "vertex_normals": (np.float32, (None, 3)),
+    "faces": (np.uint32, (None, 3)),
+    "material_index": (np.uint16, (None,)),
+    "materials": (np.float32, (None, None)),
+    "object_index": (np.uint16, (None,)),
+    "c2w": (np.float32, (None, 4, 4)),
+    "fov_deg": (np.float32, (None,)),
+}
+"""dtype and shape of every array field; None is any length, or as many as columns are declared."""
+
+
+def _check_arrays(scene: Scene) -> None:
+    for name, (dtype, shape) in ARRAY_FIELDS.items():
+        array = getattr(scene, name)
+        if array.dtype != dtype:
+            _broken(f"{name} has dtype {array.dtype}", f"{np.dtype(dtype)}")
+        fits = array.ndim == len(shape) and all(
+            wanted in (None, got) for wanted, got in zip(shape, array.shape, strict=True)
+        )
+        if not fits:
+            _broken(f"{name} has shape {array.shape}", f"{shape} with None for any length")
+        if np.issubdtype(dtype, np.floating):
+            _require(np.isfinite(array), name, array, "finite values")
+    _check_columns(scene)
+    for field in declared_ranges(Scene):
+        values = getattr(scene, field.name)
+        part = "" if field.part is None else f"{field.part.name} "
+        _require(~field.outside(values), field.name, values, f"{part}{field.within}")
+    for name, other in (("vertex_normals", "vertex_positions"), ("fov_deg", "c2w")):
+        _same_length(scene, name, other)
+    for name in ("material_index", "object_index"):
+        _same_length(scene, name, "faces")
+
+
+def _check_columns(scene: Scene) -> None:
+    """Check the width of a material row, and the ranges of the columns that were added to four."""
+    got, wanted = scene.materials.shape, material_width()
+    if got[1] != wanted:
+        names = ", ".join(column.name for column in material_columns())
+        _broken(f"materials has shape {got}", f"(None, {wanted}), since its columns are {names}")
+    for column, part in laid_out():
+        if column.name not in PUBLISHED_COLUMNS:
+            holds = np.ones(got, np.bool_)
+            holds[:, part] = column.within.holds(scene.materials[:, part])
+            _require(holds, "materials", scene.materials, f"{column.name} {column.within}")
+
+
+def _check_geometry(scene: Scene) -> None:
+    if scene.num_triangles == 0:
+        _broken("faces is empty", "at least one triangle")
+    count = len(scene.vertex_positions)
+    _require(scene.faces < count, "faces", scene.faces, f"vertex rows below {count}")
+    length = np.linalg.norm(scene.vertex_normals, axis=1)
+    _require(abs(length - 1) <= UNIT_NORMAL_TOLERANCE, "vertex_normals", length, "unit length")
+
+
+def _check_materials(scene: Scene) -> None:
+    rows = len(scene.materials)
+    _require(
+        scene.material_index < rows, "material_index", scene.material_index, f"rows below {rows}"
+    )
+    total = scene.materials[:, DIFFUSE] + scene.materials[:, SPECULAR]
+    bound = 1 + ALBEDO_SUM_TOLERANCE
+    _require(total <= bound, "materials", total, "diffuse + specular at most 1")
+    if not scene.triangle_emits.any():
+        _broken("materials holds no emission that a triangle uses", "at least one emitter")
+
+
+def _check_objects(scene: Scene) -> None:
+    rows = len(scene.objects)
+    _require(scene.object_index < rows, "object_index", scene.object_index, f"rows below {rows}")
+    names = set[str]()
+    for entry in scene.objects:  # a set: a scene may hold 65536 of them
+        if entry.name in names:
+            _broken(f"objects holds the name {entry.name!r} twice", "unique names")
+        names.add(entry.name)
+    is_emitter = np.array([entry.kind == "emitter" for entry in scene.objects])
+    agrees = is_emitter[scene.object_index] == scene.triangle_emits
+    _require(agrees, "objects", scene.object_index, "kind emitter exactly where a triangle emits")
+
+
+def _check_cameras(scene: Scene) -> None:
+    if scene.num_views == 0:
+        _broken("c2w is empty", "at least one camera")
+    rotation = scene.c2w[:, :3, :3].astype(np.float64)
+    gram = rotation.transpose(0, 2, 1) @ rotation
+    orthonormal = abs(gram - np.eye(3)).max(axis=(1, 2)) <= POSE_TOLERANCE
+    _require(orthonormal, "c2w", scene.c2w, "an orthonormal rotation")
+    _require(np.linalg.det(rotation) > 0, "c2w", scene.c2w, "a rotation without mirroring")
+    bottom = (scene.c2w[:, 3] == np.array([0, 0, 0, 1])).all(axis=1)
+    _require(bottom, "c2w", scene.c2w, "a last row of 0 0 0 1")
+
+
+def _same_length(scene: Scene, name: str, other: str) -> None:
+    got, wanted = len(getattr(scene, name)), len(getattr(scene, other))
+    if got != wanted:
+        _broken(f"{name} has {got} rows", f"{wanted}, as {other} has")
+
+
+def _require(law: NDArray[np.bool_], name: str, values: NDArray, expected: str) -> None:
+    """Raise for the first index at which `law` is false."""
+    if law.all():
+        return
+    index = tuple(int(i) for i in np.argwhere(~law)[0])
+    found = " ".join(np.array2string(values[index], threshold=16).split())
+    _broken(f"{name}{list(index)} is {found}", expected)
+
+
+def _broken(found: str, expected: str) -> None:
+    raise TrilightError(f"scene: {found}; expected {expected}.")

@@ -1,0 +1,226 @@
+"""A `Scene` as bytes: its arrays as they lie in a shard, and a whole scene as one file.
+
+A `.safetensors` scene holds the arrays of `Scene` under their names, and one metadata entry
+`trilight_scene`: JSON with schema version, objects and provenance. (One entry, because the library
+writes several in any order.) Equal scenes give equal bytes.
+
+Such a file comes from anywhere. Its size, its header and every shape are checked before an array is
+made, names and types must be exactly those of a scene, and the laws of `Scene.check` hold for
+whatever is returned.
+"""
+
+import dataclasses
+import json
+import math
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from storage.conventions import SCHEMA_VERSION
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import TrilightError
+from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
+from storage.records.safe_read import read_safetensors, safetensors_header
+from storage.records.scene import ARRAY_FIELDS, OBJECT_KINDS, Scene, SceneObject
+
+MAX_FILE_BYTES = 256 << 20
+"""A million triangles with three vertices each take 90 MB."""
+
+MAX_HEADER_BYTES = 8 << 20
+"""An object takes 150 bytes and its attribution; there are at most 65,536."""
+
+CARRIED = frozenset({*ARRAY_FIELDS, "objects", "provenance"})
+"""Of a scene (storage.records.carried): all, whatever a material or an object may come to hold."""
+
+_METADATA, _COLUMNS = "trilight_scene", "material_columns"
+_DTYPE_NAMES: Mapping[type, str] = {np.float32: "F32", np.uint32: "U32", np.uint16: "U16"}
+
+
+def encode_arrays(scene: Scene) -> bytes:
+    """Return the arrays of a scene alone, as the member `scene.safetensors` of a sample.
+
+    Material columns beyond the published ones stand there where they are not at their default; then
+    the metadata name all of them.
+    """
+    stated = stored_names(stored_columns(scene.materials))
+    return save(_arrays(scene), None if stated is None else {_COLUMNS: stated})
+
+
+def decode_arrays(data: bytes) -> dict[str, NDArray]:
+    """Return the array fields of a scene from the bytes of `encode_arrays`.
+
+    Raises:
+        TrilightError: damaged, an array is missing, or a material column is not declared here.
+    """
+    arrays, metadata = read_safetensors(data)
+    if missing := set(ARRAY_FIELDS) - set(arrays):
+        raise TrilightError(f"scene: the array {min(missing)} is missing.")
+    arrays["materials"] = completed_rows(arrays["materials"], metadata.get(_COLUMNS))
+    return {name: arrays[name] for name in ARRAY_FIELDS}
+
+
+def scene_digest(scene: Scene) -> str:
+    """Return the sha256 of `encode_arrays`: equal where geometry, materials and cameras are."""
+    return sha256_hex(encode_arrays(scene))
+
+
+def encode_scene(scene: Scene) -> bytes:
+    """Return the `.safetensors` file of a scene.
+
+    Raises:
+        TrilightError: the scene breaks a law, or is larger than `decode_scene_file` accepts.
+    """
+    scene.check()
+    record = {"schema_version": SCHEMA_VERSION, **scene_record(scene)}
+    if stated := stored_names(stored_columns(scene.materials)):
+        record[_COLUMNS] = stated
+    data = save(_arrays(scene), {_METADATA: canonical_json(record).decode()})
+    header_bytes = int.from_bytes(data[:8], "little")
+    if len(data) > MAX_FILE_BYTES or header_bytes > MAX_HEADER_BYTES:
+        raise TrilightError(
+            f"scene: its file takes {len(data)} bytes with a header of {header_bytes}; expected at "
+            f"most {MAX_FILE_BYTES} and {MAX_HEADER_BYTES}."
+        )
+    return data
+
+
+def read_scene_file(path: Path) -> Scene:
+    """Return the scene of a `.safetensors` file; its size is checked before it is read.
+
+    Raises:
+        TrilightError: it cannot be read, or as `decode_scene_file`.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:
+            raise TrilightError(
+                f"{path.name}: expected a regular file of at most {MAX_FILE_BYTES} bytes."
+            )
+        data = path.read_bytes()
+    except OSError as error:
+        raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
+    return decode_scene_file(data, path.name)
+
+
+def decode_scene_file(data: bytes, name: str) -> Scene:
+    """Return the scene of a `.safetensors` file held in memory.
+
+    Args:
+        data: the bytes.
+        name: of the file, for messages.
+
+    Raises:
+        TrilightError: larger than MAX_FILE_BYTES, damaged, an array too many, too few or of
+            another type or shape, metadata that are not a scene's, another schema version, or a
+            broken law.
+    """
+    if len(data) > MAX_FILE_BYTES:
+        raise TrilightError(f"{name}: {len(data)} bytes; expected at most {MAX_FILE_BYTES}.")
+    try:
+        _check_header(safetensors_header(data, MAX_HEADER_BYTES))
+        arrays, metadata = read_safetensors(data, MAX_HEADER_BYTES)
+        record = _metadata_record(metadata)
+        arrays["materials"] = completed_rows(arrays["materials"], record.get(_COLUMNS))
+        scene = Scene(
+            objects=scene_objects(record.get("objects")),
+            provenance=scene_provenance(record.get("provenance")),
+            **arrays,
+        )
+        scene.check()
+    except TrilightError as error:
+        raise TrilightError(f"{name}: {error}") from error
+    return scene
+
+
+def scene_record(scene: Scene) -> dict[str, Any]:
+    """Return what is no array of a scene, as JSON values."""
+    return {
+        "objects": [dataclasses.asdict(entry) for entry in scene.objects],
+        "provenance": dict(scene.provenance),
+    }
+
+
+def scene_objects(value: Any) -> tuple[SceneObject, ...]:
+    """Return the objects that a JSON value lists.
+
+    Raises:
+        TrilightError: no list, a field too many or too few, no text, or an unknown kind.
+    """
+    if not isinstance(value, list):
+        _broken("objects", value, "a list")
+    return tuple(_object(entry, row) for row, entry in enumerate(value))
+
+
+def scene_provenance(value: Any) -> Mapping[str, Any]:
+    """Return the provenance of a JSON value; raises TrilightError where it is no object."""
+    if not isinstance(value, dict):
+        _broken("provenance", value, "a JSON object")
+    return value
+
+
+def _object(value: Any, row: int) -> SceneObject:
+    names = {field.name for field in dataclasses.fields(SceneObject)}
+    if not isinstance(value, dict) or set(value) != names:
+        _broken(f"objects[{row}]", value, f"exactly the fields {', '.join(sorted(names))}")
+    for name, text in value.items():
+        if not isinstance(text, str):
+            _broken(f"objects[{row}].{name}", text, "text")
+    if value["kind"] not in OBJECT_KINDS:
+        _broken(f"objects[{row}].kind", value["kind"], f"one of {', '.join(OBJECT_KINDS)}")
+    return SceneObject(**value)
+
+
+def _arrays(scene: Scene) -> dict[str, NDArray]:
+    arrays = {name: np.ascontiguousarray(getattr(scene, name)) for name in ARRAY_FIELDS}
+    columns = stored_columns(scene.materials)
+    return arrays | {"materials": chosen_columns(scene.materials, columns)}
+
+
+def _check_header(header: Mapping[str, Any]) -> None:
+    """Refuse arrays that are not a scene's, before any of them is made."""
+    names = set(header) - {"__metadata__"}
+    if names != set(ARRAY_FIELDS):
+        odd = ", ".join(f"{name!r:.60}" for name in sorted(names ^ set(ARRAY_FIELDS))[:3])
+        raise TrilightError(f"scene: arrays missing or not expected: {odd}.")
+    for name, (dtype, wanted) in ARRAY_FIELDS.items():
+        entry = header[name] if isinstance(header[name], dict) else {}
+        shape = entry.get("shape")
+        fits = (
+            entry.get("dtype") == _DTYPE_NAMES[dtype]
+            and isinstance(shape, list)
+            and len(shape) == len(wanted)
+            and all(type(got) is int and got >= 0 for got in shape)
+            and all(want in (None, got) for want, got in zip(wanted, shape, strict=True))
+            and math.prod(shape) <= MAX_FILE_BYTES
+        )
+        if not fits:
+            _broken(name, [entry.get("dtype"), shape], f"{_DTYPE_NAMES[dtype]} of shape {wanted}")
+
+
+def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
+    try:
+        record = json.loads(metadata[_METADATA], parse_constant=_refused_constant)
+    except KeyError as error:
+        raise TrilightError(f"scene: metadata {_METADATA} are missing.") from error
+    except (ValueError, RecursionError) as error:
+        raise TrilightError(f"scene: metadata {_METADATA} are not JSON ({error}).") from error
+    version = record.get("schema_version") if isinstance(record, dict) else None
+    if version != SCHEMA_VERSION:
+        raise TrilightError(
+            f"scene: schema version {version!r:.60}; this Trilight reads {SCHEMA_VERSION}. Use the "
+            "release that made it."
+        )
+    return dict(record)
+
+
+def _refused_constant(text: str) -> float:
+    raise ValueError(f"{text} is no JSON number")
+
+
+def _broken(name: str, got: Any, expected: str) -> NoReturn:
+    raise TrilightError(f"scene: {name} is {got!r:.80}; expected {expected}.")

@@ -1,0 +1,1 @@
+"""Settings, described once at their fields: ranges, changes by dotted name, records."""

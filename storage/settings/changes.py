@@ -1,0 +1,129 @@
+"""Settings with some values changed, by dotted names such as `lights.count`.
+
+A name leads through groups of settings, and through a list of them by the number of an entry, as in
+`families.0.weight`; without a number each entry is changed. Values come as JSON has them, lists and
+whole groups included. A group whose class has `PRESETS`, makers by name, may also be replaced by
+the name of one, and a list of such groups by names; single settings of it are then changes of the
+preset: model=large with model.window_bundles=0.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from storage.errors import TrilightError
+from storage.settings.described import field_value, settings_record
+from storage.suggestion import expected_one_of
+
+Settings = TypeVar("Settings")
+
+
+Change = tuple[Sequence[str], Any, str]
+"""The way that is left to a value, the value, and the whole name."""
+
+
+def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
+    """Return settings, a frozen dataclass, with the named values replaced, all at once.
+
+    Values that only fit each other may therefore come in any order.
+
+    Raises:
+        TrilightError: a name that does not exist, a value of another kind, or one that the
+            settings themselves refuse; a name that is nearly right is asked back.
+    """
+    found: Settings = _changed(settings, [(n.split("."), v, n) for n, v in changes.items()])
+    return found
+
+
+def _changed(group: Any, changes: Sequence[Change]) -> Any:
+    values = {
+        field: _changed_field(group, field, own) for field, own in _by_field(group, changes).items()
+    }
+    try:
+        return dataclasses.replace(group, **values)
+    except TrilightError as error:
+        names = [name for _, _, name in changes]
+        if any(name in str(error) for name in names):
+            raise
+        shown = ", ".join(map(repr, names))
+        raise TrilightError(f"setting{'s' * (len(names) > 1)} {shown}: {error}") from error
+
+
+def _by_field(group: Any, changes: Sequence[Change]) -> Mapping[str, Sequence[Change]]:
+    """Return the changes by the field of the group that they lead through."""
+    fields = [field.name for field in dataclasses.fields(group)]
+    found: dict[str, list[Change]] = {}
+    for path, value, name in changes:
+        if path[0] not in fields:
+            raise TrilightError(
+                f"setting {name!r} does not exist: {path[0]!r} is unknown there; "
+                f"{expected_one_of(path[0], fields)}."
+            )
+        found.setdefault(path[0], []).append((path[1:], value, name))
+    return found
+
+
+def _changed_field(group: Any, field: str, changes: Sequence[Change]) -> Any:
+    """Return a field's new value: first as a whole, then single settings within it."""
+    value = getattr(group, field)
+    for path, new, name in changes:
+        if not path:
+            value = field_value(type(group), field, _without_names(new, value, name), name)
+    return _within(value, [change for change in changes if change[0]])
+
+
+def _without_names(new: Any, old: Any, name: str) -> Any:
+    """Return a new value with the record of a preset wherever its name stands."""
+    many = isinstance(old, tuple) and bool(old)
+    first = old[0] if many else old
+    if not dataclasses.is_dataclass(first) or new == []:
+        return new
+    presets: Mapping[str, Callable[[], Any]] = getattr(first, "PRESETS", {})
+    entries = new if many and isinstance(new, list) else [new]
+    records = [
+        settings_record(presets[each]()) if isinstance(each, str) and each in presets else each
+        for each in entries
+    ]
+    for each in records:
+        if not isinstance(each, Mapping):
+            choices = f"{expected_one_of(str(each), presets)}, or" if presets else "expected"
+            raise TrilightError(
+                f"setting {name!r} is {new!r}; {choices} one of its settings by name, such as "
+                f"{name}.{dataclasses.fields(first)[0].name}, since it is a group."
+            )
+    return records if many else records[0]
+
+
+def _within(value: Any, changes: Sequence[Change]) -> Any:
+    """Return a group, or a list of groups, with single settings of it changed."""
+    if not changes:
+        return value
+    if dataclasses.is_dataclass(value):
+        for path, new, name in changes:
+            if not path:
+                raise TrilightError(
+                    f"setting {name!r} is {new!r}; expected one of its settings by name, such as "
+                    f"{name}.{dataclasses.fields(value)[0].name}."
+                )
+        return _changed(value, changes)
+    if not isinstance(value, tuple) or not all(map(dataclasses.is_dataclass, value)):
+        _, _, name = changes[0]
+        raise TrilightError(f"setting {name!r} does not exist: it leads into a single setting.")
+    own: list[list[Change]] = [[] for _ in value]
+    for path, new, name in changes:
+        for index in _entries(path[0], len(value), name):
+            inner = path[1:] if path[0].isdigit() else path
+            own[index].append((inner, new, name))
+    return tuple(map(_within, value, own))
+
+
+def _entries(step: str, count: int, name: str) -> Sequence[int]:
+    """Return which entries of a list a step means: the one of its number, or all."""
+    if not step.isdigit():
+        return range(count)
+    if int(step) >= count:
+        raise TrilightError(
+            f"setting {name!r} does not exist: the list has {count} entries; expected a number "
+            f"from 0 to {count - 1}."
+        )
+    return [int(step)]

@@ -1,0 +1,284 @@
+"""Settings: each is described once, where its field stands, and all else is made from that.
+
+    @checked("render settings")
+    class RenderSettings:
+        resolution: Annotated[int, Within(8, 2048, unit="pixels")] = 256
+        \"\"\"Width of a square picture.\"\"\"
+
+From type, range, unit, sentence and default come the check of every value (pydantic), the complaint
+about a wrong one, the command line, Prefect's forms, docs/reference/settings.md and the records in
+manifests and checkpoints. Laws between fields stay in `__post_init__`. What streams shards does not
+import this file: tests/architecture/test_light_imports.py.
+"""
+
+import ast
+import dataclasses
+import functools
+import inspect
+import json
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal, TypeVar, dataclass_transform, get_args, get_origin
+
+import pydantic
+from pydantic.dataclasses import dataclass
+
+from storage.errors import TrilightError
+from storage.settings.ranges import Within, declared_ranges
+from storage.suggestion import expected_one_of
+
+Settings = TypeVar("Settings")
+
+_RULES = pydantic.ConfigDict(
+    extra="forbid",
+    strict=True,  # "4" is no number, 1 no truth value; a float may be given as a whole number
+    allow_inf_nan=False,
+    arbitrary_types_allowed=True,
+)
+
+_KINDS = {bool: "true or false", str: "a text", int: "a whole number", float: "a number"}
+
+
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,)
+)
+def checked(
+    called: str = "", *, option: Callable[[str], str] = str
+) -> Callable[[type[Settings]], type[Settings]]:
+    """Return a decorator that makes a class a frozen dataclass whose values are checked.
+
+    Args:
+        called: begins every complaint, such as `render settings`; empty for none.
+        option: returns what a field is called where people write it.
+
+    An instance raises TrilightError for the first field whose value is of another type or outside
+    its range: the field, the value, and what was expected.
+    """
+
+    def made(cls: type[Settings]) -> type[Settings]:
+        group: Any = dataclass(cls, frozen=True, kw_only=True, config=_RULES)
+        plain = group.__init__
+
+        @functools.wraps(plain)
+        def complaining(self: Any, **values: Any) -> None:
+            try:
+                plain(self, **values)
+            except pydantic.ValidationError as error:
+                raise _complaint(error, type(self), called=called, option=option) from None
+
+        group.__init__ = complaining
+        return typing.cast(type[Settings], group)
+
+    return made
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Described:
+    """What is said of one field."""
+
+    name: str
+    """Its name."""
+    hint: Any
+    """Its type, with its notes."""
+    default: Any
+    """Its value where nobody gives one; dataclasses.MISSING where it must be given."""
+    sentence: str
+    """What stands under it, in one line."""
+    within: Within | None
+    """The range of its numbers."""
+    expected: str
+    """What to write, for a person."""
+
+
+@functools.cache
+def described(kind: type) -> tuple[Described, ...]:
+    """Return what is said of the fields of a class of settings, in their order."""
+    hints = _hints(kind)
+    ranges = {field.name: field for field in declared_ranges(kind)}
+    sentences = field_sentences(kind)
+    return tuple(
+        Described(
+            name=field.name,
+            hint=hints[field.name],
+            default=_default(field),
+            sentence=sentences.get(field.name, ""),
+            within=ranges[field.name].within if field.name in ranges else None,
+            expected=(
+                ranges[field.name].expected
+                if field.name in ranges
+                else expected_of(hints[field.name])
+            ),
+        )
+        for field in dataclasses.fields(kind)
+    )
+
+
+def field_sentences(kind: type) -> dict[str, str]:
+    """Return what stands under each field of a dataclass, its bases' included, by name.
+
+    Read from the source when somebody asks: pydantic would read it whenever settings are imported.
+    """
+    sentences: dict[str, str] = {}
+    for cls in reversed(kind.__mro__[:-1]):
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+        assert isinstance(tree, ast.ClassDef)
+        for field, below in zip(tree.body, tree.body[1:], strict=False):
+            match field, below:
+                case (
+                    ast.AnnAssign(target=ast.Name(id=name)),
+                    ast.Expr(value=ast.Constant(value=str(text))),
+                ):
+                    sentences[name] = " ".join(text.split())
+    return sentences
+
+
+def option_of(field: str) -> str:
+    """Return the option of the command line that fills a field."""
+    return "--" + field.replace("_", "-")
+
+
+def expected_of(hint: Any) -> str:
+    """Return what a value of a type without a range looks like, for a person."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return expected_of(args[0])
+    if origin is Literal:
+        *others, last = map(str, args)
+        return f"{', '.join(others)} or {last}" if others else last
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join("none" if arg is types.NoneType else expected_of(arg) for arg in args)
+    if origin is tuple:
+        return f"a list, each entry {expected_of(args[0])}"
+    if origin in (dict, Mapping) or group_of(hint):
+        return "names with values"
+    return _KINDS.get(hint, f"a {getattr(hint, '__name__', hint)}".lower())
+
+
+def group_of(hint: Any) -> bool:
+    """Return whether a type is a class of settings, which has fields of its own."""
+    return isinstance(hint, type) and dataclasses.is_dataclass(hint)
+
+
+def settings_record(group: Any, *, stated: bool = False) -> dict[str, Any]:
+    """Return settings as JSON values, as manifests and checkpoints hold them.
+
+    Args:
+        group: an instance.
+        stated: leave out what is at its default; such a record stays what it is when a field is
+            added whose default is what was done before.
+    """
+    adapter = _adapter(typing.cast(Any, type(group)))
+    record: dict[str, Any] = adapter.dump_python(group, mode="json", exclude_defaults=stated)
+    return record
+
+
+def from_record(kind: type[Settings], record: Any) -> Settings:
+    """Return the settings of a record; what it lacks is at its default.
+
+    Raises:
+        TrilightError: a value that they refuse, by its dotted place.
+    """
+    try:
+        return typing.cast(Settings, _read(kind, record))
+    except pydantic.ValidationError as error:
+        raise _complaint(error, kind, option="setting {!r}".format) from None
+
+
+def field_value(kind: type, name: str, value: Any, shown: str) -> Any:
+    """Return a JSON value as the value of a field.
+
+    Args:
+        kind: the class.
+        name: of the field.
+        value: as `json.loads` returns it.
+        shown: what complaints call the field.
+
+    Raises:
+        TrilightError: the value is of another type or outside its range.
+    """
+    try:
+        return _read(_hints(kind)[name], value)
+    except pydantic.ValidationError as error:
+        raise _complaint(error, kind, option="setting {!r}".format, within=(name, shown)) from None
+
+
+def _read(hint: Any, value: Any) -> Any:
+    return _adapter(hint).validate_json(json.dumps(value))
+
+
+@functools.cache
+def _hints(kind: type) -> Mapping[str, Any]:
+    return typing.get_type_hints(kind, include_extras=True)
+
+
+@functools.cache
+def _adapter(hint: Any) -> "pydantic.TypeAdapter[Any]":
+    config = None if group_of(hint) else pydantic.ConfigDict(strict=True, allow_inf_nan=False)
+    return pydantic.TypeAdapter(hint, config=config)
+
+
+def _default(field: "dataclasses.Field[Any]") -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
+
+
+def _complaint(
+    error: pydantic.ValidationError,
+    kind: type,
+    *,
+    called: str = "",
+    option: Callable[[str], str],
+    within: tuple[str, str] | None = None,
+) -> TrilightError:
+    """Return what is wrong first: the place, the value and what was expected.
+
+    Args:
+        error: what pydantic found.
+        kind: the class whose values were read.
+        called: begins the complaint.
+        option: returns what a dotted place is called where people write it.
+        within: the field whose value alone was read, and what is shown of it.
+    """
+    first = error.errors(include_url=False)[0]
+    law = first.get("ctx", {}).get("error")
+    if isinstance(law, TrilightError):
+        return law
+    where = f"{called}: " if called else ""
+    steps = [str(step) for step in first["loc"]]
+    shown, holder, field = _place([within[0], *steps] if within else steps, kind)
+    if within:
+        shown[0] = within[1]
+    place = option(".".join(shown))
+    if first["type"] in ("unexpected_keyword_argument", "unexpected_property"):
+        known = [each.name for each in described(holder)]
+        return TrilightError(f"{where}{place} does not exist; {expected_one_of(steps[-1], known)}.")
+    expected = field.expected if field else expected_of(holder)
+    if first["type"].startswith("missing"):
+        return TrilightError(f"{where}{place} is missing; expected {expected}.")
+    return TrilightError(f"{where}{place} is {first['input']!r}; expected {expected}.")
+
+
+def _place(steps: Sequence[str], kind: type) -> tuple[list[str], type, Described | None]:
+    """Return the steps that a person knows, the class that holds the last, and its field."""
+    shown, holder, field = list[str](), kind, None
+    for step in steps:
+        groups = {group.__name__: group for group in _groups(field.hint if field else None)}
+        if step in groups:  # of a union of groups, the one that was tried
+            holder, field = groups[step], None
+            continue
+        if len(groups) == 1 and not step.isdigit():
+            (holder,) = groups.values()
+        field = {each.name: each for each in described(holder)}.get(step, field)
+        shown.append(step)
+    return shown, holder, field
+
+
+def _groups(hint: Any) -> Iterator[type]:
+    """Yield the classes of settings that a type is made of."""
+    if group_of(hint):
+        yield hint
+    for part in get_args(hint):
+        yield from _groups(part)

@@ -1,0 +1,230 @@
+"""Ranges of numeric fields: declared once, at the field; checked and printed from there.
+
+    fov_deg: Annotated[Range, Within(1, 170, unit="degrees")] = (30.0, 60.0)
+
+`storage.settings.described` checks them, and tests/extremes goes to both ends of each and one step
+outside. Laws between fields are none of this: they stay in `__post_init__`, or in `Scene.check`.
+"""
+
+import functools
+import types
+import typing
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Within:
+    """Least and greatest value; both are admitted, but for an end that is open."""
+
+    low: float
+    """The least value."""
+    high: float
+    """The greatest value."""
+    low_open: bool = False
+    """Whether `low` itself is refused."""
+    high_open: bool = False
+    """Whether `high` itself is refused."""
+    unit: str = ""
+    """What is counted or measured, in the plural; empty for pure numbers."""
+
+    def holds(self, value: Any) -> Any:
+        """Return whether a number is in the range, or of each number of an array; NaN is not."""
+        above = value > self.low if self.low_open else value >= self.low
+        below = value < self.high if self.high_open else value <= self.high
+        return above & below
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Let pydantic check the range after the type: of a number, or of each in a tuple."""
+        from pydantic_core import core_schema  # whoever only reads scenes has no need of it
+
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+        """Let forms show the range, at the number or at the entries of a list."""
+        return self._bounded(handler(schema))
+
+    def __str__(self) -> str:
+        """Return the range as the end of a sentence, such as `from 1 to 170 degrees`."""
+        low, high = shown_number(self.low), shown_number(self.high)
+        start = f"above {low}" if self.low_open else f"from {low}"
+        if self.high_open:
+            end = f" and below {high}" if self.low_open else f" to below {high}"
+        else:
+            end = f", up to {high}" if self.low_open else f" to {high}"
+        return start + end + (f" {self.unit}" if self.unit else "")
+
+    def _checked(self, value: Any) -> Any:
+        from pydantic_core import PydanticCustomError
+
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not all(number is None or self.holds(number) for number in numbers):
+            raise PydanticCustomError(
+                "outside_range", "expected numbers {range}", {"range": str(self)}
+            )
+        return value
+
+    def _bounded(self, form: dict[str, Any]) -> dict[str, Any]:
+        """Return a JSON schema with the ends of the range, but for those that are no limit."""
+        if "anyOf" in form:
+            return form | {"anyOf": [self._bounded(option) for option in form["anyOf"]]}
+        if form.get("type") == "array":  # pairs as lists too: forms know no tuples
+            rest = {name: part for name, part in form.items() if name != "prefixItems"}
+            return rest | {"items": self._bounded(form.get("items") or form["prefixItems"][0])}
+        if form.get("type") not in ("integer", "number"):
+            return form
+        bounds: dict[str, Any] = {}
+        if abs(self.low) <= _EXACT:
+            bounds["exclusiveMinimum" if self.low_open else "minimum"] = self.low
+        if abs(self.high) <= _EXACT:
+            bounds["exclusiveMaximum" if self.high_open else "maximum"] = self.high
+        return form | bounds
+
+
+_EXACT = 2**53
+"""Beyond it forms show other numbers than were meant: JavaScript has no larger integers."""
+
+
+@dataclass(frozen=True)
+class LowFirst:
+    """Of a pair: the first number is at most the second."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Let pydantic check the order after the type."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def _checked(self, pair: tuple[float, float]) -> tuple[float, float]:
+        from pydantic_core import PydanticCustomError
+
+        if pair[0] > pair[1]:
+            raise PydanticCustomError("not_in_order", "expected the lower number first")
+        return pair
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A range of some columns of an array."""
+
+    name: str
+    """What the columns hold."""
+    columns: slice
+    """Of the last axis."""
+    within: Within
+    """Where every number of them lies."""
+
+
+Share = Annotated[float, Within(0, 1)]
+"""A part of a whole, or a probability."""
+
+Seed = Annotated[int, Within(0, 2**256 - 1)]
+"""What randomness is drawn from (storage.seeds hashes it, so any integer would do)."""
+
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+"""The largest finite float32."""
+
+Shape = Literal["one", "pair", "many", "array"]
+
+_EXPECTED: dict[tuple[Shape, type], str] = {
+    ("one", int): "a whole number",
+    ("one", float): "a number",
+    ("pair", int): "two whole numbers",
+    ("pair", float): "two numbers",
+    ("many", int): "whole numbers",
+    ("many", float): "numbers",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Declared:
+    """What a field, or some columns of one, may hold."""
+
+    name: str
+    """Of the field."""
+    kind: type
+    """int or float; a float may be given as an int."""
+    shape: Shape
+    """One number, a pair, a tuple of any length, or an array of numpy."""
+    optional: bool
+    """Whether None is admitted."""
+    within: Within
+    """Where every number lies."""
+    ordered: bool = False
+    """Whether the lower number of a pair must come first."""
+    part: Columns | None = None
+    """The columns that are meant, where it is not the whole array."""
+
+    @property
+    def expected(self) -> str:
+        """What to write, for a person; not of arrays."""
+        order = ", the lower one first" if self.ordered else ""
+        return f"{_EXPECTED[self.shape, self.kind]} {self.within}{order}"
+
+    def outside(self, array: NDArray) -> NDArray[np.bool_]:
+        """Return where an array breaks the range, in its shape."""
+        if self.part is None:
+            return ~np.asarray(self.within.holds(array))
+        wrong = np.zeros(array.shape, np.bool_)
+        columns = self.part.columns
+        wrong[..., columns] = ~self.within.holds(array[..., columns])
+        return wrong
+
+
+@functools.cache
+def declared_ranges(settings: type) -> tuple[Declared, ...]:
+    """Return what the fields of a dataclass declare, in their order."""
+    hints = typing.get_type_hints(settings, include_extras=True)
+    return tuple(
+        declared for name, hint in hints.items() for declared in _declarations_of(name, hint)
+    )
+
+
+def shown_number(number: float) -> str:
+    """Return a number for a person: 2^64 - 1 instead of twenty digits."""
+    if isinstance(number, int):
+        power = (number + 1).bit_length() - 1
+        return f"2^{power} - 1" if power > 30 and number + 1 == 1 << power else str(number)
+    return f"{number:.6g}"
+
+
+def _declarations_of(name: str, hint: Any) -> Iterator[Declared]:
+    optional, ordered, found = False, False, list[Within | Columns]()
+    while True:
+        if get_origin(hint) is Annotated:
+            hint, *notes = get_args(hint)
+            found += [note for note in notes if isinstance(note, Within | Columns)]
+            ordered = any(isinstance(note, LowFirst) for note in notes)
+        elif get_origin(hint) in (typing.Union, types.UnionType) and type(None) in get_args(hint):
+            optional = True
+            hint = next(arg for arg in get_args(hint) if arg is not type(None))
+        else:
+            break
+    for note in found:
+        kind, shape = _kind_and_shape(hint)
+        yield Declared(
+            name=name,
+            kind=kind,
+            shape=shape,
+            optional=optional,
+            ordered=ordered,
+            within=note.within if isinstance(note, Columns) else note,
+            part=note if isinstance(note, Columns) else None,
+        )
+
+
+def _kind_and_shape(hint: Any) -> tuple[type, Shape]:
+    if hint in (int, float):
+        return hint, "one"
+    if hint == int | float:  # a whole number stays one
+        return float, "one"
+    if get_origin(hint) is tuple:
+        first, second = get_args(hint)
+        return first, "many" if second is ... else "pair"
+    (_, dtype) = get_args(hint)
+    (scalar,) = get_args(dtype)
+    return (float if issubclass(scalar, np.floating) else int), "array"
