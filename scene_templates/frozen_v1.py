@@ -1,8 +1,9 @@
 """What the published sets draw scenes from, with every number stated.
 
 A frozen set asks no list of families or layouts and takes no default: those may change, and sets
-that networks are compared on may not. Test: tests/flows/test_frozen_builds.py. The layouts that are
-named here are frozen with it; whoever wants another `plane` registers it under another name.
+that networks are compared on may not. Test: tests/pipeline/builds/test_frozen_builds.py. The
+layouts that are named here are frozen with it; whoever wants another `plane` registers it under
+another name.
 """
 
 from scene_templates.cameras import CameraSettings

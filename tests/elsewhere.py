@@ -4,7 +4,8 @@ Each library chooses its loops by what the processor can do, and sums in another
 that a float which is taken for an identity, a tolerance or a stored digest may hold on one machine
 only. Each also has a variable by which it does without: one machine stands for many.
 
-Run `python -m tests.elsewhere avx2 tests/scenes` for other tests; without any, the chosen ones.
+Run `python -m tests.elsewhere avx2 tests/pipeline/scenes` for other tests; without any, the chosen
+ones.
 """
 
 import ctypes
@@ -43,25 +44,25 @@ LLVM_TARGET = ("haswell", 8)
 """What Dr.Jit compiles for in both, and its lanes: the least that it supports."""
 
 CHOSEN = (
-    "tests/flows/test_frozen_builds.py",
+    "tests/pipeline/builds/test_frozen_builds.py",
     "tests/model/test_builtin.py",
     "tests/model/test_light_groups.py",
     "tests/model/test_neural_renderer.py",
-    "tests/model/test_published_outputs.py",
+    "tests/model/published/test_outputs.py",
     "tests/model/test_rays.py",
     "tests/model/test_windows.py",
-    "tests/objects/test_builtin.py",
-    "tests/renders/test_stored_pictures.py",
-    "tests/scenes/test_compose.py",
-    "tests/scenes/test_shading.py",
+    "tests/pipeline/objects/builtin/test_builtin.py",
+    "tests/pipeline/renders/test_stored_pictures.py",
+    "tests/pipeline/scenes/test_compose.py",
+    "tests/pipeline/scenes/test_shading.py",
     "tests/storage/test_metrics.py",
-    "tests/storage/test_shards.py",
-    "tests/train/test_data_augment.py",
-    "tests/train/test_data_stream.py",
-    "tests/train/test_evaluation.py",
-    "tests/train/test_loop_step.py",
-    "tests/train/test_loss.py",
-    "tests/train/test_processes.py",
+    "tests/storage/dataset/test_shards.py",
+    "tests/train/data/test_augment.py",
+    "tests/train/data/test_stream.py",
+    "tests/train/evaluation/test_judge.py",
+    "tests/train/loop/test_step.py",
+    "tests/train/loss/test_objective.py",
+    "tests/train/loop/test_processes.py",
     "tests/train/test_run.py",
     "tests/train/test_run_starts.py",
 )

@@ -1,7 +1,8 @@
 """The right picture of pipeline.renders.variant_probe, which every variant must meet.
 
-Printed by tests.renders.probe_reference: the mean of 1,024 pictures, of which one has this standard
-deviation. Print it anew only when the light itself or the probe's scene is meant to change.
+Printed by tests.pipeline.renders.probe_reference: the mean of 1,024 pictures, of which one has this
+standard deviation. Print it anew only when the light itself or the probe's scene is meant to
+change.
 """
 
 import numpy as np

@@ -7,7 +7,7 @@ from tests.conftest import ROOT
 ONLY_PLACE = "infra/cli/console.py"
 ELSEWHERE = {"infra/serving/local.py"}
 """What `make serve` prints: the documents' own lines,
-which tests/infra/test_serving.py compares."""
+which tests/infra/serving/test_serving.py compares."""
 
 
 def test_next_steps_are_printed_in_one_place() -> None:

@@ -31,7 +31,7 @@ from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
 from tests.columns_kit import COAT, TINT, WITH_COAT, declared
 from tests.model.kit import awake, tiny_config
-from tests.scenes.small_pool import first_scene, small_pool
+from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import toy_sample, write_toy_dataset

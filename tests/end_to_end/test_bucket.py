@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from tests.assets.meshes_by_hand import knot, write_obj
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import call
-from tests.flows.bucket_kit import empty_bucket
 from tests.http_server import serve
+from tests.pipeline.assets.meshes_by_hand import knot, write_obj
+from tests.pipeline.making.bucket_kit import empty_bucket
 from tests.s3_server import control, s3_server
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")

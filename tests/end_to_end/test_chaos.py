@@ -16,9 +16,9 @@ import pytest
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import shard_row
 from storage.dataset.verify import verify_dataset
-from tests.documents.dataset_by_hand import five_scenes
 from tests.end_to_end.conftest import kill_one, marked_environment, num_meshes, processes_with
 from tests.end_to_end.production_kit import call, postgres, served, start_served, stop_served
+from tests.pipeline.documents.dataset_by_hand import five_scenes
 
 KILLS = int(os.environ.get("TRILIGHT_CHAOS_KILLS", "8"))
 """Eight take ten minutes; 30, which the variable asks for, take half an hour and more."""

@@ -1,6 +1,6 @@
 """The rooms whose extremes are tested lend their fixtures."""
 
-from tests.renders.conftest import llvm, variant
-from tests.scenes.conftest import pool
+from tests.pipeline.conftest import pool
+from tests.pipeline.renders.conftest import llvm, variant
 
 __all__ = ["llvm", "pool", "variant"]

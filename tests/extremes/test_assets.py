@@ -8,7 +8,7 @@ import pytest
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.settings import AssetSettings
 from storage.records.asset import Asset
-from tests.assets.meshes_by_hand import (
+from tests.pipeline.assets.meshes_by_hand import (
     cube,
     geometry,
     knot,

@@ -13,14 +13,14 @@ from pipeline.exchange.renderformer_json_write import described_files
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import MAX_POSITION_M, Scene, SceneObject
-from tests.renders.scene_kit import join, light, quad
-from tests.scenes.exchange_kit import (
+from tests.pipeline.exchange.exchange_kit import (
     assert_h5_keeps_light,
     assert_json_keeps_light,
     assert_usd_keeps_all,
     h5_and_back,
     json_and_back,
 )
+from tests.pipeline.renders.scene_kit import join, light, quad
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
 
 ENDS = np.finfo(np.float32)

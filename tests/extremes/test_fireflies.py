@@ -13,9 +13,9 @@ from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Tracer
 from storage.records.scene import Scene
-from tests.renders.path_strategies import CameraPathsOnly
-from tests.renders.sampling import camera_of
-from tests.renders.scene_kit import join, light, material, quad
+from tests.pipeline.renders.path_strategies import CameraPathsOnly
+from tests.pipeline.renders.sampling import camera_of
+from tests.pipeline.renders.scene_kit import join, light, material, quad
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -17,8 +17,8 @@ from storage.dataset.splits import shards_for
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.settings.dataset import MOST_SCENES, SplitSettings
-from tests.flows.test_served_schema import _defaults
-from tests.flows.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.flows.test_forms import _defaults
+from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
 @pytest.fixture

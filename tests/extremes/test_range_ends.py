@@ -30,7 +30,7 @@ from storage.settings.dataset import MOST_SCENES, SplitSettings
 from storage.settings.ranges import Declared
 from tests.extremes.range_examples import FIELDS, SCENE_REASONS, SMOKE, End
 from tests.model.kit import awake, random_scene, tiny_config
-from tests.renders.scene_kit import join, light, material, quad
+from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import tiny_run
 from tests.train.toy import toy_sample
 from train.data.augment import augmented

@@ -13,7 +13,16 @@ from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.scene import Scene
-from tests.renders.scene_kit import Part, flat, furnace, join, light, material, quad, sphere
+from tests.pipeline.renders.scene_kit import (
+    Part,
+    flat,
+    furnace,
+    join,
+    light,
+    material,
+    quad,
+    sphere,
+)
 
 SETTINGS = RenderSettings(
     resolution=16, noise_floor_db=1.0, min_spp=32, max_spp=32, aux_spp=16, min_mean_radiance=0.0

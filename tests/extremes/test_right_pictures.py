@@ -15,7 +15,7 @@ from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from storage.conventions import camera_rays
 from storage.records.scene import Scene
-from tests.renders.scene_kit import Part, flat, join, light, material, quad
+from tests.pipeline.renders.scene_kit import Part, flat, join, light, material, quad
 
 SETTINGS = RenderSettings(
     resolution=16, noise_floor_db=1.0, min_spp=128, max_spp=128, aux_spp=16, denoiser="off",

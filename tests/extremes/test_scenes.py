@@ -16,8 +16,8 @@ from storage.errors import Rejected
 from storage.records.scene import Scene
 from storage.settings.changes import changed
 from tests.extremes.range_examples import SCENE_REASONS
-from tests.scenes.scene_facts import counts_of, digest, rows_of
-from tests.scenes.small_pool import first_scene
+from tests.pipeline.scenes.scene_facts import counts_of, digest, rows_of
+from tests.pipeline.scenes.small_pool import first_scene
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 

@@ -22,7 +22,7 @@ from storage.records.material import EMISSION
 from storage.records.profiles import PROFILES, Profile, keeps_law, pack_picture
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import MAX_POSITION_M, Scene, SceneObject
-from tests.scenes.exchange_kit import assert_usd_keeps_all
+from tests.pipeline.exchange.exchange_kit import assert_usd_keeps_all
 from tests.scenes_by_hand import LIGHT, tiny_sample, tiny_scene
 
 FINITE = np.arange(0x7C00, dtype=np.uint16).view(np.float16)

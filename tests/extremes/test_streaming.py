@@ -17,7 +17,7 @@ from storage.dataset.manifest import read_manifest, write_manifest
 from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from tests.flows.derive_kit import finished, scenes
+from tests.pipeline.making.derive_kit import finished, scenes
 from tests.train.toy import write_toy_dataset
 from train.data.order import OrderSettings, RankShare, batches_from, windows_from
 from train.data.stream import StreamSettings, stream_batches

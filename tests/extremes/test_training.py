@@ -12,7 +12,7 @@ from torch import Tensor
 
 from storage.conventions import HALF_FLOAT_MAX
 from tests.train.kit import tiny_run
-from tests.train.test_loop_step import stepper
+from tests.train.loop.test_step import stepper
 from tests.train.toy import toy_sample, toy_scene
 from train.data.augment import augmented
 from train.data.augmentation import AugmentationSettings

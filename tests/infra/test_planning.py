@@ -11,7 +11,7 @@ from pipeline.making.machine import cores_owned
 from pipeline.making.order import DatasetOrder
 from pipeline.making.pieces import MOST_TASKS
 from storage.dataset.dataset import open_dataset
-from tests.flows.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
+from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
 def _measured(core_s: tuple[float, ...], num_bytes: int = 150_000) -> MeasuredScenes:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from model.light_groups import LightGroup, light_groups
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
-from tests.renders.scene_kit import Part, box, flat, join, light, material, quad
+from tests.pipeline.renders.scene_kit import Part, box, flat, join, light, material, quad
 
 FLOOR = quad(
     [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], material(diffuse=0.5)

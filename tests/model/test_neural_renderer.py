@@ -23,7 +23,7 @@ from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.model.kit import awake, tiny_config
-from tests.renders.scene_kit import flat, join, light, material, quad
+from tests.pipeline.renders.scene_kit import flat, join, light, material, quad
 from tests.scenes_by_hand import tiny_scene
 
 TRIANGLE = 0.05 * np.array([[-1.0, 1, 0], [1, -1, 0], [1, 1, 0]])

@@ -13,7 +13,7 @@ from model.renderformer import RenderFormer
 from model.weights import encode_weights
 from storage.errors import TrilightError
 from tests.model.kit import awake, tiny_config
-from tests.model.test_published import publishable
+from tests.model.published.test_convert import publishable
 
 
 @pytest.fixture

@@ -180,8 +180,8 @@ def test_how_far_crowding_shifts_sizes_and_shares() -> None:
 
     Sizes are drawn again where none fits, so that smaller ones remain. For one object the greatest
     distance of the distribution functions stays below 0.1, for two below 0.25, for three below 0.4
-    (measured: 0.03, 0.21, 0.30). Balls claim all of their spheres; for meshes see tests/scenes.
-    Resting needs the floor, and is rarer by at most 0.05 (measured: 0.47).
+    (measured: 0.03, 0.21, 0.30). Balls claim all of their spheres; for meshes see
+    tests/pipeline/scenes. Resting needs the floor, and is rarer by at most 0.05 (measured: 0.47).
     """
     rests: list[bool] = []
     sizes: dict[int, list[float]] = {1: [], 2: [], 3: []}

@@ -17,7 +17,7 @@ from model.config import SIZES
 from model.renderformer import RenderFormer
 from tests.train import card_cases
 from tests.train.fake_card import card_process
-from tests.train.test_loss_lpips import small_weights
+from tests.train.loss.test_lpips import small_weights
 from tests.train.toy import write_toy_dataset
 from train.loss.lpips_weights import LINEAR_FILE, VGG16_FILE
 from train.runs import RUNS

@@ -8,8 +8,8 @@ import pytest
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.remote import tries, url
-from tests.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.http_server import Site, serve
+from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 
 
 @pytest.fixture

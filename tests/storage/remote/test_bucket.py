@@ -12,7 +12,7 @@ from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote import bucket as remote_bucket
 from storage.remote.tries import with_tries
 from storage.remote.url import RemoteUrl
-from tests.flows.bucket_kit import empty_bucket
+from tests.pipeline.making.bucket_kit import empty_bucket
 from tests.s3_server import s3_server
 
 pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")

@@ -17,7 +17,7 @@ from storage.records.sample import encode_sample
 from storage.remote import fetch
 from storage.remote import url as remote_url
 from storage.remote.bucket import Bucket
-from tests.flows.test_publication import ENVIRONMENT, _build
+from tests.pipeline.making.test_publication import ENVIRONMENT, _build
 
 pytest.importorskip("gcsfs", reason="gs:// needs the package gcsfs")
 emulator: Any = pytest.importorskip(

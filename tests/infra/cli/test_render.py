@@ -1,0 +1,290 @@
+"""`trilight render`: a picture of every kind of source, and one clear line where there is none."""
+
+import io
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from pipeline.exchange.open_scene import load_source, scene_source
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from pipeline.making import render_scene
+from storage.conventions import preview_srgb8
+from storage.dataset.shard_writer import write_shard
+from storage.errors import TrilightError
+from storage.records.exr import decode_exr
+from storage.records.profiles import Profile
+from storage.records.sample import Sample, encode_sample
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene, scene_digest
+from tests.command_line import trilight
+from tests.infra.rendering.render_kit import SMALL, mistake, render
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+
+FLOOR = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3 4\n"
+LAMP = "v -0.1 -0.1 2\nv 0 0.1 2\nv 0.1 -0.1 2\nf 1 2 3\n"
+
+
+def _object(mesh: str, emissive: float, **more: Any) -> dict[str, Any]:
+    place = {"translation": [0, 0, 0], "rotation": [0, 0, 0], "scale": [1, 1, 1]}
+    albedo = 0.0 if emissive else 0.4
+    return {
+        "mesh_path": mesh,
+        "transform": {**place, "normalize": False},
+        "material": {
+            "diffuse": [albedo] * 3,
+            "specular": [0.2] * 3,
+            "roughness": 0.5,
+            "emissive": [emissive] * 3,
+            "smooth_shading": False,
+        },
+        **more,
+    }
+
+
+@pytest.fixture
+def described(tmp_path: Path) -> Path:
+    """A RenderFormer scene of two meshes and two cameras."""
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    (folder / "floor.obj").write_text(FLOOR)
+    (folder / "lamp.obj").write_text(LAMP)
+    camera = {"look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
+    scene = {
+        "scene_name": "two",
+        "version": "1.0",
+        "objects": {
+            "floor": _object("floor.obj", 0, colour="red"),
+            "lamp": _object("lamp.obj", 100),
+        },
+        "cameras": [{**camera, "position": [2, 0, 1]}, {**camera, "position": [0, 2, 1]}],
+    }
+    (folder / "two.json").write_text(json.dumps(scene))
+    return folder / "two.json"
+
+
+def _shard(path: Path, scene: Scene, profile: Profile = "lossless") -> Path:
+    made = tiny_sample(key="000000012")
+    sample = Sample(key=made.key, scene=scene, radiance_rgb=made.radiance_rgb, views=made.views)
+    other = tiny_sample(key="000000011")
+    write_shard(path, [(each.key, encode_sample(each, profile)) for each in (other, sample)])
+    return path
+
+
+def test_one_scene_gives_one_picture_whatever_it_is_read_from(
+    described: Path, tmp_path: Path
+) -> None:
+    scene = load_source(scene_source(str(described))).scene
+    (tmp_path / "two.safetensors").write_bytes(encode_scene(scene))
+    shard = _shard(tmp_path / "train-000000.tar", scene)
+    packed = _shard(tmp_path / "train-000001.tar", scene, "compact")
+    sources: list[str | Path] = [
+        described,
+        tmp_path / "two.safetensors",
+        f"{shard}::000000012",
+        f"{packed}::000000012",
+    ]
+    outs = [tmp_path / f"new/{row}.exr" for row in range(len(sources))]
+    found = [
+        render(source, "--view", "1", "--out", out)
+        for source, out in zip(sources, outs, strict=True)
+    ]
+    pictures = [decode_exr(out.read_bytes()) for out in outs]
+    assert pictures[0].shape == (16, 16, 3)
+    assert pictures[0].mean() > 0.01
+    for picture, outcome in zip(pictures, found, strict=True):
+        np.testing.assert_array_equal(picture, pictures[0])
+        assert outcome["scene_sha256"] == scene_digest(scene)
+        assert (outcome["spp"], outcome["view"], outcome["at_cap"]) == (8, 1, True)
+        assert (outcome["triangles"], outcome["lights"]) == (3, 1)
+    assert found[0]["notes"][0] == "two.json: unknown field objects.floor.colour"
+    assert "may flatter" in found[1]["notes"][0]
+    shown = np.asarray(Image.open(outs[0].with_suffix(".png")))
+    assert shown.shape == (256, 256, 3)
+    np.testing.assert_array_equal(shown[::16, ::16], preview_srgb8(pictures[0]))
+
+
+def test_the_published_layout_gives_the_picture_of_its_scene(tmp_path: Path) -> None:
+    write_renderformer_h5(tmp_path / "tiny.h5", tiny_scene(), texture_type="float32")
+    found = render(tmp_path / "tiny.h5", "--out", tmp_path / "h5.exr")
+    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
+    render(tmp_path / "tiny.safetensors", "--out", tmp_path / "scene.exr")
+    pictures = [decode_exr((tmp_path / f"{name}.exr").read_bytes()) for name in ("h5", "scene")]
+    assert pictures[1].mean() > 0.01
+    # The same geometry and materials; the denoised few samples may fall on other seams of rounding.
+    np.testing.assert_allclose(pictures[0], pictures[1], rtol=0.02, atol=1e-3)
+    assert all(note.startswith("tiny.h5: ") for note in found["notes"][:-1])
+    (tmp_path / "no.h5").write_bytes(b"no scene")
+    assert "no.h5" in mistake(tmp_path / "no.h5", "--out", tmp_path / "no.exr")
+
+
+def test_the_picture_says_how_it_was_made(tmp_path: Path) -> None:
+    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
+    out = tmp_path / "tiny.exr"
+    outcome = render(tmp_path / "tiny.safetensors", "--out", out, "--seed", str(1 << 40))
+    header = OpenEXR.File(io.BytesIO(out.read_bytes()), header_only=True).header()
+    assert header["trilight.source"] == "tiny.safetensors"
+    assert header["trilight.scene_sha256"] == scene_digest(tiny_scene())
+    assert header["trilight.seed"] == str(1 << 40)
+    assert header["trilight.spp"] == 8
+    # an attribute is a float32
+    assert header["trilight.noise_floor_db"] == pytest.approx(outcome["noise_floor_db"], rel=1e-6)
+    assert json.loads(header["trilight.settings"])["resolution"] == 16
+    assert "mitsuba_variant" in json.loads(header["trilight.environment"])
+    assert str(tmp_path) not in str(header)
+    first = out.read_bytes()
+    render(tmp_path / "tiny.safetensors", "--out", out, "--seed", str(1 << 40))
+    assert out.read_bytes() == first
+
+
+def test_a_person_is_told_where_to_look(tmp_path: Path) -> None:
+    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
+    words = ["render", str(tmp_path / "tiny.safetensors"), "--out", str(tmp_path / "x.exr"), *SMALL]
+    printed = trilight(words).output
+    for text in ("x.png", "psnr_log_db", "the cap came before", "in the PNG a pixel is 16 x 16"):
+        assert text in printed.replace("\n", "")
+
+
+def _nothing(folder: Path) -> None:
+    pass
+
+
+def _pipe(folder: Path) -> None:
+    os.mkfifo(folder / "a.safetensors")
+
+
+def _text(folder: Path) -> None:
+    (folder / "a.safetensors").write_text("no scene")
+
+
+def _folder(folder: Path) -> None:
+    (folder / "set").mkdir()
+
+
+@pytest.mark.parametrize(
+    ("prepare", "source", "message"),
+    [
+        (_nothing, "absent.json", "no such file"),
+        (_nothing, "https://me:secret@host/a.json", "https://host/a.json: only files of this"),
+        (_nothing, "simplecache::https://host/a.tar::0", "only files of this machine"),
+        (_nothing, "absent.tar::000000000", "no such file"),
+        (_nothing, "absent.tar::../x", "no shard and key"),
+        (_nothing, "absent.json::000000000", "no shard and key"),
+        (_folder, "set", "a folder; expected a scene"),
+        (_text, "a.safetensors", "a.safetensors: safetensors: the header claims"),
+        (_pipe, "a.safetensors", "a.safetensors: expected a regular file"),
+    ],
+)
+def test_a_bad_source_is_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    prepare: Callable[[Path], None],
+    source: str,
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    prepare(tmp_path)
+    with pytest.raises(TrilightError, match=message) as caught:
+        load_source(scene_source(source))
+    assert "\n" not in str(caught.value)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_shard_needs_a_key_that_it_has(tmp_path: Path) -> None:
+    shard = _shard(tmp_path / "train-000000.tar", tiny_scene())
+    with pytest.raises(TrilightError, match="expected .*train-000000.tar::KEY"):
+        scene_source(str(shard))
+    with pytest.raises(TrilightError, match="no sample 000000013; expected one of its 2: 0000000"):
+        load_source(scene_source(f"{shard}::000000013"))
+    shard.write_bytes(shard.read_bytes()[:700])
+    with pytest.raises(TrilightError, match="train-000000.tar|000000012"):
+        load_source(scene_source(f"{shard}::000000012"))
+
+
+def test_a_scene_in_a_shard_obeys_the_laws(tmp_path: Path) -> None:
+    lawless = tiny_scene(fov_deg=np.array([45, 181], np.float32))
+    shard = _shard(tmp_path / "train-000000.tar", lawless)
+    with pytest.raises(TrilightError, match=r"sample 000000012: scene: fov_deg\[1\] is 181"):
+        load_source(scene_source(f"{shard}::000000012"))
+
+
+@pytest.mark.parametrize("engine", ["mitsuba", "neural"])
+def test_no_engine_takes_a_vertex_beyond_the_farthest_position(
+    engine: str, described: Path, tmp_path: Path
+) -> None:
+    """Triangles that reach so far vanish from traced pictures, and rotary angles lose digits."""
+    far = json.loads(described.read_text())
+    far["objects"]["floor"]["transform"]["scale"] = [1e6, 1, 1]
+    described.write_text(json.dumps(far))
+    positions = tiny_scene().vertex_positions.copy()
+    positions[0, 0] = 1e38
+    shard = _shard(tmp_path / "train-000000.tar", tiny_scene(vertex_positions=positions))
+    for source in (described, f"{shard}::000000012"):
+        told = mistake(source, "--engine", engine, "--out", tmp_path / "x.exr", *SMALL)
+        assert "vertex_positions[0, 0] is " in told and "expected from -1000 to 1000 m" in told
+    assert not (tmp_path / "x.exr").exists()
+
+
+def test_a_mesh_outside_of_the_folder_is_refused(described: Path) -> None:
+    described.write_text(described.read_text().replace("floor.obj", "../floor.obj"))
+    with pytest.raises(TrilightError, match="leads out of the folder"):
+        load_source(scene_source(str(described)))
+
+
+def test_mistakes_on_the_command_line_are_one_line(tmp_path: Path) -> None:
+    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
+    source.write_bytes(encode_scene(tiny_scene()))
+    for words, message in (
+        (("--engine", "cycles"), "--engine is 'cycles'; expected one of mitsuba, neural, both"),
+        (("--tone-map", "grey"), "--tone-map is 'grey'; expected one of plain, filmic"),
+        (("--fps", "0"), "--fps is 0"),
+        (("--exposure", "33"), "--exposure-ev is 33.0; expected a number from -32 to 32 stops"),
+        (("--exposure", "nan"), "--exposure-ev is nan"),
+        (("--arc", "361"), "--arc-deg is 361"),
+        (("--orbit", "0"), "--orbit is 0"),
+        (("--orbit", "3"), "expected a folder, X.mp4 or X.webp"),
+        (("--orbit", "3", "--cameras", "a.json"), "expected no --orbit beside it"),
+        (("--lights-per-pass", "0"), "--lights-per-pass is 0"),
+        (("--resolution", "20"), "resolution is 20; expected a multiple of 8"),
+        (("--max-spp", "100"), "max_spp 100; expected multiples of 8"),
+        (("--noise-floor", "0"), "--noise-floor-db is 0.0; expected a number above 0"),
+        (("--seed", "-1"), "--seed is -1"),
+        (("--threads", "0"), "--threads is 0"),
+    ):
+        assert message in mistake(source, "--out", out, *words)
+    assert "--out is" in mistake(source, "--out", tmp_path / "x.png")
+    assert "cannot write x.exr" in mistake(source, "--out", "/dev/null/x.exr")
+    assert not out.exists()
+
+
+def test_what_only_the_child_finds_out_is_one_line_too(tmp_path: Path) -> None:
+    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
+    source.write_bytes(encode_scene(tiny_scene()))
+    assert "--view is 2; expected 0 to 1" in mistake(source, "--out", out, *SMALL, "--view", "2")
+    materials = tiny_scene().materials.copy()
+    materials[1, 7:] = 3e38
+    source.write_bytes(encode_scene(tiny_scene(materials=materials)))
+    told = mistake(source, "--out", out, *SMALL)
+    assert "view 0 cannot be rendered (radiance_overflow" in told
+    assert not out.exists()
+
+
+def _crash(*arguments: object) -> None:
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def test_a_crash_in_native_code_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = tmp_path / "tiny.safetensors"
+    source.write_bytes(encode_scene(tiny_scene()))
+    monkeypatch.setattr(render_scene, "_open_scene", _crash)
+    told = mistake(source, "--out", tmp_path / "x.exr", *SMALL)
+    assert told.startswith("tiny.safetensors: rendering failed (crashed_signal_11")

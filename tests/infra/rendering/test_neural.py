@@ -1,0 +1,169 @@
+"""`trilight render --engine neural|both`: a network's pictures of every kind of source."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from model.neural_renderer import NeuralRenderer
+from pipeline.exchange.renderformer_h5 import write_renderformer_h5
+from pipeline.exchange.usd.write import write_usd
+from storage.conventions import look_at_c2w, preview_srgb8
+from storage.dataset.shard_writer import write_shard
+from storage.metrics import psnr_log_db
+from storage.records.exr import decode_exr
+from storage.records.sample import encode_sample
+from storage.records.scene_file import encode_scene, scene_digest
+from tests.command_line import trilight
+from tests.infra.rendering.render_kit import SMALL, mistake, render, write_network
+from tests.model.test_neural_renderer import many_lights
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+from train.evaluation.sheet import error_picture
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Path:
+    return write_network(tmp_path / "model.safetensors", max_triangles=2)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    (tmp_path / "tiny.safetensors").write_bytes(encode_scene(tiny_scene()))
+    return tmp_path / "tiny.safetensors"
+
+
+def neural(source: str | Path, out: Path, network: Path, *more: str) -> dict[str, object]:
+    return render(source, "--out", out, "--engine", "neural", "--checkpoint", network, *more)
+
+
+def test_every_form_of_a_scene_gives_the_picture_of_the_api(
+    network: Path, scene: Path, tmp_path: Path
+) -> None:
+    shard = tmp_path / "train-000000.tar"
+    write_shard(shard, [("000000012", encode_sample(tiny_sample(key="000000012")))])
+    write_usd(tmp_path / "tiny.usda", tiny_scene())
+    write_renderformer_h5(tmp_path / "tiny.h5", tiny_scene(), texture_type="float32")
+    renderer = NeuralRenderer.load(network, device="cpu")
+    with pytest.warns(UserWarning, match="3 triangles"):
+        expected = renderer.render(tiny_scene(), 16)[1]
+    sources: list[str | Path] = [
+        scene,
+        f"{shard}::000000012",
+        tmp_path / "tiny.usda",
+        tmp_path / "tiny.h5",
+    ]
+    for row, source in enumerate(sources):
+        out = tmp_path / f"{row}.exr"
+        found = neural(source, out, network, "--view", "1")
+        picture = decode_exr(out.read_bytes())
+        # half floats are exact to 2^-11 of their value; HDF5 orders the triangles anew
+        np.testing.assert_allclose(picture, expected, rtol=1e-3, atol=1e-4)
+        shown = np.asarray(Image.open(out.with_suffix(".png")))
+        np.testing.assert_array_equal(shown[::16, ::16], preview_srgb8(picture))
+        assert (found["engine"], found["passes"], found["triangles"]) == ("neural", 1, 3)
+    assert "trained on at most 2" in str(found["notes"])
+
+
+def test_the_picture_names_its_network(network: Path, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    neural(scene, out, network)
+    first = out.read_bytes()
+    header = OpenEXR.File(io.BytesIO(first), header_only=True).header()
+    assert header["trilight.engine"] == "neural"
+    assert header["trilight.checkpoint"] == "model.safetensors"
+    assert header["trilight.network_sha256"] == NeuralRenderer.load(network).digest
+    assert header["trilight.scene_sha256"] == scene_digest(tiny_scene())
+    assert json.loads(header["trilight.settings"]) == {
+        "lights_per_pass": 8,
+        "precision": "float32",
+        "resolution": 16,
+        "skip_empty_bundles": False,
+    }
+    assert str(tmp_path) not in str(header)
+    neural(scene, out, network)
+    assert out.read_bytes() == first
+
+
+def test_what_no_triangle_reaches_may_stay_black(network: Path, tmp_path: Path) -> None:
+    """A wide view of a small floor: the farthest bundles see nothing."""
+    scene, out = tmp_path / "edge.safetensors", tmp_path / "x.exr"
+    above = look_at_c2w(eye=[0, 0, 1.5], target=[0, 0, 0], up=[0, 1, 0]).astype(np.float32)
+    edge = tiny_scene().with_cameras(above[None], np.array([150], np.float32))
+    scene.write_bytes(encode_scene(edge))
+    pictures = []
+    for more in ([], ["--skip-empty-bundles"]):
+        words = ["render", str(scene), "--engine", "neural", "--checkpoint", str(network)]
+        trilight([*words, "--resolution", "128", "--out", str(out), *more])
+        pictures.append(decode_exr(out.read_bytes()))
+    whole, sparse = pictures
+    whole_dark, dark = ((picture == 0).all(axis=-1).mean() for picture in (whole, sparse))
+    assert whole_dark < 0.1 < 0.5 < dark < 1
+
+
+def test_both_engines_stand_side_by_side(network: Path, scene: Path, tmp_path: Path) -> None:
+    out, arguments = tmp_path / "x.exr", ("--engine", "both", "--checkpoint", network)
+    found = render(scene, "--out", out, *arguments)
+    traced, drawn = (
+        decode_exr((tmp_path / f"x.{name}.exr").read_bytes()) for name in ("mitsuba", "neural")
+    )
+    assert not out.exists()
+    assert found["psnr_log_db"] == pytest.approx(psnr_log_db(drawn, traced), abs=1e-3)
+    assert found["mitsuba"]["spp"] == 8
+    assert found["neural"]["passes"] == 1
+    sheet = np.asarray(Image.open(tmp_path / "x.png"))
+    assert sheet.shape == (256 + 24, 3 * 256 + 2 * 8, 3)
+    left, middle, right = (sheet[24::16, at : at + 256 : 16] for at in (0, 264, 528))
+    np.testing.assert_array_equal(left, preview_srgb8(traced))
+    np.testing.assert_array_equal(middle, preview_srgb8(drawn))
+    np.testing.assert_array_equal(right, error_picture(drawn, traced))
+    render(scene, "--out", out, *arguments, "--exposure", "-2")
+    darker = np.asarray(Image.open(tmp_path / "x.png"))
+    np.testing.assert_array_equal(darker[24::16, :256:16], preview_srgb8(traced / 4))
+    np.testing.assert_array_equal(darker[24:, 528:], sheet[24:, 528:])  # an error stays one
+    words = [str(word) for word in ("render", scene, "--out", out, *arguments, *SMALL)]
+    printed = trilight(words).output.replace("\n", "")
+    for text in ("agreement", "samples per pixel", "model.safetensors; passes: 1", "x.png"):
+        assert text in printed
+
+
+def test_radiance_beyond_half_floats_is_clipped_and_told(scene: Path, tmp_path: Path) -> None:
+    bright = write_network(tmp_path / "bright.safetensors", bias=6.0)
+    found = neural(scene, tmp_path / "x.exr", bright)
+    assert found["clipped_pixels"] == 16 * 16
+    assert "neural: pixels beyond what half floats hold were clipped" in str(found["notes"])
+    assert decode_exr((tmp_path / "x.exr").read_bytes()).max() == 65504
+
+
+def test_lights_are_rendered_in_groups_of_the_size_that_is_asked_for(
+    network: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "many.safetensors").write_bytes(encode_scene(many_lights(9)))
+    for most, passes in (("8", 2), ("3", 3), ("9", 1)):
+        found = neural(
+            tmp_path / "many.safetensors", tmp_path / "x.exr", network, "--lights-per-pass", most
+        )
+        assert found["passes"] == passes
+
+
+def test_mistakes_are_one_line(network: Path, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.exr"
+    for words, message in (
+        (("--checkpoint", network), "expected --engine neural or both beside it"),
+        (
+            ("--engine", "neural", "--checkpoint", tmp_path / "no"),
+            f"checkpoint {tmp_path / 'no'}: no such file",
+        ),
+        (("--engine", "neural", "--checkpoint", scene), str(tmp_path)),
+        (("--engine", "neural", "--checkpoint", network, "--resolution", "20"), "resolution is 20"),
+        (
+            ("--engine", "neural", "--checkpoint", network, "--precision", "half"),
+            "--precision is 'half'; expected one of float32",
+        ),
+        (("--engine", "both", "--checkpoint", network, "--view", "2"), "--view is 2"),
+    ):
+        assert message in mistake(scene, "--out", out, *words)
+    assert not out.exists()

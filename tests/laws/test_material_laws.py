@@ -1,0 +1,148 @@
+"""Surfaces reflect what their ten numbers say: energy, two sides, the mixture of lobes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.renders.blend import MIN_ALPHA, lobes_of, scaled_albedos
+from pipeline.renders.multiscatter import scattered_again
+from storage.conventions import alpha_ggx
+from storage.records.scene import Scene
+from tests.pipeline.renders.closed_forms import lambert_irradiance
+from tests.pipeline.renders.sampling import assert_agree, exact, render_blocks
+from tests.pipeline.renders.scene_kit import (
+    Part,
+    flat,
+    furnace,
+    join,
+    light,
+    material,
+    quad,
+    sphere,
+)
+from tests.pipeline.renders.test_multiscatter import slow_albedo
+
+PLATE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+
+
+def _albedo(row: NDArray, cos_in: float) -> NDArray[np.float64]:
+    """Directional albedo [3] by brute force and by the formula of pipeline.renders.multiscatter."""
+    alpha = max(float(alpha_ggx(row[6])), MIN_ALPHA)
+    single = slow_albedo(cos_in, alpha, "correlated")
+    again = scattered_again(row[None, 3:6], np.array([alpha]), "correlated")[0]
+    total: NDArray[np.float64] = row[0:3] + row[3:6] * (single + again * (1 - single))
+    return total
+
+
+def _furnace_plate(row: NDArray, cos_view: float) -> Scene:
+    eye = 3 * np.array([0.0, -np.sqrt(1 - cos_view**2), cos_view])
+    return join([quad(PLATE, row), furnace()], eye=eye, fov_deg=0.5)
+
+
+@pytest.mark.parametrize("roughness", [0.01, 0.1, 0.4, 0.7, 1.0])
+@pytest.mark.parametrize("cos_view", [0.95, 0.3])
+def test_a_plate_in_a_furnace_returns_the_directional_albedo(
+    roughness: float, cos_view: float
+) -> None:
+    """Each channel of a coloured mirror loses its own share at every further reflection."""
+    row = material(diffuse=[0.2, 0, 0.1], specular=[0.75, 1.0, 0.1], roughness=roughness)
+    expected = _albedo(row, cos_view)
+    estimate = render_blocks(_furnace_plate(row, cos_view), resolution=8, block=8, max_depth=2)
+    # The brute force is good to some 1e-4, the table to 2e-3 of E, which the colour damps.
+    assert_agree(estimate, exact(expected[None, None]), slack=2e-3)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        material(diffuse=[0.9, 0.5, 0.0]),
+        material(specular=[1.0, 0.6, 0.2], roughness=0.05),
+        material(),
+        material(diffuse=1e-4, specular=0.9, roughness=0.05),
+        material(diffuse=0.9, specular=1e-4, roughness=0.05),
+    ],
+    ids=["diffuse only", "mirror only", "black", "nearly mirror", "nearly diffuse"],
+)
+def test_the_ends_of_the_mixture_are_exact(row: NDArray) -> None:
+    estimate = render_blocks(_furnace_plate(row, 0.8), resolution=8, block=8, max_depth=2)
+    assert_agree(estimate, exact(_albedo(row, 0.8)[None, None]), slack=1e-3)
+
+
+def test_a_surface_shades_the_same_from_behind() -> None:
+    """Turning all triangles and normals around changes no picture: nothing has a back."""
+    row = material(diffuse=[0.3, 0.2, 0.5], specular=0.4, roughness=0.3)
+    floor = quad([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]], material(diffuse=0.5))
+    lamp = light([[-0.5, 0, 2], [0.5, 0, 2], [0, 0.6, 1.8]], 6.0)
+    ball = sphere([0, 0, 0.5], 0.5, row, rings=8)
+    turned = Part(
+        triangles=ball.triangles[:, ::-1],
+        normals=-ball.normals[:, ::-1],
+        material=row,
+        kind="object",
+    )
+    front, back = (
+        render_blocks(join([floor, part, lamp], eye=(0, -2, 1)), first_seed=seed)
+        for seed, part in enumerate([ball, turned])
+    )
+    assert_agree(front, back)
+
+
+FAR = np.array([[-20, 30, 40], [20, 30, 40], [0, 50, 60]])
+
+
+def _tilted_plate(row: NDArray, tilt: float, eye: tuple[float, float, float]) -> Scene:
+    """A small plate in z = 0 whose shading normals lean towards the far light at +y."""
+    plate = flat([[[-0.2, -0.2, 0], [0.2, -0.2, 0], [0, 0.3, 0]]], row)
+    normal = np.array([0.0, np.sin(tilt), np.cos(tilt)])
+    tilted = dataclasses.replace(plate, normals=np.broadcast_to(normal, (1, 3, 3)))
+    return join([tilted, light(FAR, 1.0)], eye=eye, target=(0, 0.001, 0), fov_deg=1)
+
+
+@pytest.mark.parametrize(
+    ("tilt", "eye"),
+    [(0.3, (0.0, 0.0, 2.0)), (1.2, (0.0, -1.88, 0.68))],
+    ids=["seen from the front", "seen from behind its shading normal"],
+)
+def test_shading_normals_are_those_of_the_scene(
+    llvm: None, tilt: float, eye: tuple[float, float, float]
+) -> None:
+    """A flat plate with tilted normals is as bright as a plate that is really tilted so, even for
+    a viewer whom only the plate itself faces."""
+    scene = _tilted_plate(material(diffuse=0.8), tilt, eye)
+    picture = render_blocks(scene, resolution=8, block=8, max_depth=2)
+    normal = np.array([0.0, np.sin(tilt), np.cos(tilt)])
+    irradiance = lambert_irradiance(np.zeros((1, 3)), normal, FAR, 1.0)[0]
+    # The view is 0.1 wide and the light 60 away: moving there changes the form factor by 0.2 %.
+    expected = exact(np.full((1, 1, 3), 0.8 / np.pi * irradiance))
+    assert_agree(picture, expected, slack=3e-3)
+
+
+def test_a_mirror_shows_nothing_to_a_viewer_behind_its_shading_normal(llvm: None) -> None:
+    """As in Cycles; nor does it reflect to below the plate, whatever its shading normal says."""
+    row = material(specular=1.0, roughness=0.5)
+    behind = _tilted_plate(row, 1.2, (0.0, -1.88, 0.68))
+    picture = render_blocks(behind, resolution=8, block=8, max_depth=2)
+    np.testing.assert_array_equal(picture.mean, 0)
+
+
+def test_lobes_add_up_to_the_material_and_never_exceed_one() -> None:
+    rng = np.random.default_rng(0)
+    rows = np.zeros((500, 10), np.float32)
+    split = rng.uniform(size=(500, 3))
+    rows[:, 0:3], rows[:, 3:6] = split * 0.97, (1 - split) * 0.97
+    rows[:, 6] = rng.uniform(size=500)
+    rows[0, 0:6], rows[1, 0:3], rows[2, 3:6] = 0, 0, 0
+    lobes = lobes_of(rows)
+    diffuse, specular = scaled_albedos(lobes)
+    weight = lobes.weight[:, None]
+    # float64 arithmetic on float32 rows: exact to 1e-12.
+    np.testing.assert_allclose((1 - weight) * diffuse, rows[:, 0:3], atol=1e-12)
+    np.testing.assert_allclose(weight * specular, rows[:, 3:6], atol=1e-12)
+    bound = lobes.diffuse.max(1) + lobes.specular.max(1) + 1e-12
+    assert (diffuse.max(1) <= bound).all() and (specular.max(1) <= bound).all()
+    assert lobes.weight[0] == 0 and lobes.weight[1] == 1 and lobes.weight[2] == 0
+    np.testing.assert_allclose(
+        lobes.alpha, np.maximum(rows[:, 6].astype(np.float64) ** 2, MIN_ALPHA)
+    )

@@ -1,0 +1,153 @@
+"""Work for children that goes wrong on purpose, and a record of who was called.
+
+`recorded_attempt` stands in for `stage.attempt_in_child`. It runs in another process, so it is told
+what to do by a file beside the source, and writes down its calls in another one.
+"""
+
+import ctypes
+import dataclasses
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.assets.prepare import AssetAttempt, prepare_asset
+from pipeline.assets.settings import AssetSettings
+from pipeline.isolation import ChildLimits, IsolatedChild, preload
+from storage.errors import Rejected, TrilightError
+from storage.records.objects import ObjectRecord
+from tests.pipeline.assets.meshes_by_hand import record_of
+
+LIMITS = ChildLimits(memory_bytes=3 << 30, wall_s=60, cpu_s=20, calls_per_child=50)
+CALLS = "calls.jsonl"
+PLAN = "plan.json"
+
+
+def nothing() -> None:
+    """Set up nothing."""
+
+
+def recorded_attempt(source: Path, settings: AssetSettings, method: str) -> AssetAttempt:
+    """Write down who was called for what, then do what the plan beside the source says."""
+    call = {"pid": os.getpid(), "name": source.name, "method": method, "budgets": settings.budgets}
+    with (source.parent / CALLS).open("a") as stream:
+        stream.write(json.dumps({**call, "epsilon": settings.epsilon}) + "\n")
+    plan: dict[str, str] = json.loads((source.parent / PLAN).read_text())
+    action, _, once = plan.get(method, "work").partition(" ")
+    marker = source.parent / f"{method} {action}"
+    if not (once and marker.exists()):
+        marker.touch()
+        _ACTIONS[action](source)
+    attempt = prepare_asset(source, settings, method)
+    missed = plan.get(f"{method} misses")
+    return _without(attempt, int(missed)) if missed else attempt
+
+
+def _without(attempt: AssetAttempt, below: int) -> AssetAttempt:
+    """Leave out the levels below a budget, as if they had failed the gate."""
+    kept = tuple(level for level in attempt.asset.levels if level.record.budget >= below)
+    gone = {
+        level.record.budget: ("silhouette_changed", "planned")
+        for level in attempt.asset.levels
+        if level.record.budget < below
+    }
+    asset = dataclasses.replace(attempt.asset, levels=kept)
+    return dataclasses.replace(attempt, asset=asset, missed={**attempt.missed, **gone})
+
+
+def crash(source: Path) -> None:
+    ctypes.string_at(0)
+
+
+def burn(source: Path) -> None:
+    while True:
+        pass
+
+
+def sleep(source: Path) -> None:
+    time.sleep(600)
+
+
+def eat(source: Path) -> None:
+    bytearray(64 << 30)
+
+
+def die(source: Path) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def leave(source: Path) -> None:
+    os._exit(3)
+
+
+def fail(source: Path) -> None:
+    raise ZeroDivisionError
+
+
+def refuse(source: Path) -> None:
+    raise Rejected("degenerate", "planned")
+
+
+def vanish(source: Path) -> None:
+    source.unlink()
+
+
+def grow(source: Path) -> None:
+    with source.open("a") as stream:
+        stream.write("# more\n")
+
+
+def mistake(source: Path) -> None:
+    raise TrilightError("planned mistake.")
+
+
+_ACTIONS: Mapping[str, Callable[[Path], None]] = {
+    "work": lambda source: None,
+    "crash": crash,
+    "burn": burn,
+    "sleep": sleep,
+    "eat": eat,
+    "die": die,
+    "leave": leave,
+    "fail": fail,
+    "refuse": refuse,
+    "vanish": vanish,
+    "grow": grow,
+    "mistake": mistake,
+}
+
+
+@dataclass
+class Bench:
+    """A folder of sources with a plan, and children to work on them."""
+
+    root: Path
+    limits: ChildLimits = LIMITS
+
+    def __post_init__(self) -> None:
+        self.root.mkdir(parents=True, exist_ok=True)
+        if not (self.root / PLAN).exists():
+            self.set()
+        preload(["pipeline.assets.decimation.pymeshlab_filters", "tests.pipeline.assets.child_kit"])
+        self.child = IsolatedChild(limits=self.limits, setup=nothing)
+
+    def set(self, **plan: str) -> None:
+        """Say what children do: an action by method, such as `die` or `die once`."""
+        (self.root / PLAN).write_text(json.dumps(plan))
+
+    @contextmanager
+    def borrow(self) -> Iterator[IsolatedChild]:
+        yield self.child
+
+    @property
+    def calls(self) -> list[dict[str, Any]]:
+        path = self.root / CALLS
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+    def record(self, name: str) -> ObjectRecord:
+        return record_of(self.root / name, name)

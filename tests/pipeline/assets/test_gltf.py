@@ -1,0 +1,186 @@
+"""glTF trees that would load wrongly or reach outside are refused, each by its own name."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.assets.reading.load import load_mesh
+from pipeline.assets.reading.source_file import read_source
+from pipeline.assets.settings import AssetSettings
+from tests.pipeline.assets.meshes_by_hand import (
+    geometry,
+    gltf_tree,
+    prepare,
+    reason_of,
+    sphere,
+    write_glb,
+)
+
+BALL = sphere(rings=5, columns=8)
+
+
+def _broken_tree(change: Callable[[dict[str, Any]], None]) -> tuple[dict[str, Any], bytes]:
+    tree, buffer = gltf_tree(BALL)
+    change(tree)
+    return tree, buffer
+
+
+def _add_draco(tree: dict[str, Any], plain: bool = True) -> None:
+    """Compressed geometry that readers may ignore where the accessors have plain data as well."""
+    extension = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    tree["meshes"][0]["primitives"][0]["extensions"] = extension
+    tree["extensionsUsed"] = ["KHR_draco_mesh_compression"]
+    if not plain:
+        del tree["accessors"][0]["bufferView"]
+
+
+def _add_targets(
+    tree: dict[str, Any], of_mesh: list[float] | None, of_node: list[float] | None
+) -> None:
+    """Two morph targets that would move every vertex by itself."""
+    tree["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}, {"POSITION": 0}]
+    if of_mesh is not None:
+        tree["meshes"][0]["weights"] = of_mesh
+    if of_node is not None:
+        tree["nodes"][0]["weights"] = of_node
+
+
+TREES: dict[str, tuple[str, Callable[[dict[str, Any]], None]]] = {
+    "own child": ("scene_cycle", lambda t: t["nodes"][0].update(children=[0])),
+    "cycle": (
+        "scene_cycle",
+        lambda t: t.update(nodes=[{"mesh": 0, "children": [1]}, {"children": [0]}]),
+    ),
+    "two parents": (
+        "scene_cycle",
+        lambda t: t.update(nodes=[{"children": [i + 1, i + 1]} for i in range(24)] + [{"mesh": 0}]),
+    ),
+    "instances": (
+        "too_many_instances",
+        lambda t: t.update(nodes=[{"children": list(range(1, 20_001))}] + [{"mesh": 0}] * 20_000),
+    ),
+    "meshopt": (
+        "compressed_geometry",
+        lambda t: t.update(extensionsRequired=["EXT_meshopt_compression"]),
+    ),
+    "meshopt with a place-holder": (
+        "compressed_geometry",
+        lambda t: t["buffers"].append(
+            {"byteLength": 9999, "extensions": {"EXT_meshopt_compression": {"fallback": True}}}
+        ),
+    ),
+    "draco, not required, without plain data": (
+        "unsupported_accessor",
+        lambda t: _add_draco(t, plain=False),
+    ),
+    "skin": ("skinned_mesh", lambda t: t["nodes"][0].update(skin=0)),
+    "morph by the mesh": ("morphed_mesh", lambda t: _add_targets(t, [0.0, 0.5], None)),
+    "morph by the node": ("morphed_mesh", lambda t: _add_targets(t, [0.0, 0.0], [0.1, 0.0])),
+    "weights of no kind": ("load_error", lambda t: t["nodes"][0].update(weights=7)),
+    "extensions of no kind": ("load_error", lambda t: t["buffers"][0].update(extensions=[1])),
+    "unknown extension": (
+        "unsupported_extension",
+        lambda t: t.update(extensionsRequired=["EXT_something_new"]),
+    ),
+    "draco": (
+        "compressed_geometry",
+        lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]),
+    ),
+    "no buffer view": ("unsupported_accessor", lambda t: t["accessors"][0].pop("bufferView")),
+    "sparse": ("unsupported_accessor", lambda t: t["accessors"][0].update(sparse={"count": 1})),
+    "quantised": ("unsupported_accessor", lambda t: t["accessors"][0].update(componentType=5122)),
+    "fan": ("unsupported_primitive", lambda t: t["meshes"][0]["primitives"][0].update(mode=6)),
+    "lines": ("no_faces", lambda t: t["meshes"][0]["primitives"][0].update(mode=1)),
+    "accessor bomb": ("too_many_faces", lambda t: t["accessors"][1].update(count=2**40)),
+    "accessor too long": ("load_error", lambda t: t["accessors"][1].update(count=3000)),
+    "indices": ("index_range", lambda t: t["accessors"][0].update(count=20)),
+    "no such node": ("load_error", lambda t: t["scenes"][0].update(nodes=[5])),
+    "no such mesh": ("load_error", lambda t: t["nodes"][0].update(mesh=5)),
+    "nan in a transform": (
+        "nonfinite_vertices",
+        lambda t: t["nodes"][0].update(translation=[float("nan"), 0, 0]),
+    ),
+    "scaled to nothing": ("extent_range", lambda t: t["nodes"][0].update(scale=[0, 0, 0])),
+}
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_bad_trees(tmp_path: Path, name: str) -> None:
+    reason, change = TREES[name]
+    tree, buffer = _broken_tree(change)
+    assert reason_of(write_glb(tmp_path / "a.glb", tree, buffer)) == reason
+
+
+HARMLESS: dict[str, Callable[[dict[str, Any]], None]] = {
+    "draco beside plain data": _add_draco,
+    "targets without weights": lambda t: _add_targets(t, None, None),
+    "targets of weight zero": lambda t: _add_targets(t, [0.0, 0.0], None),
+    "a node that undoes the mesh's weights": lambda t: _add_targets(t, [1.0, 0.0], [0.0, 0.0]),
+    "a skin that no placed node uses": lambda t: t.update(skins=[{"joints": [0]}]),
+    "required materials": lambda t: t.update(extensionsRequired=["KHR_materials_unlit"]),
+    "an empty extension": lambda t: t["buffers"][0].update(extensions={"EXT_other": {}}),
+}
+
+
+@pytest.mark.parametrize("name", HARMLESS)
+def test_what_changes_no_vertex_is_read_as_if_it_were_not_there(tmp_path: Path, name: str) -> None:
+    tree, buffer = _broken_tree(HARMLESS[name])
+    changed = prepare(write_glb(tmp_path / "a.glb", tree, buffer))
+    plain = prepare(write_glb(tmp_path / "b.glb", *gltf_tree(BALL)))
+    assert geometry(changed) == geometry(plain)
+
+
+def test_up_is_z(tmp_path: Path) -> None:
+    """glTF has +Y up and +Z to the front; we have +Z up and the front at -Y."""
+    tree, buffer = gltf_tree(BALL)
+    tree["nodes"][0] |= {"translation": [1, 2, 3]}
+    plain = read_source(write_glb(tmp_path / "a.glb", *gltf_tree(BALL)), AssetSettings())
+    path = write_glb(tmp_path / "b.glb", tree, buffer)
+    shift = load_mesh(read_source(path, AssetSettings())).positions - load_mesh(plain).positions
+    # The library places nodes in single precision.
+    np.testing.assert_allclose(shift, np.broadcast_to([1.0, -3.0, 2.0], shift.shape), atol=1e-6)
+    np.testing.assert_allclose(load_mesh(plain).positions, BALL.positions, atol=1e-6)
+
+
+def test_instances_count_as_faces(tmp_path: Path) -> None:
+    tree, buffer = gltf_tree(BALL)
+    tree["nodes"] = [{"children": list(range(1, 101))}] + [{"mesh": 0}] * 100
+    path = write_glb(tmp_path / "a.glb", tree, buffer)
+    assert reason_of(path, AssetSettings(max_source_faces=7999)) == "too_many_faces"
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "../secret.bin",
+        "a/../../secret.bin",
+        "%2e%2e/secret.bin",
+        "/etc/hostname",
+        "file:///etc/hostname",
+        "http://127.0.0.1:1/a.bin",
+        "//host/a.bin",
+        "link.bin",
+    ],
+)
+def test_buffers_do_not_lead_out(tmp_path: Path, uri: str) -> None:
+    (tmp_path / "secret.bin").write_bytes(bytes(10_000))
+    folder = tmp_path / "objects"
+    folder.mkdir()
+    (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
+    tree, _ = gltf_tree(BALL)
+    tree["buffers"][0]["uri"] = uri
+    path = folder / "a.gltf"
+    path.write_text(json.dumps(tree))
+    assert reason_of(path) == "external_uri"
+
+
+def test_a_missing_buffer_is_a_missing_file(tmp_path: Path) -> None:
+    tree, _ = gltf_tree(BALL)
+    tree["buffers"][0]["uri"] = "gone.bin"
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(tree))
+    assert reason_of(path) == "missing_file"

@@ -1,0 +1,167 @@
+"""The stage: the next method where one fails, each object once, and only lasting refusals kept."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.prepare import prepare_asset
+from pipeline.assets.settings import AssetSettings, GateSettings
+from pipeline.assets.stage import _rising, prepare_assets
+from pipeline.assets.store import AssetStore
+from storage.errors import TrilightError
+from tests.pipeline.assets.child_kit import Bench
+from tests.pipeline.assets.meshes_by_hand import knot, write_obj
+from tests.pipeline.assets.stage_kit import FIRST, SECOND, SETTINGS, THIRD, made, methods, run
+
+
+@pytest.fixture(autouse=True)
+def source(bench: Bench) -> Path:
+    """3840 faces: every level needs a method."""
+    return write_obj(bench.root / "knot.obj", knot())
+
+
+def test_the_first_method_is_enough_where_it_works(bench: Bench) -> None:
+    assert methods(made(bench)) == [(1000, FIRST), (500, FIRST), (340, FIRST)]
+    assert [call["method"] for call in bench.calls] == [FIRST]
+
+
+def test_the_next_method_starts_in_a_new_child_where_one_crashed(bench: Bench) -> None:
+    bench.set(pymeshlab_collapse="crash")
+    assert methods(made(bench)) == [(1000, SECOND), (500, SECOND), (340, SECOND)]
+    assert [call["method"] for call in bench.calls] == [FIRST, FIRST, SECOND]
+    assert len({call["pid"] for call in bench.calls}) == 3
+    assert [call["budgets"] for call in bench.calls] == 3 * [[1000, 500, 340]]
+
+
+def test_the_next_method_makes_only_what_the_first_one_missed(bench: Bench) -> None:
+    bench.set(**{f"{FIRST} misses": "900"})
+    asset = made(bench)
+    assert methods(asset) == [(1000, FIRST), (500, SECOND), (340, SECOND)]
+    first, second = bench.calls
+    assert second["budgets"] == [500, 340]
+    assert first["pid"] != second["pid"]
+
+
+def test_epsilon_goes_with_the_finest_level(bench: Bench) -> None:
+    """A second method that only fills in coarser levels must not search for the smallest."""
+    bench.set(**{f"{FIRST} misses": "900"})
+    made(bench, AssetSettings(budgets=(1000, 240, 200), epsilon=0.005))
+    first, *others = (call["epsilon"] for call in bench.calls)
+    assert first == 0.005
+    assert others and set(others) == {None}
+
+
+def test_a_level_that_wastes_its_budget_is_left_out(source: Path) -> None:
+    """Clusters at 1000 may come out coarser than the collapse at 500, which then serves both."""
+    made = prepare_asset(source, SETTINGS, FIRST).asset.levels
+    assert [len(level.faces) for level in made] == [1000, 500, 340]
+    wasteful = dataclasses.replace(made[0], faces=made[0].faces[:450])
+    for levels in ([wasteful, *made[1:]], [*made[1:], wasteful]):
+        assert _rising(levels) == made[1:]
+    assert _rising(list(made)) == made
+
+
+def test_an_object_that_no_method_serves_is_refused_as_the_first_one_failed(
+    bench: Bench, source: Path
+) -> None:
+    settings = AssetSettings(budgets=(240,), gate=GateSettings(max_error_p99=1e-4))
+    messages = [prepare_asset(source, settings, name).missed[240][1] for name in (FIRST, SECOND)]
+    assert messages[0] != messages[1]
+    prepared, (failure,) = run(bench, "knot.obj", settings=settings)
+    assert not prepared
+    assert (failure.stage, failure.item) == ("assets", "knot.obj")
+    assert (failure.reason, failure.message) == ("error_over_bound", messages[0])
+    assert [call["method"] for call in bench.calls] == [FIRST, SECOND, THIRD]
+    assert len({call["pid"] for call in bench.calls}) == 3
+
+
+def test_a_method_that_stood_in_for_another_is_not_tried_twice(bench: Bench) -> None:
+    """400 pages on one edge: pymeshlab would not end, so meshoptimizer takes its turn."""
+    pages = np.arange(2, 402)
+    faces = np.column_stack([np.zeros(400, np.int64), np.ones(400, np.int64), pages])
+    positions = np.random.default_rng(0).random((402, 3))
+    write_obj(bench.root / "book.obj", TriangleMesh(positions=positions, faces=faces))
+    tight = AssetSettings(budgets=(240,), gate=GateSettings(max_error_p99=1e-4))
+    _, (failure,) = run(bench, "book.obj", settings=tight)
+    assert failure.reason == "error_over_bound"
+    assert [call["method"] for call in bench.calls] == [FIRST, THIRD]
+
+
+def test_an_unusable_object_is_tried_once(bench: Bench) -> None:
+    bench.set(pymeshlab_collapse="refuse")
+    _, (failure,) = run(bench, "knot.obj")
+    assert failure.reason == "degenerate"
+    assert len(bench.calls) == 1
+
+
+def test_a_mistake_of_the_user_stops_the_run(bench: Bench) -> None:
+    bench.set(pymeshlab_collapse="mistake")
+    with pytest.raises(TrilightError, match="planned mistake"):
+        run(bench, "knot.obj")
+
+
+def test_the_second_run_makes_nothing_and_says_the_same(bench: Bench) -> None:
+    (bench.root / "junk.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 7\n")
+    first = run(bench, "knot.obj", "junk.obj", "gone.obj")
+    assert [failure.reason for failure in first[1]] == ["index_range", "missing_file"]
+    calls = len(bench.calls)
+    second = run(bench, "knot.obj", "junk.obj", "gone.obj")
+    assert second == first
+    assert len(bench.calls) == calls
+
+
+def test_copies_are_made_once_and_keep_their_names(bench: Bench) -> None:
+    write_obj(bench.root / "copy.obj", knot())
+    prepared, _ = run(bench, "knot.obj", "copy.obj")
+    assert [asset.record.uid for asset in prepared] == ["knot.obj", "copy.obj"]
+    assert prepared[0].path == prepared[1].path
+    assert len(bench.calls) == 1
+
+
+def test_other_settings_are_another_outcome(bench: Bench) -> None:
+    for budget in (500, 340):
+        (level,) = made(bench, AssetSettings(budgets=(budget,))).levels
+        assert len(level.faces) == budget
+    assert len(bench.calls) == 2
+
+
+def test_done_is_called_for_every_object(bench: Bench) -> None:
+    count = iter(range(1, 100))
+    last = [0]
+    prepare_assets(
+        [bench.record(name) for name in ("knot.obj", "gone.obj")],
+        SETTINGS,
+        AssetStore(bench.root.parent / "store"),
+        borrow_child=bench.borrow,
+        workers=2,
+        done=lambda: last.append(next(count)),
+    )
+    assert last == [0, 1, 2]
+
+
+def test_a_store_that_cannot_be_written_stops_the_run(bench: Bench) -> None:
+    (bench.root.parent / "store").write_text("a file where the folder should be")
+    with pytest.raises(TrilightError, match="cannot write"):
+        run(bench, "knot.obj")
+    assert not bench.calls
+
+
+def test_refusals_are_plain_text(bench: Bench) -> None:
+    bench.set(pymeshlab_collapse="refuse")
+    run(bench, "knot.obj")
+    (path,) = (bench.root.parent / "store").rglob("*.json")
+    assert json.loads(path.read_text()) == {"reason": "degenerate", "message": "planned"}
+
+
+def test_a_file_that_the_system_will_not_open_is_refused_today_only(bench: Bench) -> None:
+    loop = bench.root / "loop.obj"
+    loop.symlink_to(loop)
+    _, (failure,) = run(bench, "loop.obj")
+    assert failure.reason == "unreadable_file"
+    loop.unlink()
+    write_obj(loop, knot())
+    assert run(bench, "loop.obj")[1] == []

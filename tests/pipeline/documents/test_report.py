@@ -1,0 +1,198 @@
+"""`report.html` and its gallery: inert, complete, and the same whenever it is written."""
+
+import re
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from pipeline.documents.distributions import dataset_distributions
+from pipeline.documents.gallery import write_gallery
+from pipeline.documents.report import write_report
+from storage.dataset.dataset import Dataset
+from storage.dataset.layout import DatasetFolder
+from storage.errors import TrilightError
+from storage.records.objects import Failure
+from storage.records.scene import SceneObject
+from tests.pipeline.documents.dataset_by_hand import (
+    five_scenes,
+    furnished,
+    locked,
+    sample,
+    write_dataset,
+)
+from tests.pipeline.documents.pages_read import HARM, Tags, read
+
+ACTIVE = {"script", "iframe", "link", "object", "embed", "form", "base"}
+
+
+def report_of(dataset: Dataset, max_scenes: int = 48) -> Path:
+    return write_report(dataset, dataset_distributions(dataset), max_scenes=max_scenes)
+
+
+def pages(report: Path) -> dict[Path, Tags]:
+    files = [report, *sorted((report.parent / "report").glob("*"))]
+    return {path: read(path.read_bytes()) for path in files}
+
+
+def text_of(tags: Tags) -> str:
+    return " ".join(" ".join(tags.text).split())
+
+
+def hostile(root: Path) -> Dataset:
+    """Return a dataset whose every text from outside is markup."""
+    rights = {"licence": HARM, "attribution": HARM, "source_url": "javascript:alert(3)"}
+    scene = furnished([HARM], HARM, **rights)
+    shell = SceneObject(name=HARM, kind="shell")
+    scene = furnished([HARM], HARM, **rights).with_provenance({**scene.provenance, HARM: [HARM]})
+    object.__setattr__(scene, "objects", (shell, *scene.objects[1:]))
+    failures = [
+        Failure(stage="scenes", item="000000000", reason=HARM, message=HARM),
+        Failure(stage=HARM, item=HARM, reason="$\\frac{$ \x07\n ł 高", message=HARM),
+    ]
+    objects = [locked(HARM, HARM, title=HARM, **{k: HARM for k in ("attribution", "source_url")})]
+    shards = {"train-000000.tar": [sample(0, scene)]}
+    return write_dataset(root, shards, objects=objects, failures=failures)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Five scenes with their report."""
+    dataset = five_scenes(tmp_path_factory.mktemp("five"))
+    report_of(dataset)
+    return dataset
+
+
+@pytest.fixture(scope="module")
+def five(dataset: Dataset) -> dict[str, Tags]:
+    """The pages of five scenes, by file name without suffix."""
+    return {path.stem: tags for path, tags in pages(dataset.folder.report).items()}
+
+
+def test_text_from_outside_stays_text(tmp_path: Path) -> None:
+    shown = pages(report_of(hostile(tmp_path)))
+    assert len(shown) == 2
+    for path, tags in shown.items():
+        assert not ACTIVE & set(tags.tags)
+        assert not any(name.startswith("on") for name in tags.names)
+        assert not any("javascript" in link for link in tags.links)
+        data = path.read_bytes()
+        assert not re.search(rb"<script|@import|url\(", data)
+        assert "".join(tags.text).count(HARM) >= 4
+    # the address is shown on the page of the scene, and is no link
+    assert "javascript:alert(3)" in text_of(shown[tmp_path / "report" / "000000000.html"])
+
+
+def test_only_source_addresses_lead_elsewhere(tmp_path: Path) -> None:
+    address = 'https://example.org/a?b=1&c="x"'
+    scene = furnished(["a"], source_url=address, attribution="somebody")
+    dataset = write_dataset(tmp_path, {"test-000000.tar": [sample(0, scene)]})
+    shown = pages(report_of(dataset))
+    page = shown[tmp_path / "report" / "000000000.html"]
+    assert [link for link in page.links if urlsplit(link).scheme not in ("", "data")] == [address]
+    assert not [link for link in shown[tmp_path / "report.html"].links if "//" in link[:12]]
+    assert "somebody" in text_of(page)
+
+
+def test_links_lead_somewhere(dataset: Dataset) -> None:
+    shown = pages(dataset.folder.report)
+    followed = 0
+    for path, tags in shown.items():
+        for link in tags.links:
+            parts = urlsplit(link)
+            if parts.scheme == "data":
+                assert link.startswith("data:image/png;base64,")
+                continue
+            assert not parts.scheme, link
+            target = (path.parent / parts.path).resolve() if parts.path else path
+            assert target in shown, link
+            assert not parts.fragment or parts.fragment in shown[target].ids, link
+            followed += 1
+    # five cards, five ways back, four neighbours each way, eleven places of the report
+    assert followed == 5 + 5 + 4 + 4 + 11
+
+
+def test_neighbours_follow_the_gallery(five: dict[str, Tags]) -> None:
+    cards = [link for link in five["report"].links if link.startswith("report/")]
+    order = ["000000000", "000000001", "000000002", "000000003", "000000020"]
+    assert cards == [f"report/{key}.html" for key in order]
+    pages_only = [link for link in five["000000002"].links if link.endswith(".html")]
+    assert pages_only == ["000000001.html", "000000003.html"]
+
+
+def test_the_numbers_are_on_the_page(five: dict[str, Tags]) -> None:
+    text = text_of(five["report"])
+    assert "scenes 5 (4 train, 1 test)" in text
+    assert "views 10, 2 of each scene" in text
+    assert "objects 4, 3 of them in scenes" in text
+    assert "plane 3 0 3 wall 1 1 2 all 4 1 5" in text
+    assert "triangles of a scene 5 3 5 5.4 7" in text
+    assert "objects 6 0.0% 100.0%" in text  # smooth, many colours
+    assert "floors and walls 5 100.0% 0.0%" in text
+    assert "train 8 41.5 38.0 75.0% 25.0%" in text
+    assert "test 2 44.0 44.0 100.0% 0.0%" in text
+    assert "scenes no_room 2 1 1 0 0" in text
+    assert "CC-BY-4.0 1 1 1 CC0-1.0 3 2 5" in text
+    assert "2 cameras stand in for rejected ones" in text
+
+
+def test_a_scene_has_its_facts(five: dict[str, Tags]) -> None:
+    tags = five["000000001"]
+    text = text_of(tags)
+    assert "train, template wall, 7 triangles" in text
+    assert "0 2.000, 0.000, 1.000 2.236 26.6 0.0 45.0 128 42.00 33.25 0.25 no 0 7" in text
+    assert "0 a object a CC0-1.0 flat 2 1 b object b CC0-1.0 flat 2" in text
+    assert "light 0.000, -0.033, 2.000 2.000 100.0, 100.0, 100.0 0.02000" in text
+    assert text.count("no_room") == 2  # both rejected attempts at it
+    assert tags.tags.count("figure") == 2
+    assert tags.tags.count("i") == 1 + 2 + 2  # swatches
+    assert "no_room" not in text_of(five["000000000"])
+
+
+def test_swatches_show_the_albedo(five: dict[str, Tags]) -> None:
+    # linear 0.6 is 0.7977 in sRGB, 203 of 255
+    assert "background: #cb0000" in five["000000000"].styles
+
+
+def test_one_scene_has_neither_neighbours_nor_rejections(tmp_path: Path) -> None:
+    dataset = write_dataset(tmp_path, {"validation-000002.tar": [sample(9, furnished([]))]})
+    shown = pages(report_of(dataset))
+    assert shown[tmp_path / "report" / "000000009.html"].links[0] == "../report.html#gallery"
+    assert "before" not in text_of(shown[tmp_path / "report" / "000000009.html"])
+    assert "1 of 1 scenes" in text_of(shown[tmp_path / "report.html"])
+    assert "Nothing was rejected" in text_of(shown[tmp_path / "report.html"])
+
+
+def test_no_scenes_at_all(tmp_path: Path) -> None:
+    shown = pages(report_of(write_dataset(tmp_path, {})))
+    assert "scenes 0 (none)" in text_of(shown[tmp_path / "report.html"])
+
+
+def test_the_gallery_is_bounded_and_old_pages_go(tmp_path: Path) -> None:
+    dataset = five_scenes(tmp_path)
+    write_gallery(dataset, (), dataset.folder, 48)
+    mine = tmp_path / "report" / "notes.html"
+    mine.write_text("kept")
+    report = report_of(dataset, max_scenes=2)
+    # one scene of each split
+    names = sorted(path.name for path in (tmp_path / "report").iterdir())
+    assert names == ["000000000.html", "000000020.html", "notes.html"]
+    assert "2 of 5 scenes" in text_of(read(report.read_bytes()))
+    with pytest.raises(TrilightError, match="1001 scenes; expected 0 to 1000"):
+        report_of(dataset, max_scenes=1001)
+
+
+def test_writing_elsewhere_gives_the_same_bytes_and_leaves_the_dataset_alone(
+    tmp_path: Path, dataset: Dataset
+) -> None:
+    root = dataset.folder.root
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    found = dataset_distributions(dataset)
+    report = write_report(dataset, found, out=DatasetFolder(tmp_path))
+    assert report == tmp_path / "report.html"
+    written = {path.relative_to(tmp_path): path.read_bytes() for path in pages(report)}
+    assert written == {
+        path.relative_to(root): path.read_bytes() for path in pages(root / "report.html")
+    }
+    assert not any(str(root).encode() in data for data in written.values())
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before

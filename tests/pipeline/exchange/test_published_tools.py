@@ -1,0 +1,111 @@
+"""What the published converter demands of a scene file and its meshes, asked in plain words.
+
+It refuses fields that it does not know and values of another type, loads every mesh with trimesh
+as it stands, and writes one file for each object, named by the object.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.exchange.convert import convert_scene
+from pipeline.exchange.open_scene import scene_source
+from pipeline.exchange.renderformer_json_write import described_files
+from storage.records.scene import Scene, SceneObject
+from storage.records.scene_file import encode_scene
+from tests.pipeline.scenes.example_scenes import EXAMPLES, example_scene
+from tests.scenes_by_hand import LIGHT, tiny_scene
+
+VECTOR = [float, float, float]
+MATERIAL = {
+    "diffuse": VECTOR, "specular": VECTOR, "roughness": float, "emissive": VECTOR,
+    "smooth_shading": bool, "rand_tri_diffuse_seed": type(None),
+}  # fmt: skip
+TRANSFORM = {"translation": VECTOR, "rotation": VECTOR, "scale": VECTOR, "normalize": bool}
+OBJECT = {"mesh_path": str, "transform": TRANSFORM, "material": MATERIAL}
+CAMERA = {"position": VECTOR, "look_at": VECTOR, "up": VECTOR, "fov": float}
+"""Fields of version 1.0 with the types that they must have; some of them could be left out."""
+
+
+def shape_of(value: Any) -> Any:
+    """Return the types of a JSON value."""
+    if isinstance(value, dict):
+        return {key: shape_of(one) for key, one in value.items()}
+    return [shape_of(one) for one in value] if isinstance(value, list) else type(value)
+
+
+def written(scene: Scene, folder: Path) -> dict[str, Any]:
+    """Return what `trilight convert` writes beside the meshes."""
+    (folder / "a.safetensors").write_bytes(encode_scene(scene))
+    source = scene_source(str(folder / "a.safetensors"))
+    convert_scene(source, folder / "a.json", budget=None, done=lambda finished, of: None)
+    return dict(json.loads((folder / "a.json").read_text()))
+
+
+def assert_usable(described: dict[str, Any], scene: Scene, folder: Path) -> None:
+    assert set(described) == {"scene_name", "version", "objects", "cameras"}
+    assert described["version"] == "1.0"
+    assert shape_of(described["cameras"]) == [CAMERA] * scene.num_views
+    triangles, rows = [], []
+    for name, entry in described["objects"].items():
+        assert shape_of(entry) == OBJECT
+        assert len(f"{name}.obj".encode()) <= 255 and Path(f"{name}.obj").name == f"{name}.obj"
+        mesh = trimesh.load(f"{folder}/{entry['mesh_path']}", process=False)
+        assert isinstance(mesh, trimesh.Trimesh)
+        triangles.append(mesh.triangles.astype(np.float32))
+        material = entry["material"]
+        row = [*material["diffuse"], *material["specular"], material["roughness"]]
+        rows += [[*row, *material["emissive"]]] * len(mesh.triangles)
+        assert (np.array(material["diffuse"]) + material["specular"]).max() <= 1 + 1e-6
+    assert len({name.casefold() for name in described["objects"]}) == len(described["objects"])
+    found = np.concatenate([np.concatenate(triangles).reshape(-1, 9), rows], axis=1)
+    corners = scene.vertex_positions[scene.faces].reshape(-1, 9)
+    want = np.concatenate([corners, scene.materials[scene.material_index]], axis=1)
+    assert np.array_equal(np.unique(found, axis=0), np.unique(want, axis=0))
+    assert len(found) == len(want)
+
+
+@pytest.mark.parametrize("name", list(EXAMPLES))
+def test_published_scenes_are_written_as_the_published_converter_reads(
+    shared: Path, tmp_path: Path, name: str
+) -> None:
+    scene = example_scene(shared, name)
+    assert_usable(written(scene, tmp_path), scene, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("light/../x", "light\\..\\x"), ("A", "a"), (".", ".."), ("ü" * 200, "ü" * 100), ("", "\0")],
+)
+def test_any_names_become_names_of_files(tmp_path: Path, names: tuple[str, str]) -> None:
+    objects = (SceneObject(name=names[0], kind="shell"), SceneObject(name=names[1], kind="emitter"))
+    scene = dataclasses.replace(tiny_scene(), objects=objects)
+    assert_usable(written(scene, tmp_path), scene, tmp_path)
+
+
+def test_light_beyond_half_floats_is_said_to_be_cut_off() -> None:
+    scene = tiny_scene()
+    scene.materials[LIGHT, 7:] = 65505
+    assert any("cuts off" in text for text in described_files(scene, "a").lost)
+
+
+def test_our_hdf5_has_what_the_published_program_takes(shared: Path, tmp_path: Path) -> None:
+    """Every array that it loads, of one number of triangles and of views, finite in half floats."""
+    scene = example_scene(shared, "crystals")
+    (tmp_path / "a.safetensors").write_bytes(encode_scene(scene))
+    source = scene_source(str(tmp_path / "a.safetensors"))
+    convert_scene(source, tmp_path / "a.h5", budget=None, done=lambda finished, of: None)
+    with h5py.File(tmp_path / "a.h5") as file:
+        found = {name: np.array(file[name]).astype(np.float32) for name in file}
+    count, views = scene.num_triangles, scene.num_views
+    assert {name: array.shape for name, array in found.items()} == {
+        "triangles": (count, 3, 3), "vn": (count, 3, 3), "texture": (count, 13, 32, 32),
+        "c2w": (views, 4, 4), "fov": (views,),
+    }  # fmt: skip
+    assert all(np.isfinite(array.astype(np.float16)).all() for array in found.values())

@@ -1,0 +1,144 @@
+"""Scene files: what is read, what is named, and what is refused with file, field, got, expected."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.exchange.renderformer_json import MAX_BYTES, read_description
+from storage.errors import TrilightError
+from tests.pipeline.scenes.example_scenes import EXAMPLES
+from tests.pipeline.scenes.one_box import BOX, CAMERA, MATERIAL, OBJECT, SCENE, TRANSFORM, changed
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_example_scenes_hold_no_unknown_field(shared: Path, name: str) -> None:
+    data = (shared / "renderformer_scenes" / f"{name}.json").read_bytes()
+    described = read_description(data, name)
+    assert described.unknown_fields == ()
+    assert [entry.name for entry in described.objects] == list(json.loads(data)["objects"])
+    assert len(described.cameras) == 1
+
+
+def test_values_are_those_of_the_file() -> None:
+    described = read_description(changed(), "a.json")
+    (box,), (camera,) = described.objects, described.cameras
+    assert box.transform.translation == (0, 0, 0.5)
+    assert box.transform.scale == (1, 2, 1)
+    assert box.transform.rotation_deg == (0, 90, 0)
+    assert box.material.diffuse == (0.5, 0.4, 0.3)
+    assert not box.material.emits
+    assert box.remesh_faces is None
+    assert camera.fov_deg == 40
+
+
+def test_what_may_be_missing_has_the_published_default() -> None:
+    scene = json.loads(changed())
+    del scene["objects"]["box"]["transform"]["normalize"]
+    for name in ("rand_tri_diffuse_seed", "random_diffuse_max", "random_diffuse_type"):
+        del scene["objects"]["box"]["material"][name]
+    (box,) = read_description(json.dumps(scene).encode(), "a.json").objects
+    assert box.transform.normalize
+    assert box.material.rand_tri_diffuse_seed is None
+    assert box.material.random_diffuse_max == 1
+    assert box.material.random_diffuse_type == "per-shading-group"
+    assert (box.remesh, box.remesh_target_face_num) == (False, 2048)
+
+
+def test_seed_zero_is_a_seed() -> None:
+    (box,) = read_description(changed(*MATERIAL, rand_tri_diffuse_seed=0), "a.json").objects
+    assert box.material.rand_tri_diffuse_seed == 0
+
+
+def test_unknown_fields_are_named_and_harmless() -> None:
+    scene = json.loads(changed())
+    scene["environment"] = {}
+    scene["objects"]["box"]["material"]["ruoghness"] = 1
+    scene["objects"]["box"]["transform"]["line\nbreak"] = 1
+    scene["cameras"][0]["near"] = 0.1
+    described = read_description(json.dumps(scene).encode(), "a.json")
+    assert sorted(described.unknown_fields) == sorted(
+        [
+            "environment",
+            "objects.box.material.ruoghness",
+            repr("objects.box.transform.line\nbreak"),
+            "cameras[0].near",
+        ]
+    )
+    assert described.objects == read_description(changed(), "a.json").objects
+
+
+REFUSED = [
+    (changed(version="2.0"), "version is '2.0'; expected '1.0'"),
+    (changed(objects=[]), "objects is []; expected a JSON object"),
+    (changed(objects={}), "0 objects; expected 1 to 8192"),
+    (changed(objects={str(i): 1 for i in range(8193)}), "8193 objects; expected 1 to 8192"),
+    (changed(objects={"a\nb": OBJECT}), "expected a printable name"),
+    (changed(cameras=[]), "cameras is []; expected a list of 1 to 1000"),
+    (changed(cameras=[1]), "cameras[0] is 1; expected a JSON object"),
+    (changed(scene_name=...), "scene_name is missing"),
+    (changed(*BOX, mesh_path=...), "objects.box.mesh_path is missing"),
+    (changed(*BOX, mesh_path="a\0b"), "objects.box.mesh_path is 'a\\x00b'; expected printable"),
+    (changed(*BOX, remesh=1), "objects.box.remesh is 1; expected true or false"),
+    (changed(*BOX, remesh_target_face_num=2), "is 2; expected a whole number from 4"),
+    (changed(*TRANSFORM, scale=2), "objects.box.transform.scale is 2; expected a list of three"),
+    (changed(*TRANSFORM, scale=[1, 1]), "expected a list of three numbers"),
+    (changed(*TRANSFORM, rotation=[0, "90", 0]), "transform.rotation[1] is 90; expected a number"),
+    (changed(*TRANSFORM, translation=[1e9, 0, 0]), "translation[0] is 1000000000.0; expected a nu"),
+    (changed(*TRANSFORM, translation=[10**400, 0, 0]), "translation[0] is 1000000"),
+    (changed(*TRANSFORM, normalize="yes"), "transform.normalize is yes; expected true or false"),
+    (changed(*MATERIAL, diffuse=[0.5, 0.5, 1.5]), "diffuse[2] is 1.5; expected a number from 0 to"),
+    (changed(*MATERIAL, diffuse=[True, 0, 0]), "diffuse[0] is True; expected a number"),
+    (changed(*MATERIAL, emissive=[-1, 0, 0]), "emissive[0] is -1; expected a number from 0"),
+    (changed(*MATERIAL, roughness=None), "roughness is None; expected a number"),
+    (changed(*MATERIAL, smooth_shading=...), "objects.box.material.smooth_shading is missing"),
+    (changed(*MATERIAL, random_diffuse_type="x"), "is x; expected one of per-triangle, per-shadi"),
+    (changed(*MATERIAL, random_diffuse_type=[]), "is []; expected one of per-triangle"),
+    (changed(*MATERIAL, rand_tri_diffuse_seed=-1), "is -1; expected a whole number from 0"),
+    (changed(*MATERIAL, rand_tri_diffuse_seed=1.5), "is 1.5; expected a whole number"),
+    (changed(*CAMERA, fov=180), "cameras[0].fov is 180; expected a number from 0.001 to 179"),
+    (changed().replace(b"40", b"1e999"), "cameras[0].fov is inf; expected a number"),
+    (b"", "not readable as JSON"),
+    (b"\xff\xfe", "not readable as JSON"),
+    (b"[" * 100_000, "a.json: "),
+    (b"[]", "the file is []; expected a JSON object"),
+    (b'{"a": NaN}', "NaN is no JSON number"),
+    (b'{"a": 1' + b"0" * 5000 + b"}", "not readable as JSON"),
+    (b'{"a": 1, "a": 2}', "the name 'a' stands twice"),
+    (b" " * (MAX_BYTES + 1), "expected at most 4194304"),
+]
+
+
+@pytest.mark.parametrize(("data", "message"), REFUSED)
+def test_what_is_wrong_is_named(data: bytes, message: str) -> None:
+    with pytest.raises(TrilightError) as caught:
+        read_description(data, "a.json")
+    assert message in str(caught.value)
+    assert str(caught.value).startswith("a.json: ")
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400  # however long the value is
+
+
+def test_every_field_is_looked_at() -> None:
+    """No field of the example may be turned into nonsense, or left out, without a complaint."""
+    optional = {"normalize", "rand_tri_diffuse_seed", "random_diffuse_max", "random_diffuse_type"}
+
+    def visit(path: tuple[str | int, ...], node: Any) -> None:
+        for name in list(node):
+            if isinstance(node[name], dict):
+                visit((*path, name), node[name])
+            _expect_refusal(changed(*path, **{name: {"x": "y"}}))
+            if name not in optional:
+                _expect_refusal(changed(*path, **{name: ...}))
+
+    visit((), {name: value for name, value in SCENE.items() if name != "objects"})
+    visit(BOX, OBJECT)
+    visit(CAMERA, SCENE["cameras"][0])  # type: ignore[index]
+
+
+def _expect_refusal(data: bytes) -> None:
+    read: Callable[[], Any] = lambda: read_description(data, "a.json")  # noqa: E731
+    with pytest.raises(TrilightError):
+        read()

@@ -1,0 +1,275 @@
+"""What other programs write in USD, as a scene: places, areas, colours, radiance, and losses."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
+
+from pipeline.exchange.usd.polygons import triangulated
+from pipeline.exchange.usd.read import UsdScene, read_usd, usd_keys
+from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
+from storage.errors import TrilightError
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_scene
+from tests.pipeline.exchange.strangers_stage import L_SHAPE, mesh, write_stage
+from tests.scenes_by_hand import tiny_scene
+
+
+def read(path: Path, key: str | None = None) -> UsdScene:
+    return read_usd(path, key, None, "LicenseRef-user-provided")
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> UsdScene:
+    return read(write_stage(tmp_path))
+
+
+def object_of(scene: Scene, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners [T, 3, 3] and material rows [T, 10] of an object by name."""
+    (row,) = (i for i, entry in enumerate(scene.objects) if entry.name == name)
+    own = scene.object_index == row
+    corners = scene.vertex_positions[scene.faces[own]].astype(np.float64)
+    return corners, scene.materials[scene.material_index[own]]
+
+
+def facing(corners: np.ndarray) -> np.ndarray:
+    """Return the sum of area vectors [3]: area times direction of a flat object."""
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(cross.sum(axis=0) / 2)
+
+
+def test_units_and_axes(stage: UsdScene) -> None:
+    """Centimetres with Y up become metres with Z up; to single precision."""
+    corners, _ = object_of(stage.scene, "Grid")
+    assert facing(corners) == pytest.approx([0, 0, 4], abs=1e-6)
+    assert stage.scene.c2w[0, :3, 3] == pytest.approx([0, -3, 0.5], abs=1e-6)
+    assert stage.scene.fov_deg[0] == pytest.approx(2 * math.degrees(math.atan(18 / 50)), rel=1e-6)
+
+
+def test_a_texture_becomes_the_mean_of_each_triangle_in_linear_light(stage: UsdScene) -> None:
+    """Left half red, right half green of sRGB 188, linear 0.503; the parting runs through both.
+
+    Either triangle of the square has three quarters of its area on one side of the parting; the
+    grid of 36 points gives that within a column of points: 0.04.
+    """
+    _, rows = object_of(stage.scene, "Grid")
+    assert rows[:, 0].sum() == pytest.approx(1, abs=0.08)
+    assert rows[:, 0].max() == pytest.approx(0.75, abs=0.04)
+    assert rows[:, 1].sum() == pytest.approx(0.503, abs=0.04)
+    assert rows[:, 6] == pytest.approx(0.3)
+    assert any("texture of diffuseColor became one value" in text for text in stage.lost)
+
+
+@pytest.mark.parametrize(
+    ("name", "area_vector", "radiance"),
+    [
+        ("rect", [0, 0, -0.1], [20, 20, 20]),
+        ("disk", [0, math.pi * 0.04, 0], [1, 0.5, 0.25]),
+        ("lamp", [0, 0, 0.005], [7, 7, 7]),
+        ("sphere", [0, 0, 0], [3 / (4 * math.pi * 0.01)] * 3),
+    ],
+)
+def test_lights_have_their_area_and_radiance(
+    stage: UsdScene, name: str, area_vector: list[float], radiance: list[float]
+) -> None:
+    corners, rows = object_of(stage.scene, name)
+    # sums of up to 128 areas in single precision
+    assert facing(corners) == pytest.approx(area_vector, abs=1e-6)
+    assert rows[:, EMISSION] == pytest.approx(np.tile(radiance, (len(rows), 1)), rel=1e-5)
+
+
+@pytest.mark.parametrize(("kelvin", "redder"), [(None, 1.0), (3000.0, 6.5)])
+def test_a_stated_temperature_tints_a_light(
+    tmp_path: Path, kelvin: float | None, redder: float
+) -> None:
+    """USD's own table for 3000 K, red over blue; Blender switches it on and states none."""
+    path = write_stage(tmp_path)
+    opened = Usd.Stage.Open(str(path))
+    light = UsdLux.RectLight.Get(opened, "/W/rect")
+    light.CreateEnableColorTemperatureAttr(True)
+    if kelvin is not None:
+        light.CreateColorTemperatureAttr(kelvin)
+    opened.GetRootLayer().Save()
+    red, _, blue = object_of(read(path).scene, "rect")[1][0, EMISSION]
+    assert red / blue == pytest.approx(redder, rel=0.01)  # 6.51 in the table
+    assert (red == blue == 20) == (kelvin is None)
+
+
+def test_a_sphere_has_the_area_of_a_sphere(stage: UsdScene) -> None:
+    corners, _ = object_of(stage.scene, "sphere")
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.linalg.norm(cross, axis=1).sum() / 2 == pytest.approx(4 * math.pi * 0.01, rel=1e-5)
+    outward = np.einsum("ti,ti->t", cross, corners.mean(axis=1))
+    assert (outward > 0).all()
+
+
+def test_instances_stand_where_they_are_placed_and_mirrors_keep_their_outside(
+    stage: UsdScene,
+) -> None:
+    for name, left in (("L", 0), ("L.2", 0.3), ("L.3", 0.6), ("L.4", -0.2)):
+        corners, _ = object_of(stage.scene, name)
+        assert facing(corners) == pytest.approx([0, -0.03, 0], abs=1e-7)
+        assert corners[..., 0].min() == pytest.approx(left, abs=1e-7)
+    names = [entry.name for entry in stage.scene.objects]
+    assert "hidden" not in names and "guide" not in names
+
+
+def test_what_is_lost_is_said(stage: UsdScene) -> None:
+    assert not stage.exact
+    for words in ("1 x DomeLight", "/W/rect: emits to one side", "does not glow"):
+        assert any(words in text for text in stage.lost), words
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_our_own_files_are_exact(tmp_path: Path, suffix: str) -> None:
+    write_usd(tmp_path / f"a{suffix}", tiny_scene())
+    found = read(tmp_path / f"a{suffix}")
+    assert found.exact and found.lost == ()
+    assert encode_scene(found.scene) == encode_scene(tiny_scene())
+    assert usd_keys(tmp_path / f"a{suffix}") == [""]
+
+
+def test_our_own_files_read_as_a_stranger_does_hold_the_same_light(tmp_path: Path) -> None:
+    """Every word of USD that we write means to our own reader what the exact attributes say."""
+    write_usd(tmp_path / "a.usda", tiny_scene())
+    text = (tmp_path / "a.usda").read_text()
+    (tmp_path / "b.usda").write_text(text.replace("trilight:", "other:"))
+    found, scene = read(tmp_path / "b.usda"), tiny_scene()
+    assert not found.exact
+    back = found.scene
+    assert np.array_equal(back.vertex_positions[back.faces], scene.vertex_positions[scene.faces])
+    assert np.array_equal(back.vertex_normals[back.faces], scene.vertex_normals[scene.faces])
+    assert np.array_equal(
+        back.materials[back.material_index], scene.materials[scene.material_index]
+    )
+    assert np.array_equal(back.c2w, scene.c2w)
+    assert back.fov_deg == pytest.approx(scene.fov_deg, rel=1e-6)  # a focal length in between
+
+
+def test_what_was_moved_is_moved(tmp_path: Path) -> None:
+    write_usd(tmp_path / "a.usda", tiny_scene())
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/floor")).AddTranslateOp().Set((1, 2, 3))
+    stage.GetRootLayer().Export(str(tmp_path / "b.usda"))
+    found = read(tmp_path / "b.usda")
+    assert not found.exact and any("changed since" in text for text in found.lost)
+    corners, _ = object_of(found.scene, "floor")
+    assert corners.reshape(-1, 3).min(axis=0) == pytest.approx([0, 1, 3])
+    assert [entry.kind for entry in found.scene.objects] == ["shell", "emitter"]
+
+
+def test_shards_give_their_scenes(tmp_path: Path) -> None:
+    other = tiny_scene(fov_deg=np.array([30, 50], np.float32))
+    write_usd_shard(tmp_path / "s.usdc", [("000000001", tiny_scene()), ("000000002", other)])
+    assert usd_keys(tmp_path / "s.usdc") == ["000000001", "000000002"]
+    assert encode_scene(read(tmp_path / "s.usdc", "000000002").scene) == encode_scene(other)
+    with pytest.raises(TrilightError, match="no scene 000000003; expected one of 000000001"):
+        read(tmp_path / "s.usdc", "000000003")
+
+
+def test_time_samples_are_a_sequence(tmp_path: Path) -> None:
+    path = write_stage(tmp_path)
+    stage = Usd.Stage.Open(str(path))
+    move = UsdGeom.Xformable(stage.GetPrimAtPath("/W/Grid")).AddTranslateOp()
+    for frame, height in ((1, 0), (3, 100)):
+        move.Set((0, height, 0), frame)
+    stage.SetStartTimeCode(1)
+    stage.SetEndTimeCode(3)
+    stage.GetRootLayer().Save()
+    assert usd_keys(path) == ["1", "2", "3"]
+    heights = [object_of(read(path, key).scene, "Grid")[0][..., 2].max() for key in ("1", "2", "3")]
+    assert heights == pytest.approx([0, 0.5, 1], abs=1e-6)
+    with pytest.raises(TrilightError, match="no time code 4; expected one of 1 to 3"):
+        read(path, "4")
+
+
+def test_metals_and_too_bright_surfaces_keep_the_law(tmp_path: Path) -> None:
+    path = write_stage(tmp_path)
+    stage = Usd.Stage.Open(str(path))
+    shader = UsdShade.Shader.Get(stage, "/W/mat/preview")
+    shader.GetInput("diffuseColor").ClearSources()
+    shader.GetInput("diffuseColor").Set((0.9, 0.8, 0.7))
+    metal = shader.CreateInput("metallic", Sdf.ValueTypeNames.Float)
+    for amount, diffuse, specular in ((0.0, 0.9, 0.04), (1.0, 0.0, 0.9)):
+        metal.Set(amount)
+        stage.GetRootLayer().Save()
+        _, rows = object_of(read(path).scene, "Grid")
+        assert rows[0, [0, 3]] == pytest.approx([diffuse, specular], abs=1e-6)
+    shader.GetInput("diffuseColor").Set((1, 1, 1))
+    metal.Set(0.0)
+    stage.GetRootLayer().Save()
+    found = read(path)
+    assert object_of(found.scene, "Grid")[1][0, :3] == pytest.approx([0.96] * 3)
+    assert any("diffuse lowered" in text for text in found.lost)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "message"),
+    [
+        ("faceVertexIndices", [0, 3, 2, 9], "faceVertexIndices go from 0 to 9; expected 0 to 3"),
+        ("faceVertexCounts", [5], "faceVertexCounts add up to 5; expected 4"),
+        ("points", [(math.nan, 0, 0)] * 4, "points are not finite"),
+    ],
+)
+def test_meshes_that_contradict_themselves(
+    tmp_path: Path, attribute: str, value: Any, message: str
+) -> None:
+    path = write_stage(tmp_path)
+    stage = Usd.Stage.Open(str(path))
+    stage.GetPrimAtPath("/W/Grid").GetAttribute(attribute).Set(value)
+    stage.GetRootLayer().Save()
+    with pytest.raises(TrilightError, match=f"^stage.usda: /W/Grid: {message}"):
+        read(path)
+
+
+def test_a_texture_outside_is_refused_and_a_missing_one_noted(tmp_path: Path) -> None:
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    path = write_stage(folder)
+    (folder / "tex.png").unlink()
+    assert any("texture './tex.png': missing" in text for text in read(path).lost)
+    path.write_text(path.read_text().replace("./tex.png", "../tex.png"))
+    with pytest.raises(TrilightError, match="outside of its folder"):
+        read(path)
+
+
+def test_a_stage_without_light_or_camera(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateInMemory()
+    mesh(stage, "/L", L_SHAPE, [6], [0, 1, 2, 3, 4, 5])
+    stage.GetRootLayer().Export(str(tmp_path / "a.usda"))
+    with pytest.raises(TrilightError, match="no light that can be carried over"):
+        read(tmp_path / "a.usda")
+    path = write_stage(tmp_path)
+    whole = Usd.Stage.Open(str(path))
+    whole.RemovePrim("/W/cam")
+    whole.GetRootLayer().Save()
+    found = read(path)
+    assert found.scene.num_views == 1
+    assert any("no camera" in text for text in found.lost)
+
+
+def test_polygons_of_any_shape_keep_their_area() -> None:
+    """Stars of up to 40 corners with random radii, in random planes: triangles add up to them."""
+    rng = np.random.default_rng(0)
+    for count in (3, 4, 5, 8, 13, 40):
+        for _ in range(20):
+            turn = np.sort(rng.uniform(0, 2 * np.pi, count))
+            flat = rng.uniform(0.2, 1, count)[:, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
+            basis, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+            points = np.einsum("nk,ki->ni", flat, basis[:2])
+            corners, owner = triangulated(points, np.array([count]), np.arange(count))
+            assert len(corners) == count - 2 and (owner == 0).all()
+            ahead = np.roll(points, -1, axis=0)
+            whole = np.cross(points, ahead).sum(axis=0)
+            parts = np.cross(
+                points[corners[:, 1]] - points[corners[:, 0]],
+                points[corners[:, 2]] - points[corners[:, 0]],
+            )
+            assert parts.sum(axis=0) == pytest.approx(whole, abs=1e-12)
+            if np.diff(turn).max(initial=0) < np.pi and turn[0] + 2 * np.pi - turn[-1] < np.pi:
+                # a star around its middle: no triangle lies outside, so none is turned around
+                assert (np.einsum("ti,i->t", parts, whole) >= -1e-12).all()

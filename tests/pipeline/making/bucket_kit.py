@@ -1,0 +1,56 @@
+"""A bucket on a real S3 server, and machines that make a dataset of tiny scenes in it."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.builds.named import named_build
+from pipeline.making.bucket_publication import begin_dataset, joined
+from pipeline.making.publication import Publication
+from storage.dataset.output import dataset_folder
+from storage.remote import tries
+from storage.remote import url as remote_url
+from tests.pipeline.making.test_publication import ENVIRONMENT, _build
+from tests.s3_server import CREDENTIALS, control
+
+OUT = "s3://shards/set"
+
+
+@contextlib.contextmanager
+def empty_bucket(port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Give the driver of an empty server with a bucket `shards`, which the environment names."""
+    for name, value in {**CREDENTIALS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(tries, "PAUSE_S", 0.0)
+    control(port, "reset")
+    remote_url._driver_of.cache_clear()
+    place = remote_url.parse_url("s3://shards", what="bucket")
+    assert isinstance(place, remote_url.RemoteUrl)
+    driver = remote_url.open_driver(place)
+    driver.mkdir("shards")
+    yield driver
+    remote_url._driver_of.cache_clear()
+
+
+class Machines:
+    """Makers with a cache each: nothing joins them but the bucket."""
+
+    def __init__(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._tmp_path = tmp_path
+        self._monkeypatch = monkeypatch
+
+    def use(self, name: str) -> None:
+        """Be this machine from now on."""
+        self._monkeypatch.setenv("TRILIGHT_CACHE", str(self._tmp_path / name))
+
+    @contextlib.contextmanager
+    def maker(self, name: str, scenes: int = 8, **changes: Any) -> Iterator[Publication]:
+        """Take part from a machine, as a run does."""
+        self.use(name)
+        folder = dataset_folder(OUT)
+        build = named_build("smoke", changes=changes) if changes else _build()
+        with joined(folder):
+            yield begin_dataset(folder, build, ENVIRONMENT, scenes, accept_environment=False)

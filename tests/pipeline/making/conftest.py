@@ -1,0 +1,32 @@
+"""A bucket, and machines that share nothing else, for who asks for them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.pipeline.making.bucket_kit import Machines, empty_bucket
+from tests.s3_server import s3_server
+
+
+@pytest.fixture(autouse=True)
+def _bare(bare_reports: None) -> None:
+    """No test here looks at a figure."""
+
+
+@pytest.fixture(scope="module")
+def moto() -> Iterator[int]:
+    with s3_server() as port:
+        yield port
+
+
+@pytest.fixture
+def bucket(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    with empty_bucket(moto, monkeypatch) as driver:
+        yield driver
+
+
+@pytest.fixture
+def machines(bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machines:
+    return Machines(tmp_path, monkeypatch)

@@ -1,0 +1,111 @@
+"""Two makers in one bucket, one of them late: nothing that the first has said is lost."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.making import publication as publications
+from pipeline.making.publication import Publication
+from pipeline.shards.pack import pack_shard
+from storage.dataset.dataset import open_dataset
+from storage.dataset.staging import stage_scene
+from storage.dataset.verify import verify_dataset
+from storage.errors import TrilightError
+from storage.records.failures import decode_failures
+from storage.records.objects import Failure
+from storage.records.sample import sample_key
+from tests.pipeline.making.bucket_kit import OUT, Machines
+from tests.pipeline.making.test_publication import _dataset, _locked, make_tiny_shard
+from tests.scenes_by_hand import tiny_sample
+
+pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
+pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
+
+FIRST = "train-000000.tar"
+
+
+def _failures(bucket: Any, name: str) -> list[Failure]:
+    return decode_failures(bucket.cat_file(f"shards/set/{name}"))
+
+
+def test_who_freezes_late_takes_nothing_back(bucket: Any, machines: Machines) -> None:
+    with machines.maker("b") as late, machines.maker("a") as first:
+        first.add_failures([Failure(stage="assets", item="c", reason="no_faces", message="x")])
+        first.lock_objects([_locked()])
+        make_tiny_shard(first, 0)
+        first.publish()
+        rejected = _failures(bucket, "failures.jsonl")
+        assert len(rejected) == 5
+        machines.use("b")
+        late.add_failures([Failure(stage="assets", item="b", reason="no_faces", message="x")])
+        late.lock_objects([_locked()])
+        assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]
+        assert set(rejected) < set(_failures(bucket, "failures.jsonl"))
+
+
+def _other_shard(publication: Publication) -> Any:
+    """Pack a first shard of other bytes, as another processor may, with rejections of its own."""
+    for index in range(4):
+        sample = dataclasses.replace(tiny_sample(seed=9 + index), key=sample_key(index))
+        failure = Failure(stage="renders", item=sample_key(index), reason="other", message="y")
+        staged = publication.folder.staged_shard(FIRST)
+        stage_scene(staged, index, sample, [failure], "lossless")
+    return pack_shard(publication.folder, FIRST, range(4))
+
+
+def test_the_rejections_are_those_of_the_shard_that_is_there(
+    bucket: Any, machines: Machines
+) -> None:
+    with machines.maker("a") as first, machines.maker("b") as second:
+        machines.use("a")
+        first.lock_objects([_locked()])
+        machines.use("b")
+        second.lock_objects([_locked()])
+        other = _other_shard(second)
+        machines.use("a")
+        make_tiny_shard(first, 0)
+        machines.use("b")
+        second.add_shard(other)
+        second.publish()
+    for name in (f".staging/failures/{FIRST}.jsonl", "failures.jsonl"):
+        assert {row.reason for row in _failures(bucket, name)} == {"no_camera"}, name
+    assert verify_dataset(OUT).problems == []
+
+
+def test_a_shard_whose_maker_died_at_once_gets_the_rejections_of_the_next(
+    bucket: Any, machines: Machines
+) -> None:
+    with machines.maker("a") as publication:
+        publication.lock_objects([_locked()])
+        other = _other_shard(publication)
+        bucket.pipe_file(f"shards/set/{FIRST}", publication.folder.shard(FIRST).read_bytes())
+        publication.add_shard(other)
+        publication.publish()
+    assert {row.reason for row in _failures(bucket, "failures.jsonl")} == {"other"}
+
+
+def test_a_worker_with_another_cache_is_named(
+    bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has packed a shard that is neither here nor in the bucket."""
+    monkeypatch.setattr(publications.time, "sleep", lambda seconds: None)
+    elsewhere = _dataset(tmp_path / "elsewhere").manifest.shards[1]
+    with machines.maker("a") as publication:
+        publication.lock_objects([_locked()])
+        with pytest.raises(TrilightError, match="folder is not this one.*TRILIGHT_CACHE"):
+            publication.add_shard(elsewhere)
+        assert open_dataset(OUT).manifest.shards == ()
+
+
+def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: Machines) -> None:
+    with machines.maker("a") as publication:
+        publication.lock_objects([_locked()])
+        with machines.maker("b") as worker:
+            make_tiny_shard(worker, 0)
+            entry = worker.manifest.shards[0]
+        machines.use("a")
+        publication.add_shard(entry)
+        publication.publish()
+        assert publication.manifest.shards == (entry,)

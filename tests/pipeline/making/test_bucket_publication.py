@@ -1,0 +1,262 @@
+"""A dataset made in a bucket by machines that share nothing else: one digest, whoever dies when."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.making.publication import Publication
+from pipeline.shards.mirror import Mirror
+from pipeline.shards.pack import pack_shard
+from storage.dataset.dataset import open_dataset
+from storage.dataset.staging import is_staged, stage_scene
+from storage.dataset.verify import verify_dataset
+from storage.errors import TrilightError
+from storage.records.sample import sample_key
+from storage.remote import bucket as remote_bucket
+from tests.pipeline.making.bucket_kit import OUT, Machines
+from tests.pipeline.making.test_publication import _build, _dataset, _locked, make_tiny_shard
+from tests.s3_server import control
+from tests.scenes_by_hand import tiny_sample
+
+pytest.importorskip("s3fs", reason="needs the package s3fs (setup-all)")
+pytest.importorskip("moto", reason="needs the package moto with its server (setup-all)")
+
+FIRST, SECOND = "train-000000.tar", "train-000001.tar"
+
+
+class Killed(BaseException):
+    """Ends a maker between two requests, as SIGKILL would: locks go with it, and nothing else."""
+
+
+def make(publication: Publication, *shards: int) -> None:
+    """Freeze the objects where nobody has, make shards that are missing, and publish."""
+    if not publication.manifest.objects_lock_sha256:
+        publication.lock_objects([_locked()])
+    for index in set(shards) & set(publication.missing_shards()):
+        make_tiny_shard(publication, index)
+    publication.publish()
+
+
+def names(bucket: Any) -> set[str]:
+    bucket.invalidate_cache()
+    return {path.removeprefix("shards/set/") for path in bucket.find("shards/set")}
+
+
+def test_two_machines_end_in_the_bytes_of_one_folder(
+    bucket: Any, machines: Machines, tmp_path: Path
+) -> None:
+    plain = _dataset(tmp_path / "plain")
+    with machines.maker("a") as publication:
+        make(publication, 0)
+        assert publication.missing_shards() == [1]
+    with machines.maker("b") as publication:
+        assert publication.missing_shards() == [1]
+        make(publication, 1)
+        assert publication.missing_shards() == []
+    for path in (plain.folder.manifest, plain.folder.failures, plain.folder.objects_lock):
+        assert bucket.cat_file(f"shards/set/{path.name}") == path.read_bytes(), path.name
+    for name in (FIRST, SECOND):
+        assert bucket.cat_file(f"shards/set/{name}") == plain.folder.shard(name).read_bytes()
+    assert verify_dataset(OUT).problems == []
+
+
+def test_a_kill_before_any_request_loses_nothing(
+    bucket: Any, machines: Machines, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The n-th write of each run never happens; two machines take turns until one gets through."""
+    plain = _dataset(tmp_path / "plain")
+    put, left, runs = remote_bucket.Bucket._put, 0, 0
+
+    def put_or_die(self: Any, *arguments: Any, **options: Any) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise Killed
+        put(self, *arguments, **options)
+
+    monkeypatch.setattr(remote_bucket.Bucket, "_put", put_or_die)
+    while True:
+        left, runs = runs // 2, runs + 1
+        try:
+            with machines.maker("ab"[runs % 2]) as publication:
+                make(publication, 0, 1)
+            break
+        except Killed:
+            there = names(bucket)
+            if "manifest.json" in there:
+                assert verify_dataset(OUT).problems == []
+            for name in there & {FIRST, SECOND}:
+                shard = bucket.cat_file(f"shards/set/{name}")
+                assert shard == plain.folder.shard(name).read_bytes()
+    assert runs > 10  # each run gets at least one write further than the one before
+    assert open_dataset(OUT).digest == plain.manifest.dataset_digest
+    assert bucket.cat_file("shards/set/manifest.json") == plain.folder.manifest.read_bytes()
+
+
+def test_the_first_writer_of_a_shard_wins(bucket: Any, machines: Machines) -> None:
+    """Also where the second has made other bytes, as another processor may."""
+    with machines.maker("a") as first:
+        make(first)
+        with machines.maker("b") as second:
+            make(second)
+            for index in range(4):
+                sample = dataclasses.replace(tiny_sample(seed=9 + index), key=sample_key(index))
+                stage_scene(second.folder.staged_shard(FIRST), index, sample, [], "lossless")
+            other = pack_shard(second.folder, FIRST, range(4))
+            machines.use("a")
+            make(first, 0)
+            machines.use("b")
+            second.add_shard(other)
+            second.publish()
+        (listed,) = open_dataset(OUT).manifest.shards
+        assert listed == first.manifest.shards[0] != other
+        assert listed in second.manifest.shards
+    assert verify_dataset(OUT).problems == []
+
+
+def test_an_old_manifest_that_arrives_late_is_mended(
+    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two requests of the first maker the second one finishes the dataset."""
+    send_manifest = Mirror.send_manifest
+    with machines.maker("a") as first:
+        make(first, 0)
+        with machines.maker("b") as second:
+            held = first.folder.manifest.read_bytes()
+
+            def late(self: Mirror) -> None:
+                monkeypatch.setattr(Mirror, "send_manifest", send_manifest)
+                machines.use("b")
+                make(second, 1)
+                machines.use("a")
+                assert len(open_dataset(OUT).manifest.shards) == 2
+                assert first.folder.manifest.read_bytes() == held
+                send_manifest(self)
+                assert len(open_dataset(OUT).manifest.shards) == 1
+
+            monkeypatch.setattr(Mirror, "send_manifest", late)
+            machines.use("a")
+            first.publish()
+    assert len(open_dataset(OUT).manifest.shards) == 2
+
+
+def test_other_objects_and_other_settings_are_refused(bucket: Any, machines: Machines) -> None:
+    with machines.maker("a") as first, machines.maker("b") as second:
+        machines.use("a")
+        first.lock_objects([_locked()])
+        machines.use("b")
+        with pytest.raises(TrilightError, match=rf"{OUT}: another maker has frozen other objects"):
+            second.lock_objects([dataclasses.replace(_locked(), uid="b")])
+        second.lock_objects([_locked()])
+    changed = {"renders.resolution": 32}
+    with (
+        pytest.raises(TrilightError, match=rf"{OUT}: this dataset was begun with another setting"),
+        machines.maker("c", **changed),
+    ):
+        pass
+
+
+def test_scenes_that_wait_are_kept_for_their_dataset_only(bucket: Any, machines: Machines) -> None:
+    with machines.maker("a") as publication:
+        make(publication)
+        staged = publication.folder.staged_shard(FIRST)
+        stage_scene(staged, 0, tiny_sample(), [], "lossless")
+    with machines.maker("a"):
+        assert is_staged(staged, 0)
+    bucket.rm("shards/set", recursive=True)
+    with machines.maker("a") as publication:
+        assert not is_staged(staged, 0)
+        assert not publication.manifest.objects_lock_sha256
+
+
+def test_a_shard_that_was_deleted_is_made_again(bucket: Any, machines: Machines) -> None:
+    with machines.maker("a") as publication:
+        make(publication, 0, 1)
+        digest = publication.manifest.dataset_digest
+    bucket.rm_file(f"shards/set/{FIRST}")
+    with machines.maker("b") as publication:
+        assert publication.missing_shards() == [0]
+        make(publication, 0)
+    assert open_dataset(OUT).digest == digest
+    assert verify_dataset(OUT).problems == []
+
+
+def test_a_shard_is_listed_only_when_it_is_in_the_bucket(bucket: Any, machines: Machines) -> None:
+    """A thread, or another process of this machine, packs it while somebody publishes."""
+    with machines.maker("a") as publication:
+        make(publication, 0)
+        folder, profile = publication.folder, _build().storage.profile
+        for index in range(4, 8):
+            sample = dataclasses.replace(tiny_sample(seed=index), key=sample_key(index))
+            stage_scene(folder.staged_shard(SECOND), index, sample, [], profile)
+        pack_shard(folder, SECOND, range(4, 8))
+        publication.publish()
+        assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]
+        assert verify_dataset(OUT).problems == []
+        assert publication.missing_shards() == []
+    assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST, SECOND]
+
+
+def test_a_larger_wish_of_one_maker_is_known_to_all(bucket: Any, machines: Machines) -> None:
+    with machines.maker("a", 4) as first:
+        make(first, 0)
+        with machines.maker("b", 8):
+            machines.use("a")
+            assert first.missing_shards() == [1]
+            assert first.manifest.num_scenes == 8
+    with machines.maker("c", 4) as third:
+        assert third.num_shards == 2
+
+
+def test_a_sent_shard_need_not_be_fetched(
+    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with machines.maker("a") as publication:
+        make(publication, 0)
+        assert not publication.folder.shard(FIRST).exists()
+
+        def never(*arguments: Any) -> None:
+            raise AssertionError("fetched")
+
+        monkeypatch.setattr("storage.remote.cache.download", never)
+        dataset = publication.dataset()
+        assert len(list(dataset.read_shard(dataset.manifest.shards[0]))) == 4
+
+
+def test_access_that_is_lost_in_the_middle_loses_nothing(
+    bucket: Any, machines: Machines, moto: int, tmp_path: Path
+) -> None:
+    expected = _dataset(tmp_path / "plain").manifest.dataset_digest
+    with machines.maker("a") as publication:
+        make(publication, 0)
+        control(moto, "reset-auth", b"0")
+        try:
+            with pytest.raises(TrilightError) as caught:
+                make_tiny_shard(publication, 1)
+        finally:
+            control(moto, "reset-auth", b"inf")
+        assert publication.folder.shard(SECOND).exists()
+    text = str(caught.value)
+    assert text.startswith(f"out '{OUT}': cannot be written") and "\n" not in text
+    assert "access that lets you list, read and write" in text and "s3cret" not in text
+    with machines.maker("a") as publication:
+        assert publication.missing_shards() == []
+    assert open_dataset(OUT).digest == expected
+
+
+def test_what_is_lacking_is_said_at_once(bucket: Any, machines: Machines, moto: int) -> None:
+    bucket.rm("shards", recursive=True)
+    with (
+        pytest.raises(TrilightError, match=rf"out '{OUT}': cannot be listed .*404.*that exists"),
+        machines.maker("a"),
+    ):
+        pass
+    bucket.mkdir("shards")
+    for name, message in (("x.tar", "there are shards but no manifest"), ("README.md", "replace")):
+        bucket.pipe_file(f"shards/set/{name}", b"theirs")
+        with pytest.raises(TrilightError, match=rf"{OUT}: .*{message}"), machines.maker("a"):
+            pass
+        bucket.rm_file(f"shards/set/{name}")
+    assert names(bucket) == set()

@@ -1,0 +1,176 @@
+"""Datasets that a user's own files had part in: what is recorded, refused, never imported."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+from prefect.exceptions import ParameterTypeError
+
+from infra.repair import repair
+from pipeline.builds.named import BUILDS, named_build, typed_build
+from pipeline.exchange.file_child import file_child
+from pipeline.making.make_task import ShardJob, make_task
+from pipeline.making.publication import begin
+from pipeline.shards.derive import _extensions
+from scene_templates.default_families import FAMILIES
+from storage.dataset.asked import read_asked, write_asked
+from storage.dataset.dataset import open_dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import read_manifest, write_manifest
+from storage.dataset.verify import verify_dataset
+from storage.errors import TrilightError
+from tests.extensions_kit import EXAMPLES, loaded, parts_of, room_for_extensions, written
+from tests.pipeline.making.test_publication import ENVIRONMENT, begin_tiny, make_tiny_shard
+
+TEMPLATE = EXAMPLES / "template.py"
+TRAP = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
+"""Leaves a mark when it is imported."""
+
+
+def _begin(root: Path) -> None:
+    build = named_build("smoke")
+    begin(DatasetFolder(root), build, ENVIRONMENT, 4, accept_environment=False)
+
+
+def test_the_manifest_records_what_had_part_in_a_dataset(tmp_path: Path) -> None:
+    with loaded(TEMPLATE) as extension:
+        _begin(tmp_path)
+    manifest = read_manifest(tmp_path / "manifest.json")
+    assert manifest.extensions == {"template.py": extension.sha256}
+    assert str(EXAMPLES) not in (tmp_path / "manifest.json").read_text()
+    with pytest.raises(TrilightError, match=r"begun with the extension template\.py, which is not"):
+        _begin(tmp_path)
+    other = written(tmp_path, TEMPLATE.read_text() + "\n# changed\n", "template.py")
+    with (
+        loaded(other),
+        pytest.raises(TrilightError, match=r"another extension template\.py: its sha256 was"),
+    ):
+        _begin(tmp_path)
+    with loaded(TEMPLATE):
+        _begin(tmp_path)
+
+
+def test_a_manifest_without_extensions_is_what_it_was(tmp_path: Path) -> None:
+    with loaded(EXAMPLES / "executor.py"):  # changes how a dataset is made, and nothing of it
+        _begin(tmp_path)
+    assert "extensions" not in json.loads((tmp_path / "manifest.json").read_text())
+    with (
+        loaded(TEMPLATE),
+        pytest.raises(TrilightError, match=r"begun without the extension template\.py; leave"),
+    ):
+        _begin(tmp_path)
+
+
+def test_a_worker_without_the_extension_is_refused(tmp_path: Path) -> None:
+    job = ShardJob(
+        folder=DatasetFolder(tmp_path),
+        settings=named_build("smoke"),
+        environment={},
+        accepted=None,  # type: ignore[arg-type]
+        lock_sha256="",
+        num_at_once=1,
+        extensions={"template.py": "1" * 64},
+    )
+    with pytest.raises(TrilightError, match=r"this worker: .* add --extend template\.py"):
+        make_task(job, ())
+
+
+def test_children_know_what_is_registered() -> None:
+    """Also those of a fork server that was started before."""
+    child = file_child()
+    try:
+        with pytest.raises(TrilightError, match="template 'corridor' is unknown"):
+            child.call(parts_of, "corridor")
+        child.retire()
+        with loaded(TEMPLATE):
+            assert child.call(parts_of, "corridor") == ("floor", "wall1", "wall2")
+            child.retire()
+    finally:
+        child.close()
+
+
+@pytest.mark.parametrize("extended", [{}, {"trap.py": "0" * 64}])
+def test_a_dataset_never_causes_an_import(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extended: dict[str, str]
+) -> None:
+    """Its build may say FILE.py:FUNCTION, and its extensions may lie beside it."""
+    folder = tmp_path / "set"
+    monkeypatch.chdir(tmp_path)
+    publication = begin_tiny(folder, 4)
+    make_tiny_shard(publication, 0)
+    for place in (tmp_path, folder):
+        written(place, TRAP, "trap.py")
+    manifest = dataclasses.replace(publication.manifest, build="trap.py:f", extensions=extended)
+    write_manifest(folder / "manifest.json", manifest)
+    verify_dataset(str(folder))
+    expected = "begun with the extension trap.py" if extended else "'trap.py:f' is unknown"
+    with pytest.raises(TrilightError, match=expected):
+        repair(str(folder), ["train-000000.tar"], objects="builtin:", scenes_from=None)
+    for words in (["generate", "trap.py:f"], ["generate", "smoke", "--extend", "trap.py"]):
+        write_asked(DatasetFolder(folder), words)
+        assert read_asked(open_dataset(str(folder))) is None
+    assert not list(tmp_path.rglob("*.ran"))
+
+
+def test_a_form_cannot_name_a_file(tmp_path: Path) -> None:
+    from pipeline.flows.generate_scenes import generate_scenes
+
+    trap = written(tmp_path, TRAP)
+    with pytest.raises(ParameterTypeError, match="build"):
+        generate_scenes.validate_parameters({"build": f"{trap}:f"})
+    assert not list(tmp_path.rglob("*.ran"))
+
+
+def test_families_are_chosen_by_name() -> None:
+    with loaded(EXAMPLES / "family.py"):
+        for names in ("crowd", ["crowd", "plane-single"]):
+            families = named_build("smoke", changes={"scenes.families": names}).scenes.families
+            assert families[0] == FAMILIES["crowd"]()
+            assert len(families) == (2 if isinstance(names, list) else 1)
+        heavy = {"scenes.families": ["crowd"], "scenes.families.weight": 5.0}
+        assert named_build("smoke", changes=heavy).scenes.families[0].weight == 5.0
+    for wrong in ("crowd", ["plane-single", "crowd"], 3):
+        with pytest.raises(
+            TrilightError, match=r"setting 'scenes\.families' is .* of plane-single"
+        ):
+            named_build("smoke", changes={"scenes.families": wrong})
+    with pytest.raises(TrilightError, match=r"families.* expected at least one"):
+        named_build("smoke", changes={"scenes.families": []})
+
+
+def test_a_build_of_ones_own_has_a_name_of_its_own(tmp_path: Path) -> None:
+    text = """
+from pipeline.builds.training import smoke
+import dataclasses
+
+def mine():
+    return dataclasses.replace(smoke(), build="mine")
+
+def posing():
+    return smoke()
+
+def nothing():
+    pass
+"""
+    path = written(tmp_path, text)
+    with room_for_extensions():
+        name = typed_build(f"{path}:mine")
+        assert (name, named_build(name).build, BUILDS[name].num_scenes) == (
+            "own.py:mine",
+            "mine",
+            32,
+        )
+        with pytest.raises(TrilightError, match="build='smoke', which is one of Trilight's own"):
+            named_build(typed_build(f"{path}:posing"))
+        with pytest.raises(TrilightError, match=r"own\.py: it returned a NoneType; expected Build"):
+            typed_build(f"{path}:nothing")
+    assert name not in BUILDS
+
+
+def test_derived_sets_name_the_extensions_of_their_sources(tmp_path: Path) -> None:
+    manifest = begin_tiny(tmp_path, 4).manifest
+    one, other = ({"a.py": "1"}, {"a.py": "2", "b.py": "3"})
+    manifests = [dataclasses.replace(manifest, extensions=each) for each in (one, other)]
+    assert _extensions([manifest, *manifests]) == {"a.py": "1 2", "b.py": "3"}
+    assert _extensions([manifest]) == {}

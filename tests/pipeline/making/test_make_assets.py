@@ -1,0 +1,267 @@
+"""`trilight assets`, from real objects and broken ones to a folder that is a source of objects."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from infra.cli import assets
+from pipeline.assets.settings import AssetSettings
+from pipeline.making.make_assets import AssetFolder, AssetReport, make_assets
+from pipeline.objects.licences import DEFAULT_ALLOWED
+from pipeline.objects.sources import find_objects
+from storage.errors import TrilightError
+from storage.records.failures import read_failures
+from tests.conftest import ROOT
+from tests.pipeline.assets.meshes_by_hand import cube, sphere, write_obj
+
+REAL = (
+    "classic/suzanne.obj",
+    "classic/teapot.obj",
+    "classic/spot.obj",
+    "kaykit_dungeon/floor_dirt_small_B.gltf.glb",
+    "kaykit_dungeon/floor_dirt_small_D.gltf.glb",
+    "kaykit_dungeon/floor_tile_small_corner.gltf.glb",
+)
+BUDGET = 1000
+WHOLE = AssetSettings(budgets=(100_000,))
+"""Nothing is decimated: quick, where a test is about something else."""
+BAD = {
+    "bad/empty.obj": (b"", "no_faces"),
+    "bad/noise.stl": (bytes(range(256)) * 4, "header_size_mismatch"),
+    "bad/zip.ply": (b"PK\x03\x04" + bytes(50), "archive_refused"),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A store of our own, for children and commands too."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TRILIGHT_CACHE", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def source(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("source")
+    for name in REAL:
+        (folder / name).parent.mkdir(exist_ok=True)
+        shutil.copy(shared / "objects" / name, folder / name)
+    (folder / "bad").mkdir()
+    for name, (data, _) in BAD.items():
+        (folder / name).write_bytes(data)
+    return folder
+
+
+def _nothing_to_fetch(done: int, total: int) -> None:
+    raise AssertionError("these sources lie on this machine")
+
+
+def run(source: Path | str, out: Path, settings: AssetSettings | None = None) -> AssetReport:
+    counts: list[int] = []
+    report = make_assets(
+        str(source),
+        AssetFolder(out),
+        settings or AssetSettings(budgets=(BUDGET,)),
+        allowed_licences=DEFAULT_ALLOWED,
+        licence=None,
+        workers=2,
+        downloaded=_nothing_to_fetch,
+        planned=counts.append,
+        done=lambda: counts.append(-1),
+    )
+    planned, *steps = counts
+    assert steps == [-1] * planned
+    return report
+
+
+@pytest.fixture(scope="module")
+def made(source: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AssetReport]:
+    out = tmp_path_factory.mktemp("made") / "out"
+    return out, run(source, out)
+
+
+def test_every_object_has_its_outcome(made: tuple[Path, AssetReport]) -> None:
+    _, report = made
+    assert len(report.rows) == len(REAL)
+    assert [failure.reason for failure in report.failures] == [why for _, why in BAD.values()]
+    for row in report.rows:
+        assert 1 <= row.num_faces <= BUDGET
+        assert row.quality.error_p99 <= 0.03
+        assert (row.method == "source") == (row.source.num_faces <= BUDGET)
+    assert any(row.method != "source" for row in report.rows)
+
+
+def test_the_meshes_open_elsewhere(made: tuple[Path, AssetReport]) -> None:
+    out, report = made
+    for row in report.rows:
+        mesh = trimesh.load_mesh(out / row.path, process=False)
+        assert len(mesh.faces) == row.num_faces
+        # The box of the source is 1 wide; a vertex may leave it by 1 % of its diagonal.
+        assert mesh.extents.max() == pytest.approx(1, abs=2 * 0.01 * 3**0.5)
+
+
+def test_the_folder_is_a_source_of_objects(made: tuple[Path, AssetReport], tmp_path: Path) -> None:
+    out, report = made
+    found = find_objects(str(out), work_dir=tmp_path, allowed_licences=DEFAULT_ALLOWED)
+    assert not found.failures
+    assert [record.uid for record in found.records] == [row.uid for row in report.rows]
+    for record, row in zip(found.records, report.rows, strict=True):
+        for field in ("title", "licence", "licence_source", "attribution", "source_url"):
+            assert getattr(record, field) == getattr(row, field)
+    again = run(out, tmp_path / "again")
+    assert [row.num_faces for row in again.rows] == [row.num_faces for row in report.rows]
+    assert {row.method for row in again.rows} == {"source"}
+
+
+def test_every_document_tells_the_same(made: tuple[Path, AssetReport]) -> None:
+    out, report = made
+    assert set(read_failures(AssetFolder(out).failures)) == set(report.failures)
+    summary = json.loads(AssetFolder(out).summary.read_bytes())
+    assert (summary["accepted"], summary["rejected"]) == (len(REAL), len(BAD))
+    with AssetFolder(out).attribution.open(newline="") as stream:
+        assert [row["uid"] for row in csv.DictReader(stream)] == [row.uid for row in report.rows]
+    page = AssetFolder(out).page.read_text()
+    for row in report.rows:
+        assert row.uid in page
+    assert page.count("header_size_mismatch") == 1
+    assert not list(out.rglob("*.part"))
+
+
+def test_again_gives_the_same_folder(made: tuple[Path, AssetReport], source: Path) -> None:
+    out, report = made
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert run(source, out) == report
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+def test_objects_that_are_gone_leave_no_mesh(source: Path, tmp_path: Path) -> None:
+    out, fewer = tmp_path / "out", tmp_path / "fewer"
+    run(source, out, WHOLE)
+    shutil.copytree(source, fewer)
+    shutil.rmtree(fewer / "kaykit_dungeon")
+    shutil.rmtree(fewer / "bad")
+    report = run(fewer, out, WHOLE)
+    assert len(report.rows) == 3
+    assert {path.name for path in (out / "meshes").iterdir()} == {
+        Path(row.path).name for row in report.rows
+    }
+    assert read_failures(out / "failures.jsonl") == []
+    assert len((out / "objects.jsonl").read_text().splitlines()) == 3
+
+
+def test_names_from_outside_make_safe_file_names(tmp_path: Path) -> None:
+    """Names that differ in odd letters only stay apart; none leads out of the folder."""
+    folder = tmp_path / "source"
+    folder.mkdir()
+    names = ["a b.obj", "a_b.obj", "=1+1.obj", "-rf.obj", "ä" * 60 + ".obj"]
+    for number, name in enumerate(names):
+        write_obj(folder / name, sphere(9, 12 + number))
+    report = run(folder, tmp_path / "out", WHOLE)
+    files = [path.name for path in (tmp_path / "out" / "meshes").iterdir()]
+    assert len(files) == len(report.rows) == len(names)
+    for name in files:
+        assert re.fullmatch(r"[A-Za-z0-9-]*[0-9a-f]{8}\.ply", name)
+
+
+def test_a_folder_of_somebody_else_is_left_alone(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(TrilightError, match="holds files that are not of"):
+        run(source, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    with pytest.raises(TrilightError, match="is a file; expected a folder"):
+        run(source, tmp_path / "thesis.tex")
+
+
+def test_only_bad_objects_make_a_folder_too(source: Path, tmp_path: Path) -> None:
+    report = run(source / "bad", tmp_path / "out")
+    assert not report.rows
+    assert len(report.failures) == len(BAD)
+    assert (tmp_path / "out" / "quality.html").read_text().count("<img") == 0
+
+
+def trilight(*arguments: str, cache: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "trilight", *arguments],
+        cwd=ROOT,
+        env=os.environ | {"TRILIGHT_CACHE": str(cache)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def few(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One good object and the bad ones."""
+    folder = tmp_path_factory.mktemp("few")
+    shutil.copytree(source / "bad", folder / "bad")
+    shutil.copy(source / "classic" / "suzanne.obj", folder)
+    return folder
+
+
+def test_the_command_prints_json_and_nothing_else(few: Path, tmp_path: Path, cache: Path) -> None:
+    out = tmp_path / "out"
+    options = ["--out", str(out), "--budget", "500", "--json"]
+    result = trilight("assets", str(few), *options, cache=cache)
+    assert result.returncode == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert (answer["accepted"], answer["rejected"]) == (1, len(BAD))
+    (row,) = answer["objects"]
+    assert row["num_faces"] <= 500
+    assert {failure["reason"] for failure in answer["failures"]} == {why for _, why in BAD.values()}
+    assert (out / "quality.html").exists()
+
+
+@pytest.mark.slow
+def test_the_command_for_people(few: Path, tmp_path: Path, cache: Path) -> None:
+    """Epsilon as a share in percent; the table names what was refused."""
+    out = tmp_path / "out"
+    result = trilight("assets", str(few), "--out", str(out), "--epsilon", "1%", cache=cache)
+    assert result.returncode == 0, result.stderr
+    assert "archive_refused" in result.stdout
+    (row,) = (json.loads(line) for line in (out / "objects.jsonl").read_text().splitlines())
+    assert row["quality"]["error_p99"] <= 0.01
+    assert row["num_faces"] < 0.9 * row["source"]["num_faces"]
+
+
+@pytest.mark.parametrize(
+    "option",
+    [("--epsilon", "half"), ("--budget", "0"), ("--profile", "fast"), ("--licence", "not one")],
+)
+def test_a_mistake_is_one_line(tmp_path: Path, cache: Path, option: tuple[str, str]) -> None:
+    write_obj(tmp_path / "a.obj", cube())
+    out = tmp_path / "out"
+    result = trilight("assets", str(tmp_path), "--out", str(out), *option, cache=cache)
+    assert result.returncode in (1, 2)
+    (line,) = result.stderr.strip().splitlines()
+    assert line.startswith("trilight: ")
+    assert option[1] in line
+    assert not (out / "objects.jsonl").exists()
+
+
+def _asked(epsilon: str) -> assets.Meshes:
+    return assets.Meshes(source="builtin:", out=Path("meshes"), epsilon=epsilon)
+
+
+@pytest.mark.parametrize("epsilon", ["half", "9", "-1%", "nan", "inf", "0", "%", "1%%", "5 %."])
+def test_epsilons_without_meaning_are_refused(epsilon: str) -> None:
+    with pytest.raises(TrilightError, match="epsilon is"):
+        assets._settings(_asked(epsilon))
+
+
+@pytest.mark.parametrize(("text", "share"), [("0.5%", 0.005), ("0.005", 0.005), (" 1 %", 0.01)])
+def test_epsilons_are_shares_or_percent(text: str, share: float) -> None:
+    settings = assets._settings(_asked(text))
+    # One division in double precision.
+    assert settings.epsilon == pytest.approx(share, rel=1e-15)
+    assert settings.budgets == (4096,)

@@ -1,0 +1,61 @@
+"""Runs that are real in all but objects and pictures: scenes by hand, which cost nothing."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from pipeline.making.accept_objects import AcceptedObjects
+from pipeline.making.order import DatasetOrder
+from pipeline.making.publication import Publication
+from pipeline.making.runners import ThreadRunner
+from storage.dataset.statistics import Statistics
+from storage.records.objects import Failure
+from storage.records.sample import Sample, sample_key
+from tests.pipeline.making.test_publication import _locked
+from tests.scenes_by_hand import tiny_sample
+
+
+def tiny_order(**changes: Any) -> DatasetOrder:
+    """Return an order that fits the scenes by hand: two views of 16 pixels, four to a shard."""
+    return DatasetOrder(**{"resolution": 16, "changes": {"scenes.num_views": 2}, **changes})
+
+
+def without_rendering(
+    monkeypatch: pytest.MonkeyPatch, made: Callable[[int], None] = lambda scene: None
+) -> list[tuple[str, int]]:
+    """Replace objects and pictures; returns a list that fills with split and scene of each made.
+
+    Args:
+        monkeypatch: takes it back.
+        made: called with each scene as it is made.
+    """
+    scenes: list[tuple[str, int]] = []
+
+    def accept(
+        source: str, licence: str | None, settings: Any, publication: Publication, workers: int
+    ) -> AcceptedObjects:
+        if not publication.manifest.objects_lock_sha256:
+            publication.lock_objects([_locked()])
+        return AcceptedObjects(objects=(), num_found=1)
+
+    def make(split: str, scene: int, *more: Any) -> tuple[Sample, list[Failure]]:
+        scenes.append((split, scene))
+        made(scene)
+        return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
+
+    monkeypatch.setattr("pipeline.making.dataset_run.accept_objects", accept)
+    monkeypatch.setattr("pipeline.making.make_shard._make_scene", make)
+    monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")  # needs no probe
+    return scenes
+
+
+class Undocumented(ThreadRunner):
+    """Threads, as `trilight generate` uses them; no report is drawn of a finished dataset."""
+
+    def __init__(self) -> None:
+        self.finished = 0
+
+    def finish(self, write_documents: Callable[[], Statistics]) -> Any:
+        self.finished += 1

@@ -1,0 +1,266 @@
+"""Parts of built-in objects, and those put together from them: furniture, trees, plants."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.objects.builtin.furniture import FurnitureParams, furniture
+from pipeline.objects.builtin.grids import Mesh
+from pipeline.objects.builtin.plant import LeafParams, leaf_sheet
+from pipeline.objects.builtin.solids import beam, box, icosphere, join, lathe, moved, tube
+from pipeline.objects.builtin.tree import TreeParams, tree
+from tests.pipeline.objects.builtin.test_builtin import is_closed, made, parts_of, volume
+
+
+def polygon(sides: int) -> float:
+    """Area of a regular polygon in the unit circle."""
+    return 0.5 * sides * float(np.sin(2 * np.pi / sides))
+
+
+@pytest.mark.parametrize("frequency", [1, 2, 3, 7, 12])
+def test_an_icosphere_is_an_even_ball(frequency: int) -> None:
+    positions, faces = icosphere(frequency)
+    assert len(faces) == 20 * frequency**2
+    assert len(positions) == 10 * frequency**2 + 2
+    assert is_closed((positions, faces))
+    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 1, rtol=1e-12)
+    a, b, c = positions[faces].transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    # Projection stretches the middle of a side most: less than 2.2 times for any frequency.
+    assert area.max() < 2.2 * area.min()
+    # An icosahedron lacks 0.395 of its ball, finer ones about 0.55 over the frequency's square.
+    lack = 1 - volume((positions, faces)) / (4 / 3 * np.pi)
+    assert 0.39 < lack * frequency**2 < 0.56
+
+
+def test_a_lathed_outline_has_the_volume_of_its_frustums() -> None:
+    outline = [(0.5, 0.0), (1.0, 0.3), (0.2, 1.0)]
+    frustums = [
+        (z1 - z0) / 3 * (r0 * r0 + r0 * r1 + r1 * r1) for (r0, z0), (r1, z1) in pairwise(outline)
+    ]
+    solid = lathe(outline, 12)
+    # A ring is a dozen-sided polygon, whose frustums are exact.
+    assert volume(solid) == pytest.approx(polygon(12) * sum(frustums), rel=1e-12)
+    assert is_closed(solid)
+
+
+def test_a_straight_tube_is_a_prism_in_any_direction() -> None:
+    for end in np.array([[2.0, 0, 0], [0, 0, -3.0], [1, 2, 3]]):
+        path = np.linspace(0, 1, 5)[:, None] * end
+        bar = tube(path, np.full(5, 0.1), 7)
+        expected = polygon(7) * 0.01 * np.linalg.norm(end)
+        assert volume(bar) == pytest.approx(expected, rel=1e-9)
+        assert is_closed(bar)
+
+
+def test_a_bent_tube_keeps_its_thickness_and_does_not_turn() -> None:
+    turn = np.linspace(0, np.pi, 65)
+    path = np.stack([np.cos(turn), np.zeros(65), np.sin(turn)], axis=1)
+    positions, _ = tube(path, np.full(65, 0.2), 8)
+    ring = positions[:-2].reshape(65, 8, 3)
+    np.testing.assert_allclose(np.linalg.norm(ring - path[:, None], axis=2), 0.2, rtol=1e-12)
+    # In a flat bend every vertex stays at its own distance from the plane.
+    np.testing.assert_allclose(np.ptp(ring[..., 1], axis=0), 0, atol=1e-12)
+
+
+def test_a_box_is_cut_at_its_edges_only() -> None:
+    half, cut = np.array([0.5, 0.3, 0.2]), 0.05
+    positions, faces = box([1.0, 2.0, 3.0], half, cut)
+    assert len(faces) == 44 and is_closed((positions, faces))
+    np.testing.assert_allclose([positions.min(axis=0), positions.max(axis=0)],
+                               [[0.5, 1.7, 2.8], [1.5, 2.3, 3.2]])  # fmt: skip
+    # A bevel takes a prism of cut^2 / 2 from each of four edges per axis; at a corner two thirds
+    # of the three prisms' last stretches overlap, which is at most cut^3 each.
+    prisms = 4 * cut**2 / 2 * float((2 * half).sum())
+    assert volume((positions, faces)) == pytest.approx(0.24 - prisms, abs=8 * cut**3)
+    assert volume((positions, faces)) > 0.24 - prisms
+
+
+def test_a_beam_runs_from_point_to_point() -> None:
+    for end in np.array([[1.0, 0, 0], [0, 0, 1], [0.1, 0.05, -0.7], [0.5, 0.5, 0.1]]):
+        start = np.array([0.2, 0.3, 0.4])
+        mesh = beam(start, start + end, (0.05, 0.02), 0.001)
+        along = (mesh[0] - start) @ end / (end @ end)
+        assert (along.min(), along.max()) == pytest.approx((0, 1), abs=1e-9)
+        # Bevels of a thousandth take less than 3 % of a section of 0.1 x 0.04.
+        expected = 0.1 * 0.04 * float(np.linalg.norm(end))
+        assert volume(mesh) == pytest.approx(expected, rel=0.03)
+        assert is_closed(mesh)
+
+
+def test_a_tapered_beam_is_thinner_at_its_end() -> None:
+    positions, _ = beam([0, 0, 1], [0, 0, 0], (0.1, 0.1), 0.01, taper=0.5)
+    top, foot = positions[positions[:, 2] > 0.5], positions[positions[:, 2] < 0.5]
+    assert np.abs(foot[:, :2]).max() == pytest.approx(0.5 * np.abs(top[:, :2]).max(), rel=0.03)
+
+
+def test_joined_parts_keep_their_faces() -> None:
+    ball, bar = icosphere(2), moved(lathe([(1.0, 0.0), (1.0, 1.0)], 6), [5, 0, 0], 0.5)
+    both = join([ball, bar, ball])
+    assert len(both[0]) == 2 * len(ball[0]) + len(bar[0])
+    assert volume(both) == pytest.approx(2 * volume(ball) + volume(bar), rel=1e-12)
+    np.testing.assert_array_equal(both[0][both[1][-80:]], ball[0][ball[1]])
+
+
+def _furniture(**changes: object) -> FurnitureParams:
+    shape = {
+        "kind": "chair", "width": 0.5, "depth": 0.4, "height": 0.45, "board": 0.04, "leg": 0.02,
+        "leg_style": "square", "splay": 0.0, "stretchers": True, "back": 0.5, "slats": 4,
+        "level_slats": False, "boards": 3, "books": (),
+    }  # fmt: skip
+    return FurnitureParams(**(shape | changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        # A seat, four legs, four aprons, four stretchers, two posts, a rail and four slats.
+        ({}, 1 + 4 + 4 + 4 + 2 + 1 + 4),
+        ({"level_slats": True}, 1 + 4 + 4 + 4 + 2 + 4),
+        ({"kind": "table", "slats": 1, "stretchers": False}, 1 + 4 + 4),
+        ({"kind": "table", "slats": 5}, 5 + 2 + 4 + 4 + 4),
+        ({"kind": "round"}, 1 + 4 + 4 + 4),
+        ({"kind": "shelf", "books": ((0.05, 0.8),) * 3}, 2 + 5 + 3),
+    ],
+)
+def test_furniture_has_its_parts(changes: dict[str, object], parts: int) -> None:
+    assert len(parts_of(furniture(_furniture(**changes)))) == parts
+
+
+def test_a_shelf_holds_no_more_books_than_fit() -> None:
+    books = ((0.05, 0.8),) * 500
+    shelf = furniture(_furniture(kind="shelf", books=books))
+    low, high = shelf[0].min(axis=0), shelf[0].max(axis=0)
+    empty = furniture(_furniture(kind="shelf"))
+    np.testing.assert_allclose([low, high], [empty[0].min(axis=0), empty[0].max(axis=0)])
+    # Four bays of 0.44 in steps of 0.053.
+    assert len(parts_of(shelf)) - len(parts_of(empty)) == 4 * 8
+
+
+def _overlap(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
+    """Whether two triangles [3, 2] share area: no edge of either separates them."""
+    for one, other in ((first, second), (second, first)):
+        edge = np.roll(one, -1, axis=0) - one
+        normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        inner, outer = one @ normal.T, other @ normal.T
+        gap = np.maximum(
+            outer.min(axis=0) - inner.max(axis=0), inner.min(axis=0) - outer.max(axis=0)
+        )
+        # A hundredth of a millimetre of furniture: rounding is far below.
+        if (gap > -1e-5).any():
+            return False
+    return True
+
+
+def _shared_planes(mesh: Mesh) -> int:
+    """Pairs of faces of different parts that look the same way from the same place."""
+    parts = parts_of(mesh)
+    corners = np.concatenate([positions[faces] for positions, faces in parts])
+    owner = np.repeat(np.arange(len(parts)), [len(faces) for _, faces in parts])
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    offset = np.einsum("ij,ij->i", normal, corners[:, 0])
+    _, plane = np.unique(
+        np.rint(np.column_stack([normal, offset]) * 1e5), axis=0, return_inverse=True
+    )
+    count = 0
+    for number in np.flatnonzero(np.bincount(plane.reshape(-1)) > 1):
+        members = np.flatnonzero(plane.reshape(-1) == number)
+        axes = np.delete(np.arange(3), np.abs(normal[members[0]]).argmax())
+        flat = corners[members][..., axes]
+        count += sum(
+            _overlap(flat[i], flat[j])
+            for i in range(len(members))
+            for j in range(i)
+            if owner[members[i]] != owner[members[j]]
+        )
+    return count
+
+
+@pytest.mark.parametrize("number", range(40))
+def test_no_two_boards_share_a_plane_where_they_meet(number: int) -> None:
+    assert _shared_planes(made("furniture", number)) == 0
+
+
+def test_boards_that_share_a_plane_are_found() -> None:
+    first, second = box([0, 0, 0], [1, 1, 1], 0.1), box([0.5, 0, 0], [1, 0.8, 1], 0.1)
+    assert _shared_planes(join([first, second])) > 0
+
+
+def _tree(**changes: object) -> Mesh:
+    shape = {
+        "crown": "bare", "children": (4, 3), "spread_rad": 0.7, "shrink": 0.6, "thickness": 0.07,
+        "rise": 0.3, "mass": 0.25, "tiers": 4, "folds": 6, "variant": 0,
+    }  # fmt: skip
+    return tree(TreeParams(**(shape | changes)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        ({}, 1 + 4 + 12),
+        ({"children": (2, 2, 2)}, 1 + 2 + 4 + 8),
+        ({"crown": "masses"}, 1 + 4 + 12 + 12),
+        ({"crown": "tiers"}, 1 + 4),
+    ],
+)
+def test_trees_have_their_parts(changes: dict[str, object], parts: int) -> None:
+    assert len(parts_of(_tree(**changes))) == parts
+
+
+def test_variants_are_trees_of_one_kind() -> None:
+    first, other = _tree(), _tree(variant=1)
+    assert np.array_equal(first[1], other[1])
+    assert not np.allclose(first[0], other[0], atol=0.01)
+
+
+def _leaf(**changes: float) -> Mesh:
+    shape = {
+        "length": 2.0, "width": 0.3, "widest": 0.5, "base": 0.2, "arch_rad": 0.0, "fold_rad": 0.0,
+        "teeth": 0, "tooth_depth": 0.5, "rows": 10,
+    }  # fmt: skip
+    return leaf_sheet(LeafParams(**(shape | changes)), 0.0)  # type: ignore[arg-type]
+
+
+def test_a_flat_leaf_lies_level_and_looks_up() -> None:
+    positions, faces = _leaf()
+    np.testing.assert_allclose(np.ptp(positions, axis=0), [2.0, 0.6, 0.0], atol=1e-12)
+    a, b, c = positions[faces].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    assert (normal[:, 2] > 0).all()
+    assert not is_closed((positions, faces))
+
+
+def test_a_leaf_has_one_border() -> None:
+    faces = _leaf()[1]
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()
+    back = {(b, a) for a, b in edges}
+    follow = {a: b for a, b in edges if (a, b) not in back}
+    start = place = next(iter(follow))
+    length = 0
+    while length == 0 or place != start:
+        place, length = follow[place], length + 1
+    # Four edges at the base, and ten to the tip on either side.
+    assert length == len(follow) == 4 + 2 * 10
+
+
+def test_leaves_arch_fold_and_have_teeth() -> None:
+    plain = _leaf()
+    arched, folded, toothed = _leaf(arch_rad=1.0), _leaf(fold_rad=0.5), _leaf(teeth=4)
+    assert arched[0][-1, 2] < -0.5 and np.ptp(arched[0][:, 0]) < 2.0
+    assert folded[0][:, 2].max() > 0.1 and np.ptp(folded[0][:, 1]) < 0.6
+    width = np.ptp(toothed[0][:-1].reshape(10, 5, 3)[..., 1], axis=1)
+    full = np.ptp(plain[0][:-1].reshape(10, 5, 3)[..., 1], axis=1)
+    np.testing.assert_allclose(width / full, [1.0, 0.5] * 5)
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_plants_have_a_closed_pot_below_open_leaves(number: int) -> None:
+    parts = parts_of(made("plant", number))
+    assert is_closed(parts[0]) and parts[0][0][:, 2].min() == 0.0
+    leaves = [part for part in parts if not is_closed(part)]
+    assert len(leaves) >= 7
+    assert all(leaf[0][:, 2].max() > parts[0][0][:, 2].max() for leaf in leaves)

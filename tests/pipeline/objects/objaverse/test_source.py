@@ -1,0 +1,154 @@
+"""Objaverse through its real package: which objects, with which rights; mistakes in sources."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from storage.errors import TrilightError
+from tests.http_server import Site
+from tests.pipeline.objects.objaverse.objaverse_kit import (
+    FREE,
+    IN_ORDER,
+    UID,
+    find,
+    found_names,
+    glb,
+    packed,
+    reasons,
+    uid_of,
+)
+
+
+def test_uids_come_with_their_rights(site: Site, place: Path) -> None:
+    found = find(f"{UID['a'].upper()} ,{UID['b']},{UID['c']},{UID['a']}")
+    by_name = dict(zip(found_names(found), found.records, strict=True))
+    assert found_names(found) == [name for name in IN_ORDER if name in "abc"]
+    a = by_name["a"]
+    assert (a.uid, a.title) == (f"objaverse/{UID['a']}", r"The a\n")
+    assert (a.licence, a.attribution) == ("CC-BY-4.0", r"The a\n by Ada (https://p/ada)")
+    assert a.licence_source == "Objaverse 1.0 annotations; object published 2019-05-03"
+    assert a.source_url == "https://v/a"
+    assert Path(a.path).read_text() == "glTF a"
+    assert (by_name["b"].licence, by_name["c"].licence) == ("CC-BY-SA-4.0", "CC0-1.0")
+    assert found.num_found == 3
+
+
+def test_a_second_run_asks_for_nothing(site: Site, place: Path) -> None:
+    first = find("category/chair,sofa_bed")
+    site.requests.clear()
+    assert find("category/chair,sofa_bed") == first
+    assert site.requests == []
+
+
+def test_a_file_of_uids(place: Path, tmp_path: Path) -> None:
+    path = tmp_path / "uids.txt"
+    path.write_text(f"# mine\n\n{UID['a']}  # good\r\n  {UID['d']}\n")
+    assert found_names(find(str(path))) == [name for name in IN_ORDER if name in "ad"]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_first_n_of_a_category_are_the_first_allowed(
+    site: Site, place: Path, count: int
+) -> None:
+    members = [name for name in IN_ORDER if name in ("a", "d", "b", "paid", "mute")]
+    chosen = [name for name in members if name in FREE][:count]
+    found = find(f"category/chair,sofa_bed:{count}")
+    assert found_names(found) == chosen
+    passed_over = members[: members.index(chosen[-1])]
+    assert set(reasons(found)) == set(passed_over) - set(FREE)
+    assert {path for path in site.gets() if path.startswith("/glbs")} == {glb(n) for n in chosen}
+
+
+def test_more_than_there_are_is_all(place: Path) -> None:
+    assert set(found_names(find("category/vase:99"))) == {"a", "c"}
+
+
+def test_refused_licences_are_not_asked_for(site: Site, place: Path) -> None:
+    found = find("category/chair")
+    assert reasons(found) == {"paid": "licence_refused", "mute": "licence_refused"}
+    assert "CC-BY-NC-4.0" in " ".join(one.message for one in found.failures)
+    assert "LicenseRef-unknown" in " ".join(one.message for one in found.failures)
+    assert not {glb("paid"), glb("mute")} & set(site.gets())
+    allowed = find("category/chair", allowed_licences=["CC-BY-NC-4.0"])
+    assert found_names(allowed) == ["paid"]
+
+
+def test_an_unknown_uid_costs_itself_only(place: Path) -> None:
+    found = find(f"{UID['a']},{'0' * 32}")
+    assert found_names(found) == ["a"]
+    assert reasons(found) == {f"objaverse/{'0' * 32}": "unknown_uid"}
+
+
+def test_the_package_is_left_as_it_was(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    objaverse = sys.modules["objaverse"]
+    before = {name: value for name, value in vars(objaverse).items() if not name.startswith("__")}
+    steps: list[tuple[int, int]] = []
+    find("category/vase", downloaded=lambda *step: steps.append(step))
+    after = {name: value for name, value in vars(objaverse).items() if not name.startswith("__")}
+    assert after == before
+    assert capfd.readouterr() == ("", "")
+    assert steps == [(0, 2), (1, 2), (2, 2)]
+
+
+def test_annotations_that_say_little(site: Site, place: Path) -> None:
+    odd = {UID["a"]: {"license": 7, "user": None, "name": None, "publishedAt": "soon"}}
+    site.files["/metadata/000-000.json.gz"] = packed(odd)
+    (one,) = find(UID["a"], allowed_licences=["LicenseRef-unknown"]).records
+    assert (one.title, one.source_url) == (UID["a"], "")
+    assert one.attribution == f"{UID['a']} by an unknown author"
+    assert one.licence_source.endswith("of unknown date")
+
+
+def test_paths_that_lead_out_are_unknown(site: Site, place: Path) -> None:
+    paths = {UID["a"]: "../../glbs/x.glb", UID["b"]: glb("b")[1:], UID["c"]: "/etc/x.glb"}
+    site.files["/object-paths.json.gz"] = packed(paths)
+    found = find(f"{UID['a']},{UID['b']},{UID['c']}")
+    assert found_names(found) == ["b"]
+    assert reasons(found) == {"a": "unknown_uid", "c": "unknown_uid"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "names no file and no uid"),
+        ("nowhere.txt", "names no file and no uid"),
+        ("category/", "malformed"),
+        ("category/chair:0", "malformed"),
+        ("category/chair:", "malformed"),
+        ("category/chair:x", "malformed"),
+        ("category/chair,,vase", "malformed"),
+        ("category/chairs", "no such category.*3 LVIS categories.*Did you mean chair"),
+        ("category/sofabed", "Did you mean sofa_bed"),
+        ("category/zzzzz", "no such category"),
+    ],
+)
+def test_mistakes(place: Path, text: str, message: str) -> None:
+    with pytest.raises(TrilightError, match=message) as caught:
+        find(text)
+    assert "expected" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (f"{uid_of('a')}\nchair\n", r"uids\.txt:2: got 'chair'"),
+        (f"{uid_of('a')} {uid_of('b')}", r"uids\.txt:1"),
+        ("# nothing\n", "holds no uid"),
+        (b"\xff\xfe", "UTF-8"),
+    ],
+)
+def test_mistakes_in_a_file_of_uids(
+    place: Path, tmp_path: Path, content: str | bytes, message: str
+) -> None:
+    path = tmp_path / "uids.txt"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(TrilightError, match=message):
+        find(str(path))
+
+
+def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "objaverse", None)
+    with pytest.raises(TrilightError, match="make setup-all"):
+        find(UID["a"])

@@ -1,0 +1,236 @@
+"""Remote folders over a real local server: what is asked for, and what is not."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.objects.licences import USER_PROVIDED
+from storage.errors import TrilightError
+from tests.http_server import Fault, Site, serve
+from tests.pipeline.objects.find_kit import find, reasons
+
+pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
+
+ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+")
+
+
+def gltf(*uris: str) -> str:
+    return json.dumps({"buffers": [{"uri": uri, "byteLength": 1} for uri in uris]})
+
+
+def test_a_listed_folder_is_fetched_at_any_depth(site: Site, cache: Path) -> None:
+    site.put("set/b.obj", "B")
+    site.put("set/deep/er/a b&c.GLB", "A")
+    site.put("set/größe.ply", "G")
+    for name in ("set/notes.txt", "set/.hidden.obj", "set/.git/x.obj", "other/y.obj"):
+        site.put(name)
+    steps: list[tuple[int, int]] = []
+    found = find(f"{site.url}/set", downloaded=lambda *step: steps.append(step))
+    assert [record.uid for record in found.records] == ["b", "deep/er/a b&c", "größe"]
+    assert [Path(record.path).read_text() for record in found.records] == ["B", "A", "G"]
+    assert all(Path(record.path).is_relative_to(cache / "objects") for record in found.records)
+    assert found.records[1].source_url == f"{site.url}/set/deep/er/a%20b%26c.GLB"
+    assert {record.licence for record in found.records} == {USER_PROVIDED}
+    assert steps == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert not {
+        path for path in site.gets() if "hidden" in path or "git" in path or "y.obj" in path
+    }
+
+
+def test_bytes_that_are_no_utf8_and_breaks_in_names(site: Site) -> None:
+    site.files["/s/latin-%E9.obj"] = b"L"
+    site.files["/s/line%0Abreak.obj"] = b"B"
+    site.files["/s/-rf.obj"] = b"R"
+    found = find(f"{site.url}/s/")
+    assert [record.uid for record in found.records] == ["-rf", r"latin-\xe9", r"line\nbreak"]
+    assert [Path(record.path).read_bytes() for record in found.records] == [b"R", b"L", b"B"]
+
+
+def test_a_second_run_fetches_only_what_changed(site: Site) -> None:
+    for name in "abc":
+        site.put(f"{name}.obj", name)
+    first = find(site.url)
+    site.requests.clear()
+    assert find(site.url) == first
+    assert not [path for path in site.gets() if path.endswith(".obj")]
+    site.put("b.obj", "B")  # of the same length: only the ETag tells
+    site.requests.clear()
+    second = find(site.url)
+    assert [path for path in site.gets() if path.endswith(".obj")] == ["/b.obj"]
+    assert Path(second.records[1].path).read_text() == "B"
+
+
+def test_a_size_alone_tells_and_what_is_damaged_here_is_mended(site: Site) -> None:
+    site.etags = False
+    site.put("a.obj", "whole")
+    (record,) = find(site.url).records
+    site.requests.clear()
+    find(site.url)
+    assert "/a.obj" not in site.gets()
+    Path(record.path).write_text("who")
+    find(site.url)
+    assert Path(record.path).read_text() == "whole"
+
+
+def test_without_size_or_tag_it_is_fetched_again(site: Site) -> None:
+    site.etags = False
+    site.put("a.obj", "one")
+    site.always["/a.obj"] = Fault(no_length=True)
+    find(site.url)
+    site.put("a.obj", "two")
+    (record,) = find(site.url).records
+    assert Path(record.path).read_text() == "two"
+
+
+def test_only_allowed_rows_of_a_catalogue_are_asked_for(site: Site) -> None:
+    rows = [
+        {"uid": "free", "path": "x/free.glb", "licence": "CC0-1.0", "source_url": "u"},
+        {"uid": "again", "path": "x/free.glb", "licence": "CC0-1.0"},
+        {"uid": "paid", "path": "x/paid.glb", "licence": "LicenseRef-shop"},
+        {"uid": "mute", "path": "x/mute.glb"},
+        {"uid": "gone", "path": "x/gone.glb", "licence": "MIT"},
+    ]
+    site.put("objects.jsonl", "\n".join(json.dumps(row) for row in rows))
+    for name in ("free", "paid", "mute", "unlisted"):
+        site.put(f"x/{name}.glb", name)
+    site.listed = False
+    found = find(site.url)
+    assert [record.uid for record in found.records] == ["again", "free"]
+    assert [record.source_url for record in found.records] == [f"{site.url}/x/free.glb", "u"]
+    assert {record.licence_source for record in found.records} == {"objects.jsonl"}
+    assert reasons(found) == {
+        "gone": "download_failed", "mute": "licence_refused", "paid": "licence_refused",
+    }  # fmt: skip
+    assert found.num_found == 5
+    asked = {request.path for request in site.requests}
+    assert not asked & {"/x/paid.glb", "/x/mute.glb", "/x/unlisted.glb"}
+    assert site.gets()["/x/free.glb"] == 1
+
+
+def test_a_csv_catalogue_and_two_of_them(site: Site) -> None:
+    site.put("objects.csv", "uid,path,licence\na,a.obj,MIT\n")
+    site.put("a.obj")
+    (record,) = find(site.url).records
+    assert (record.licence, record.licence_source) == ("MIT", "objects.csv")
+    site.put("objects.jsonl", "{}")
+    with pytest.raises(TrilightError, match=r"objects\.jsonl and objects\.csv.*Remove one"):
+        find(site.url)
+
+
+def test_refused_licences_cost_no_download(site: Site) -> None:
+    site.put("a.obj")
+    found = find(site.url, licence="LicenseRef-mine")
+    assert reasons(found) == {"a": "licence_refused"}
+    assert "/a.obj" not in site.gets()
+    (record,) = find(
+        site.url, licence="LicenseRef-mine", allowed_licences=["licenseref-MINE"]
+    ).records
+    assert record.licence_source == "stated by the user (--licence)"
+
+
+def test_buffers_of_a_gltf_come_with_it(site: Site) -> None:
+    site.put("m/a.gltf", gltf("a%20b.bin", "sub/c.bin", "data:,x", "a%20b.bin"))
+    site.put("m/b.gltf", gltf("a%20b.bin"))
+    site.put(
+        "m/evil.gltf",
+        gltf("../up.bin", "%2e%2e/up.bin", "/etc/x", "http://h/x", "x/../../up.bin", ".."),
+    )
+    site.put("m/poor.gltf", gltf("gone.bin"))
+    site.put("m/odd.gltf", "[")
+    for name in ("m/a b.bin", "m/sub/c.bin", "up.bin"):
+        site.put(name, name)
+    found = find(site.url)
+    assert [record.uid for record in found.records] == ["m/a", "m/b", "m/evil", "m/odd"]
+    assert reasons(found) == {"m/poor": "download_failed"}
+    assert "gone.bin" in found.failures[0].message
+    folder = Path(found.records[0].path).parent
+    assert (folder / "a b.bin").read_text() == "m/a b.bin"
+    assert (folder / "sub" / "c.bin").read_text() == "m/sub/c.bin"
+    assert site.gets()["/m/a%20b.bin"] == 1
+    assert not site.gets()["/up.bin"]
+
+
+def test_names_cannot_lead_out_of_the_cache(site: Site, cache: Path) -> None:
+    site.put("a.obj", "good")
+    site.put("dot.obj", "good")
+    site.pages["/"] = "".join(
+        f'<a href="{link}">'
+        for link in (
+            "a.obj", "../up.obj", "..%2fup.obj", "x%2f..%2f..%2fup.obj", "%2e%2e/up.obj",
+            "/up.obj", "%2fetc%2fx.obj", "//evil/x.obj", "http://evil/x.obj", "nul%00.obj",
+            "a.obj?C=N;O=D", "#a.obj", "x" * 300 + ".obj", "./a.obj", "./dot.obj", "b//c.obj",
+        )
+    )  # fmt: skip
+    found = find(site.url)
+    assert [record.uid for record in found.records] == ["a", "dot"]
+    assert set(reasons(found).values()) <= {"unsafe_name", "download_failed"}
+    files = [path for path in cache.rglob("*") if path.is_file() and path.suffix != ".json"]
+    assert sorted(files) == sorted(Path(record.path) for record in found.records)
+    assert not list(cache.parent.rglob("up.obj"))
+
+
+def test_a_file_and_a_folder_of_one_name(site: Site) -> None:
+    rows = [{"uid": n, "path": n, "licence": "MIT"} for n in ("a.obj", "a.obj/b.obj", "c.obj")]
+    site.put("objects.jsonl", "\n".join(json.dumps(row) for row in rows))
+    for row in rows:
+        site.put(row["path"])
+    found = find(site.url)
+    assert found.num_found == 3
+    assert set(reasons(found).values()) == {"unsafe_name"}
+    assert "c.obj" in [record.uid for record in found.records]
+
+
+def test_at_most_eight_at_a_time(site: Site) -> None:
+    for number in range(40):
+        site.put(f"{number}.obj")
+    site.delay_s = 0.01  # so that all that are asked for at once are seen at once
+    assert len(find(site.url).records) == 40
+    assert 2 <= site.most_busy <= 8
+
+
+def test_credentials_go_to_the_server_and_nowhere_else(site: Site, cache: Path) -> None:
+    site.put("s/a.obj")
+    found = find(f"{site.url.replace('//', '//ada:s3%20cret@')}/s?sig=s3cret%2B#x")
+    sent = {request.headers["Authorization"] for request in site.requests}
+    assert sent == {"Basic YWRhOnMzIGNyZXQ="}
+    assert {request.path.partition("?")[2] for request in site.requests} == {"sig=s3cret%2B"}
+    assert "cret" not in repr(found) and "ada" not in repr(found)
+    kept = [path for path in cache.rglob("*") if path.is_file()]
+    assert len(kept) == 2
+    for path in kept:
+        assert "cret" not in str(path) and b"cret" not in path.read_bytes()
+
+
+def test_credentials_do_not_follow_to_another_server(site: Site) -> None:
+    site.put("a.obj", "A")
+    with serve() as other:
+        other.put("elsewhere.obj", "E")
+        site.moved["/a.obj"] = f"{other.url}/elsewhere.obj"
+        (record,) = find(f"{site.url.replace('//', '//ada:s3cret@')}?sig=s3cret").records
+        assert Path(record.path).read_text() == "E"
+        assert other.requests
+        assert not any("Authorization" in request.headers for request in other.requests)
+        assert not any("s3cret" in request.path for request in other.requests)
+
+
+def test_a_licence_beside_a_catalogue_is_refused(site: Site) -> None:
+    site.put("objects.jsonl", '{"uid": "a", "path": "a.obj"}')
+    with pytest.raises(TrilightError, match="--licence is 'MIT', but objects.jsonl states"):
+        find(site.url, licence="MIT")
+
+
+def test_real_objects_over_http(site: Site, shared: Path) -> None:
+    folder = shared / "objects"
+    rows = (folder / "objects.jsonl").read_text().splitlines()[:12]
+    site.put("objects.jsonl", "\n".join(rows))
+    for row in map(json.loads, rows):
+        site.put(row["path"], (folder / row["path"]).read_bytes())
+    found = find(site.url)
+    assert len(found.records) == 12
+    for record, row in zip(
+        found.records, sorted(map(json.loads, rows), key=lambda r: r["uid"]), strict=True
+    ):
+        assert Path(record.path).read_bytes() == (folder / row["path"]).read_bytes()
+    assert not ADDRESS.search(repr([record.source_url for record in found.records]))

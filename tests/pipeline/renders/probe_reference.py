@@ -1,0 +1,26 @@
+"""Prints the table of pipeline.renders.probe_picture.
+
+python -m tests.pipeline.renders.probe_reference
+"""
+
+import sys
+
+import numpy as np
+
+_RENDERS = 1024
+
+
+def main() -> None:
+    from pipeline.renders.variant import activate, choose_variant
+
+    activate(choose_variant())
+    from pipeline.renders.variant_probe import probe_blocks
+
+    taken = np.stack([probe_blocks(seed)[0] for seed in range(1, 1 + _RENDERS)])
+    mean, deviation = taken.mean(axis=0), taken.std(axis=0, ddof=1)
+    for row in np.concatenate([mean, deviation], axis=-1).reshape(16, 6):
+        sys.stdout.write(" ".join(f"{number:#.4g}" for number in row) + "\n")
+
+
+if __name__ == "__main__":
+    main()

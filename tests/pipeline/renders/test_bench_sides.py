@@ -1,0 +1,60 @@
+"""Our side and plain Mitsuba's, as experiments render them: the product's own pictures."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from infra.bench.sides.bare_pictures import bare_pictures
+from infra.bench.sides.plain_mitsuba import render_levels
+from infra.bench.sides.shots import SEED, fixed_samples, shots
+from pipeline.renders.renderer import SceneRenderer
+from storage.metrics import psnr_log_db
+from storage.seeds import rng_for
+from tests.pipeline.renders.scene_kit import sampled_like_scene
+from tests.scenes_by_hand import tiny_scene
+
+
+def test_shared_passes_are_the_pictures_that_each_setting_gives_alone() -> None:
+    scene, base = tiny_scene(), fixed_samples(16, 512)
+    variants = {
+        "easy": dataclasses.replace(base, min_spp=32, noise_floor_db=40.0),
+        "hard": base,
+    }
+    together = shots(scene, variants)
+    for name, settings in variants.items():
+        renderer = SceneRenderer(scene, settings)
+        alone = renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), SEED)
+        np.testing.assert_array_equal(together[name].view.radiance_rgb, alone.radiance_rgb)
+        assert together[name].view.spp == alone.spp
+        assert together[name].core_s > 0 and together[name].packed_bytes > 0
+    assert together["easy"].view.spp < together["hard"].view.spp == 512
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("llvm")
+def test_plain_mitsuba_comes_to_the_same_picture() -> None:
+    """With other samples of another sampler: its error falls with samples, towards our picture."""
+    scene = tiny_scene()
+    ours = shots(scene, {"ours": fixed_samples(32, 2048)})["ours"].view.radiance_rgb
+    found = render_levels(scene, 32, (16, 64, 1024), 5)
+    assert [level.spp for level in found.levels] == [16, 64, 1024]
+    assert found.levels[0].core_s > 0
+    errors = [psnr_log_db(level.radiance_rgb, ours) for level in found.levels]
+    # With three seeds 57 to 59, 60 to 62, and 68 to 69 dB; light off by half a percent is at 60.
+    assert errors[0] < errors[2]
+    assert errors[0] > 50 and errors[1] > 53 and errors[2] > 62
+
+
+def test_bare_pictures_come_nearer_with_samples() -> None:
+    scene = sampled_like_scene(rng_for(0, "trade"), num_views=1)
+    reference = shots(scene, {"ours": fixed_samples(32, 2048)})["ours"].view.radiance_rgb
+    sampled, denoised = (one.levels for one in bare_pictures(scene, 32, (1, 8, 128)))
+    assert [one.spp for one in sampled] == [one.spp for one in denoised] == [1, 8, 128]
+    raw = [psnr_log_db(one.radiance_rgb, reference) for one in sampled]
+    # 128 times the samples are 21 dB of a raw picture; half of that is left for luck
+    assert raw[2] > raw[0] + 10
+    assert psnr_log_db(denoised[0].radiance_rgb, reference) > raw[0]
+    assert denoised[0].core_s > sampled[0].core_s > 0
+    # the mean of all samples is the scene's light, up to the noise of 128 of them
+    assert abs(sampled[2].radiance_rgb.mean() / reference.mean() - 1) < 0.02

@@ -1,0 +1,220 @@
+"""Every scene beyond the trained range has the value that it names, and all else at its median."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
+
+from pipeline.builds.named import named_build
+from pipeline.builds.settings import differences
+from pipeline.scenes.pool import PooledAsset
+from scene_templates.out_of_range import median_settings
+from scene_templates.plans import scene_plan
+from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
+from storage.records.scene import Scene
+from tests.pipeline.scenes.scene_facts import planes_of, points_of, rows_of, triangles_of
+from tests.pipeline.scenes.small_pool import first_scene
+
+SETTINGS = named_build("out-of-range").scenes
+
+SEED = 20261121
+
+AXES: dict[str, tuple[tuple[float, ...], set[str]]] = {
+    "triangles": ((6144, 8192, 12288, 16384), {"max_triangles", "fill_to"}),
+    "fov_deg": ((10, 20, 75, 90, 110), {"cameras.fov_deg"}),
+    "distance": ((1.0, 1.25, 2.5, 3.0, 4.0), {"cameras.distance"}),
+    "lights": ((9, 16, 24, 32), {"lights.count"}),
+    "lights_inside": ((1, 2), {"lights.num_inside"}),
+    "light_size": ((0.1, 0.3, 3.0, 10.0), {"lights.scale"}),
+    "light_strength": ((0.1, 0.3, 3.0, 10.0), {"lights.total_emission"}),
+    "objects": ((4, 5, 6, 7, 8), {"families", "placement.overlap_share"}),
+    "roughness": ((0.01, 0.02, 0.03, 0.04), {"materials.roughness_clip"}),
+}
+"""The values of every axis, and the settings that make them."""
+
+MEDIAN = {
+    "triangles": 4096,
+    "fov_deg": 45.0,
+    "distance": 1.75,
+    "lights": 4,
+    "lights_inside": 0,
+    "light_size": 1.0,
+    "light_strength": 1.0,
+    "objects": 2,
+    # The middle of the logarithmic range, less what is taken off: sqrt(0.06 * 1.055) - 0.05.
+    "roughness": 0.2016,
+}
+
+ROUNDING = 1e-5
+"""Float32 numbers up to 4, a few operations each; values on the axes are a hundredth apart."""
+
+
+@pytest.fixture(scope="module")
+def strange(pool: list[PooledAsset]) -> list[Scene]:
+    """Half a turn: 37 values in two layouts each. None is rejected sixteen times."""
+    return [first_scene(SETTINGS, pool, seed=SEED, scene_index=index) for index in range(74)]
+
+
+def _value(scene: Scene, axis: str) -> float:
+    excursion = scene.provenance["excursion"]
+    return float(excursion["value"] if excursion["axis"] == axis else MEDIAN[axis])
+
+
+def test_every_value_is_planned_in_every_layout_and_composed(strange: list[Scene]) -> None:
+    found = []
+    for index in range(148):
+        excursion = SETTINGS.excursion_of(index)
+        assert excursion is not None
+        template = scene_plan(SETTINGS, seed=SEED, scene_index=index).family.template
+        found.append((excursion.axis, excursion.value, template))
+    for scene, planned in zip(strange, found, strict=False):
+        axis, value, template = planned
+        assert scene.provenance["excursion"] == {"axis": axis, "value": value}
+        assert scene.provenance["template"] == template
+    layouts = ("plane", "wall", "corner", "open_box")
+    stated = {(axis, value) for axis, (values, _) in AXES.items() for value in values}
+    assert len(stated) == 37
+    assert sorted(found) == sorted((*pair, layout) for pair in stated for layout in layouts)
+
+
+def test_each_excursion_changes_its_own_settings_only() -> None:
+    median = median_settings(4096)
+    assert dataclasses.replace(SETTINGS, excursions=()) == median
+    for index, excursion in enumerate(SETTINGS.excursions):
+        after = SETTINGS.of_scene(index)
+        paths = differences(dataclasses.asdict(median), dataclasses.asdict(after))
+        changed_paths = {path for path, _, _ in paths} - {"num_views"}
+        # At 1.0 times the median a value would be no excursion.
+        assert changed_paths == AXES[excursion.axis][1], excursion
+    # Every range of the median scenes is one point, but for jitters and what has no median.
+    free = {"roughness_log", "specular_ratio"}
+    for group in (median.materials, median.lights, median.cameras, median.families[0]):
+        for field in dataclasses.fields(group):
+            bounds = getattr(group, field.name)
+            if isinstance(bounds, tuple) and field.name not in free:
+                assert bounds[0] == bounds[1], field.name
+
+
+def _triangles(scene: Scene) -> float:
+    return scene.num_triangles
+
+
+def _fov(scene: Scene) -> float:
+    return float(scene.fov_deg[0])
+
+
+def _lights(scene: Scene) -> float:
+    return len(rows_of(scene, "emitter"))
+
+
+def _objects(scene: Scene) -> float:
+    return len(rows_of(scene, "object"))
+
+
+def _roughness(scene: Scene) -> float:
+    solid = ~np.any(scene.materials[:, EMISSION] > 0, axis=1)
+    values = scene.materials[solid][:, ROUGHNESS]
+    assert values.min() == values.max()
+    return float(values.min())
+
+
+def _emitters(scene: Scene) -> NDArray[np.float64]:
+    return np.concatenate([triangles_of(scene, row) for row in rows_of(scene, "emitter")])
+
+
+def _light_size(scene: Scene) -> float:
+    """Edge over that of the median, 2.25 times 0.0707."""
+    corners = _emitters(scene)
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    assert np.ptp(edges) < ROUNDING
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    factor = float(edges.mean()) / (2.25 * math.sqrt(0.005))
+    # The size is that of the edge; the area, and with it the light, goes by its square.
+    assert np.abs(area / (2 * 0.0021651 * 2.25**2) / factor**2 - 1).max() < 1e-3
+    return factor
+
+
+def _light_strength(scene: Scene) -> float:
+    emitted = scene.materials[scene.material_index[scene.triangle_emits]][:, EMISSION]
+    assert np.ptp(emitted) < ROUNDING * emitted.max()
+    return float(emitted[:, 0].sum() / 3750)
+
+
+MEASURED: dict[str, Callable[[Scene], float]] = {
+    "fov_deg": _fov,
+    "lights": _lights,
+    "objects": _objects,
+    "roughness": _roughness,
+    "light_size": _light_size,
+    "light_strength": _light_strength,
+}
+
+
+@pytest.mark.parametrize("axis", MEASURED)
+def test_scenes_have_the_value_that_they_name(strange: list[Scene], axis: str) -> None:
+    """Those of other axes have the median."""
+    for scene in strange:
+        assert abs(MEASURED[axis](scene) / _value(scene, axis) - 1) < ROUNDING
+
+
+def test_objects_are_subdivided_to_the_stated_number(strange: list[Scene]) -> None:
+    for scene in strange:
+        most = _value(scene, "triangles")
+        assert scene.num_triangles <= most
+        if scene.provenance["excursion"]["axis"] == "triangles":
+            assert scene.num_triangles >= 0.97 * most
+
+
+def test_cameras_stand_at_the_stated_distance(strange: list[Scene]) -> None:
+    """From a point within 0.2 per axis of the origin."""
+    for scene in strange:
+        c2w = scene.c2w[0].astype(np.float64)
+        target = c2w[:3, 3] - _value(scene, "distance") * c2w[:3, 2]
+        assert np.abs(target).max() <= 0.2 + ROUNDING
+
+
+def test_lights_hang_outside_but_for_those_that_are_put_inside(strange: list[Scene]) -> None:
+    for scene in strange:
+        boxes = [triangles_of(scene, row).reshape(-1, 3) for row in rows_of(scene, "object")]
+        low = np.array([points.min(axis=0) for points in boxes])
+        high = np.array([points.max(axis=0) for points in boxes])
+        count = 0
+        for corners in _emitters(scene):
+            centre = corners.mean(axis=0)
+            if ((centre > low) & (centre < high)).all(axis=1).any():
+                count += 1
+                continue
+            # No corner is in a box, and the middle hangs 2.4 from a point of the cube of 0.2.
+            assert not ((corners[:, None] > low) & (corners[:, None] < high)).all(axis=2).any()
+            nearest = np.linalg.norm(np.maximum(np.abs(centre) - 0.2, 0))
+            farthest = np.linalg.norm(np.abs(centre) + 0.2)
+            assert nearest - ROUNDING <= 2.4 <= farthest + ROUNDING
+        assert count == _value(scene, "lights_inside")
+
+
+def test_everything_else_is_at_its_median(strange: list[Scene]) -> None:
+    for index, scene in enumerate(strange):
+        plan = scene_plan(SETTINGS, seed=SEED, scene_index=index)
+        assert plan.overlaps == (scene.provenance["excursion"]["axis"] == "objects")
+        floor = scene.vertex_positions[scene.faces[scene.object_index == 0].ravel()]
+        # Square rooms of side 1.175, raised by 0.1, before halving.
+        assert np.abs(floor[:, 2] - (0.1 - 1.175) / 2).max() < ROUNDING
+        assert np.abs(np.abs(floor[:, :2]).max(axis=0) - 1.175 / 2).max() < ROUNDING
+        solid = scene.materials[~np.any(scene.materials[:, EMISSION] > 0, axis=1)]
+        assert np.abs(solid[:, SPECULAR] - 0.95 / 2).max() < ROUNDING
+        assert solid[:, DIFFUSE].max() <= 0.95 / 2 + ROUNDING
+        planes = planes_of(scene)
+        for row in rows_of(scene, "object"):
+            points = points_of(scene, row)
+            # The farthest vertex is 1.3 / 4 from the centre, so that no two are twice as far apart.
+            # Of the pool's shapes only the cone reaches less to all sides, 0.79 of it.
+            if len(points) < 700:
+                reach = float(pdist(points).max()) / 2
+                assert 0.75 * 1.3 / 4 < reach < 1.3 / 4 + ROUNDING
+            assert (points @ planes[:, :3].T + planes[:, 3]).min() > -ROUNDING

@@ -1,0 +1,157 @@
+"""Laws of cameras: where they stand, what they see, and how the next one is found."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.scenes.compose import compose_scene
+from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.sight import Sight
+from pipeline.scenes.views import CAMERA_ATTEMPTS, complaint, next_camera
+from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.settings import SceneSettings, ViewLaws
+from storage.conventions import camera_rays, look_at_c2w
+from storage.errors import Rejected
+from storage.records.scene import ARRAY_FIELDS, Scene
+from tests.pipeline.scenes.slow_rays import first_hits
+from tests.scenes_by_hand import tiny_scene
+
+SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
+
+
+def _slow_view(scene: Scene, view: int, grid: int) -> tuple[float, float, float]:
+    """Coverage, share of shell backs and least depth of a view, by the slow twin."""
+    solid = ~scene.triangle_emits
+    triangles = scene.vertex_positions[scene.faces[solid]].astype(np.float64)
+    is_object = np.array([entry.kind == "object" for entry in scene.objects])
+    face_is_object = is_object[scene.object_index[solid]]
+    origin, directions = camera_rays(scene.c2w[view], float(scene.fov_deg[view]), grid)
+    rays = directions.reshape(-1, 3)
+    face, depth = first_hits(origin, rays, triangles)
+    met = face >= 0
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    behind = met & ~face_is_object[face] & (np.sum(normal[face] * rays, axis=1) > 0)
+    return float((met & face_is_object[face]).mean()), float(behind.mean()), float(depth.min())
+
+
+def test_facts_agree_with_the_slow_twin(scenes: list[Scene]) -> None:
+    for scene in scenes[::20]:
+        facts = Sight(scene).facts(scene.c2w[0], float(scene.fov_deg[0]), 32)
+        coverage, shell_back, depth = _slow_view(scene, 0, 32)
+        # A ray through an edge may fall to either side in single precision: two of 1024.
+        assert abs(facts.coverage - coverage) <= 2 / 1024
+        assert abs(facts.shell_back - shell_back) <= 2 / 1024
+        assert facts.depth <= depth + 1e-5  # the box of an object is nearer than the object
+
+
+def test_accepted_views_hold_on_a_finer_grid_that_shares_no_ray(scenes: list[Scene]) -> None:
+    for scene in scenes[::25]:
+        for view in range(scene.num_views):
+            coverage, shell_back, depth = _slow_view(scene, view, 45)
+            # The outline of an object crosses about 4 sqrt(coverage) of the 32 cells of a side,
+            # and each crossing errs by a third of a cell or so, independently: under 0.01.
+            assert coverage > SETTINGS.views.min_coverage - 0.01
+            assert shell_back < SETTINGS.views.max_shell_back + 0.01
+            assert depth > SETTINGS.views.min_depth
+
+
+def test_cameras_keep_their_ranges(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        assert (scene.fov_deg >= 30).all()
+        assert (scene.fov_deg <= 60).all()
+        for c2w in scene.c2w.astype(np.float64):
+            # The point looked at is 1.5 to 2.0 ahead, within 0.2 of the origin per axis; steps of
+            # 0.25 mm along the axis leave half a step.
+            ahead = c2w[:3, 3] - np.linspace(1.5, 2.0, 2001)[:, None] * c2w[:3, 2]
+            assert np.abs(ahead).max(axis=1).min() <= 0.2 + 2.5e-4
+
+
+def test_cameras_are_outside_of_every_objects_box(scenes: list[Scene]) -> None:
+    for scene in scenes:
+        for row, entry in enumerate(scene.objects):
+            if entry.kind == "object":
+                points = scene.vertex_positions[scene.faces[scene.object_index == row].ravel()]
+                eyes = scene.c2w[:, :3, 3]
+                inside = (eyes > points.min(axis=0)) & (eyes < points.max(axis=0))
+                assert not inside.all(axis=1).any()
+
+
+def _camera(eye: list[float]) -> NDArray[np.float32]:
+    return look_at_c2w(eye=eye, target=[0, 0, 0], up=[0, 1, 0.1]).astype(np.float32)
+
+
+def test_light_is_seen_only_on_the_side_that_the_camera_sees() -> None:
+    """The hand-made floor is lit from above: fully so from above, not at all from below."""
+    sight = Sight(tiny_scene())
+    above, below = (sight.facts(_camera([0, 0, z]), 30.0, 16) for z in (1.0, -1.0))
+    assert (above.lit, above.shell_back, above.coverage) == (1.0, 0.0, 0.0)
+    assert (below.lit, below.shell_back, below.coverage) == (0.0, 1.0, 0.0)
+    # A scene without objects need not show any, and one with objects must.
+    assert complaint(above, ViewLaws(), has_objects=False) is None
+    assert complaint(above, ViewLaws(), has_objects=True) == "sees too little of the objects"
+    assert complaint(below, ViewLaws(), has_objects=False) == "sees the back of the shell"
+    assert complaint(below, ViewLaws(max_shell_back=1.0), has_objects=False) is not None
+
+
+def test_a_roof_takes_the_light_away() -> None:
+    scene = tiny_scene()
+    roof = scene.vertex_positions[:4] + np.array([0, 0, 1.5], np.float32)
+    covered = dataclasses.replace(
+        scene,
+        vertex_positions=np.concatenate([scene.vertex_positions, roof]),
+        vertex_normals=np.concatenate([scene.vertex_normals, scene.vertex_normals[:4]]),
+        faces=np.concatenate([scene.faces, scene.faces[:2] + np.uint32(7)]),
+        material_index=np.concatenate([scene.material_index, scene.material_index[:2]]),
+        object_index=np.concatenate([scene.object_index, scene.object_index[:2]]),
+    )
+    assert Sight(covered).facts(_camera([0, 0, 1.0]), 30.0, 16).lit == 0.0
+
+
+def test_emitters_are_hidden_from_the_camera() -> None:
+    """From right above the emitter the view goes through it to the floor."""
+    facts = Sight(tiny_scene()).facts(_camera([0, 0, 2.01]), 5.0, 16)
+    assert facts.lit == 1.0
+    # The rays nearest to the axis are half a pixel off it, which lengthens them by 7e-6.
+    assert 2.01 < facts.depth < 2.01 * 1.00001
+
+
+def test_next_camera_changes_one_view_only_and_ends(scenes: list[Scene]) -> None:
+    scene = scenes[0]
+    seen = {scene.c2w[1].tobytes()}
+    attempts = [scene.provenance["camera_attempts"][1]]
+    with pytest.raises(Rejected) as caught:
+        for _ in range(CAMERA_ATTEMPTS + 1):
+            following = next_camera(scene, SETTINGS, view=1)
+            following.check()
+            for name in ARRAY_FIELDS:
+                if name not in ("c2w", "fov_deg"):
+                    assert np.array_equal(getattr(following, name), getattr(scene, name))
+            others = [0, 2, 3]
+            assert np.array_equal(following.c2w[others], scene.c2w[others])
+            assert np.array_equal(following.fov_deg[others], scene.fov_deg[others])
+            scene = following
+            seen.add(scene.c2w[1].tobytes())
+            attempts.append(scene.provenance["camera_attempts"][1])
+    assert caught.value.reason == "no_camera"
+    assert len(seen) == len(attempts) > 5
+    assert attempts == sorted(set(attempts))
+    assert attempts[-1] < CAMERA_ATTEMPTS
+
+
+def test_next_camera_needs_nothing_but_the_stored_scene(scenes: list[Scene]) -> None:
+    scene = scenes[1]
+    stored = dataclasses.replace(scene, provenance=json.loads(json.dumps(dict(scene.provenance))))
+    one, other = (next_camera(each, SETTINGS, view=0) for each in (scene, stored))
+    assert np.array_equal(one.c2w, other.c2w)
+    assert one.provenance == other.provenance
+
+
+def test_views_that_nobody_can_find_are_rejected(pool: list[PooledAsset]) -> None:
+    settings = dataclasses.replace(SETTINGS, views=ViewLaws(min_coverage=1.0))
+    with pytest.raises(Rejected) as caught:
+        compose_scene(settings, pool, seed=0, scene_index=0, attempt=0)
+    assert caught.value.reason == "no_camera"
+    assert "sees too little of the objects x16" in caught.value.message

@@ -1,0 +1,292 @@
+"""The evaluation: its figures, its rivals, its parts, and the command as a whole."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import flip_evaluator
+import numpy as np
+import pytest
+from PIL import Image
+
+from infra.excursion_plots import plot_excursions
+from model.light_groups import light_groups
+from model.weights import encode_weights
+from storage.dataset.dataset import Dataset
+from storage.dataset.training_data import open_training_data
+from storage.errors import TrilightError
+from storage.metrics import psnr_log_db
+from storage.records.material import ROUGHNESS
+from storage.records.scene import Scene
+from storage.seeds import rng_for
+from tests.command_line import trilight
+from tests.train.kit import tiny_run
+from tests.train.loss.test_lpips import small_weights
+from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
+from train.data.scenes import training_scene
+from train.evaluation.evaluate import (
+    Contest,
+    judged_views,
+    make_rivals,
+    worst_and_median,
+    worst_of_each_excursion,
+)
+from train.evaluation.grouped_lights import GROUPED, grouped_pictures
+from train.evaluation.groups import by_group, summary
+from train.evaluation.judge import judged_scene, median_picture, predict
+from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
+from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
+from train.evaluation.report import markdown, record
+from train.evaluation.rivals import MEDIAN, NEAREST, Rivals
+from train.loop.state import new_state
+from train.loss.lpips import Lpips
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=5, validation=3, per_shard=3)
+
+
+def contest(dataset: Dataset, lpips: Lpips | None = None) -> Contest:
+    data = open_training_data([str(dataset.folder.root)])
+    return Contest(
+        network=new_state(tiny_run()).model,
+        shards=data.split("validation"),
+        resolution=16,
+        rivals=make_rivals(data.split("train"), 16),
+        lpips=lpips,
+        most_scenes=99,
+    )
+
+
+def test_hdr_flip_is_the_packages_and_sees_errors() -> None:
+    rng = rng_for(0, "flip")
+    target = rng.uniform(0, 4, (24, 24, 3)).astype(np.float32)
+    worse = np.maximum(target + rng.normal(0, 0.5, target.shape), 0)
+    _, expected, _ = flip_evaluator.evaluate(target, worse.astype(np.float32), "HDR")
+    assert hdr_flip(worse, target) == pytest.approx(float(expected))
+    assert hdr_flip(target, target) == 0
+    assert 0.05 < float(expected) < 1
+    assert hdr_flip(worse, np.zeros_like(target)) is None
+
+
+def test_what_cannot_be_measured_is_not_a_number() -> None:
+    picture = rng_for(0, "picture").uniform(0, 2, (16, 16, 3))
+    hits = np.ones((16, 16), bool)
+    without = picture_scores(picture, picture, hits, None)
+    assert list(without) == list(METRICS)
+    assert without["lpips"] is None
+    assert (without["psnr_log_db"], without["ssim"], without["log_l1"]) == (100.0, 1.0, 0.0)
+    with_weights = picture_scores(picture * 0.5, picture, hits, Lpips(*small_weights()))
+    assert with_weights["lpips"] is not None and with_weights["lpips"] > 0
+
+
+def test_rivals_are_the_median_and_the_closest_training_picture() -> None:
+    scenes = [training_scene(toy_sample(index), 16) for index in range(5)]
+    rivals = Rivals(scenes)
+    target = 10 ** scenes[3].target_VRR3[1].double().numpy() - 1
+    shown = rivals.pictures(target)
+    # half floats of log10(1 + radiance) below 1: 2^-11 of it
+    np.testing.assert_allclose(shown[NEAREST], target, rtol=5e-3, atol=2e-3)
+    np.testing.assert_allclose(shown[MEDIAN], median_picture(scenes), rtol=5e-3, atol=2e-3)
+
+
+def test_every_view_is_judged_beside_its_rivals(dataset: Dataset) -> None:
+    done: list[None] = []
+    rows = judged_views(contest(dataset), lambda: done.append(None))
+    assert len(done) == 3 and [(row.key, row.view) for row in rows] == [
+        (f"{scene:09d}", view) for scene in (5, 6, 7) for view in (0, 1)
+    ]
+    for row in rows:
+        assert set(row.scores) == {NETWORK, MEDIAN, NEAREST}
+        assert row.floors["psnr_log_db"] == 100.0 and row.floors["log_l1"] == pytest.approx(1e-5)
+        score = row.scores[NETWORK]["psnr_log_db"]
+        assert score is not None and row.gap("psnr_log_db") == pytest.approx(100 - score)
+        similarity = row.scores[NETWORK]["ssim"]
+        assert similarity is not None and row.gap("ssim") == pytest.approx(1 - similarity, abs=1e-6)
+        assert row.gap("lpips") is None
+    few = dataclasses.replace(contest(dataset), most_scenes=1)
+    assert len(judged_views(few, lambda: None)) == 2
+    with pytest.raises(TrilightError, match="resolution 24: expected a divisor of 32"):
+        judged_views(dataclasses.replace(contest(dataset), resolution=24), lambda: None)
+
+
+SCORES = dict.fromkeys(METRICS, 31.0) | {"lpips": None, "log_l1": 0.1}
+
+
+def with_lights(scene: Scene, lights: int) -> Scene:
+    """Return the scene with its last triangle, which shines, so many times, a step apart."""
+    corners = scene.vertex_positions[scene.faces[-1]]
+    added = np.concatenate([corners + np.array([0, 0, 0.1 * step]) for step in range(1, lights)])
+    first = len(scene.vertex_positions)
+    return dataclasses.replace(
+        scene,
+        vertex_positions=np.concatenate([scene.vertex_positions, added.astype(np.float32)]),
+        vertex_normals=np.concatenate(
+            [scene.vertex_normals, np.tile(scene.vertex_normals[-3:], (lights - 1, 1))]
+        ),
+        faces=np.concatenate(
+            [scene.faces, np.arange(first, first + len(added), dtype=np.uint32).reshape(-1, 3)]
+        ),
+        material_index=np.append(
+            scene.material_index, np.repeat(scene.material_index[-1], lights - 1)
+        ),
+        object_index=np.append(scene.object_index, np.repeat(scene.object_index[-1], lights - 1)),
+    )
+
+
+def row(number: int, **changes: object) -> JudgedView:
+    scores = {name: 30.0 + number for name in METRICS} | {"lpips": None, "log_l1": 0.1}
+    base = JudgedView(
+        key=f"{number:09d}",
+        view=0,
+        template="box",
+        num_triangles=100,
+        num_lights=1,
+        roughness=0.3,
+        excursion=None,
+        floors={"psnr_log_db": 40.0, "log_l1": 0.02},
+        scores={NETWORK: scores},
+    )
+    return dataclasses.replace(base, **changes)  # type: ignore[arg-type]
+
+
+def test_parts_are_ordered_and_hold_every_view() -> None:
+    rows = [
+        row(0, num_triangles=5000, num_lights=9, roughness=0.01),
+        row(1, num_triangles=256, template="wall"),
+        row(2, num_triangles=257, num_lights=3),
+        row(3, num_triangles=1200),
+    ]
+    groups = by_group(rows)
+    assert list(groups["triangles"]) == [
+        "up to 256",
+        "over 256, up to 512",
+        "over 1024, up to 1536",
+        "over 4096",
+    ]
+    assert list(groups["lights"]) == ["up to 1", "over 2, up to 4", "over 8"]
+    assert list(groups["smoothest roughness"]) == ["up to 0.1", "over 0.25, up to 0.5"]
+    assert {name: part["views"] for name, part in groups["template"].items()} == {
+        "box": 3,
+        "wall": 1,
+    }
+
+
+def test_a_summary_shows_the_bad_ones_and_the_noise() -> None:
+    rows = [row(number) for number in range(11)]
+    found = summary(rows)
+    assert found["psnr_log_db"]["median"] == 35.0
+    assert found["psnr_log_db"]["worse_5_percent"] == pytest.approx(30.5)
+    assert found["psnr_log_db"]["median_worse_than_noise"] == 5.0
+    assert found["log_l1"]["median_worse_than_noise"] == pytest.approx(0.08)
+    assert found["lpips"] == dict.fromkeys(found["lpips"], None)
+    assert found["near_floor"] == pytest.approx(4 / 11)  # 37 to 40 dB of 40
+    partly = [*rows, row(11, scores={NETWORK: rows[0].scores[NETWORK] | {"lpips": 0.5}})]
+    assert summary(partly)["lpips"]["median"] is None, "never a median of another set"
+
+
+def test_another_scenes_triangles_through_the_same_cameras(dataset: Dataset) -> None:
+    judging = contest(dataset)
+    rows, samples = judged_views(judging, lambda: None), list(judging.samples())
+    assert [row.swapped_psnr_log_db is None for row in rows] == [True] * 2 + [False] * 4
+    before, judged = samples[1], judged_scene(samples[2], judging.resolution)
+    seen = before.scene.with_cameras(samples[2].scene.c2w, samples[2].scene.fov_deg)
+    mixed = training_scene(dataclasses.replace(samples[2], scene=seen), judging.resolution)
+    shown = predict(judging.network, mixed)
+    for row, picture, target in zip(rows[4:], shown, judged.target_VRR3, strict=True):
+        assert row.swapped_psnr_log_db == psnr_log_db(picture, target)
+
+
+def test_what_swapping_costs_is_told_view_by_view() -> None:
+    swapped = [None, 28.0, 20.0, 34.0]
+    rows = [row(0, swapped_psnr_log_db=value) for value in swapped]
+    loss = record(rows, {})["swapped scenes"]
+    assert loss["views"] == 3 and loss["median_db"] == 2.0  # 30 less 28, 20 and 34
+    assert loss["mean_db"] == pytest.approx(8 / 3) and loss["share_lost"] == pytest.approx(2 / 3)
+    assert "loses 2.00 dB" in markdown(record(rows, {}))
+    assert record(rows[:1], {})["swapped scenes"] is None
+
+
+def test_worst_median_and_excursions_are_found() -> None:
+    rows = [row(number, excursion=("lights", 16.0 + number % 3)) for number in range(30)]
+    rows.append(row(40, excursion=("fov_deg", 90.0)))
+    chosen = worst_and_median(rows)
+    assert [view.key for view in chosen["worst"]] == [f"{number:09d}" for number in range(8)]
+    assert f"{15:09d}" in [view.key for view in chosen["median"]]
+    assert [view.key for view in worst_of_each_excursion(rows)] == [f"{40:09d}", f"{0:09d}"]
+
+
+def test_excursions_are_plotted_where_there_are_any(tmp_path: Path) -> None:
+    assert plot_excursions(tmp_path / "none.png", [row(0)]) == 0
+    assert not (tmp_path / "none.png").exists()
+    rows = [row(k, excursion=(axis, 10.0**k)) for axis in ("a", "b", "c", "d") for k in range(3)]
+    assert plot_excursions(tmp_path / "some.png", rows) == 4
+    with Image.open(tmp_path / "some.png") as picture:
+        assert min(picture.size) > 400
+
+
+def test_the_page_prints_na_and_escapes_what_comes_from_outside() -> None:
+    page = markdown(record([row(0, template="a|b<c>")], {"data": "x_y"}))
+    assert "a\\|b\\<c\\>" in page and "x\\_y" in page
+    (line,) = [line for line in page.splitlines() if line.startswith("| lpips (lower")]
+    assert line.endswith("| n/a |")
+
+
+def test_many_lights_are_judged_in_one_pass_and_in_groups(dataset: Dataset) -> None:
+    network = new_state(tiny_run()).model
+    scene = toy_scene(0)
+    assert grouped_pictures(network, scene, 16) is None, "one light is one group"
+    many = with_lights(scene, 20)
+    grouped = grouped_pictures(network, many, 16)
+    assert grouped is not None and grouped.shape == (2, 16, 16, 3)
+    # by hand: every group's picture times its share, the same sums in another order
+    expected = sum(
+        group.share
+        * predict(
+            network, training_scene(dataclasses.replace(toy_sample(0), scene=group.scene), 16)
+        )
+        for group in light_groups(many, 8)
+    )
+    np.testing.assert_allclose(grouped, expected, rtol=1e-5, atol=1e-6)
+    alone, both = row(0), row(1, scores={NETWORK: SCORES, GROUPED: SCORES | {"ssim": 0.5}})
+    assert record([alone], {})["light passes"] is None
+    found = record([alone, both], {})
+    assert list(found["contestants"]) == [NETWORK], "a column is of all views"
+    assert found["light passes"]["groups"]["views"] == 1
+    page = markdown(found)
+    assert "| groups | 1 | 31.00 | 31.00 | 31.00 | 0.5000 |" in page, page
+
+
+def test_facts_come_from_the_scene() -> None:
+    sample = toy_sample(0)
+    provenance = {"template": "toy", "excursion": {"axis": "lights", "value": 16}}
+    scene = sample.scene.with_provenance(provenance)
+    facts = facts_of(dataclasses.replace(sample, scene=scene))
+    assert facts["excursion"] == ("lights", 16.0) and facts["template"] == "toy"
+    *surfaces, _lamp = scene.materials[:, ROUGHNESS].tolist()
+    assert (facts["num_lights"], facts["roughness"]) == (1, min(surfaces))
+
+
+def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) -> None:
+    weights, out = tmp_path / "model.safetensors", tmp_path / "out"
+    weights.write_bytes(encode_weights(new_state(tiny_run()).model))
+    data = ["--data", str(dataset.folder.root)]
+    command = ["evaluate", str(weights), *data, "--split", "validation", "--out", str(out)]
+    done = trilight([*command, "--json", "--resolution", "16"])
+    assert done.exit_code == 0, done.output
+    found = json.loads((out / "evaluation.json").read_text())
+    assert found["contestants"] == json.loads(done.output[done.output.index("{") :])["contestants"]
+    assert len(found["views"]) == 6
+    assert "## By template" in (out / "evaluation.md").read_text()
+    for name in ("worst.png", "median.png"):
+        with Image.open(out / name) as sheet:
+            assert min(sheet.size) > 200
+    shown = trilight(command, env={"COLUMNS": "160"}).output.splitlines()
+    (scores,) = [line.split() for line in shown if line.split()[:1] == ["psnr_log_db"]]
+    assert len(scores) == 1 + len(found["contestants"])  # a column for each
+    missing = trilight(["evaluate", str(tmp_path / "no"), *data])
+    assert isinstance(missing.exception, TrilightError)
+    assert "no such file or folder" in str(missing.exception)
+    empty = trilight(["evaluate", str(weights), *data])
+    assert "the test split holds no scene" in str(empty.exception)
