@@ -1,8 +1,8 @@
 """The recipe by name: its methods and what can change its results; loads no mesh library."""
 
-import ast
 import functools
 import hashlib
+import re
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -51,6 +51,12 @@ def methods_of(profile: Profile) -> tuple[str, ...]:
     return tuple(name for name in _METHODS[profile] if not name.startswith("pymeshlab"))
 
 
+_IMPORT = re.compile(
+    rb"^[ \t]*(?:from [\w.]+ import (?:\([^)]*\)|[^\n]*)|import [^\n]*)\n", re.MULTILINE
+)
+"""A statement as ruff writes it. Python 3.11's `ast` fails now and then where threads parse."""
+
+
 @functools.cache
 def code_sha256(folder: Path = Path(__file__).parent) -> str:
     """Return the digest of this stage's own source: another program may give another outcome.
@@ -60,14 +66,5 @@ def code_sha256(folder: Path = Path(__file__).parent) -> str:
     """
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.py")):
-        digest.update(_without_imports(path.read_bytes()))
+        digest.update(_IMPORT.sub(b"", path.read_bytes()))
     return digest.hexdigest()
-
-
-def _without_imports(source: bytes) -> bytes:
-    lines = source.splitlines(keepends=True)
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            for number in range(node.lineno - 1, node.end_lineno or node.lineno):
-                lines[number] = b""
-    return b"".join(lines)
