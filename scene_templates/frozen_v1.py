@@ -7,7 +7,7 @@ another name.
 """
 
 from scene_templates.cameras import CameraSettings
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings

@@ -6,10 +6,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_templates.cameras import Sector
 from scene_templates.checks import OFFSET, SIZE, Counts, Range
 from scene_templates.layout import Emitter
 from scene_templates.rotations import Orientation, rotated, rotation_rand
-from scene_templates.sectors import Sector
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from scene_templates.checks import Range
 from scene_templates.layout import Plane, Pose
-from scene_templates.patches import SIDES
-from scene_templates.rooms import Room
+from scene_templates.rooms import SIDES, Room
 from scene_templates.rotations import Orientation, rotated, rotation_rand
 from storage.errors import Rejected
 from storage.settings.described import checked

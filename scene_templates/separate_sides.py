@@ -12,8 +12,7 @@ from typing import Annotated
 import numpy as np
 
 from scene_templates.checks import SHIFT, SIZE, Range
-from scene_templates.patches import SIDES, PatchPlacement
-from scene_templates.rooms import Room
+from scene_templates.rooms import SIDES, PatchPlacement, Room
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 

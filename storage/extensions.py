@@ -18,8 +18,7 @@ from types import ModuleType
 from typing import Any, Literal
 
 from storage.digests import sha256_hex
-from storage.errors import TrilightError
-from storage.suggestion import expected_one_of
+from storage.errors import TrilightError, expected_one_of
 
 VARIABLE = "TRILIGHT_EXTEND"
 """Names the files, as absolute paths with os.pathsep between them, to processes that start."""

@@ -9,9 +9,8 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar
 
-from storage.errors import TrilightError
+from storage.errors import TrilightError, expected_one_of
 from storage.extensions import Decided, Extension, is_reference, loading, opened, short_name
-from storage.suggestion import expected_one_of
 
 Entry = TypeVar("Entry")
 

@@ -24,7 +24,7 @@ from pipeline.exchange.from_description import SHELL_FOLDER, LoadedMesh, scene_f
 from pipeline.exchange.reader import SceneReader
 from pipeline.objects.generated import builtin_mesh
 from pipeline.objects.licences import USER_PROVIDED
-from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.scene import Scene
@@ -125,7 +125,7 @@ class SceneBuilder:
         """Add a procedural object, such as the 3rd `rock` or `torus_knot` of `builtin:`.
 
         Args:
-            family: a name of pipeline.objects.builtin.families.
+            family: a name of pipeline.objects.generated.
             number: which of the family, from 0.
             material, name, at, size, rotation_deg: as `add_mesh`.
 

@@ -1,10 +1,18 @@
 """The forms in which a file holds scenes, by the suffix that chooses each: one table for all.
 
-Reading happens in child processes only (pipeline.exchange.file_child), since a file may come from
+Reading happens in child processes only (pipeline.exchange.reader), since a file may come from
 anybody; a child loads the extensions that have added a form.
+
+What a form of file holds of a scene: stated by its writer, compared with what the scene has.
+
+A writer that names what it knows drops what it does not know. So each form states the members that
+it carries, and whatever a scene has besides, not at its default, is said to be lost. A member is a
+field of `Scene`, or a part of one: `materials.diffuse` (storage.records.material) and `objects.uid`
+(SceneObject). A form that carries `materials` carries all columns, also those that are added.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,24 +20,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange import renderformer_h5, renderformer_json_write
-from pipeline.exchange.described_albedos import AlbedoOverOne
-from pipeline.exchange.from_description import scaled_albedo_notes
-from pipeline.exchange.renderformer_h5 import reflecting_emitters, write_renderformer_h5
-from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
-from pipeline.exchange.renderformer_json_write import described_files
+from pipeline.exchange import renderformer_h5, renderformer_json
+from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
+from pipeline.exchange.renderformer_h5 import (
+    read_renderformer_h5,
+    reflecting_emitters,
+    write_renderformer_h5,
+)
+from pipeline.exchange.renderformer_json import described_files
 from pipeline.exchange.scene_files import build_scene, cameras_by, described_by
 from pipeline.exchange.usd import write as usd
 from pipeline.exchange.usd.read import read_usd, usd_keys
 from pipeline.exchange.usd.write import write_usd, write_usd_shard
 from pipeline.objects.licences import USER_PROVIDED
 from storage.atomic import write_atomically
-from storage.dataset.shard_reader import iterate_samples, read_members
+from storage.dataset.shard import iterate_samples, read_members
 from storage.errors import TrilightError
 from storage.records import scene_file
+from storage.records.material import columns_in_use
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.sample import decode_sample, decode_scene
-from storage.records.scene import Scene
+from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene, read_scene_file
 from storage.registry import Registry
 
@@ -94,7 +105,7 @@ class SceneFormat:
     write_many: Callable[[Path, Iterable[tuple[str, Scene]]], None] | None = None
     """Writes scenes with their keys into one file."""
     carried: Collection[str] = frozenset()
-    """Members of a scene that it holds (storage.records.carried); of others in use the loss is
+    """Members of a scene that it holds (pipeline.exchange.formats); of others in use the loss is
     noted."""
     holds_pictures: bool = False
     """Whether `write` makes use of pictures."""
@@ -221,7 +232,7 @@ FORMATS: Registry[SceneFormat] = Registry(
             read=_read_json,
             cameras=_json_cameras,
             write=_write_json,
-            carried=renderformer_json_write.CARRIED,
+            carried=renderformer_json.CARRIED,
         ),
         ".h5": SceneFormat(
             read=_read_h5,
@@ -236,3 +247,26 @@ FORMATS: Registry[SceneFormat] = Registry(
     },
 )
 """By suffix, in small letters and with its point."""
+
+
+def lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]:
+    """Return what a form that carries these members loses of a scene: one text, or none."""
+    lost = [
+        member
+        for member in _members_in_use(scene)
+        if not {member, member.partition(".")[0]} & set(carried)
+    ]
+    return (", ".join(lost),) if lost else ()
+
+
+def _members_in_use(scene: Scene) -> Iterator[str]:
+    """Yield the members that are not at their defaults."""
+    for field in dataclasses.fields(Scene):
+        if field.name == "materials":
+            yield from (f"materials.{name}" for name in columns_in_use(scene.materials))
+        elif field.name == "objects":
+            for part in dataclasses.fields(SceneObject):
+                if any(getattr(entry, part.name) != part.default for entry in scene.objects):
+                    yield f"objects.{part.name}"
+        elif len(getattr(scene, field.name)):
+            yield field.name

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.described_albedos import AlbedoOverOne
 from pipeline.exchange.description import DescribedObject, SceneDescription
 from pipeline.exchange.from_description import (
+    AlbedoOverOne,
     LoadedMesh,
     described_cameras,
     scene_from_description,

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.exchange.described_albedos import AlbedoOverOne
 from pipeline.exchange.description import SceneDescription
+from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.exchange.scene_files import described_by
 from storage.errors import EnvironmentFailure, TrilightError
 

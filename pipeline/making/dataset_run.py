@@ -29,8 +29,7 @@ from pipeline.making.runners import Runner
 from pipeline.objects.sources import look_at_source
 from pipeline.renders.variant import choose_variant
 from storage.dataset.asked import write_asked
-from storage.dataset.layout import DatasetFolder
-from storage.dataset.output import dataset_folder
+from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 

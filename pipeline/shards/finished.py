@@ -13,8 +13,7 @@ from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_man
 from storage.dataset.splits import shards_for
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject
-from storage.records.objects_lock import read_objects_lock
+from storage.records.objects import LockedObject, read_objects_lock
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
 from storage.remote.safe_url import safe_url
 from storage.settings.dataset import SplitSettings

@@ -16,12 +16,10 @@ import shutil
 from collections.abc import Collection
 from pathlib import Path
 
-from pipeline.shards.notes import note_of, note_shard, noted_shard
-from pipeline.shards.pack import rejections_of_shard
+from pipeline.shards.pack import note_of, note_shard, noted_shard, rejections_of_shard
 from storage.atomic import write_atomically
 from storage.dataset.claims import claimed
-from storage.dataset.dataset import Dataset
-from storage.dataset.files import RemoteDatasetFiles
+from storage.dataset.dataset import Dataset, RemoteDatasetFiles
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (
     SHARD_NAME,
@@ -33,10 +31,10 @@ from storage.dataset.manifest import (
     shard_of_row,
     write_manifest,
 )
-from storage.dataset.scene_log import log_name
+from storage.dataset.progress import log_name
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.failures import decode_failures, read_failures, write_failures
+from storage.records.objects import decode_failures, read_failures, write_failures
 from storage.remote.bucket import Bucket
 from storage.remote.cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_url

@@ -6,6 +6,8 @@ deleted at any time, and then it is made again.
 No folder holds more than 5,000 entries: of files that are numbered, the first 4,096 stand in their
 folder, and each following 4,096 in one of its `part-0001`, `part-0002`, ... Where a file stands
 follows from its number alone, so nothing moves when a dataset grows.
+
+Where a dataset is made: in a folder, or in a bucket with a folder of this machine before it.
 """
 
 import contextlib
@@ -16,8 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import remove_leftovers, write_error
+from storage.cache import cache_folder
 from storage.dataset.claims import claimed
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.remote.bucket import WRITABLE
+from storage.remote.safe_url import printable, safe_url
+from storage.remote.url import parse_url
 
 _LEFT_S = 3600.0
 """What nobody has written to for so long was left by a kill. Not all file systems carry locks
@@ -38,7 +45,7 @@ class DatasetFolder:
     """The paths of one dataset, or of this machine's part of one that is made in a bucket."""
 
     root: Path
-    """The folder that users name; for a bucket, one in the cache (storage.dataset.output)."""
+    """The folder that users name; for a bucket, one in the cache (storage.dataset.layout)."""
     bucket: str = ""
     """URL of the bucket that the dataset is made in, where it is; without secrets."""
 
@@ -207,3 +214,33 @@ def _lock_alone(descriptor: int) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+_ADMITTED = f"expected a folder, or a URL of {' or '.join(WRITABLE)}"
+
+
+def dataset_folder(out: str) -> DatasetFolder:
+    """Return the folder of a dataset that is to be made.
+
+    For a bucket that is a folder of the cache, the same one whenever the same URL is named, with
+    the scenes that are not in a shard yet and a copy of what stands beside the shards.
+
+    Args:
+        out: a folder, or a URL of WRITABLE.
+
+    Raises:
+        TrilightError: the URL is refused (storage.remote.url), is none that can be written to only
+            once, or has a query.
+    """
+    if "://" not in out and not out.startswith("pipe:"):
+        return DatasetFolder(Path(out))
+    place = parse_url(out, what="out")
+    if isinstance(place, Path):
+        return DatasetFolder(place)
+    shown = printable(safe_url(out))
+    if place.scheme not in WRITABLE:
+        raise TrilightError(f"out {shown!r} has the scheme {place.scheme!r}; {_ADMITTED}.")
+    if "?" in place.root or "#" in place.root:
+        raise TrilightError(f"out {shown!r} has a query or fragment; {_ADMITTED}, without one.")
+    name = sha256_hex(place.shown.encode())[:16]
+    return DatasetFolder(cache_folder("outputs") / name, place.shown)

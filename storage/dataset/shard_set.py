@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.shard import Member, scan_samples
 from storage.dataset.shard_places import ShardPlace
-from storage.dataset.shard_reader import Member, scan_samples
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.sample import Sample, decode_sample
@@ -27,7 +27,7 @@ class OpenShard:
     """A shard that is being read."""
 
     def __init__(self, name: str, stream: BinaryIO) -> None:
-        """Look at the headers; raises TrilightError as `storage.dataset.shard_reader`."""
+        """Look at the headers; raises TrilightError as `storage.dataset.shard`."""
         self.name = name
         self._stream = stream
         self._samples: list[tuple[str, Mapping[str, Member]]] = list(scan_samples(stream, name))

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import SPLITS
 from storage.dataset.dataset import open_dataset
-from storage.dataset.manifest import Manifest, ShardEntry
-from storage.dataset.member_table import MemberTable
+from storage.dataset.manifest import Manifest, MemberTable, ShardEntry
 from storage.dataset.shard_places import listed_shards
 from storage.dataset.shard_set import (
     KeysSeen,

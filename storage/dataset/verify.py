@@ -1,4 +1,7 @@
-"""Is a dataset what its manifest says? Every hash, member and law, and a list of what is wrong."""
+"""Is a dataset what its manifest says? Every hash, member and law, and a list of what is wrong.
+
+The laws of one sample of a dataset: scene, pictures, lights, and rights of its objects.
+"""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -6,21 +9,21 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from storage.dataset.check_sample import check_sample
-from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.files import LocalFiles, RemoteDatasetFiles
+import numpy as np
+
+from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, index_stream
-from storage.dataset.member_table import MemberTable
+from storage.dataset.manifest import Manifest, MemberTable, ShardEntry, index_stream
 from storage.dataset.progress import planned_shards
-from storage.dataset.shard_reader import samples_of, scan_members
+from storage.dataset.shard import samples_of, scan_members
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject
-from storage.records.objects_lock import decode_objects_lock
-from storage.records.sample import decode_sample
+from storage.licences import mixed_share_alike
+from storage.records.lights import sum_of_lights
+from storage.records.objects import LockedObject, decode_objects_lock
+from storage.records.sample import Sample, decode_sample
 from storage.remote.fetch import download
 from storage.remote.tries import TransferFailed
 
@@ -220,3 +223,51 @@ def _check_content(
             found.faults.append(str(error))
             continue
         found.faults += check_sample(sample, shard.split, manifest, locked)
+
+
+def check_sample(
+    sample: Sample, split: str, manifest: Manifest, locked: Mapping[str, LockedObject]
+) -> Iterator[str]:
+    """Yield the faults of one sample: laws of the scene, pictures, and rights of its objects."""
+    try:
+        sample.scene.check()
+    except TrilightError as error:
+        yield f"sample {sample.key}: {error}"
+    resolution = _setting(manifest, "renders", "resolution")
+    expected = (manifest.num_views, resolution, resolution, 3)
+    if sample.radiance_rgb.shape != expected or sample.scene.num_views != manifest.num_views:
+        yield f"sample {sample.key}: pictures {sample.radiance_rgb.shape}; expected {expected}"
+    if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
+        yield f"sample {sample.key}: a picture holds a value that is not finite or negative"
+    yield from _check_lights(sample, apart=bool(manifest.settings["renders"].get("per_light")))
+    if mixed := mixed_share_alike(entry.licence for entry in sample.scene.objects):
+        yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
+    for entry in sample.scene.objects:
+        if entry.kind != "object":
+            continue
+        lock = locked.get(entry.uid)
+        if lock is None:
+            yield f"sample {sample.key}: object {entry.uid!r} is not in objects.lock.jsonl"
+        elif lock.split != split:
+            yield f"sample {sample.key}: object {entry.uid!r} belongs to split {lock.split}"
+
+
+def _check_lights(sample: Sample, *, apart: bool) -> Iterator[str]:
+    """Yield the faults of the pictures of single lights; older manifests know no such setting."""
+    if (sample.lights_rgb is not None) != apart:
+        found = "lacks" if apart else "has"
+        yield f"sample {sample.key}: {found} pictures by light; renders.per_light is {apart}"
+    if sample.lights_rgb is None:
+        return
+    for view, lights in enumerate(sample.lights_rgb):
+        differs = (sum_of_lights(lights) != sample.radiance_rgb[view]).any(axis=-1)
+        if differs.any():
+            row, column = (int(index) for index in np.argwhere(differs)[0])
+            yield (
+                f"sample {sample.key}: view {view} is not the sum of its lights in "
+                f"{int(differs.sum())} pixels, first in ({row}, {column})"
+            )
+
+
+def _setting(manifest: Manifest, group: str, name: str) -> Any:
+    return manifest.settings[group][name]

@@ -3,12 +3,18 @@
 The file holds, per level, `positions_<budget>` f32 [V, 3] and `faces_<budget>` u32 [F, 3], and in
 its metadata what is known of the source and of each level. Positions are in the unit box: the
 bounding box of the cleaned source is centred on the origin and its longest side is 1.
+
+One row per object of an asset folder: what `trilight assets` says of it, to people and programs.
+
+The rows of the accepted objects are a catalogue (`objects.jsonl`), so that the folder is itself a
+source of objects.
 """
 
 import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,3 +161,38 @@ def decode_asset(data: bytes) -> Asset:
         for record in records
     )
     return Asset(levels=levels, source=SourceFacts(**header.pop("source")), **header)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssetRow:
+    """An accepted object."""
+
+    uid: str
+    """As in ObjectRecord."""
+    path: str
+    """Its mesh, below the folder."""
+    title: str
+    """For people."""
+    licence: str
+    """SPDX identifier, or `LicenseRef-...`."""
+    licence_source: str
+    """Where the licence is stated."""
+    attribution: str
+    """Whom to name."""
+    source_url: str
+    """Where the object came from."""
+    num_faces: int
+    """Triangles of the mesh."""
+    method: str
+    """How it was made; `source` where nothing had to be left out."""
+    quality: LevelQuality
+    """How it compares with the source."""
+    source: SourceFacts
+    """What the file held."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the row as JSON values, with the two judgements that readers ask for."""
+        row = dataclasses.asdict(self)
+        row["repaired"] = self.source.repaired
+        row["source"]["watertight"] = self.source.watertight
+        return row

@@ -7,6 +7,8 @@ The four published columns stand first. Another one is declared by whoever needs
 Every process that handles such scenes must load the file that does so. A scene in memory has all
 the declared columns; a stored one names what it has, and lacks those that are at their default
 everywhere, so that a new column changes no byte of a scene that does not use it.
+
+Which rows of an array are the same, to the last bit.
 """
 
 import json
@@ -242,3 +244,14 @@ DIFFUSE, SPECULAR, EMISSION = (_PLACES[name] for name in ("diffuse", "specular",
 ROUGHNESS = _PLACES["roughness"].start
 REFLECTING = slice(0, EMISSION.start)
 """Albedos and roughness: what stands before the emission."""
+
+
+def distinct_rows(rows: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where each distinct row first stands, in that order, and which one each row is.
+
+    Rows [N, K] are compared by their bytes.
+    """
+    keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * 4))).ravel()
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first, kind="stable"), kind="stable")
+    return np.sort(first), rank[inverse]

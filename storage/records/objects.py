@@ -1,6 +1,20 @@
-"""What one stage hands to the next: rows of plain values, each with the rights of its object."""
+"""What one stage hands to the next: rows of plain values, each with the rights of its object.
 
+`objects.lock.jsonl`: which objects a dataset uses, frozen before its first scene.
+
+`failures.jsonl`: every object, scene and view that was rejected, with its reason.
+"""
+
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
+
+from storage.atomic import write_atomically
+from storage.digests import canonical_json
+from storage.errors import TrilightError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,3 +73,72 @@ class Failure:
     """One sentence for a person."""
     attempt: int = 0
     """Which attempt at the item this was, from 0."""
+
+
+def encode_objects_lock(objects: Iterable[LockedObject]) -> bytes:
+    """Return the file of a lock: one line per object, sorted by uid."""
+    rows = sorted(objects, key=lambda entry: entry.uid)
+    return b"".join(canonical_json(dataclasses.asdict(row)) + b"\n" for row in rows)
+
+
+def write_objects_lock(path: Path, objects: Iterable[LockedObject]) -> None:
+    """Write the lock atomically."""
+    write_atomically(path, encode_objects_lock(objects))
+
+
+def read_objects_lock(path: Path) -> list[LockedObject]:
+    """Return the objects of a lock.
+
+    Raises:
+        TrilightError: missing, or a line that is not a locked object.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+    return decode_objects_lock(data, str(path))
+
+
+def decode_objects_lock(data: bytes, place: str) -> list[LockedObject]:
+    """Return the objects of the bytes of a lock; raises as `read_objects_lock`, naming `place`."""
+    objects = []
+    for number, line in enumerate(data.splitlines(), start=1):
+        try:
+            objects.append(LockedObject(**json.loads(line)))
+        except (TypeError, ValueError) as error:
+            raise TrilightError(f"{place}:{number}: not a locked object ({error}).") from error
+    return objects
+
+
+def encode_failures(failures: Iterable[Failure]) -> bytes:
+    """Return one line per failure, each once, sorted by stage, item and attempt."""
+    rows = sorted(set(failures), key=lambda row: (row.stage, row.item, row.attempt, row.reason))
+    return b"".join(canonical_json(dataclasses.asdict(row)) + b"\n" for row in rows)
+
+
+def decode_failures(data: bytes) -> list[Failure]:
+    """Return the failures of a file that `encode_failures` made.
+
+    Raises:
+        TrilightError: a line is not a failure.
+    """
+    try:
+        return [Failure(**json.loads(line)) for line in data.splitlines()]
+    except (TypeError, ValueError) as error:
+        raise TrilightError(f"failures.jsonl: a line is not a failure ({error}).") from error
+
+
+def read_failures(path: Path) -> list[Failure]:
+    """Return the failures of a file; none where there is no file."""
+    return decode_failures(path.read_bytes()) if path.exists() else []
+
+
+def write_failures(path: Path, failures: Iterable[Failure]) -> None:
+    """Write the failures atomically."""
+    write_atomically(path, encode_failures(failures))
+
+
+def count_by_reason(failures: Iterable[Failure]) -> list[tuple[str, str, int]]:
+    """Return (stage, reason, how many), the most frequent first."""
+    counts = Counter((failure.stage, failure.reason) for failure in failures)
+    return [(stage, reason, count) for (stage, reason), count in counts.most_common()]

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from storage.errors import TrilightError
-from storage.remote.pace import PATIENCE, Pace
-from storage.remote.tries import Interrupted, TransferFailed, with_tries
+from storage.remote.tries import PATIENCE, Interrupted, Pace, TransferFailed, with_tries
 from storage.remote.url import RemoteUrl, shared_driver, transfer_timeout
 
 PIECE_BYTES = 8 << 20
@@ -69,7 +68,7 @@ def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_byt
 
     Raises:
         TransferFailed: as `facts_of`, it has another size than `num_bytes`, it breaks off again and
-            again without moving on, or comes too slowly (storage.remote.pace).
+            again without moving on, or comes too slowly (storage.remote.tries).
         TrilightError: the driver's package is missing, or the disk is full.
     """
     driver = shared_driver(url)

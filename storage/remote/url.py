@@ -135,7 +135,7 @@ def _driver_of(access: RemoteUrl, process: int) -> Any:
 
 
 def transfer_timeout() -> Any:
-    """Return the limits of a request for a file, which storage.remote.pace bounds as a whole."""
+    """Return the limits of a request for a file, which storage.remote.tries bounds as a whole."""
     import aiohttp
 
     return aiohttp.ClientTimeout(connect=_CONNECT_S, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)

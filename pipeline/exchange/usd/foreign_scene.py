@@ -16,8 +16,7 @@ from pipeline.exchange.usd.stage import OpenedUsd
 from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.shading import ShadedMesh, flat_shaded
 from storage.errors import TrilightError
-from storage.records.material import EMISSION, ROUGHNESS, default_rows
-from storage.records.rows import distinct_rows
+from storage.records.material import EMISSION, ROUGHNESS, default_rows, distinct_rows
 from storage.records.scene import ObjectKind, Scene, SceneObject
 
 MAX_TRIANGLES = 1_000_000

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.exchange.usd.diagnostics import quietly
 from pipeline.exchange.usd.foreign_scene import scene_of_stage
 from pipeline.exchange.usd.read_ours import is_marked, read_exact, scene_keys
-from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.exchange.usd.stage import OpenedUsd, quietly
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 

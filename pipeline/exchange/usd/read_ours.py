@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import as_expected
-from pipeline.exchange.usd.write_cameras import camera_attributes
+from pipeline.exchange.usd.write import camera_attributes
 from pipeline.exchange.usd.write_materials import OPENPBR, PREVIEW, material_tables
 from pipeline.exchange.usd.write_meshes import MESH, SUBSET, object_attributes
 from storage.conventions import require_readable

@@ -8,15 +8,17 @@ the stage are compared with the folder once more when it stands, and before anyt
 How large the stage may be is for `pipeline.exchange.usd.composition` to say. The bytes are still
 parsed by native code: whoever opens files of strangers does so in a child process with limits
 (pipeline.isolation).
+
+What USD says of a broken file, as one line that names the file and nothing of this machine.
 """
 
 import re
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from pipeline.exchange.usd.composition import composition_errors
-from pipeline.exchange.usd.diagnostics import said
 from storage.errors import TrilightError
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -210,3 +212,43 @@ def _check_package(path: Path, size: int) -> None:
             )
         if member.filename.startswith("/") or ".." in Path(member.filename).parts:
             raise TrilightError(f"{path.name}: member {member.filename!r:.80} leads outside.")
+
+
+Read = TypeVar("Read")
+
+_MAX_LETTERS = 300
+
+
+def quietly(path: Path, read: Callable[[], Read]) -> Read:
+    """Return what `read` makes of a file, without USD's own warnings on standard error.
+
+    Raises:
+        TrilightError: as `read`, or it met what is broken, or of another type than USD states.
+    """
+    from pxr import Tf, UsdUtils
+
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        return read()
+    except TrilightError:
+        raise
+    except Tf.ErrorException as error:
+        raise TrilightError(f"{path.name}: not readable as USD ({said(error, path)}).") from error
+    except (TypeError, ValueError, AttributeError, LookupError, OverflowError) as error:
+        raise TrilightError(
+            f"{path.name}: holds a value of another kind than USD states ({said(error, path)})."
+        ) from error
+    finally:
+        delegate.TakeUncoalescedDiagnostics()
+        del delegate
+
+
+def said(error: Exception, path: Path) -> str:
+    """Return what an error says, without USD's own source files and the folder of `path`."""
+    try:
+        text = " ".join(str(error).split())
+    except UnicodeDecodeError:  # it cites the file
+        return "bytes that are no text"
+    found = re.findall(r"\.(?:cpp|h|yy) : '(.*?)'?(?= Error in |$)", text)
+    text = (found[-1] if found else text).replace(f"{path.resolve().parent}/", "")
+    return "".join(letter if letter.isprintable() else "?" for letter in text)[:_MAX_LETTERS]

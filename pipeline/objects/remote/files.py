@@ -3,29 +3,31 @@
 A file lies below `files` under its own name, since the parts of a glTF name each other. Beside it,
 below `versions`, stands what the server said about it then: while the server says the same, the
 file is not fetched again.
+
+Which other files a glTF needs: so that they are fetched with it.
 """
 
 import errno
 import hashlib
 import json
 import os
+import posixpath
 import threading
 import time
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from fsspec.asyn import sync
 from fsspec.callbacks import Callback
 
 from pipeline.objects.remote.folder import RemoteFolder
-from pipeline.objects.remote.gltf_buffers import buffer_names
 from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_atomically
 from storage.errors import TrilightError
 from storage.remote.fetch import version_of
-from storage.remote.pace import Pace
 from storage.remote.safe_url import printable
-from storage.remote.tries import Interrupted, TransferFailed, with_tries
+from storage.remote.tries import Interrupted, Pace, TransferFailed, with_tries
 from storage.remote.url import transfer_timeout
 
 _MAX_NAME_BYTES = 220
@@ -208,3 +210,47 @@ def _remove_stale(files: Path) -> None:
                 leftover.unlink()
         except OSError:
             continue
+
+
+_MAX_JSON_BYTES = 64_000_000
+
+
+def buffer_names(path: Path, name: str) -> list[str]:
+    """Return the files that the buffers of a `.gltf` name, each once, in their order.
+
+    Whatever is not a relative URI to below the folder of the file is left out, and so is everything
+    of a file that is not a glTF: the mesh stage reads it again, and says what is wrong.
+
+    Args:
+        path: the file on this machine.
+        name: its path below the remote folder; the results are such paths too.
+    """
+    try:
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            return []
+        tree = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return []
+    buffers = tree.get("buffers") if isinstance(tree, dict) else None
+    folder = posixpath.dirname(name)
+    found: dict[str, None] = {}
+    for buffer in buffers if isinstance(buffers, list) else ():
+        uri = buffer.get("uri") if isinstance(buffer, dict) else None
+        inner = _inner(uri) if isinstance(uri, str) else None
+        if inner is not None:
+            found[posixpath.join(folder, inner)] = None
+    return list(found)
+
+
+def _inner(uri: str) -> str | None:
+    """Return the path that a relative URI names below its folder, or None."""
+    try:
+        parts = urlsplit(uri)
+    except ValueError:
+        return None
+    inner = posixpath.normpath(unquote(uri))
+    if parts.scheme or parts.netloc or not uri or "\x00" in inner or "\n" in inner:
+        return None
+    if inner.startswith("/") or inner in (".", "..") or inner.startswith("../"):
+        return None
+    return inner

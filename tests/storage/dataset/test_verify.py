@@ -9,7 +9,7 @@ import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.manifest import index_shard, write_manifest
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.records.sample import encode_sample
