@@ -1,7 +1,4 @@
-"""Cameras: they look near the origin from the open side of a layout.
-
-Sectors of the sphere of directions: from where a layout may be seen and lit.
-"""
+"""Cameras, which look near the origin from a sector of directions: the open side of a layout."""
 
 import math
 from dataclasses import dataclass
@@ -24,7 +21,7 @@ class Sector:
     azimuth_deg: float
     """Middle of the sector; 0 is +X, 90 is +Y."""
     half_width_deg: float
-    """Most angle to either side of it; 180 is all around."""
+    """Largest angle to either side of the azimuth; 180 is all around."""
     elevation_deg: tuple[float, float]
     """Least and greatest angle above the horizon."""
 
@@ -43,11 +40,11 @@ class CameraSettings:
     """What cameras are drawn from, as published."""
 
     distance: Annotated[Range, SIZE] = (1.5, 2.0)
-    """From the camera to the point it looks at, world units."""
+    """Distance from the camera to the point it looks at, world units."""
     target_jitter: Annotated[float, OFFSET] = 0.2
-    """Most offset per axis from the origin of the point it looks at."""
+    """Largest offset, per axis, of the point it looks at from the origin."""
     up_jitter: Annotated[float, Within(0, 1)] = 0.1
-    """Most offset per axis of a camera's up vector from +Z."""
+    """Largest offset, per axis, of a camera's up vector from +Z."""
     fov_deg: Annotated[Range, Within(1, 170, unit="degrees")] = (30.0, 60.0)
     """Full field of view, horizontal and vertical."""
 

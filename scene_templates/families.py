@@ -1,6 +1,6 @@
-"""A family: one layout with how many objects of which size it holds, and how often it is drawn.
+"""Families: a layout, how many objects of which size it holds, and how often it is drawn.
 
-Trilight's own families: every layout equally often, with 1, 2 or 3 objects equally often.
+Trilight's own draw every layout equally often, with 1, 2 or 3 objects equally often.
 """
 
 from collections.abc import Callable, Mapping

@@ -2,8 +2,7 @@
 
 A frozen set asks no list of families or layouts and takes no default: those may change, and sets
 that networks are compared on may not. Test: tests/pipeline/builds/test_frozen_builds.py. The
-layouts that are named here are frozen with it; whoever wants another `plane` registers it under
-another name.
+layouts that are named here are frozen with it; another `plane` is registered under another name.
 """
 
 from scene_templates.cameras import CameraSettings

@@ -63,7 +63,7 @@ class PlaceableShape(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectSpace:
-    """Where objects may be."""
+    """The space in which objects are placed."""
 
     room: Room
     """The space between the shell parts."""

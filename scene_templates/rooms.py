@@ -6,9 +6,8 @@ diagonals, and edges meet exactly. In the others the spin is free, parts tilt a 
 square is made just large enough to cover its side of the room: parts cross instead of gaping, at
 the price of some hidden triangles.
 
-Flat patches of 128 triangles, and where the four parts of a shell stand.
-
-The order of transforms is the published one: turn about X, Y, Z, scale per axis, move, halve.
+A patch is a square of 128 triangles. The order of its transforms is the published one: turn about
+X, Y, Z, scale per axis, move, halve.
 """
 
 import math
@@ -37,7 +36,7 @@ class Side:
     axis: int
     """The axis that the side is perpendicular to."""
     sign: int
-    """At which end of that axis it stands."""
+    """The end of that axis at which it stands."""
 
 
 SIDES = MappingProxyType(
@@ -63,7 +62,7 @@ class PatchPlacement:
     scale: tuple[float, float, float]
     """Per axis."""
     translation: tuple[float, float, float]
-    """After scaling."""
+    """Translation after scaling."""
 
 
 def patch(side: Side, placement: PatchPlacement) -> NDArray[np.float64]:
@@ -93,7 +92,7 @@ PATCH_FACES.setflags(write=False)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Room:
-    """Where the shell parts stand, and the space between them."""
+    """The places of the shell parts, and the space between them."""
 
     patches: tuple[PatchPlacement, ...]
     """One per shell part."""

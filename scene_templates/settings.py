@@ -4,7 +4,7 @@ Numbers follow the RenderFormer V1 recipes where they are known and sound; each 
 World units throughout: the nominal shell is the cube [-0.5, 0.5]^3, so sizes that the recipes
 state for a cube of side 2 are halved on use (fields that hold such numbers say "before halving").
 
-Excursions: scenes that leave the usual range along one axis, while all else stays.
+An excursion takes a scene beyond the usual range along one axis, while all else stays.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ class Excursion:
     axis: str
     """What is varied, such as `fov_deg`; stands in the provenance of its scenes."""
     value: Annotated[int | float, Within(-FLOAT32_MAX, FLOAT32_MAX)]
-    """Where on the axis; stands there too."""
+    """The value on the axis; also in the provenance."""
     changes: tuple[tuple[str, Any], ...]
     """Dotted names of scene settings with their values (storage.settings.changes)."""
 
@@ -86,7 +86,7 @@ class SceneSettings:
     lights: LightSettings = field(default_factory=LightSettings)
     """What shines on them."""
     cameras: CameraSettings = field(default_factory=CameraSettings)
-    """From where they are seen."""
+    """Cameras of the scenes."""
     views: ViewLaws = field(default_factory=ViewLaws)
     """What a view must show."""
     excursions: tuple[Excursion, ...] = ()

@@ -1,11 +1,7 @@
-"""The four layouts as data: which walls they have, and from where they are seen and lit.
-
-`Template`: a layout as data, and the function that builds one from its parameters.
+"""Layouts as data: which walls they have, and from where they are seen and lit.
 
 Following infinigen's convention, `Template.layout(params)` builds and draws nothing, while
-`layout_rand(rng, ...)` in the file of that name draws the parameters and builds. The layouts differ
-in the walls that they have and the side from which they are seen and lit, and in nothing else:
-each is one value in scene_templates/templates.py.
+`layout_rand(rng, ...)` in the file of that name draws the parameters and builds.
 """
 
 from dataclasses import dataclass
@@ -46,13 +42,13 @@ class Template:
     """A layout."""
 
     name: str
-    """As in `Family.template`."""
+    """Name by which `Family.template` refers to it."""
     parts: tuple[str, ...]
     """Names of its shell parts (scene_templates.rooms.SIDES), the floor first."""
     cameras: Sector
-    """From where it is seen."""
+    """Directions from which it is seen."""
     lights: Sector
-    """From where it is lit."""
+    """Directions from which it is lit."""
 
     @property
     def shell_triangles(self) -> int:

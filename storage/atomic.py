@@ -61,7 +61,7 @@ def remove_leftovers(folder: Path, *, older_than_s: float = 0.0) -> None:
 
     Args:
         folder: where to look, however deep.
-        older_than_s: what was written to within so many seconds stays; for locks that may not reach
+        older_than_s: files that were written to more recently stay; for locks that may not reach
             every machine that writes there.
     """
     for leftover in folder.rglob(f"*{TEMPORARY_SUFFIX}"):

@@ -1,7 +1,4 @@
-"""The ways in which something can be wrong: a user's mistake, the machine, an unusable item.
-
-What to say of a name that nobody knows: the names that are known, the closest one first.
-"""
+"""Errors: a user's mistake, a failure of the environment, an unusable item."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -16,7 +13,7 @@ class TrilightError(ValueError):
 
 
 class EnvironmentFailure(TrilightError):
-    """Something outside of us that may pass: a full disk, a lack of memory, a server away.
+    """A failure of the environment that may pass: a full disk, too little memory, no server.
 
     The same call may succeed later, so a scheduler tries it again; any other TrilightError stays.
     """

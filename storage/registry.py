@@ -2,7 +2,7 @@
 
 Each kind of thing that can be added from outside has one such table beside its own type: templates,
 families, builds, runs, sizes of networks, object sources, decimations, metrics, scene formats and
-executors. Whoever wants to know what there is lists the table.
+executors. Listing the table shows all of them.
 """
 
 import re
@@ -103,7 +103,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return name
 
     def find(self, name: str) -> Entry:
-        """Return an entry; raises TrilightError for a name that nobody has registered."""
+        """Return an entry; raises TrilightError for a name that is not registered."""
         if name not in self._entries:
             raise TrilightError(
                 f"{self.what} {name!r} is unknown; {expected_one_of(name, self._entries)}."

@@ -33,7 +33,7 @@ class Converted:
     files: tuple[Path, ...]
     """What was written, without the meshes beside a scene JSON."""
     triangles: int
-    """Of all scenes."""
+    """Triangles of all scenes."""
     notes: tuple[str, ...]
     """What could not be carried over, for people."""
 

@@ -61,17 +61,17 @@ class DescribedObject:
     mesh_path: str
     """Relative to the scene file."""
     transform: DescribedTransform
-    """Where it stands."""
+    """How its mesh comes to its place."""
     material: DescribedMaterial
     """What it is made of."""
     remesh: bool
     """Whether the mesh is replaced by one of even triangles."""
     remesh_target_face_num: int
-    """Most triangles of that mesh."""
+    """Maximum number of triangles of the remeshed mesh."""
 
     @property
     def remesh_faces(self) -> int | None:
-        """Most triangles of the remeshed mesh, or None where it stays as it is."""
+        """Maximum number of triangles after remeshing; None where the mesh stays as it is."""
         return self.remesh_target_face_num if self.remesh else None
 
 

@@ -1,14 +1,12 @@
-"""The forms in which a file holds scenes, by the suffix that chooses each: one table for all.
+"""The formats of scene files, by the suffix that chooses each: one table for all.
 
-Reading happens in child processes only (pipeline.exchange.reader), since a file may come from
-anybody; a child loads the extensions that have added a form.
+A file may be hostile, so it is read in child processes only (pipeline.exchange.reader); a child
+loads the extensions that have added a format.
 
-What a form of file holds of a scene: stated by its writer, compared with what the scene has.
-
-A writer that names what it knows drops what it does not know. So each form states the members that
-it carries, and whatever a scene has besides, not at its default, is said to be lost. A member is a
-field of `Scene`, or a part of one: `materials.diffuse` (storage.records.material) and `objects.uid`
-(SceneObject). A form that carries `materials` carries all columns, also those that are added.
+Each format states the members of a scene that it carries. Every other member that is not at its
+default is reported as lost, so that no writer drops one without a word. A member is a field of
+`Scene`, or a part of one: `materials.diffuse` (storage.records.material) and `objects.uid`
+(SceneObject). A format that carries `materials` carries all columns, added ones too.
 """
 
 import dataclasses
@@ -45,7 +43,7 @@ from storage.records.scene_file import encode_scene, read_scene_file
 from storage.registry import Registry
 
 SEPARATOR = "::"
-"""Between a file of many scenes and the key of one."""
+"""Separates the name of a file of many scenes from the key of one."""
 
 _MEMBERS = ("json", PLAIN, PACKED)
 
@@ -55,7 +53,7 @@ Pictures = NDArray[np.float32] | None
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSource:
-    """Where one scene is."""
+    """The place of one scene."""
 
     path: Path
     """The file."""
@@ -64,7 +62,7 @@ class SceneSource:
     usd_folder: Path | None = None
     """A USD file may name files below it; below its own folder by default."""
     albedo_over_one: AlbedoOverOne = "scale"
-    """Of RenderFormer's JSON: what to do where albedos add up to more than 1."""
+    """What to do in RenderFormer's JSON where albedos add up to more than 1."""
 
     @property
     def name(self) -> str:
@@ -81,7 +79,7 @@ class LoadedScene:
     notes: tuple[str, ...]
     """What a person should know: what of a file means nothing, or could not be carried over."""
     radiance_rgb: Pictures = None
-    """Of all views, where they were asked for and the source has them."""
+    """Pictures of all views, where they were requested and the source has them."""
 
 
 Cameras = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -95,7 +93,7 @@ class SceneFormat:
     read: Callable[[SceneSource, bool], LoadedScene] | None = None
     """Reads a scene, and its pictures where the second argument says so; raises TrilightError."""
     keys: Callable[[SceneSource], Sequence[str | None]] | None = None
-    """Of a form that may hold many scenes: the key of each, None for a file of one."""
+    """Returns the key of each scene in a file; None stands for the only scene of a file."""
     always_many: bool = False
     """Whether a file is no scene without a key."""
     cameras: Callable[[SceneSource], Cameras] | None = None
@@ -246,7 +244,7 @@ FORMATS: Registry[SceneFormat] = Registry(
         ".tar": SceneFormat(read=_read_sample, keys=_shard_keys, always_many=True),
     },
 )
-"""By suffix, in small letters and with its point."""
+"""Formats by suffix, in lower case with the point."""
 
 
 def lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]:

@@ -8,27 +8,8 @@ its vertices. Template files, whose scales and translations are meant to be halv
 
 An emitter's triangles become emitters each. They reflect by the albedos that the file gives them,
 since the published renderer's emitters have a white surface, as its files say. Materials whose
-albedos add up to more than 1 are scaled or refused (pipeline.exchange.from_description); what was
-scaled stands in the provenance, by object.
-
-Albedos of a scene file that add up to more than 1: made lawful, or refused.
-
-Such a surface gives off more light than it gets; published scene files have some (1.1). Scaled,
-both albedos of the material are multiplied by one number, 1 / their largest sum over the channels.
-One number for all channels keeps the hue of both, and one for both keeps how glossy the surface is
-against how coloured; a number for each channel would bleach a red of 1.1 towards white.
-
-The random colours of RenderFormer's scene files: the published numbers, in the order of faces.
-
-The published converter seeds numpy's legacy Mersenne Twister and draws whole numbers, one triple
-per group, in the order in which trimesh splits the shaded mesh. On flat meshes that is the order of
-the faces, and colours are exactly the published ones. On smooth meshes trimesh has its own order,
-and its own groups where an object has large flat parts; there our groups come in the order of their
-first faces, and the same numbers may fall on other groups than published.
-
-The numbers stand in the published tokens as linear albedos, and so they do here. (Its renders took
-them through vertex colours that Blender decodes as sRGB: the same numbers meant darker surfaces
-there, which we do not imitate.)
+albedos add up to more than 1 are scaled or refused (`lawful_albedos`); the provenance names the
+scaled ones by object.
 """
 
 import math
@@ -61,12 +42,12 @@ SHELL_FOLDER = "templates/backgrounds/"
 """Meshes below it are floors and walls; the published scene files keep them there."""
 
 SMOOTH_ANGLE_DEG = 30.0
-"""As published."""
+"""Smoothing angle of the published converter."""
 
 MAX_TRIANGLES = 1_000_000
 MAX_EMITTERS = 4096
 MAX_MATERIALS = 1 << 16
-"""Most triangles, emitting triangles and material rows of one scene."""
+"""Maximum numbers of triangles, emitting triangles and material rows in a scene."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -279,6 +260,11 @@ def lawful_albedos(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Return albedos that add up to at most 1, and by what the darkened ones were multiplied.
 
+    A surface beyond 1 gives off more light than it gets; published scene files have some (1.1).
+    Both albedos of such a material are multiplied by 1 / their largest sum over the channels. One
+    number for all channels keeps the hue of both, and one for both keeps how glossy the surface is
+    against how coloured; a number for each channel would bleach a red of 1.1 towards white.
+
     Args:
         diffuse: [M, 3] of M materials.
         specular: [3] of all of them.
@@ -318,6 +304,16 @@ def colour_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.i
 
 def random_diffuse(seed: int, bound: float, count: int) -> NDArray[np.float64]:
     """Return `count` diffuse albedos [count, 3]: whole numbers below ceil(256 bound), over 255.
+
+    The published converter seeds numpy's legacy Mersenne Twister and draws one triple per group, in
+    the order in which trimesh splits the shaded mesh. On flat meshes that is the order of faces,
+    and colours are exactly the published ones. On smooth meshes trimesh has its own order, and its
+    own groups where an object has large flat parts; our groups come in the order of their first
+    faces, and the same numbers may fall on other groups than published.
+
+    The numbers stand in the published tokens as linear albedos, and so they do here. Published
+    renders took them through vertex colours that Blender decodes as sRGB, so the same numbers meant
+    darker surfaces there, which we do not imitate.
 
     Args:
         seed: of the legacy generator, 0 to 2^32 - 1. Seed 0 is an ordinary seed.

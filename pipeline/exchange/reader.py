@@ -1,7 +1,4 @@
-"""Scenes of a user's files, read in a child process with limits; only checked scenes come out.
-
-The child process that reads a user's scene files: meshes, stages and shards of any origin.
-"""
+"""Reads scenes of a user's files in a child process with limits; only checked scenes come out."""
 
 import dataclasses
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""RenderFormer's published HDF5 file of one scene, written: every array with its quirks.
+"""RenderFormer's published HDF5 file of one scene, written and read: every array with its quirks.
 
 | array | dtype, shape | meaning |
 |---|---|---|
@@ -22,13 +22,9 @@
 - `mvp` is OpenGL's, for column vectors; the published training multiplies it by zero.
 
 What a file cannot say: which triangles are one object, names and rights, provenance, shared
-vertices. `pipeline.exchange.renderformer_h5` reads it.
-
-RenderFormer's published HDF5 file, read without trusting it: arrays become a `Scene`.
-
-The layout is described in `pipeline.exchange.renderformer_h5`. A texture may vary in files of other
-tools; a `Scene` has one material a triangle, so the mean of the filled cells is taken, and that is
-said.
+vertices. The reader does not trust the file (pipeline.exchange.safe_h5). Textures may vary in files
+of other tools; a `Scene` has one material a triangle, so the mean of the filled cells is taken, and
+a note says so.
 """
 
 import io
@@ -66,16 +62,16 @@ CARRIED = frozenset(
     {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg"}
     | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
 )
-"""Of a scene (pipeline.exchange.formats)."""
+"""Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 CHANNELS, CELLS = 13, 32
-"""Of a texture; it has CELLS x CELLS cells."""
+"""A texture has CHANNELS channels of CELLS x CELLS cells."""
 TEXTURE_EMISSION = slice(10, 13)
 TEXTURE_NORMAL = slice(7, 10)
 """Channels of a texture row; those before them are REFLECTING (storage.records.material)."""
 FLAT_NORMAL = (0.5, 0.5, 1.0)
 NEAR, FAR = 0.05, 5.0
-"""Of `mvp`, in metres."""
+"""Clip distances of `mvp`, in metres."""
 GZIP_LEVEL = 9
 
 TextureType = Literal["float16", "float32"]
@@ -200,9 +196,9 @@ def _mvp(scene: Scene) -> NDArray[np.float32]:
 MAX_TRIANGLES = 1_000_000
 MAX_VIEWS = 1000
 MAX_PICTURE_BYTES = 1 << 30
-"""Of all pictures of a file, as float32."""
+"""Maximum size of all pictures of a file as float32."""
 MAX_PALETTE = 1 << 16
-"""Most material rows and most objects: `Scene` counts them in 16 bits."""
+"""Maximum number of material rows and of objects: `Scene` counts them in 16 bits."""
 
 UNKNOWN_LICENCE = "LicenseRef-unknown"
 """A file names no rights."""

@@ -1,16 +1,14 @@
-"""Reads RenderFormer's scene JSON (version 1.0): text to a checked `SceneDescription`.
+"""RenderFormer's scene JSON (version 1.0), read as a `SceneDescription`, written from a `Scene`.
 
-Which fields may be missing, and what then holds, follows the published reader. Unlike it, fields
-that mean nothing to us are named and left out. Only the fields of the published example scenes are
-known: no templates, whose values would have to be halved, no textures, no environment.
+Which fields may be missing, and their defaults, follow the published reader. Unlike it, unknown
+fields are named and left out. Only the fields of the published example scenes are known: no
+templates, whose values would have to be halved, no textures, no environment.
 
-A `Scene` as RenderFormer's scene JSON (version 1.0), with an OBJ file per mesh that it names.
-
-An object of the file has one material, so that an object of ours becomes as many as it has
-materials. Meshes stand in world space and are not normalised. `CARRIED` says what the form holds;
-of that, `DescribedFiles.lost` lists what does not come back whole: which triangles of several
-colours were one object; shading normals other than flat ones and those that its readers make
-(smooth across edges of up to 30 degrees).
+A written file names one OBJ file per mesh, in world space and not normalised. An object of the file
+has one material, so an object of ours becomes one for each of its materials. `CARRIED` lists what
+the format holds; of that, `DescribedFiles.lost` lists what does not come back whole: which
+triangles of several colours were one object; shading normals other than flat ones and those that
+its readers make (smooth across edges of up to 30 degrees).
 """
 
 import json
@@ -43,10 +41,10 @@ MAX_BYTES = 4 << 20
 """Largest accepted file; an object takes about 1 KiB."""
 
 MAX_OBJECTS = 8192
-"""Of one file: where every triangle has a colour of its own, each is an object there."""
+"""Maximum number of objects in a file; a triangle with its own colour counts as an object."""
 
 MAX_CAMERAS = 1000
-"""Of one file."""
+"""Maximum number of cameras in a file."""
 
 _VERSION = "1.0"
 _MAX_LENGTH = 1e6
@@ -185,14 +183,14 @@ CARRIED = frozenset(
     {*ARRAY_FIELDS, "objects.name", "objects.kind"} - {"materials"}
     | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
 )
-"""Of a scene (pipeline.exchange.formats)."""
+"""Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 _FLAT = 1e-5
-"""Most that a float32 normal of a flat face lies from its geometric one."""
+"""Largest difference between a flat face's float32 normal and its geometric normal."""
 _CLOSE = 1e-2
 """How far a normal may lie from the one that a reader makes before it counts as lost: 0.6 deg."""
 _NAME_LETTERS = 48
-"""Of an object: the published converter makes a file of that name, of at most 255 bytes."""
+"""Length limit of object names; the published converter makes files of them (255 bytes)."""
 _NO_FILE_LETTERS = '/\\:*?"<>|'
 """Letters that a name of a file must not have, on some system."""
 

@@ -43,7 +43,7 @@ class SceneFiles:
     unusable: Mapping[str, str]
     """What is wrong with each file of which no scene can be made, by its name."""
     licence: str
-    """Of every object."""
+    """Licence of every object."""
     albedo_over_one: AlbedoOverOne = "scale"
     """What to do where albedos add up to more than 1."""
     notes: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ from pipeline.exchange.scene_files import described_by
 from storage.errors import EnvironmentFailure, TrilightError
 
 MAX_SCENES = 100_000
-"""Most scene files of one folder."""
+"""Maximum number of scene files in a folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class SceneFolder:
     """What to do where albedos add up to more than 1."""
 
     def views(self, wanted: int | None) -> int:
-        """Return how many views every scene gets: `wanted`, or as many as every file has.
+        """Return how many views every scene gets: `wanted`, or the fewest cameras of any file.
 
         No camera is ever invented: the pictures show what the files say.
 

@@ -61,7 +61,7 @@ def serve(connection: Connection, memory_bytes: int, cpu_s: int | None) -> None:
         try:
             function, args = connection.recv()
         except EOFError:
-            os._exit(0)  # the parent is gone: nobody waits for destructors of native libraries
+            os._exit(0)  # the parent has died: skip the destructors of native libraries
         _allow_cpu(cpu_s)
         connection.send(_answer(function, args))
 

@@ -5,8 +5,6 @@ learn from all others and be judged on these.
 
 The files are made anew on every run (milliseconds each) and written only where they differ, so the
 stages after this one read files and nothing else, and a damaged file is mended.
-
-The built-in families by name; a new one is a file and a line here.
 """
 
 from collections.abc import Callable, Mapping

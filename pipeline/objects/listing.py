@@ -1,9 +1,4 @@
-"""What a source says that it holds, before a licence is judged and before anything is fetched.
-
-Names of files as uids of objects.
-
-Fetching many things that may each fail, a few at a time.
-"""
+"""What a source lists: its objects before licences are checked, their uids, their downloads."""
 
 import threading
 from collections.abc import Callable, Iterable
@@ -41,7 +36,7 @@ def failure(uid: str, reason: str, message: str) -> Failure:
 
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
-"""Of the files that are objects; compared in lower case."""
+"""Suffixes of object files, compared in lower case."""
 
 
 def is_object_file(name: str) -> bool:

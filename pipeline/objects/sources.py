@@ -1,8 +1,7 @@
-"""Where objects come from, as one list of records: folders, catalogues, servers, Objaverse, ours.
+"""The sources of objects by the word before their colon, and the objects that one holds.
 
-Nothing is loaded here: a record names a file, and the mesh stage finds out whether it is any good.
-
-The sources of objects by the word before their colon: what each lists, and how.
+Sources are folders, catalogues, servers, Objaverse and our own. Nothing is loaded here: a record
+names a file, and the mesh stage finds out whether it is usable.
 """
 
 import contextlib
@@ -39,9 +38,9 @@ class SourceQuery:
     source: str
     """The source as it was written, such as `objaverse:category/chair`."""
     work_dir: Path
-    """Where a source may write files that it makes."""
+    """Folder for files that a source makes."""
     licence: str | None
-    """Of files that come without any statement, as the user states it."""
+    """Licence that the user states for files without a statement of their own."""
     allowed_licences: Sequence[str]
     """For sources that need not list what would be refused; the others are refused later."""
 
@@ -53,14 +52,14 @@ class SourceQuery:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectSource:
-    """Where objects come from."""
+    """A source of objects."""
 
     list: Callable[[SourceQuery], Listing]
     """Returns what the source holds; raises TrilightError where it is missing or malformed."""
     look: Callable[[SourceQuery], object] | None = None
     """Raises the same errors and writes nothing, where `list` would be dear."""
     states_licences: bool = True
-    """Whether the licence of every object is known, so that nobody else may state one."""
+    """Whether the source states the licence of every object; `--licence` is then refused."""
     is_place: bool = False
     """Whether the name is the scheme of a URL, which may hold a secret."""
 
@@ -101,7 +100,7 @@ SOURCES: Registry[ObjectSource] = Registry(
     },
     decides=("data",),
 )
-"""By the word before the colon."""
+"""Sources by the word before the colon."""
 
 
 def source_of(text: str) -> ObjectSource:
@@ -111,9 +110,9 @@ def source_of(text: str) -> ObjectSource:
 
 
 ENVIRONMENT = "env:"
-"""Begins a source that names an environment variable: the way for URLs that hold a secret."""
+"""Prefix of a source that an environment variable holds, for URLs with a secret."""
 VARIABLES = "TRILIGHT_SOURCE_"
-"""Begins the names that may follow: who may start a run is not to read any other variable."""
+"""Prefix of the variables that may be named: starting a run must not reveal any other."""
 
 _QUOTED = re.compile(r"^objects (?:is )?(?:'[^']*'|\"[^\"]*\")")
 """How messages about a source begin."""
@@ -169,8 +168,8 @@ def find_objects(
 
     Raises:
         TrilightError: the source is malformed, missing or empty; its catalogue has a mistake; a
-            licence has no form of one, or is stated where the source states its own; a package is
-            missing; a server does not answer, or nothing could be downloaded.
+            licence identifier is malformed, or is stated where the source states its own; a package
+            is missing; a server does not answer, or nothing could be downloaded.
     """
     with _said_by(source) as value:
         return _find(value, work_dir, allowed_licences, licence, downloaded)
@@ -179,7 +178,7 @@ def find_objects(
 def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
     """Find out whether a source is there and holds anything, before a dataset of it is begun.
 
-    Nothing is written beside what a server's listing leaves in the cache.
+    Writes nothing except the cached listing of a server.
 
     Raises:
         TrilightError: as `find_objects`, as far as listing the source tells.

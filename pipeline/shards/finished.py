@@ -24,7 +24,7 @@ class FinishedDataset:
     """A dataset that is whole."""
 
     folder: DatasetFolder
-    """Where it is."""
+    """Its folder."""
     manifest: Manifest
     """What it says of itself."""
     objects: Mapping[str, list[LockedObject]]
@@ -42,7 +42,7 @@ class SceneFacts:
     template: str
     """Layout of the scene."""
     noise_floor_db: float
-    """Of its worst view, as psnr_log_db."""
+    """Noise floor of its worst view, as psnr_log_db."""
     uids: tuple[str, ...]
     """Objects that stand in it."""
     arrays_sha256: str

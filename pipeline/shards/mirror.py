@@ -40,7 +40,7 @@ from storage.remote.cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_url
 
 _PLANNED = ".staging/planned/"
-"""Below it stands a file for each number of scenes that was asked for; the largest counts."""
+"""Folder with one file for each requested number of scenes; the largest counts."""
 
 
 class Mirror:
@@ -65,7 +65,7 @@ class Mirror:
         """Make the folder say what the bucket says, as far as that was published.
 
         Scenes that wait for their shard stay where they are of the same dataset; where the folder
-        is of another one, or the bucket is empty, they go. Call while nobody else has the folder.
+        is of another one, or the bucket is empty, they go. Call while no other process holds it.
 
         Raises:
             TrilightError: the bucket cannot be read.
@@ -86,7 +86,7 @@ class Mirror:
         return self._bucket.create("manifest.json", self._folder.manifest)
 
     def plan(self, num_scenes: int) -> None:
-        """Tell all makers for how many scenes the dataset is meant."""
+        """Tell all workers how many scenes the dataset is to have."""
         self._bucket.write(f"{_PLANNED}{num_scenes:012d}", b"\n")
 
     def freeze(self, lock: bytes) -> None:
@@ -95,7 +95,7 @@ class Mirror:
         What others have rejected in the meantime stays.
 
         Raises:
-            TrilightError: somebody else has frozen others in the meantime.
+            TrilightError: another worker has frozen other objects in the meantime.
         """
         name = self._folder.objects_lock.name
         theirs = self._files.read(name)
@@ -107,12 +107,12 @@ class Mirror:
             theirs = self._files.read(name)
         if theirs not in (None, lock):
             raise TrilightError(
-                f"{self._folder.shown}: another maker has frozen other objects in the meantime; "
+                f"{self._folder.shown}: another worker has frozen other objects in the meantime; "
                 "expected the same --objects everywhere. Give that, or choose another --out."
             )
 
     def receive(self, listed: Collection[str]) -> tuple[int, int]:
-        """Learn what other makers have finished and planned.
+        """Read what other workers have finished and planned.
 
         Args:
             listed: names of the shards that the folder's manifest lists.
@@ -220,7 +220,7 @@ class Mirror:
             return None
 
     def _take_note(self, name: str, note: str) -> None:
-        """Copy what another maker says of a shard into the folder."""
+        """Copy another worker's note on a shard into the folder."""
         try:
             entry = shard_of_row(json.loads(self._files.read(note) or b""))
             if entry.name != name:

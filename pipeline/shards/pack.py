@@ -1,7 +1,4 @@
-"""Stage "shards": the staged scenes of one shard become its tar file.
-
-Notes on packed shards until the manifest lists them, so that none has to be read again.
-"""
+"""Stage "shards": the staged scenes of a shard become its tar file, and a note for the manifest."""
 
 import contextlib
 import json
@@ -20,7 +17,7 @@ from storage.records.sample import sample_key
 def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardEntry:
     """Write a shard from its staged scenes and return its manifest entry.
 
-    The rejections are written before the shard, so that whoever sees the shard can find them, and
+    The rejections are written before the shard, so that every reader of the shard finds them, and
     the staged scenes are deleted after it: a kill in between loses nothing and repeats little.
 
     Where the shard is there already, it stays: the first writer wins.
@@ -60,7 +57,7 @@ def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
 
 def remove_staged(staged_folder: Path) -> None:
     """Delete the staged scenes of a shard that is packed."""
-    shutil.rmtree(staged_folder, ignore_errors=True)  # what stays is read by nobody
+    shutil.rmtree(staged_folder, ignore_errors=True)  # leftovers are never read
 
 
 def note_shard(folder: DatasetFolder, shard: ShardEntry) -> None:

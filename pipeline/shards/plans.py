@@ -19,11 +19,11 @@ class Selection:
     """Which scenes are taken; by default all."""
 
     split: str | None = None
-    """Of this split only."""
+    """Take only scenes of this split."""
     template: str | None = None
-    """Of this layout only."""
+    """Take only scenes of this layout."""
     min_noise_floor_db: float | None = None
-    """Whose every view has at least this noise floor (psnr_log_db)."""
+    """Take only scenes whose views all have at least this noise floor (psnr_log_db)."""
 
     def __post_init__(self) -> None:
         if self.split not in (None, *SPLITS):
@@ -44,7 +44,7 @@ class Taken:
     source: int
     """Which of the sources it is from."""
     facts: SceneFacts
-    """Where it is there."""
+    """Its place in the source."""
     key: str
     """Its new key."""
 

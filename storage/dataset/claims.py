@@ -1,4 +1,4 @@
-"""Claims: who is at work on what, among processes that share a folder.
+"""Claims: locks that tell processes in a shared folder which work is taken.
 
 A claim is a lock on a small file. It ends with the process that holds it, whatever ends that, so
 nothing has to be cleaned up after a kill. Claims spare work; they are not what keeps files right.
@@ -20,7 +20,7 @@ def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
     """Hold a claim for the block, and say whether it is ours.
 
     Args:
-        path: the file of the claim; it is made, and may be deleted by whoever holds it.
+        path: the file of the claim; it is created here, and its holder may delete it.
         wait: until the claim is free, so that it always becomes ours.
 
     Raises:
@@ -35,7 +35,7 @@ def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
 
 
 def _locked(path: Path, wait: bool) -> int | None:
-    """Return the descriptor that holds the lock, or None where somebody else holds it."""
+    """Return the descriptor that holds the lock, or None where another process holds it."""
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,4 @@
-"""A finished dataset, for whoever reads it: the manifest and the samples of its shards.
-
-The files of a dataset: in a folder of this machine, or below a URL.
-
-What is said of a shard that cannot be read, whatever of it is wrong.
-"""
+"""A dataset that is read, in a folder of this machine or on a server: manifest, files, samples."""
 
 import contextlib
 import os
@@ -34,7 +29,7 @@ MAX_BESIDE_BYTES = 1 << 30
 
 
 class _Files(ABC):
-    """What is beside the shards."""
+    """The files beside the shards."""
 
     @abstractmethod
     def open_beside(self, name: str) -> BinaryIO | None:
@@ -168,14 +163,14 @@ _OF_DAMAGED_BYTES = (ValueError, LookupError, TypeError, EOFError, zlib.error)
 
 @contextlib.contextmanager
 def reading(dataset: str, shard: str) -> Iterator[None]:
-    """Turn whatever the bytes of a shard lead to into one sentence with the next step.
+    """Turn any error of reading a shard into one sentence with the next step.
 
     Args:
-        dataset: where it is, for people.
-        shard: the name.
+        dataset: its place, for messages.
+        shard: its name.
 
     Raises:
-        TrilightError: the block raised one, or any error that damaged bytes may lead to.
+        TrilightError: the block raised one, or another error that damaged bytes cause.
     """
     try:
         yield
@@ -200,7 +195,7 @@ class Dataset:
 
     @property
     def shown(self) -> str:
-        """Where the dataset is, for people: without secrets."""
+        """The place of the dataset for messages, without secrets."""
         return self.files.shown
 
     @property

@@ -1,13 +1,12 @@
-"""Where things are in a dataset folder, and how several makers of it stay out of each other's way.
+"""Paths of a dataset folder, and the locks by which several workers share it.
 
-What stands beside the shards is the dataset. `.staging` holds what is not finished; it may be
-deleted at any time, and then it is made again.
+The shards and the files beside them are the dataset. `.staging` holds unfinished work; it may be
+deleted at any time, and is then made again.
 
 No folder holds more than 5,000 entries: of files that are numbered, the first 4,096 stand in their
-folder, and each following 4,096 in one of its `part-0001`, `part-0002`, ... Where a file stands
-follows from its number alone, so nothing moves when a dataset grows.
-
-Where a dataset is made: in a folder, or in a bucket with a folder of this machine before it.
+folder, and each following 4,096 in one of its `part-0001`, `part-0002`, ... The place of a file
+follows from its number alone, so nothing moves when a dataset grows. A dataset in a bucket has a
+folder of this machine before it.
 """
 
 import contextlib
@@ -27,8 +26,8 @@ from storage.remote.safe_url import printable, safe_url
 from storage.remote.url import parse_url
 
 _LEFT_S = 3600.0
-"""What nobody has written to for so long was left by a kill. Not all file systems carry locks
-between machines, so who seems to be alone may not be; no file is an hour in the writing."""
+"""Age at which a temporary file counts as left by a kill. Not all file systems carry locks between
+machines, so a worker that seems alone may not be; no file takes an hour to write."""
 
 FILES_PER_FOLDER = 4096
 """Numbered files of one folder; with their sub-folders and what else lies there, below 5,000."""
@@ -155,7 +154,7 @@ class DatasetFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the folder for one maker; the lock dies with the process that holds it.
+        """Hold the folder exclusively; the lock ends with the process that holds it.
 
         Raises:
             TrilightError: the folder cannot be written, or another process is at work in it.
@@ -175,12 +174,12 @@ class DatasetFolder:
 
     @contextlib.contextmanager
     def joined(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
-        """Take part in the making, with any number of others.
+        """Join the workers that make the dataset.
 
-        Whoever is alone at first clears away what killed writers have left for an hour.
+        A worker that is alone at first removes what killed writers left more than an hour ago.
 
         Args:
-            when_alone: called by whoever is alone at first, before anybody else can join.
+            when_alone: called by a worker that is alone at first, before another one can join.
 
         Raises:
             TrilightError: the folder cannot be written; or as `when_alone`.
@@ -196,7 +195,7 @@ class DatasetFolder:
             os.close(descriptor)
 
     def turn(self, what: str) -> "contextlib.AbstractContextManager[bool]":
-        """Wait for one's turn at what one maker does at a time, such as `manifest`."""
+        """Hold the lock of a step that one worker does at a time, such as `manifest`."""
         return claimed(self.staging / "turns" / what, wait=True)
 
     def _open_lock(self) -> int:
@@ -223,7 +222,7 @@ def dataset_folder(out: str) -> DatasetFolder:
     """Return the folder of a dataset that is to be made.
 
     For a bucket that is a folder of the cache, the same one whenever the same URL is named, with
-    the scenes that are not in a shard yet and a copy of what stands beside the shards.
+    the scenes that are not in a shard yet and a copy of the files beside the shards.
 
     Args:
         out: a folder, or a URL of WRITABLE.

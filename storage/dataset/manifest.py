@@ -3,8 +3,6 @@
 It names the settings in full, what the pictures depend on (Mitsuba variant, processor, library
 versions), and each shard with its digest and an index of its members. The dataset digest is taken
 over the shards, the object lock and the settings; "the same bytes" always means this digest.
-
-Names and places of the members of a shard, in 33 bytes each instead of 300 as Python objects.
 """
 
 import dataclasses
@@ -75,7 +73,7 @@ SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.t
 """Names are relative to the manifest and cannot leave its folder."""
 
 _MOST_BYTES = 1 << 62
-"""Of a shard; what fits into a MemberTable."""
+"""Maximum size of a shard, which fits into a MemberTable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +118,7 @@ class Manifest:
     settings: Mapping[str, Any]
     """All settings of the build; a dataset keeps them for life."""
     environment: Mapping[str, Any]
-    """What the bytes depend on beside the settings: variant, processor, library versions."""
+    """What the bytes depend on besides the settings: variant, processor, library versions."""
     num_scenes: int
     """How many scenes were asked for so far; more extend the dataset."""
     num_views: int
@@ -132,8 +130,8 @@ class Manifest:
     schema_version: int = SCHEMA_VERSION
     """Version of the formats."""
     extensions: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """The sha256 of each file of the makers' own that had part in it, by its name; nothing that is
-    read from here is ever imported (storage.extensions)."""
+    """The sha256 of each extension that took part in making it, by its file name; nothing that is
+    named here is ever imported (storage.extensions)."""
 
     @property
     def num_samples(self) -> int:

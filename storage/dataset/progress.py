@@ -1,8 +1,7 @@
-"""How far a dataset is, from its files alone: anybody may look, from any process.
+"""Progress of a dataset, from its files alone: counts, the rate of the last scenes, time left.
 
-`logs/<shard>.jsonl`: what must not be in a dataset, one row per scene: times, hosts, retries.
-
-How far a dataset is and when it will be done, from its files alone: here, or on a server.
+Any process may read it. `logs/<shard>.jsonl` holds what must not be in a dataset, one row per
+scene: times, hosts, retries.
 """
 
 import contextlib
@@ -28,7 +27,7 @@ from storage.records.sample import sample_key
 from storage.settings.dataset import SplitSettings
 
 _AT_WORK_S = 600.0
-"""What is told of a scene is not older than a pass of samples takes; else a kill has left it."""
+"""Older notes on unfinished views were left by a kill: a pass of samples takes less time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,14 +184,14 @@ def _done(folder: DatasetFolder) -> Path:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneLog:
-    """One scene that somebody made."""
+    """Log row of one finished scene."""
 
     seconds: float
     """Wall time."""
     cores: int
-    """Cores that its maker had for it."""
+    """Cores that the worker used for it."""
     finished_unix_s: float
-    """When, by the maker's clock."""
+    """Time of completion by the worker's clock."""
 
 
 def log_scene(
@@ -253,18 +252,18 @@ def decode_scene_log(text: str) -> Iterator[SceneLog]:
 
 
 _RATE_SCENES = 200
-"""In a folder the rate is that of the last so many scenes, whoever made them."""
+"""The rate of a local dataset is taken over this many last scenes of all workers."""
 
 _LOGS_READ = 64
-"""Of a dataset on a server at most so many logs are fetched, evenly spaced over its shards."""
+"""Maximum number of logs fetched from a remote dataset, evenly spaced over its shards."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetStatus:
-    """What can be said of a dataset in the making, or of a finished one."""
+    """Status of a dataset, finished or not."""
 
     shown: str
-    """Where it is, without secrets."""
+    """Its place, without secrets."""
     build: str
     """Name of its build."""
     shards_done: int
@@ -280,12 +279,12 @@ class DatasetStatus:
     finished: bool
     """Every shard is listed, and the documents are there."""
     views_per_hour: float | None
-    """Of the last scenes; on a server of all of them, pauses included. None where the logs say too
-    little."""
+    """Rate over the last scenes; of a remote dataset over all scenes, pauses included. None without
+    enough log rows."""
     remaining_s: float | None
-    """Until all scenes are made at that rate."""
+    """Time until all scenes are made at that rate."""
     core_hours: float | None
-    """Spent on scenes so far, those of killed makers not counted; None without logs."""
+    """Core hours spent on finished scenes; killed workers are not counted. None without logs."""
     last_scene_unix_s: float | None
     """When the last scene was made."""
     failures: Sequence[tuple[str, str, int]]
@@ -294,7 +293,7 @@ class DatasetStatus:
     """The dataset digest, of the listed shards."""
 
     asked: Sequence[str] | None
-    """Words of the command that makes it, without its place; None where nobody wrote them down."""
+    """Words of the command that makes it, without its place; None where they were not recorded."""
 
     @property
     def next_words(self) -> Sequence[str] | None:
@@ -342,7 +341,7 @@ def read_status(url: str) -> DatasetStatus:
 def _sampled_logs(dataset: Dataset) -> tuple[list[SceneLog], float]:
     """Return rows of logs on a server, and of what share of the listed scenes; none and 0 without.
 
-    Logs of some shards stand for all; where the first is missing, nobody has sent any.
+    A sample of the logs stands for all; where the first is missing, the dataset has none.
     """
     shards = dataset.manifest.shards
     rows: list[SceneLog] = []

@@ -1,9 +1,8 @@
-"""Shards are byte-reproducible tar files: sorted members, no clock, no owner, atomic appearance.
+"""Shards: byte-reproducible tar files, and a reader that does not trust them.
 
-Reading tar shards without trusting them: plain members, sane names, whole samples.
-
-The headers are walked here, 512 bytes at a time: whatever is not a plain file is refused before any
-of it is read, and no number in a header makes anybody take memory.
+Written members are sorted and have no clock and no owner. The reader walks the headers itself, 512
+bytes at a time: anything that is not a plain file is refused before it is read, and no number in a
+header decides how much memory is taken.
 """
 
 import re
@@ -56,11 +55,11 @@ class Member:
     """One file in a shard."""
 
     key: str
-    """Of its sample."""
+    """Key of its sample."""
     suffix: str
     """What it is in the sample."""
     offset: int
-    """Of its first byte in the shard."""
+    """Offset of its first byte in the shard."""
     num_bytes: int
     """Its size."""
 

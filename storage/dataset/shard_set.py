@@ -1,4 +1,4 @@
-"""The shards of one split for whoever draws samples from them in an order of its own.
+"""The shards of one split, from which samples are drawn in any order.
 
 A set knows its shards by number and opens each when it is wanted. An open shard gives any of its
 samples, in any order and from several threads at once; nothing of it stays in memory but the names

@@ -94,7 +94,7 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
 
 @dataclass(kw_only=True, eq=False)
 class _Tally:
-    """Counts in the making."""
+    """Running counts."""
 
     splits: Counter[str] = field(default_factory=Counter)
     templates: Counter[str] = field(default_factory=Counter)

@@ -34,11 +34,11 @@ class TrainingData:
     """The shards of every split that holds a sample."""
 
     shown: str
-    """Where they are, for people."""
+    """Their place, for messages."""
     digest: str
     """What a checkpoint remembers: the dataset digest; of a list, a digest of its names only."""
     splits: Mapping[str, ShardSet]
-    """By split; those without a shard are left out."""
+    """Shards by split; splits without a shard are left out."""
     num_views: int | None
     """Pictures per scene, where a manifest says it."""
     build: str | None = None

@@ -1,7 +1,4 @@
-"""Is a dataset what its manifest says? Every hash, member and law, and a list of what is wrong.
-
-The laws of one sample of a dataset: scene, pictures, lights, and rights of its objects.
-"""
+"""Checks a dataset against its manifest: every hash, every member, and the laws of every sample."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -86,7 +83,7 @@ def verify_dataset(
     lock = dataset.files.read("objects.lock.jsonl")
     problems = list(_check_lock(lock, manifest))
     locked = {} if problems or lock is None else _by_uid(lock)
-    problems += [f"{name}: not in the manifest" for name in _strangers(dataset)]
+    problems += [f"{name}: not in the manifest" for name in _unlisted(dataset)]
     where: dict[str, str] = {}
     bad: list[str] = []
     threads = os.cpu_count() or 1 if isinstance(dataset.files, LocalFiles) else REMOTE_THREADS
@@ -124,8 +121,8 @@ def _num_planned(manifest: Manifest) -> int:
         return len(manifest.shards)
 
 
-def _strangers(dataset: Dataset) -> list[str]:
-    """Return shards in the folder that nobody lists; a server's folder is not listed."""
+def _unlisted(dataset: Dataset) -> list[str]:
+    """Return shard files that the manifest does not list; of a remote dataset, none."""
     if isinstance(dataset.files, RemoteDatasetFiles):
         return []
     listed = {shard.name for shard in dataset.manifest.shards}

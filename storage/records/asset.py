@@ -4,10 +4,8 @@ The file holds, per level, `positions_<budget>` f32 [V, 3] and `faces_<budget>` 
 its metadata what is known of the source and of each level. Positions are in the unit box: the
 bounding box of the cleaned source is centred on the origin and its longest side is 1.
 
-One row per object of an asset folder: what `trilight assets` says of it, to people and programs.
-
-The rows of the accepted objects are a catalogue (`objects.jsonl`), so that the folder is itself a
-source of objects.
+`AssetRow` is what `trilight assets` reports of one object. The rows of the accepted objects are a
+catalogue (`objects.jsonl`), so that the output folder is itself a source of objects.
 """
 
 import dataclasses
@@ -168,7 +166,7 @@ class AssetRow:
     """An accepted object."""
 
     uid: str
-    """As in ObjectRecord."""
+    """The uid of its ObjectRecord."""
     path: str
     """Its mesh, below the folder."""
     title: str

@@ -1,8 +1,7 @@
-"""What one stage hands to the next: rows of plain values, each with the rights of its object.
+"""Rows that stages hand on: objects with their rights, the lock of a dataset, and rejections.
 
-`objects.lock.jsonl`: which objects a dataset uses, frozen before its first scene.
-
-`failures.jsonl`: every object, scene and view that was rejected, with its reason.
+`objects.lock.jsonl` lists the objects of a dataset and is frozen before its first scene.
+`failures.jsonl` lists every object, scene and view that was rejected, with its reason.
 """
 
 import dataclasses
@@ -42,7 +41,7 @@ class LockedObject:
     """One accepted object of a dataset, as `objects.lock.jsonl` freezes it."""
 
     uid: str
-    """As in ObjectRecord."""
+    """The uid of its ObjectRecord."""
     asset_sha256: str
     """Digest of the prepared asset file: the exact triangles that scenes use."""
     split: str

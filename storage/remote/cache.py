@@ -70,7 +70,7 @@ class ShardCache:
             raise unreadable(url, error) from error
 
     def keep(self, path: Path, url: RemoteUrl, sha256: str) -> None:
-        """Take over a shard of this machine that is on the server too: nobody has to fetch it.
+        """Move a shard of this machine into the cache, since it is on the server too.
 
         The file is gone afterwards, also where the cache has no room for it.
 
@@ -103,7 +103,7 @@ class ShardCache:
         )
 
     def _make_room(self, num_bytes: int) -> None:
-        """Remove what was not read for longest, until so many bytes more are within the limit."""
+        """Remove the least recently read shards, until `num_bytes` more fit within the limit."""
         found = []
         for path in self.root.glob("*"):
             with contextlib.suppress(OSError):
@@ -177,7 +177,7 @@ def _open_shared(path: Path) -> BinaryIO | None:
 
 
 def _remove_unread(path: Path) -> bool:
-    """Remove a shard unless somebody reads it; returns whether its bytes are free."""
+    """Remove a shard unless a process reads it; return whether its bytes are free."""
     try:
         with path.open("rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)

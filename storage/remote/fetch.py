@@ -19,7 +19,7 @@ _VERSION_FIELDS = (
     "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "updated",
     "md5Hash", "Content-MD5", "blob_id",
 )  # fmt: skip
-"""Under which names the drivers say when a file changed."""
+"""Names under which the drivers report the version of a file."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,4 @@
-"""Trying again what may pass by itself, and saying what went wrong without secrets.
-
-How slow a transfer may be: a stalled server, or one that trickles, holds nobody for days.
-"""
+"""Retries of remote requests, the least rate of a transfer, and error messages without secrets."""
 
 import errno
 import os
@@ -16,19 +13,19 @@ from storage.remote.safe_url import printable, safe_text
 Result = TypeVar("Result")
 
 TRIES = 5
-"""In a row without progress at the least rate (storage.remote.tries)."""
+"""Number of tries in a row without progress at the least rate (`Patience`)."""
 PAUSE_S = 0.5
-"""Before the second try; doubled before each further one, up to MAX_PAUSE_S."""
+"""Pause before the second try; doubled before each further one, up to MAX_PAUSE_S."""
 MAX_PAUSE_S = 20.0
 _MOST_TRIES = 1000
-"""Of a transfer that moves on a little each time."""
+"""Maximum number of tries of a transfer that progresses a little each time."""
 _MAX_MESSAGE = 200
 _MAY_PASS_STATUS = (408, 409, 425, 429)
-"""Among them: two who create one file at the same time, of whom one is told to ask again."""
+"""HTTP statuses worth a retry; 409: concurrent creation, the loser retries."""
 
 
 class TransferFailed(Exception):
-    """Something cannot be had, for good.
+    """A permanent transfer failure.
 
     Attributes:
         reason: a stable code in snake_case.
@@ -46,7 +43,7 @@ class Interrupted(Exception):
 
 
 def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) -> Result:
-    """Call a function again while what goes wrong may pass by itself, after longer and longer.
+    """Retry a function after transient errors, with growing pauses.
 
     The pause before try n is PAUSE_S 2^(n-1), at most MAX_PAUSE_S, times a random factor between a
     half and one and a half, so that many readers of one server do not come back all at once.
@@ -84,7 +81,7 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
 
 
 def root_error(error: BaseException) -> BaseException:
-    """Return what went wrong: the HTTP driver reports every error of a question as a lack."""
+    """Return the cause: the HTTP driver reports every error of a request as a missing file."""
     while isinstance(error, FileNotFoundError | Interrupted) and error.__cause__ is not None:
         error = error.__cause__
     return error

@@ -52,7 +52,7 @@ class RemoteUrl:
 
     @property
     def is_http(self) -> bool:
-        """Names of files in URLs of http are quoted; those of buckets are as they are."""
+        """Whether the scheme is http or https; file names in such URLs are quoted."""
         return self.scheme in ("http", "https")
 
     @property

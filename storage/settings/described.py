@@ -9,8 +9,6 @@ From type, range, unit, sentence and default come the check of every value (pyda
 about a wrong one, the command line, Prefect's forms, docs/reference/settings.md and the records in
 manifests and checkpoints. Laws between fields stay in `__post_init__`. What streams shards does not
 import this file: tests/architecture/test_light_imports.py.
-
-Settings as words of the command line, so that a command can be repeated elsewhere.
 """
 
 import ast
@@ -84,9 +82,9 @@ class Described:
     hint: Any
     """Its type, with its notes."""
     default: Any
-    """Its value where nobody gives one; dataclasses.MISSING where it must be given."""
+    """Its default; dataclasses.MISSING where a value must be given."""
     sentence: str
-    """What stands under it, in one line."""
+    """The sentence under it, in one line."""
     within: Within | None
     """The range of its numbers."""
     expected: str
@@ -119,7 +117,7 @@ def described(kind: type) -> tuple[Described, ...]:
 def field_sentences(kind: type) -> dict[str, str]:
     """Return what stands under each field of a dataclass, its bases' included, by name.
 
-    Read from the source when somebody asks: pydantic would read it whenever settings are imported.
+    Read from the source on demand: pydantic would read it whenever settings are imported.
     """
     sentences: dict[str, str] = {}
     for cls in reversed(kind.__mro__[:-1]):

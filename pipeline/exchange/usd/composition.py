@@ -14,12 +14,12 @@ from typing import Any
 from storage.errors import TrilightError
 
 MAX_PRIMS = 500_000
-"""That composition may make; instances of one prototype count once."""
+"""Maximum number of composed prims; instances of one prototype count once."""
 MAX_DEPTH = 150
-"""Of prims within prims."""
+"""Maximum nesting of prims."""
 MAX_COMPOSITION_S = 20.0
-"""Processor seconds for all prims: 500,000 of few arcs each take 4 to 10, chains of thousands of
-references or prims of thousands of sites take hours."""
+"""Maximum processor seconds for all prims: 500,000 of few arcs each take 4 to 10;
+chains of thousands of references or prims of thousands of sites take hours."""
 
 
 def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:

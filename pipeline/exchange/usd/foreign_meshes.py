@@ -1,6 +1,6 @@
 """A USD mesh as triangles in our world, with the normals that it states or that its faces have.
 
-Polygons into triangles: fans where they are convex, ears cut off where they are not.
+Polygons become triangles: fans where they are convex, cut-off ears where they are not.
 """
 
 from dataclasses import dataclass
@@ -170,7 +170,7 @@ def _array(values: Any, dtype: type, shape: tuple[int, ...]) -> NDArray:
 
 
 MAX_EAR_CORNERS = 2000
-"""Of a polygon that is not convex; larger ones are cut as fans."""
+"""Maximum corners of a polygon that is not convex; larger polygons are cut as fans."""
 
 
 def triangulated(

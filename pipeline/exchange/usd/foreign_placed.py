@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from storage.errors import TrilightError
 
 MAX_PLACED = 100_000
-"""Most prims that are looked at, instances counted each."""
+"""Maximum number of visited prims; every instance counts."""
 MAX_NESTED = 150
-"""Most prims within prims, through prototypes too."""
+"""Maximum nesting of prims, through prototypes too."""
 
 _READ = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight")
 _SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "SkelRoot", "")

@@ -18,7 +18,7 @@ from storage.errors import TrilightError
 
 MAX_BYTES = 256 << 20
 MAX_PIXELS = 64 << 20
-"""Of one picture."""
+"""Maximum size of one picture."""
 
 _STEPS = 8
 """Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""

@@ -17,9 +17,9 @@ from storage.errors import TrilightError
 from storage.records.scene import Scene
 
 MAX_FRAMES = 10_000
-"""Most scenes of a stage with time samples."""
+"""Maximum number of scenes in a stage with time samples."""
 MAX_NOTES = 40
-"""Most notes on one scene; what follows is counted."""
+"""Maximum number of notes on one scene; further notes are only counted."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,7 +27,7 @@ class UsdScene:
     """A scene and what could not be carried over."""
 
     key: str
-    """Of a shard's sample, or the time code of a frame; empty where the file has one scene."""
+    """Key of a shard's sample, or time code of a frame; empty where the file has one scene."""
     scene: Scene
     """It passes `Scene.check`."""
     lost: tuple[str, ...]

@@ -1,9 +1,9 @@
 """A scene that Trilight wrote, read back from its layer bit for bit, without composing a stage.
 
-A file that somebody has changed - a mesh moved, a colour picked, a light added - is no longer what
-its exact attributes say. So everything that export writes is compared with what is there, and the
-geometry with its digest; where anything differs, this reader gives the file up and it is read like
-a stranger's (pipeline.scenes.usd).
+After an edit - a mesh moved, a colour picked, a light added - the exact attributes of a file are
+stale. So everything that export writes is compared with the file, and the geometry with its digest;
+where anything differs, this reader returns None and the file is read as a foreign one
+(pipeline.exchange.usd.foreign_scene).
 """
 
 import json

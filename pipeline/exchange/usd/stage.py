@@ -1,15 +1,13 @@
-"""Opening a USD file of a stranger: which files may be read.
+"""Opens an untrusted USD file, and decides which other files it may read.
 
 A USD file can name other files, and the network. Which of them composition opens depends on all of
 them together; so nothing is foretold. Every file that any layer names for composition, used or
 not, is looked at by the path that USD's own resolver gives, is refused outside of the folder, and
 is opened here first: the closure of all names holds whatever composition can ask for. The layers of
 the stage are compared with the folder once more when it stands, and before anything of it is used.
-How large the stage may be is for `pipeline.exchange.usd.composition` to say. The bytes are still
-parsed by native code: whoever opens files of strangers does so in a child process with limits
-(pipeline.isolation).
-
-What USD says of a broken file, as one line that names the file and nothing of this machine.
+`pipeline.exchange.usd.composition` bounds the size of the stage. The bytes are still parsed by
+native code, so untrusted files are opened in a child process with limits (pipeline.isolation).
+`quietly` turns USD's own errors into one line that names the file and no folder of this machine.
 """
 
 import re
@@ -23,10 +21,10 @@ from storage.errors import TrilightError
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 MAX_FILE_BYTES = 1 << 30
-"""Of one file; a million triangles take about 70 MB."""
+"""Maximum size of a file; a million triangles take about 70 MB."""
 MAX_LAYERS = 1000
 MAX_MEMBERS = 10_000
-"""Of a usdz archive."""
+"""Maximum number of members in a usdz archive."""
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 

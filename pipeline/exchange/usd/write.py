@@ -1,12 +1,9 @@
 """`Scene` to USD: `.usda`, `.usdc` or `.usdz`, one scene or the scenes of a whole shard.
 
 Z up, metres, a default prim, nothing that names a file. Equal scenes give equal bytes.
-`pipeline.exchange.usd.names` says what stands where, `pipeline.exchange.usd.read_ours` reads it
-back.
-
-Cameras of a scene as USD: a pose, and a lens in tenths of a metre on a square film of 36 mm.
-
-`.usdz`: a zip archive whose members are stored plainly, each beginning at a multiple of 64.
+`pipeline.exchange.usd.names` lists the paths; `pipeline.exchange.usd.read_ours` reads it back. A
+camera has a pose and a lens, in tenths of a metre, on a square film of 36 mm. A `.usdz` file is a
+zip archive of plainly stored members that begin at multiples of 64 bytes.
 """
 
 import io
@@ -47,7 +44,7 @@ from storage.records.scene_file import scene_digest
 SUFFIXES = (".usda", ".usdc", ".usdz")
 
 CARRIED = frozenset({*ARRAY_FIELDS, "provenance"} | {f"objects.{field}" for field in OBJECT_TEXTS})
-"""Of a scene (pipeline.exchange.formats)."""
+"""Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 
 def write_usd(path: Path, scene: Scene) -> None:
@@ -86,7 +83,7 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
 
 
 def root_attributes(scene: Scene) -> Attributes:
-    """Return what stands on the prim of a scene."""
+    """Return the attributes of the prim of a scene."""
     unused = np.ones(len(scene.vertex_positions), np.bool_)
     unused[scene.faces] = False
     rows = np.flatnonzero(unused)
@@ -156,7 +153,7 @@ def add_cameras(layer: Any, folder: str, scene: Scene) -> None:
 
 
 def camera_attributes(c2w: NDArray[np.float32], fov_deg: float) -> Attributes:
-    """Return what stands on a camera's prim: pose [4, 4], and full field of view in degrees."""
+    """Return the attributes of a camera's prim: pose [4, 4], and full field of view in degrees."""
     focal = APERTURE / (2 * math.tan(math.radians(fov_deg) / 2))
     rows = c2w.astype(np.float64).T.tolist()  # USD multiplies rows from the left
     return {
@@ -176,7 +173,7 @@ LAYER_NAME = "scene.usdc"
 
 _HEADER_BYTES = 30
 _PADDING_ID = 0x1986
-"""Of the extra field that moves a member's bytes to where they must begin; readers skip it."""
+"""Identifier of the extra field that aligns a member's bytes; readers skip it."""
 
 
 def packaged(layer: bytes) -> bytes:

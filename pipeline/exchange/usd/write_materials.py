@@ -4,7 +4,7 @@ Our BRDF is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface i
 workflow takes the same albedos and roughness, but lets its specular albedo rise to 1 at grazing
 angles. OpenPBR's base has one index of refraction: it is chosen so that the strongest channel
 reflects our specular albedo head-on, and the tint gives the others. So both look alike and neither
-is equal; whoever wants it exactly reads the attributes (infra/blender does).
+is equal; the exact values are in the attributes, which our Blender script reads.
 
 OpenPBR counts emission in nits and UsdPreviewSurface as a plain colour: both get our radiance.
 """
@@ -42,7 +42,7 @@ from storage.records.material import (
 )
 
 PREVIEW, OPENPBR = "Preview", "OpenPBR"
-"""Names of the two shaders below a material."""
+"""Names of the two shaders of a material."""
 
 _MOST_REFLECTING = 0.98
 """Head-on reflectance beyond which no index of refraction is sought: 0.98 needs 199."""

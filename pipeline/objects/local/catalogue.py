@@ -2,8 +2,6 @@
 
 A mistake in it stops the run, since it is the user's text; a file that it names and that is missing
 does not, since one lost download must not cost the others.
-
-Rows of a catalogue file, as JSON lines or as CSV, each with the line where it begins.
 """
 
 import csv

@@ -1,7 +1,4 @@
-"""Object files of a folder that has no catalogue.
-
-Objects of a folder of this machine: by its catalogue, or else its object files.
-"""
+"""Objects of a folder of this machine: those of its catalogue, or else its object files."""
 
 import os
 from pathlib import Path

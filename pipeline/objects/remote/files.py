@@ -2,9 +2,7 @@
 
 A file lies below `files` under its own name, since the parts of a glTF name each other. Beside it,
 below `versions`, stands what the server said about it then: while the server says the same, the
-file is not fetched again.
-
-Which other files a glTF needs: so that they are fetched with it.
+file is not fetched again. The files that a glTF names are fetched with it.
 """
 
 import errno
