@@ -1,7 +1,7 @@
 """A run: from an order to a dataset, or to a part of one. Resumable at any moment, by anybody.
 
 Files are the truth. A run looks at what is there, makes what is missing, and leaves each shard as
-it is done; several runs on one folder share the work (storage.dataset.claims), and those on one
+it is done; several runs on one folder share the work (storage.claims), and those on one
 bucket what is finished (pipeline.shards.mirror). Who runs the tasks is not known here: `trilight
 generate` uses threads, the flows Prefect.
 """

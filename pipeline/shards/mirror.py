@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pipeline.shards.pack import note_of, note_shard, noted_shard, rejections_of_shard
 from storage.atomic import write_atomically
-from storage.dataset.claims import claimed
+from storage.claims import claimed
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (

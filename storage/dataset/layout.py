@@ -16,9 +16,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.atomic import remove_leftovers, write_error
+from storage.atomic import remove_leftovers
 from storage.cache import cache_folder
-from storage.dataset.claims import claimed
+from storage.claims import claimed, flock_now, open_lock
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.bucket import WRITABLE
@@ -39,6 +39,16 @@ def numbered(number: int, name: str) -> str:
     return f"part-{part:04d}/{name}" if part else name
 
 
+class _Below:
+    """A path below the folder of a dataset."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, folder: "DatasetFolder", owner: type) -> Path:
+        return folder.root / self._name
+
+
 @dataclass(frozen=True)
 class DatasetFolder:
     """The paths of one dataset, or of this machine's part of one that is made in a bucket."""
@@ -48,89 +58,37 @@ class DatasetFolder:
     bucket: str = ""
     """URL of the bucket that the dataset is made in, where it is; without secrets."""
 
+    manifest = _Below("manifest.json")
+    objects_lock = _Below("objects.lock.jsonl")
+    failures = _Below("failures.jsonl")
+    attribution = _Below("attribution.csv")
+    card = _Below("README.md")
+    """The dataset card, which is what hubs and people open first."""
+    licences = _Below("LICENSE.md")
+    croissant = _Below("croissant.json")
+    contact_sheet = _Below("contact_sheet.png")
+    template_sheet = _Below("templates.png")
+    report = _Below("report.html")
+    report_pages = _Below("report")
+    """Folder of the report's pages, one per scene that it shows."""
+    logs = _Below("logs")
+    staging = _Below(".staging")
+    staged_objects = _Below(".staging/objects")
+    """Built-in objects, written out as files."""
+    staged_failures = _Below(".staging/failures")
+    """Rejections of shards that are packed but not yet in the manifest."""
+    staged_entries = _Below(".staging/entries")
+    """What the manifest will say of shards that are packed but not yet in it."""
+    staged_samples = _Below(".staging/samples")
+    """Finished samples of unfinished shards, in a folder for each shard."""
+    staged_sent = _Below(".staging/sent")
+    """An empty file for each shard that is known to be in the bucket."""
+    _lock = _Below(".staging/lock")
+
     @property
     def shown(self) -> str:
         """What people call the dataset."""
         return self.bucket or str(self.root)
-
-    @property
-    def manifest(self) -> Path:
-        return self.root / "manifest.json"
-
-    @property
-    def objects_lock(self) -> Path:
-        return self.root / "objects.lock.jsonl"
-
-    @property
-    def failures(self) -> Path:
-        return self.root / "failures.jsonl"
-
-    @property
-    def attribution(self) -> Path:
-        return self.root / "attribution.csv"
-
-    @property
-    def card(self) -> Path:
-        """The dataset card, which is what hubs and people open first."""
-        return self.root / "README.md"
-
-    @property
-    def licences(self) -> Path:
-        return self.root / "LICENSE.md"
-
-    @property
-    def croissant(self) -> Path:
-        return self.root / "croissant.json"
-
-    @property
-    def contact_sheet(self) -> Path:
-        return self.root / "contact_sheet.png"
-
-    @property
-    def template_sheet(self) -> Path:
-        return self.root / "templates.png"
-
-    @property
-    def report(self) -> Path:
-        return self.root / "report.html"
-
-    @property
-    def report_pages(self) -> Path:
-        """Folder of the report's pages, one per scene that it shows."""
-        return self.root / "report"
-
-    @property
-    def logs(self) -> Path:
-        return self.root / "logs"
-
-    @property
-    def staging(self) -> Path:
-        return self.root / ".staging"
-
-    @property
-    def staged_objects(self) -> Path:
-        """Built-in objects, written out as files."""
-        return self.staging / "objects"
-
-    @property
-    def staged_failures(self) -> Path:
-        """Rejections of shards that are packed but not yet in the manifest."""
-        return self.staging / "failures"
-
-    @property
-    def staged_entries(self) -> Path:
-        """What the manifest will say of shards that are packed but not yet in it."""
-        return self.staging / "entries"
-
-    @property
-    def staged_samples(self) -> Path:
-        """Finished samples of unfinished shards, in a folder for each shard."""
-        return self.staging / "samples"
-
-    @property
-    def staged_sent(self) -> Path:
-        """An empty file for each shard that is known to be in the bucket."""
-        return self.staging / "sent"
 
     def staged_shard(self, name: str) -> Path:
         """Folder of the finished samples of an unfinished shard."""
@@ -159,18 +117,13 @@ class DatasetFolder:
         Raises:
             TrilightError: the folder cannot be written, or another process is at work in it.
         """
-        descriptor = self._open_lock()
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise TrilightError(
-                f"{self.root}: another process is making this dataset. Wait for it, or choose "
-                "another --out."
-            ) from error
-        else:
+        with claimed(self._lock) as ours:
+            if not ours:
+                raise TrilightError(
+                    f"{self.root}: another process is making this dataset. Wait for it, or choose "
+                    "another --out."
+                )
             yield
-        finally:
-            os.close(descriptor)
 
     @contextlib.contextmanager
     def joined(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
@@ -184,9 +137,9 @@ class DatasetFolder:
         Raises:
             TrilightError: the folder cannot be written; or as `when_alone`.
         """
-        descriptor = self._open_lock()
+        descriptor = open_lock(self._lock)
         try:
-            if _lock_alone(descriptor):
+            if flock_now(descriptor):
                 remove_leftovers(self.root, older_than_s=_LEFT_S)
                 when_alone()
             fcntl.flock(descriptor, fcntl.LOCK_SH)
@@ -197,22 +150,6 @@ class DatasetFolder:
     def turn(self, what: str) -> "contextlib.AbstractContextManager[bool]":
         """Hold the lock of a step that one worker does at a time, such as `manifest`."""
         return claimed(self.staging / "turns" / what, wait=True)
-
-    def _open_lock(self) -> int:
-        lock = self.staging / "lock"
-        try:
-            self.staging.mkdir(parents=True, exist_ok=True)
-            return os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise write_error(lock, error) from error
-
-
-def _lock_alone(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 _ADMITTED = f"expected a folder, or a URL of {' or '.join(WRITABLE)}"

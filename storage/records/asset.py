@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+from storage.records.objects import NamedObject
 from storage.records.safe_read import read_safetensors
 
 
@@ -162,23 +163,11 @@ def decode_asset(data: bytes) -> Asset:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AssetRow:
+class AssetRow(NamedObject):
     """An accepted object."""
 
-    uid: str
-    """The uid of its ObjectRecord."""
     path: str
     """Its mesh, below the folder."""
-    title: str
-    """For people."""
-    licence: str
-    """SPDX identifier, or `LicenseRef-...`."""
-    licence_source: str
-    """Where the licence is stated."""
-    attribution: str
-    """Whom to name."""
-    source_url: str
-    """Where the object came from."""
     num_faces: int
     """Triangles of the mesh."""
     method: str

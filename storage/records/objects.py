@@ -17,13 +17,11 @@ from storage.errors import TrilightError
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectRecord:
-    """One 3D object as it was found: a readable file and the rights to it."""
+class NamedObject:
+    """What every row about an object says: which one it is, and the rights to it."""
 
     uid: str
     """Unique in its source, and stable: it names the object in every later record."""
-    path: str
-    """The file, absolute, on this machine; never published."""
     title: str
     """For people."""
     licence: str
@@ -37,25 +35,21 @@ class ObjectRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LockedObject:
+class ObjectRecord(NamedObject):
+    """One 3D object as it was found: a readable file and the rights to it."""
+
+    path: str
+    """The file, absolute, on this machine; never published."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LockedObject(NamedObject):
     """One accepted object of a dataset, as `objects.lock.jsonl` freezes it."""
 
-    uid: str
-    """The uid of its ObjectRecord."""
     asset_sha256: str
     """Digest of the prepared asset file: the exact triangles that scenes use."""
     split: str
     """train, validation or test, by a hash of the cleaned geometry: copies stay together."""
-    licence: str
-    """SPDX identifier, or `LicenseRef-...`."""
-    licence_source: str
-    """Where the licence is stated, and as of when."""
-    title: str
-    """For people."""
-    attribution: str
-    """Whom to name."""
-    source_url: str
-    """Where the object came from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +70,7 @@ class Failure:
 
 def encode_objects_lock(objects: Iterable[LockedObject]) -> bytes:
     """Return the file of a lock: one line per object, sorted by uid."""
-    rows = sorted(objects, key=lambda entry: entry.uid)
-    return b"".join(canonical_json(dataclasses.asdict(row)) + b"\n" for row in rows)
+    return _lines(sorted(objects, key=lambda entry: entry.uid))
 
 
 def write_objects_lock(path: Path, objects: Iterable[LockedObject]) -> None:
@@ -112,7 +105,7 @@ def decode_objects_lock(data: bytes, place: str) -> list[LockedObject]:
 def encode_failures(failures: Iterable[Failure]) -> bytes:
     """Return one line per failure, each once, sorted by stage, item and attempt."""
     rows = sorted(set(failures), key=lambda row: (row.stage, row.item, row.attempt, row.reason))
-    return b"".join(canonical_json(dataclasses.asdict(row)) + b"\n" for row in rows)
+    return _lines(rows)
 
 
 def decode_failures(data: bytes) -> list[Failure]:
@@ -141,3 +134,7 @@ def count_by_reason(failures: Iterable[Failure]) -> list[tuple[str, str, int]]:
     """Return (stage, reason, how many), the most frequent first."""
     counts = Counter((failure.stage, failure.reason) for failure in failures)
     return [(stage, reason, count) for (stage, reason), count in counts.most_common()]
+
+
+def _lines(rows: Iterable[LockedObject | Failure]) -> bytes:
+    return b"".join(canonical_json(dataclasses.asdict(row)) + b"\n" for row in rows)

@@ -9,12 +9,12 @@ import contextlib
 import fcntl
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_error
+from storage.atomic import TEMPORARY_SUFFIX, atomic_writer
 from storage.cache import cache_folder
+from storage.claims import claimed
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.remote.fetch import download, facts_of, unreadable
@@ -63,7 +63,7 @@ class ShardCache:
             while True:
                 if (stream := _open_shared(path)) is not None:
                     return stream
-                with self._only_fetcher_of(path):
+                with claimed(self._lock_of(path), wait=True):
                     if not path.exists():
                         self._fetch(url, path, num_bytes, sha256)
         except TransferFailed as error:
@@ -119,20 +119,9 @@ class ShardCache:
             if _remove_unread(path):
                 taken -= size
 
-    @contextlib.contextmanager
-    def _only_fetcher_of(self, path: Path) -> Iterator[None]:
-        folder = self.root.with_name(f"{self.root.name}-locks")
-        lock = folder / f"{int(sha256_hex(path.name.encode())[:8], 16) % _LOCKS:02d}"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise write_error(lock, error) from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-            yield
-        finally:
-            os.close(descriptor)
+    def _lock_of(self, path: Path) -> Path:
+        number = int(sha256_hex(path.name.encode())[:8], 16) % _LOCKS
+        return self.root.with_name(f"{self.root.name}-locks") / f"{number:02d}"
 
 
 class _WrongBytes(Exception):

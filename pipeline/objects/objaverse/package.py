@@ -6,7 +6,6 @@ a dead server for ever; prints; and reads its list of all objects anew for each 
 """
 
 import contextlib
-import fcntl
 import importlib
 import re
 import socket
@@ -15,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from storage.atomic import write_error
+from storage.claims import claimed
 from storage.errors import TrilightError
 from storage.remote.tries import TransferFailed, with_tries
 
@@ -124,7 +123,7 @@ class ObjaversePackage:
             replaced["_load_object_paths"] = lambda: self._paths
         missing = object()
         kept = {name: self._package.__dict__.get(name, missing) for name in replaced}
-        with self._locked():
+        with claimed(self._root / ".trilight.lock", wait=True):
             socket.setdefaulttimeout(_SILENCE_S)
             self._package.__dict__.update(replaced)
             try:
@@ -136,19 +135,6 @@ class ObjaversePackage:
                         del self._package.__dict__[name]
                     else:
                         self._package.__dict__[name] = value
-
-    @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Keep other runs from writing the same unfinished files; the kernel frees the lock."""
-        path = self._root / ".trilight.lock"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            stream = path.open("wb")
-        except OSError as error:
-            raise write_error(path, error) from error
-        with stream:
-            fcntl.flock(stream, fcntl.LOCK_EX)
-            yield
 
 
 def _print_nothing(*values: object, **options: object) -> None:

@@ -18,7 +18,7 @@ from pipeline.making.make_scene import SceneAttempt
 from pipeline.making.make_shard import is_free, make_piece
 from pipeline.making.pieces import Piece
 from pipeline.shards.pack import note_shard, noted_shard
-from storage.dataset.claims import claimed
+from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
 from storage.dataset.shard import write_shard

@@ -34,12 +34,16 @@ def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
             os.close(descriptor)
 
 
-def _locked(path: Path, wait: bool) -> int | None:
-    """Return the descriptor that holds the lock, or None where another process holds it."""
+def open_lock(path: Path) -> int:
+    """Return the descriptor of a lock's file, which is created where it is missing.
+
+    Raises:
+        TrilightError: the folder cannot be written.
+    """
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            return os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         except FileNotFoundError:  # the folder went between the two calls: its owner was done
             continue
         except OSError as error:
@@ -47,9 +51,24 @@ def _locked(path: Path, wait: bool) -> int | None:
             if isinstance(error, FileExistsError) and not path.parent.is_file():
                 continue
             raise write_error(path, error) from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
+
+
+def flock_now(descriptor: int) -> bool:
+    """Take an exclusive lock without waiting; return whether it is ours."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _locked(path: Path, wait: bool) -> int | None:
+    """Return the descriptor that holds the lock, or None where another process holds it."""
+    while True:
+        descriptor = open_lock(path)
+        if wait:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        elif not flock_now(descriptor):
             os.close(descriptor)
             return None
         if _is(path, descriptor):
