@@ -65,7 +65,7 @@ def remove_leftovers(folder: Path, *, older_than_s: float = 0.0) -> None:
             every machine that writes there.
     """
     for leftover in folder.rglob(f"*{TEMPORARY_SUFFIX}"):
-        with contextlib.suppress(FileNotFoundError):  # its writer is alive, and was done just now
+        with contextlib.suppress(OSError):  # its writer has just finished, or it is not ours
             if time.time() - leftover.stat().st_mtime >= older_than_s:
                 leftover.unlink()
 

@@ -37,14 +37,10 @@ _DEFLATE, _SHUFFLE = 1, 2
 class H5Array:
     """A plain array of a file, not yet read."""
 
-    name: str
-    """For messages."""
-    shape: tuple[int, ...]
-    """What it claims; its blocks are counted against it."""
-    dtype: np.dtype
-    """Type of its elements in the file."""
-    dataset: Any
-    """The h5py dataset."""
+    name: str  # for messages
+    shape: tuple[int, ...]  # what it claims; its blocks are counted against it
+    dtype: np.dtype  # type of its elements in the file
+    dataset: Any  # the h5py dataset
 
 
 @contextlib.contextmanager

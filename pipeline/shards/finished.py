@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
-from storage.dataset.splits import shards_for
+from storage.dataset.progress import planned_shards
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, read_objects_lock
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
 from storage.remote.safe_url import safe_url
-from storage.settings.dataset import SplitSettings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,7 +58,7 @@ def open_finished(place: str) -> FinishedDataset:
         raise TrilightError(f"{safe_url(place)}: expected the folder of a dataset on this machine.")
     folder = DatasetFolder(Path(place))
     manifest = read_manifest(folder.manifest)
-    planned = _planned_shards(manifest)
+    planned = len(planned_shards(manifest))
     if len(manifest.shards) < planned:
         raise TrilightError(
             f"{place}: {len(manifest.shards)} of {planned} shards are there; expected a finished "
@@ -146,13 +144,3 @@ def _facts(shard: ShardEntry, key: str, members: Mapping[str, bytes]) -> SceneFa
         raise TrilightError(
             f"{shard.name}: sample {key} is not as expected ({error!r}); run `trilight verify`."
         ) from error
-
-
-def _planned_shards(manifest: Manifest) -> int:
-    """Return how many shards the dataset has when it is finished."""
-    if derivation_of(manifest.settings):
-        return len(manifest.shards)  # it only ever appears whole
-    try:
-        return shards_for(manifest.num_scenes, SplitSettings(**manifest.settings["splits"]))
-    except (KeyError, TypeError) as error:
-        raise TrilightError(f"manifest: settings.splits is not readable ({error!r}).") from error

@@ -135,10 +135,17 @@ def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, int, M
 
 
 def planned_shards(manifest: Manifest) -> dict[str, int]:
-    """Return the names of the shards of the finished dataset, with their numbers of scenes."""
-    if derivation_of(manifest.settings):
+    """Return the names of the shards of the finished dataset, with their numbers of scenes.
+
+    Raises:
+        TrilightError: the settings in the manifest do not say how the dataset is divided.
+    """
+    if derivation_of(manifest.settings):  # it only ever appears whole
         return {entry.name: entry.num_samples for entry in manifest.shards}
-    splits = SplitSettings(**manifest.settings["splits"])
+    try:
+        splits = SplitSettings(**manifest.settings["splits"])
+    except (KeyError, TypeError) as error:
+        raise TrilightError(f"manifest: settings.splits is not readable ({error!r}).") from error
     return {
         shard_name(index, splits): len(scenes_of_shard(index, splits))
         for index in range(shards_for(manifest.num_scenes, splits))

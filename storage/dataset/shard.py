@@ -54,14 +54,10 @@ _BINARY = 0x80
 class Member:
     """One file in a shard."""
 
-    key: str
-    """Key of its sample."""
-    suffix: str
-    """What it is in the sample."""
-    offset: int
-    """Offset of its first byte in the shard."""
-    num_bytes: int
-    """Its size."""
+    key: str  # key of its sample
+    suffix: str  # what it is in the sample
+    offset: int  # offset of its first byte in the shard
+    num_bytes: int  # its size
 
 
 def scan_members(stream: BinaryIO, name: str) -> Iterator[Member]:

@@ -117,7 +117,7 @@ def _num_planned(manifest: Manifest) -> int:
     """Return how many shards there will be; of settings that do not say, those that are there."""
     try:
         return len(planned_shards(manifest))
-    except (KeyError, TypeError, TrilightError):
+    except TrilightError:
         return len(manifest.shards)
 
 

@@ -23,14 +23,11 @@ _SMALLEST_DOUBLE_AREA = 1e-12
 class TriangleSoup:
     """Triangles with three corners of their own each."""
 
-    positions: NDArray[np.float32]
-    """[T, 3, 3] world."""
-    normals: NDArray[np.float32]
-    """[T, 3, 3] unit."""
+    positions: NDArray[np.float32]  # [T, 3, 3] world
+    normals: NDArray[np.float32]  # [T, 3, 3] unit
     corners: NDArray[np.int64]
     """[T, 3] which corner of the mesh each was: where values per corner are found."""
-    polygons: NDArray[np.int64]
-    """[T] which polygon of the mesh."""
+    polygons: NDArray[np.int64]  # [T] which polygon of the mesh
 
 
 def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:

@@ -23,10 +23,8 @@ _SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "S
 class Placed:
     """A prim in its place."""
 
-    prim: Any
-    """The USD prim; several places may share one."""
-    to_world: NDArray[np.float64]
-    """[4, 4], for column vectors, into metres with +Z up."""
+    prim: Any  # the USD prim; several places may share one
+    to_world: NDArray[np.float64]  # [4, 4], for column vectors, into metres with +Z up
 
 
 def placed_prims(stage: Any, time: Any, lost: list[str]) -> list[Placed]:

@@ -28,18 +28,12 @@ _STEPS = 8
 class Texture:
     """A picture as a material uses it."""
 
-    linear: NDArray[np.float32]
-    """[H, W, C] linear values, row 0 on top."""
-    wrap: tuple[str, str]
-    """USD's wrap modes along s and t."""
-    scale: NDArray[np.float32]
-    """[4]."""
-    bias: NDArray[np.float32]
-    """[4]."""
-    primvar: str
-    """Name of the texture coordinates."""
-    output: str
-    """rgb, r, g, b or a: what is connected."""
+    linear: NDArray[np.float32]  # [H, W, C] linear values, row 0 on top
+    wrap: tuple[str, str]  # USD's wrap modes along s and t
+    scale: NDArray[np.float32]  # [4]
+    bias: NDArray[np.float32]  # [4]
+    primvar: str  # name of the texture coordinates
+    output: str  # rgb, r, g, b or a: what is connected
 
     def means(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.float32], float]:
         """Return the mean [T, 3] over triangles with coordinates [T, 3, 2], and the deviation.

@@ -37,15 +37,11 @@ OBJECT_TEXTS = {
 }
 """Attributes of a mesh: row of its object, rows of vertices and faces, fields of SceneObject."""
 
-DIFFUSE_ALBEDO = NAMESPACE + "diffuseAlbedo"
-SPECULAR_ALBEDO = NAMESPACE + "specularAlbedo"
-ROUGHNESS_VALUE = NAMESPACE + "roughness"
-EMITTED_RADIANCE = NAMESPACE + "emittedRadiance"
 MATERIAL_ATTRIBUTES = {
-    "diffuse": DIFFUSE_ALBEDO,
-    "specular": SPECULAR_ALBEDO,
-    "roughness": ROUGHNESS_VALUE,
-    "emission": EMITTED_RADIANCE,
+    "diffuse": NAMESPACE + "diffuseAlbedo",
+    "specular": NAMESPACE + "specularAlbedo",
+    "roughness": NAMESPACE + "roughness",
+    "emission": NAMESPACE + "emittedRadiance",
 }
 """Attributes of a material, by the names of its columns (storage.records.material)."""
 

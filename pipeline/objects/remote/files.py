@@ -6,12 +6,10 @@ file is not fetched again. The files that a glTF names are fetched with it.
 """
 
 import errno
-import hashlib
 import json
 import os
 import posixpath
 import threading
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,8 @@ from fsspec.asyn import sync
 from fsspec.callbacks import Callback
 
 from pipeline.objects.remote.folder import RemoteFolder
-from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_atomically
+from storage.atomic import atomic_writer, remove_leftovers, write_atomically
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.fetch import version_of
 from storage.remote.safe_url import printable
@@ -34,6 +33,7 @@ _MAX_PATH_BYTES = 2000
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 _NAME_ERRORS = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.EILSEQ)
 _MAX_BUFFERS = 100
+_MAX_JSON_BYTES = 64_000_000
 _STALE_S = 24 * 3600.0
 
 
@@ -55,7 +55,8 @@ class RemoteFiles:
         self._max_bytes = max_bytes
         self._lock = threading.Lock()
         self._outcomes: dict[str, _Outcome] = {}
-        _remove_stale(self.files)
+        # what is younger may belong to a run that is at work
+        remove_leftovers(self.files, older_than_s=_STALE_S)
 
     def path(self, name: str) -> Path:
         """Return where a file goes; raises TransferFailed `unsafe_name` for names that lead out."""
@@ -120,7 +121,7 @@ class RemoteFiles:
         version = version_of(facts)
         if size is not None:
             version["size"] = str(size)
-        note = self._versions / f"{hashlib.sha256(os.fsencode(name)).hexdigest()}.json"
+        note = self._versions / f"{sha256_hex(os.fsencode(name))}.json"
         if version and _is_here(path, note, version):
             return
         self._transfer(name, path, size, limit)
@@ -198,19 +199,6 @@ def _is_here(path: Path, note: Path, version: dict[str, str]) -> bool:
         )
     except (OSError, ValueError):
         return False
-
-
-def _remove_stale(files: Path) -> None:
-    """Delete what killed runs left; what is younger may belong to a run that is at work."""
-    for leftover in files.rglob(f"*{TEMPORARY_SUFFIX}"):
-        try:
-            if time.time() - leftover.stat().st_mtime > _STALE_S:
-                leftover.unlink()
-        except OSError:
-            continue
-
-
-_MAX_JSON_BYTES = 64_000_000
 
 
 def buffer_names(path: Path, name: str) -> list[str]:

@@ -22,6 +22,7 @@ from storage.dataset.progress import (
     read_status,
     tell_views,
 )
+from storage.errors import TrilightError
 from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
 
 
@@ -137,3 +138,15 @@ def test_logs_without_rows_say_nothing(tmp_path: Path) -> None:
     begin_tiny(tmp_path, 4)
     assert list(read_scene_logs(DatasetFolder(tmp_path))) == []
     assert read_status(str(tmp_path)).views_per_hour is None
+
+
+def test_a_manifest_that_does_not_say_how_it_is_divided_is_a_mistake_in_words(
+    tmp_path: Path,
+) -> None:
+    path = begin_tiny(tmp_path, 4).folder.manifest
+    manifest = read_manifest(path)
+    for splits in ({}, {"splits": {"shards": 3}}, {"splits": 3}):
+        settings = {k: v for k, v in manifest.settings.items() if k != "splits"} | splits
+        write_manifest(path, dataclasses.replace(manifest, settings=settings))
+        with pytest.raises(TrilightError, match=r"split"):
+            read_status(str(tmp_path))
