@@ -30,12 +30,9 @@ from storage.records.scene import Scene
 class Converted:
     """What came of a conversion."""
 
-    files: tuple[Path, ...]
-    """What was written, without the meshes beside a scene JSON."""
-    triangles: int
-    """Triangles of all scenes."""
-    notes: tuple[str, ...]
-    """What could not be carried over, for people."""
+    files: tuple[Path, ...]  # what was written, without the meshes beside a scene JSON
+    triangles: int  # triangles of all scenes
+    notes: tuple[str, ...]  # what could not be carried over, for people
 
 
 def convert_scene(

@@ -54,18 +54,12 @@ MAX_MATERIALS = 1 << 16
 class LoadedMesh:
     """The mesh of an object, as its file has it or remeshed."""
 
-    uid: str
-    """Path of the file below the folder of the scenes, with slashes."""
-    licence: str
-    """SPDX identifier, or `LicenseRef-...`."""
-    positions: NDArray[np.float64]
-    """[V, 3] in the units of the file."""
-    faces: NDArray[np.int64]
-    """[F, 3]."""
-    centre: NDArray[np.float64]
-    """[3] mean of the vertices of the file."""
-    reach: float
-    """Distance of the farthest of them from the centre."""
+    uid: str  # path of the file below the folder of the scenes, with slashes
+    licence: str  # SPDX identifier, or `LicenseRef-...`
+    positions: NDArray[np.float64]  # [V, 3] in the units of the file
+    faces: NDArray[np.int64]  # [F, 3]
+    centre: NDArray[np.float64]  # [3] mean of the vertices of the file
+    reach: float  # distance of the farthest of them from the centre
 
 
 def scene_from_description(

@@ -199,12 +199,9 @@ _NO_FILE_LETTERS = '/\\:*?"<>|'
 class DescribedFiles:
     """The files of one scene."""
 
-    json: bytes
-    """The scene file."""
-    meshes: dict[str, bytes]
-    """OBJ files by path relative to it."""
-    lost: tuple[str, ...]
-    """What of the members in CARRIED does not come back, for people."""
+    json: bytes  # the scene file
+    meshes: dict[str, bytes]  # OBJ files by path relative to it
+    lost: tuple[str, ...]  # what of the members in CARRIED does not come back, for people
 
 
 def described_files(scene: Scene, stem: str) -> DescribedFiles:

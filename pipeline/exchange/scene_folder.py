@@ -21,16 +21,12 @@ MAX_SCENES = 100_000
 class SceneFolder:
     """The scene files of one folder."""
 
-    root: Path
-    """The folder, without links; nothing outside of it is read."""
+    root: Path  # the folder, without links; nothing outside of it is read
     names: tuple[str, ...]
     """Every scene file, sorted; the position is the index of the scene, usable or not."""
-    descriptions: tuple[SceneDescription, ...]
-    """What each usable file describes, in the same order."""
-    unusable: Mapping[str, str]
-    """What is wrong with each of the others, by its name."""
-    albedo_over_one: AlbedoOverOne
-    """What to do where albedos add up to more than 1."""
+    descriptions: tuple[SceneDescription, ...]  # what each usable file describes, in the same order
+    unusable: Mapping[str, str]  # what is wrong with each of the others, by its name
+    albedo_over_one: AlbedoOverOne  # what to do where albedos add up to more than 1
 
     def views(self, wanted: int | None) -> int:
         """Return how many views every scene gets: `wanted`, or the fewest cameras of any file.

@@ -48,10 +48,8 @@ _SAME = ("renders.resolution", "renders.per_light")
 class Derive:
     """What to make of finished datasets."""
 
-    operation: Operation
-    """What it is called."""
-    selection: Selection = dataclasses.field(default_factory=Selection)
-    """Which scenes are taken."""
+    operation: Operation  # what it is called
+    selection: Selection = dataclasses.field(default_factory=Selection)  # which scenes are taken
     scenes_per_shard: int | None = None
     """Scenes of each new shard; `merge` keeps shards, `select` fills them as its source does."""
 

@@ -21,10 +21,8 @@ from storage.remote.safe_url import safe_url
 class FinishedDataset:
     """A dataset that is whole."""
 
-    folder: DatasetFolder
-    """Its folder."""
-    manifest: Manifest
-    """What it says of itself."""
+    folder: DatasetFolder  # its folder
+    manifest: Manifest  # what it says of itself
     objects: Mapping[str, list[LockedObject]]
     """Its locked objects by uid; a merged dataset may know several under one."""
 
@@ -33,18 +31,12 @@ class FinishedDataset:
 class SceneFacts:
     """What decides whether a scene is taken, and where it goes."""
 
-    shard: ShardEntry
-    """The shard that it is in."""
-    key: str
-    """Its key there."""
-    template: str
-    """Layout of the scene."""
-    noise_floor_db: float
-    """Noise floor of its worst view, as psnr_log_db."""
-    uids: tuple[str, ...]
-    """Objects that stand in it."""
-    arrays_sha256: str
-    """Digest of its unpacked arrays: equal for equal scenes."""
+    shard: ShardEntry  # the shard that it is in
+    key: str  # its key there
+    template: str  # layout of the scene
+    noise_floor_db: float  # noise floor of its worst view, as psnr_log_db
+    uids: tuple[str, ...]  # objects that stand in it
+    arrays_sha256: str  # digest of its unpacked arrays: equal for equal scenes
 
 
 def open_finished(place: str) -> FinishedDataset:

@@ -18,10 +18,8 @@ from storage.records.sample import sample_key
 class Selection:
     """Which scenes are taken; by default all."""
 
-    split: str | None = None
-    """Take only scenes of this split."""
-    template: str | None = None
-    """Take only scenes of this layout."""
+    split: str | None = None  # take only scenes of this split
+    template: str | None = None  # take only scenes of this layout
     min_noise_floor_db: float | None = None
     """Take only scenes whose views all have at least this noise floor (psnr_log_db)."""
 
@@ -41,12 +39,9 @@ class Selection:
 class Taken:
     """One scene of the new dataset."""
 
-    source: int
-    """Which of the sources it is from."""
-    facts: SceneFacts
-    """Its place in the source."""
-    key: str
-    """Its new key."""
+    source: int  # which of the sources it is from
+    facts: SceneFacts  # its place in the source
+    key: str  # its new key
 
 
 def taken_scenes(

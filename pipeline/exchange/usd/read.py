@@ -26,14 +26,10 @@ MAX_NOTES = 40
 class UsdScene:
     """A scene and what could not be carried over."""
 
-    key: str
-    """Key of a shard's sample, or time code of a frame; empty where the file has one scene."""
-    scene: Scene
-    """It passes `Scene.check`."""
-    lost: tuple[str, ...]
-    """For people."""
-    exact: bool
-    """Whether Trilight wrote the file, and nothing has been changed since."""
+    key: str  # key of a shard's sample, or time code of a frame; empty where the file has one scene
+    scene: Scene  # it passes `Scene.check`
+    lost: tuple[str, ...]  # for people
+    exact: bool  # whether Trilight wrote the file, and nothing has been changed since
 
 
 def usd_keys(path: Path, folder: Path | None = None) -> list[str]:
