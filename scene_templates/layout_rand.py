@@ -75,7 +75,7 @@ def layout_rand(
 
     Args:
         rng: where the numbers come from.
-        settings: the ranges; its families are not looked at, the plan has one.
+        settings: the ranges; its families are ignored, since the plan has one.
         plan: the family and the counts.
         shapes: what the `plan.num_objects` objects look like.
 

@@ -1,6 +1,6 @@
 """Claims: locks that tell processes in a shared folder which work is taken.
 
-A claim is a lock on a small file. It ends with the process that holds it, whatever ends that, so
+A claim is a lock on a small file. It ends with the process that holds it, however that ends, so
 nothing has to be cleaned up after a kill. Claims spare work; they are not what keeps files right.
 Where a file system does not carry locks between machines, two of them may make the same scene, of
 the same bytes, and the first writer of a shard wins (storage.atomic).
@@ -17,7 +17,7 @@ from storage.atomic import write_error
 
 @contextlib.contextmanager
 def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
-    """Hold a claim for the block, and say whether it is ours.
+    """Hold a claim for the block; yield whether it is ours.
 
     Args:
         path: the file of the claim; it is created here, and its holder may delete it.

@@ -88,7 +88,7 @@ class SceneBuilder:
             licence: SPDX identifier, or `LicenseRef-...`.
 
         Raises:
-            TrilightError: no such file, arrays that are no mesh, or numbers that mean nothing.
+            TrilightError: no such file, arrays that are no mesh, or invalid numbers.
         """
         if isinstance(mesh, tuple):
             name = name or f"object{len(self._objects)}"
@@ -181,7 +181,7 @@ class SceneBuilder:
             towards: the point that it faces.
 
         Raises:
-            TrilightError: numbers that mean nothing.
+            TrilightError: invalid numbers.
         """
         name = self._unused("lamp")
         middle, target = (
@@ -234,7 +234,10 @@ class SceneBuilder:
                 than 1, or there is no lamp, no camera or no surface.
         """
         if not self._objects:
-            raise TrilightError(f"{self._name}: holds no object; expected add_mesh and its kin.")
+            raise TrilightError(
+                f"{self._name}: holds no object; expected at least one. Call add_mesh, add_builtin "
+                "or add_floor."
+            )
         description = SceneDescription(
             file=self._name,
             scene_name=self._name,

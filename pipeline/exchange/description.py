@@ -80,4 +80,4 @@ class SceneDescription:
     objects: tuple[DescribedObject, ...]  # in the order of the file
     cameras: tuple[DescribedCamera, ...]  # in the order of the file
     unknown_fields: tuple[str, ...]
-    """Dotted names of fields that mean nothing to us and were left out."""
+    """Dotted names of unknown fields, which were left out."""

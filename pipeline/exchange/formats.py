@@ -77,7 +77,7 @@ class LoadedScene:
     scene: Scene
     """It passes `Scene.check`."""
     notes: tuple[str, ...]
-    """What a person should know: what of a file means nothing, or could not be carried over."""
+    """Notes for people: unknown parts of the file, and what could not be carried over."""
     radiance_rgb: Pictures = None
     """Pictures of all views, where they were requested and the source has them."""
 

@@ -84,7 +84,7 @@ def scene_from_description(
         triangle.
 
     Raises:
-        TrilightError: an object or a camera that means nothing, named; or too much of something.
+        TrilightError: an unusable object or camera, by its name; or a count above its maximum.
     """
     pieces: list[ScenePiece] = []
     scales: dict[str, float] = {}
@@ -286,7 +286,7 @@ def lawful_albedos(
 
 
 def colour_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.int64]:
-    """Return, for every triangle [T], which draw gives its colour.
+    """Return the number of the draw that colours each triangle, [T].
 
     As published, a flat mesh shares no vertices, so that each of its triangles is a group of its
     own, whatever the type says.

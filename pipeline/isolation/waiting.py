@@ -19,7 +19,7 @@ LOOKS_BEFORE_WORDS = 3
 """Looks at which a child was stopped before that is said. One may see a child that is about to
 continue together with this process."""
 LOOKS_BEFORE_KILL = 60
-"""Looks at which a child was stopped before it is given up: time to continue it by hand."""
+"""Polls that may find a child stopped before it is given up: time to continue it by hand."""
 
 
 def wait_for_answer(connection: Connection, process_id: int, wall_s: float) -> None:
@@ -55,7 +55,7 @@ def wait_for_answer(connection: Connection, process_id: int, wall_s: float) -> N
 
 
 def _is_stopped(process_id: int) -> bool:
-    """Say whether a process stands still until it is continued; always no where /proc is not."""
+    """Return whether a process is stopped until it is continued; False without /proc."""
     try:
         line = Path(f"/proc/{process_id}/stat").read_text()
     except OSError:

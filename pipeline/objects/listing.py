@@ -27,7 +27,7 @@ class Listing:
     """Objects that cannot be used, whatever their licence."""
     fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _here_already
     """Brings objects to this machine; returns them with their paths, and a failure for each that
-    could not be had. Files of this machine are left where they are."""
+    could not be fetched. Files of this machine are left where they are."""
 
 
 def failure(uid: str, reason: str, message: str) -> Failure:
@@ -40,7 +40,7 @@ SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 
 
 def is_object_file(name: str) -> bool:
-    """Say whether a path names an object and none of its parts is hidden."""
+    """Return whether a path names an object and none of its parts is hidden."""
     return name.lower().endswith(SUFFIXES) and not any(
         part.startswith(".") for part in name.split("/")
     )
@@ -53,7 +53,7 @@ def assign_uids(names: Iterable[str]) -> tuple[dict[str, str], list[Failure]]:
     is `banner`. Where that is taken, by the order of the names, it is the full name: of `a.obj` and
     `a.stl`, `a` and `a.stl`. So a new file may take the uid of an older one that differs in its
     suffix only; a catalogue keeps uids fixed. Two names that print alike (a line break, and a
-    backslash with an n) cannot both be told from outside: the later one fails.
+    backslash with an n) cannot be told apart: the later one fails.
     """
     uids: dict[str, str] = {}
     failures = []
@@ -96,7 +96,7 @@ def fetch_all(
         stop: set where the run ends early, so that `fetch` may give up.
 
     Raises:
-        Exception: whatever else `fetch` raises; what has not begun by then is left out.
+        Exception: any other error of `fetch`; fetches that have not begun are cancelled.
     """
     here: list[ObjectRecord] = []
     failures: list[Failure] = []

@@ -208,7 +208,7 @@ def _find(
 
 @contextlib.contextmanager
 def _said_by(source: str) -> Iterator[str]:
-    """Lend the source that is meant; where a variable says it, no message shows what it says."""
+    """Yield the source, or what its environment variable holds; no message quotes that."""
     value = _value(source)
     try:
         yield value
@@ -219,7 +219,7 @@ def _said_by(source: str) -> Iterator[str]:
 
 
 def _value(source: str) -> str:
-    """Return the source that is meant, where an environment variable says it."""
+    """Return the source, read from the environment variable where one is named."""
     if not source.startswith(ENVIRONMENT):
         return source
     name, shown = source.removeprefix(ENVIRONMENT), printable(source)

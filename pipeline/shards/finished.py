@@ -74,8 +74,8 @@ def read_facts(dataset: FinishedDataset, *, shard_done: Callable[[], None]) -> I
     Memory is that of one scene. Pictures are hashed with the shard and not decoded.
 
     Raises:
-        TrilightError: a shard is missing or its bytes are not those of the manifest, or a scene
-            lacks what is asked of it.
+        TrilightError: a shard is missing or its bytes are not those of the manifest, or the record
+            of a scene is incomplete.
     """
     for shard in dataset.manifest.shards:
         path = dataset.folder.shard(shard.name)

@@ -72,7 +72,7 @@ class LocalFiles(_Files):
 
         Args:
             shard: which one.
-            checked: look at its digest before, once as long as the file stays as it is.
+            checked: check its digest first, once as long as the file stays unchanged.
 
         Raises:
             TrilightError: it is missing, or its bytes are not those of the manifest.
@@ -140,7 +140,7 @@ class RemoteDatasetFiles(_Files):
             raise unreadable(url, error) from error
 
     def open(self, shard: ShardEntry, *, checked: bool) -> BinaryIO:
-        """Open a shard for reading; its digest is looked at when it arrives, in any case.
+        """Open a shard for reading; its digest is always checked on arrival.
 
         Raises:
             TrilightError: as `storage.remote.cache`.
@@ -248,7 +248,7 @@ class Dataset:
     def read_scenes(self, shard: ShardEntry) -> Iterator[SceneRecord]:
         """Yield the samples of a shard without their pictures, through the manifest's index.
 
-        Only what is needed is read, so that a large dataset can be looked at; the digest of the
+        Only what is needed is read, so that a large dataset can be browsed; the digest of the
         shard is therefore not checked (`read_shard` and `trilight verify` do that).
 
         Raises:

@@ -53,18 +53,18 @@ class Progress:
 
 
 def announce_downloads(folder: DatasetFolder, done: int, total: int) -> None:
-    """Write down how many object files have come from a server."""
+    """Record how many object files have been downloaded."""
     write_atomically(_downloads(folder), json.dumps([done, total]).encode())
 
 
 def announce_objects(folder: DatasetFolder, num_objects: int) -> None:
-    """Write down how many objects the asset stage will look at, and that none is done."""
+    """Record how many objects the asset stage has to do, and that none is done."""
     write_atomically(_done(folder), b"")
     write_atomically(_plan(folder), json.dumps({"objects": num_objects}).encode())
 
 
 def count_object(folder: DatasetFolder) -> None:
-    """Write down that one more object is prepared or rejected: a byte, from any thread."""
+    """Record that one more object is prepared or rejected: one byte, from any thread."""
     path = _done(folder)
     try:
         with path.open("ab") as stream:
@@ -74,9 +74,9 @@ def count_object(folder: DatasetFolder) -> None:
 
 
 def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
-    """Write down how many views of a scene at work are finished, the one at hand in part.
+    """Record how many views of an unfinished scene are done; the current one counts in part.
 
-    It is for people alone, so that where it cannot be written nothing is said.
+    The note only shows progress, so failing to write it is no error.
     """
     with contextlib.suppress(OSError):
         path = _at_work(folder) / numbered(scene_index, f"{scene_index:09d}")
@@ -85,7 +85,7 @@ def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
 
 
 def forget_views(folder: DatasetFolder, scene_index: int) -> None:
-    """Take back what `tell_views` wrote: the scene is finished, or begun anew."""
+    """Delete the note of `tell_views`: the scene is finished, or begun anew."""
     with contextlib.suppress(OSError):
         (_at_work(folder) / numbered(scene_index, f"{scene_index:09d}")).unlink()
 
@@ -117,14 +117,14 @@ def read_progress(folder: DatasetFolder) -> Progress:
 
 
 def _views_at_work(folder: DatasetFolder) -> float:
-    """Return how many views are told of that a kill has not left long ago."""
+    """Return how many views are in progress, without old notes that a kill has left."""
     since = time.time() - _AT_WORK_S
-    told = 0.0
+    views = 0.0
     for path in _at_work(folder).rglob("[0-9]*"):
         with contextlib.suppress(OSError, ValueError):  # it is gone, or half written
             if path.is_file() and path.stat().st_mtime > since:
-                told += float(path.read_text())
-    return told
+                views += float(path.read_text())
+    return views
 
 
 @functools.lru_cache(maxsize=4)
@@ -234,7 +234,7 @@ def log_scene(
 
 
 def read_scene_logs(folder: DatasetFolder) -> Iterator[SceneLog]:
-    """Yield what the logs of a dataset say; rows that a kill has cut are left out."""
+    """Yield the rows of a dataset's logs; rows that a kill has cut are left out."""
     for path in sorted(folder.logs.rglob("*.jsonl")):
         yield from decode_scene_log(path.read_text())
 
@@ -245,7 +245,7 @@ def log_name(shard: str) -> str:
 
 
 def decode_scene_log(text: str) -> Iterator[SceneLog]:
-    """Yield what the rows of a log say; those that a kill has cut are left out."""
+    """Yield the rows of a log; those that a kill has cut are left out."""
     for line in text.splitlines():
         try:
             row = json.loads(line)

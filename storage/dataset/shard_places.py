@@ -41,7 +41,7 @@ class ShardPlace:
         return next((split for split in SPLITS if name.startswith(f"{split}-")), "train")
 
     def open(self) -> BinaryIO:
-        """Open the shard; raises TrilightError where it cannot be had."""
+        """Open the shard; raises TrilightError where it cannot be read."""
         if isinstance(self.place, RemoteUrl):
             return shard_cache().open(self.place, num_bytes=None, sha256=None)
         try:

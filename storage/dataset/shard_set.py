@@ -84,7 +84,7 @@ class ShardSet(ABC):
         """Open a shard, fetched and checked.
 
         Raises:
-            TrilightError: it cannot be had, or is not what it should be; names it.
+            TrilightError: it cannot be read, or is not what it should be; the message names it.
         """
 
 

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -37,7 +37,7 @@ class Verification:
     problems: Sequence[str]
     """One line per fault, naming shard and sample; empty where the dataset is whole."""
     num_samples: int
-    """Samples that were looked at."""
+    """Samples that were checked."""
     bad_shards: Sequence[str]
     """Names of the shards that are missing or not what they should be."""
     num_shards_planned: int
@@ -65,14 +65,14 @@ def verify_dataset(
 ) -> Verification:
     """Check a dataset, in a folder or on a server, against its manifest.
 
-    Several shards are looked at side by side in threads: hashing and unpacking leave Python's lock.
+    Several shards are checked at once in threads: hashing and unpacking release Python's lock.
     Shards of a server are fetched anew, past the cache, and not kept.
 
     Args:
         root: the dataset, opened, or its path or URL.
         fast: compare only sizes, and in a folder also the members' names and places; reads no
             picture. A changed byte is not seen.
-        shard_done: called with the name of each shard that was looked at.
+        shard_done: called with the name of each checked shard.
 
     Raises:
         TrilightError: there is no readable manifest, so there is nothing to check against, or the
@@ -230,13 +230,15 @@ def check_sample(
         sample.scene.check()
     except TrilightError as error:
         yield f"sample {sample.key}: {error}"
-    resolution = _setting(manifest, "renders", "resolution")
+    renders = manifest.settings.get("renders")
+    renders = renders if isinstance(renders, Mapping) else {}
+    resolution = renders.get("resolution")
     expected = (manifest.num_views, resolution, resolution, 3)
     if sample.radiance_rgb.shape != expected or sample.scene.num_views != manifest.num_views:
         yield f"sample {sample.key}: pictures {sample.radiance_rgb.shape}; expected {expected}"
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
         yield f"sample {sample.key}: a picture holds a value that is not finite or negative"
-    yield from _check_lights(sample, apart=bool(manifest.settings["renders"].get("per_light")))
+    yield from _check_lights(sample, apart=bool(renders.get("per_light")))
     if mixed := mixed_share_alike(entry.licence for entry in sample.scene.objects):
         yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
     for entry in sample.scene.objects:
@@ -264,7 +266,3 @@ def _check_lights(sample: Sample, *, apart: bool) -> Iterator[str]:
                 f"sample {sample.key}: view {view} is not the sum of its lights in "
                 f"{int(differs.sum())} pixels, first in ({row}, {column})"
             )
-
-
-def _setting(manifest: Manifest, group: str, name: str) -> Any:
-    return manifest.settings[group][name]

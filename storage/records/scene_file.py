@@ -6,7 +6,7 @@ writes several in any order.) Equal scenes give equal bytes.
 
 Such a file comes from anywhere. Its size, its header and every shape are checked before an array is
 made, names and types must be exactly those of a scene, and the laws of `Scene.check` hold for
-whatever is returned.
+every scene that is returned.
 """
 
 import dataclasses

@@ -2,7 +2,7 @@
 
 A bucket shows a file when all of it has come, however large it is, so a kill leaves nothing half
 written; parts of an upload that was cut off are invisible, and a rule of the bucket may delete them
-(AbortIncompleteMultipartUpload). "Only once" is a condition that the server itself looks at.
+(AbortIncompleteMultipartUpload). "Only once" is a condition that the server itself checks.
 """
 
 from collections.abc import Callable
@@ -58,7 +58,7 @@ class Bucket:
         self._tried(lambda: self._put(name, content, mode="overwrite"), "written")
 
     def create(self, name: str, content: Path | bytes) -> bool:
-        """Write a file unless there is one, and say whether it was written; else as `write`.
+        """Write a file unless it exists, and return whether it was written; otherwise as `write`.
 
         Where the answer to a successful write is lost, another worker counts as its writer.
         """

@@ -1,7 +1,7 @@
 """Shards of servers on this machine: fetched whole, checked on arrival, bounded, shared.
 
 Any number of processes may use the same folder. A shard appears by rename, when all of it has come
-and its hash is right. Who reads one holds a shared lock on it; what is locked is never removed. One
+and its hash is right. A reader holds a shared lock on its shard, which is then never removed. One
 process fetches a shard while the others wait for it. Locks die with the process that holds them.
 """
 
@@ -52,11 +52,11 @@ class ShardCache:
             url: the shard.
             num_bytes: its size, where a manifest says it.
             sha256: its digest, where a manifest says it; without one, the shard is known by what
-                the server says of it, and whatever arrives is taken.
+                the server says of it, and its bytes are not checked.
 
         Raises:
-            TrilightError: it cannot be had, has another size, its bytes are wrong twice in a row,
-                or the disk is full.
+            TrilightError: it cannot be fetched, has another size, twice has the wrong bytes, or
+                the disk is full.
         """
         try:
             path = self.root / _name(url, sha256)

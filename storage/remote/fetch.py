@@ -100,7 +100,7 @@ class _Expected:
             raise TransferFailed("too_large_bytes", message)
 
     def is_same(self, version: Mapping[str, str]) -> bool:
-        """Say whether the file is still the one that the bytes so far came from."""
+        """Return whether the file is still the one that the bytes so far came from."""
         before, self.version = self.version, dict(version)
         return before in (None, self.version)
 
@@ -175,7 +175,7 @@ def _start_over(stream: BinaryIO) -> None:
 
 
 def unreadable(url: RemoteUrl, error: TransferFailed) -> TrilightError:
-    """Return the user's view of a file that cannot be had."""
+    """Return the user's view of a file that cannot be read."""
     hint = " Public buckets need FSSPEC_S3_ANON=true." if url.scheme == "s3" else ""
     return TrilightError(
         f"{url.what} {url.shown!r}: cannot be read ({error.message}); expected a file that can be "

@@ -88,24 +88,24 @@ def root_error(error: BaseException) -> BaseException:
 
 
 def is_missing(error: BaseException) -> bool:
-    """Say whether a server answered that there is no such file."""
+    """Return whether a server answered that there is no such file."""
     cause = root_error(error)
     return isinstance(cause, FileNotFoundError) or _status(cause) in (404, 410)
 
 
 def is_absent(error: BaseException) -> bool:
-    """Say whether a server answered that there is no such file, or none that we may see."""
+    """Return whether a server answered that there is no such file, or none that we may see."""
     cause = root_error(error)
     return is_missing(error) or isinstance(cause, PermissionError) or _status(cause) in (401, 403)
 
 
 def is_taken(error: BaseException) -> bool:
-    """Say whether a server answered that there is such a file already."""
+    """Return whether a server answered that there is such a file already."""
     return isinstance(error, FileExistsError) or 412 in (_status(error), _status(error.__cause__))
 
 
 def may_pass(error: BaseException) -> bool:
-    """Say whether the same request may succeed a little later."""
+    """Return whether the same request may succeed a little later."""
     status = _status(error)
     if status is not None:
         return status >= 500 or status in _MAY_PASS_STATUS

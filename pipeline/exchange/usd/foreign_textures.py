@@ -62,7 +62,7 @@ class Texture:
 
 
 def read_texture(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Texture | None:
-    """Return the texture of a UsdUVTexture shader, or None where it cannot be had (it is noted).
+    """Return the texture of a UsdUVTexture shader, or None, with a note, if unreadable.
 
     Raises:
         TrilightError: its file is outside of the folder or on the network.

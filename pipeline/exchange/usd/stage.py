@@ -1,10 +1,10 @@
 """Opens an untrusted USD file, and decides which other files it may read.
 
 A USD file can name other files, and the network. Which of them composition opens depends on all of
-them together; so nothing is foretold. Every file that any layer names for composition, used or
-not, is looked at by the path that USD's own resolver gives, is refused outside of the folder, and
-is opened here first: the closure of all names holds whatever composition can ask for. The layers of
-the stage are compared with the folder once more when it stands, and before anything of it is used.
+them together; so none is predicted. Every file that any layer names for composition, used or
+not, is checked by the path that USD's own resolver gives, is refused outside of the folder, and is
+opened here first: the closure of all names holds every file that composition can ask for. When the
+stage stands, its layers are compared with the folder once more, before anything of it is used.
 `pipeline.exchange.usd.composition` bounds the size of the stage. The bytes are still parsed by
 native code, so untrusted files are opened in a child process with limits (pipeline.isolation).
 `quietly` turns USD's own errors into one line that names the file and no folder of this machine.
@@ -79,12 +79,12 @@ class OpenedUsd:
             self._refuse(plain, ", which is a link without an end")
         if not target.is_relative_to(self.folder) or ".." in Path(plain.partition("[")[2]).parts:
             self._refuse(plain, ", which is outside of its folder; copy it there")
-        if found and not target.is_file():  # opening a FIFO would wait for ever
+        if found and not target.is_file():  # opening a FIFO would block forever
             self._refuse(plain, ", which is no plain file")
         return found or None
 
     def compose(self) -> Any:
-        """Return the composed stage, of files that have all been looked at.
+        """Return the composed stage; all of its files have been checked.
 
         Raises:
             TrilightError: a file outside, the network, value clips, a circle, or too much of

@@ -24,7 +24,7 @@ def only_catalogue(exists: Callable[[str], bool]) -> str | None:
     """Return the name of a folder's catalogue, or None where it has none.
 
     Args:
-        exists: says whether the folder has a file of a name.
+        exists: returns whether the folder has a file of this name.
 
     Raises:
         TrilightError: it has both.

@@ -82,8 +82,8 @@ def _uncatalogued(
     for catalogue in set(CATALOGUE_NAMES) & set(names):
         # it would rule, so that going on without it could use what it forbids
         raise TrilightError(
-            f"objects {folder.url.shown!r}: {catalogue} is listed but not given out; expected a "
-            "catalogue that can be read. Check your access to it."
+            f"objects {folder.url.shown!r}: {catalogue} is listed but cannot be fetched; expected "
+            "a readable catalogue. Check your access to it."
         )
     uids, failures = assign_uids(name for name in names if is_object_file(name))
     records = []

@@ -124,7 +124,7 @@ def test_a_catalogue_that_is_kept_from_us_still_rules(site: Site) -> None:
     site.put("objects.jsonl", '{"uid": "a", "path": "a.obj", "licence": "LicenseRef-shop"}')
     site.put("a.obj")
     site.forbidden.add("/objects.jsonl")
-    with pytest.raises(TrilightError, match="objects.jsonl is listed but not given out"):
+    with pytest.raises(TrilightError, match="objects.jsonl is listed but cannot be fetched"):
         find(site.url)
 
 
