@@ -216,7 +216,7 @@ def test_children_die_with_a_parent_that_is_killed(tmp_path: Path) -> None:
             import sys
             sys.path.insert(0, {str(ROOT)!r})
             from pipeline.isolation import ChildLimits, IsolatedChild
-            from tests.flows import test_isolation as t
+            from tests.pipeline.isolation import test_isolation as t
             if __name__ == "__main__":
                 limits = ChildLimits(memory_bytes=2 << 30, wall_s=60, calls_per_child=9)
                 folder = {str(tmp_path)!r}
