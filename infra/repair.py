@@ -6,7 +6,7 @@ from typing import cast
 
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import differences
-from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.making.dataset_run import make_dataset
 from pipeline.making.order import DatasetOrder
 from pipeline.making.runners import ThreadRunner

@@ -7,9 +7,8 @@ from typing import Annotated, Any, Literal
 
 from storage.errors import TrilightError
 from storage.extensions import function_name
-from storage.settings.described import checked
+from storage.settings.described import checked, option_words
 from storage.settings.ranges import Within
-from storage.settings.words import option_words
 from train.runs import changed_run
 from train.settings import TrainSettings
 from train.start import Start

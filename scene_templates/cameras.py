@@ -1,15 +1,38 @@
-"""Cameras: they look near the origin from the open side of a layout."""
+"""Cameras, which look near the origin from a sector of directions: the open side of a layout."""
 
+import math
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scene_templates.checks import OFFSET, SIZE, Range
 from scene_templates.layout import CameraPose
-from scene_templates.sectors import Sector
 from storage.conventions import look_at_c2w
 from storage.settings.described import checked
 from storage.settings.ranges import Within
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sector:
+    """Directions between two elevations and within an angle of one azimuth."""
+
+    azimuth_deg: float
+    """Middle of the sector; 0 is +X, 90 is +Y."""
+    half_width_deg: float
+    """Largest angle to either side of the azimuth; 180 is all around."""
+    elevation_deg: tuple[float, float]
+    """Least and greatest angle above the horizon."""
+
+    def direction_rand(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Draw a unit direction [3], uniform by solid angle."""
+        low, high = (math.sin(math.radians(angle)) for angle in self.elevation_deg)
+        z = rng.uniform(low, high)
+        turn = rng.uniform(-self.half_width_deg, self.half_width_deg)
+        azimuth = math.radians(self.azimuth_deg + turn)
+        across = math.sqrt(1 - z * z)
+        return np.array([across * math.cos(azimuth), across * math.sin(azimuth), z])
 
 
 @checked("scene settings")
@@ -17,11 +40,11 @@ class CameraSettings:
     """What cameras are drawn from, as published."""
 
     distance: Annotated[Range, SIZE] = (1.5, 2.0)
-    """From the camera to the point it looks at, world units."""
+    """Distance from the camera to the point it looks at, world units."""
     target_jitter: Annotated[float, OFFSET] = 0.2
-    """Most offset per axis from the origin of the point it looks at."""
+    """Largest offset, per axis, of the point it looks at from the origin."""
     up_jitter: Annotated[float, Within(0, 1)] = 0.1
-    """Most offset per axis of a camera's up vector from +Z."""
+    """Largest offset, per axis, of a camera's up vector from +Z."""
     fov_deg: Annotated[Range, Within(1, 170, unit="degrees")] = (30.0, 60.0)
     """Full field of view, horizontal and vertical."""
 

@@ -6,19 +6,19 @@ from storage.errors import TrilightError
 from storage.settings.ranges import LowFirst, Within
 
 Range = Annotated[tuple[float, float], LowFirst()]
-"""Least and greatest value, both included."""
+"""Lowest and highest value, both included."""
 
 Counts = Annotated[tuple[int, int], LowFirst()]
 """Fewest and most, each number between equally likely."""
 
 SIZE = Within(1e-3, 1e3)
-"""Of what has a size or a distance, in nominal rooms: a thousandth, to a thousand of them."""
+"""Range of lengths, in room units."""
 
 OFFSET = Within(0, 1e3)
-"""Of the most by which something is moved, either way."""
+"""Range of the largest offset in either direction, in room units."""
 
 SHIFT = Within(-1e3, 1e3)
-"""Of where something is moved to."""
+"""Range of translations, in room units."""
 
 
 def require(law: bool, name: str, value: object, expected: str) -> None:

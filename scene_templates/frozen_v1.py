@@ -2,12 +2,11 @@
 
 A frozen set asks no list of families or layouts and takes no default: those may change, and sets
 that networks are compared on may not. Test: tests/pipeline/builds/test_frozen_builds.py. The
-layouts that are named here are frozen with it; whoever wants another `plane` registers it under
-another name.
+layouts that are named here are frozen with it; another `plane` is registered under another name.
 """
 
 from scene_templates.cameras import CameraSettings
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings

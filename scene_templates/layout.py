@@ -48,7 +48,7 @@ class ShellPart:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
-    """Where an object is: a sphere that its mesh is scaled into, and its rotation."""
+    """Place of an object: a sphere that its mesh is scaled into, and its rotation."""
 
     centre: NDArray[np.float64]
     """[3] world units."""
@@ -63,7 +63,7 @@ class ObjectPlacement:
     """An object without its mesh."""
 
     pose: Pose
-    """Where it is."""
+    """Its place."""
     surface: SurfaceLook
     """Its material."""
 

@@ -1,22 +1,68 @@
-"""Draws a whole layout: the room, then the objects in it, then what shines on them."""
+"""Draws a whole layout: the plan, then the room, the objects in it, and the lights.
+
+A plan is the family of a scene and its counts. It depends on seed and scene index alone, never on
+the attempt: scenes that are hard to compose are replaced by scenes of the same kind, so that
+rejection does not distort their shares.
+"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.layout import Layout, ObjectPlacement, SurfaceLook
 from scene_templates.lights import emitters_rand
 from scene_templates.materials import surface_rand
-from scene_templates.patches import SIDES, patch
 from scene_templates.placement import ObjectSpace, PlaceableShape, poses_rand
-from scene_templates.plans import ScenePlan
-from scene_templates.rooms import plane_of
+from scene_templates.rooms import SIDES, patch, plane_of
 from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
-from scene_templates.template import LayoutParams
-from scene_templates.templates import TEMPLATES
+from scene_templates.templates import TEMPLATES, LayoutParams
+from storage.seeds import rng_for
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenePlan:
+    """The kind of a scene."""
+
+    family: Family
+    """The layout, and what goes into it."""
+    num_objects: int
+    """How many objects."""
+    num_lights: int
+    """How many emitters."""
+    overlaps: bool
+    """Whether objects may run into each other."""
+
+
+def scene_plan(settings: SceneSettings, *, seed: int, scene_index: int) -> ScenePlan:
+    """Return the plan of a scene; a pure function of its arguments."""
+    rng = rng_for(seed, "scene-plan", scene_index)
+    turn = scene_index // max(1, len(settings.excursions))  # every excursion meets every family
+    settings = settings.of_scene(scene_index)
+    family = _family_rand(rng, settings, turn)
+    return ScenePlan(
+        family=family,
+        num_objects=_count_rand(rng, family.num_objects),
+        num_lights=_count_rand(rng, settings.lights.count),
+        overlaps=bool(rng.random() < settings.placement.overlap_share),
+    )
+
+
+def _family_rand(rng: np.random.Generator, settings: SceneSettings, turn: int) -> Family:
+    if settings.families_in_turn:
+        return settings.families[turn % len(settings.families)]
+    weights = np.array([family.weight for family in settings.families])
+    # By hand: how numpy's choice uses its generator is not promised to stay.
+    position = rng.random() * weights.sum()
+    row = int(np.searchsorted(np.cumsum(weights), position, side="right"))
+    return settings.families[min(row, len(weights) - 1)]
+
+
+def _count_rand(rng: np.random.Generator, bounds: tuple[int, int]) -> int:
+    return int(rng.integers(bounds[0], bounds[1] + 1))
 
 
 def layout_rand(
@@ -29,7 +75,7 @@ def layout_rand(
 
     Args:
         rng: where the numbers come from.
-        settings: the ranges; its families are not looked at, the plan has one.
+        settings: the ranges; its families are ignored, since the plan has one.
         plan: the family and the counts.
         shapes: what the `plan.num_objects` objects look like.
 

@@ -6,10 +6,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from scene_templates.cameras import Sector
 from scene_templates.checks import OFFSET, SIZE, Counts, Range
 from scene_templates.layout import Emitter
 from scene_templates.rotations import Orientation, rotated, rotation_rand
-from scene_templates.sectors import Sector
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
@@ -24,7 +24,7 @@ SPACING_TRIES = 256
 used up; the candidate farthest from the others is taken if it is."""
 
 MOST_LIGHTS = 64
-"""As many as may be kept apart (storage.records.lights); the published scenes have up to 8."""
+"""Maximum number whose pictures can be kept apart (storage.records.lights); published: 8."""
 
 PALEST = 0.2
 """Least channel of a coloured light before its mean is made 1: no light is quite monochrome."""
@@ -43,7 +43,7 @@ class LightSettings:
     distance: Annotated[Range, SIZE] = (2.1, 2.7)
     """Distance of an emitter from a point near the origin (see `target_jitter`), world units."""
     target_jitter: Annotated[float, OFFSET] = 0.2
-    """Most offset per axis from the origin of the point that an emitter hangs around."""
+    """Largest offset, per axis, of the point around which an emitter hangs from the origin."""
     spacing: Annotated[float, Within(0, 2 * SPACING_RADIUS)] = 0.3
     """Least distance between two emitters as seen from the origin, on a sphere of radius 0.866."""
     orientation: Orientation = "uniform"

@@ -10,11 +10,10 @@ import math
 from typing import Any
 
 from scene_templates.checks import Range
-from scene_templates.excursions import Excursion
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH, SCENES_V1
 from scene_templates.rooms import SharedRoom
-from scene_templates.settings import SceneSettings
+from scene_templates.settings import Excursion, SceneSettings
 
 _MEDIAN_EMISSION, _MEDIAN_SIZE = 3750.0, 2.25
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from scene_templates.checks import Range
 from scene_templates.layout import Plane, Pose
-from scene_templates.patches import SIDES
-from scene_templates.rooms import Room
+from scene_templates.rooms import SIDES, Room
 from scene_templates.rotations import Orientation, rotated, rotation_rand
 from storage.errors import Rejected
 from storage.settings.described import checked
@@ -64,7 +63,7 @@ class PlaceableShape(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectSpace:
-    """Where objects may be."""
+    """The space in which objects are placed."""
 
     room: Room
     """The space between the shell parts."""

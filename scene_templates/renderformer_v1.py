@@ -20,7 +20,7 @@ The two background policies are those of `separate_sides`; both public stages us
 from typing import Literal
 
 from scene_templates.checks import Range
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.separate_sides import SeparateSides, SideRanges
 
 Policy = Literal["original", "de-biased"]

@@ -5,11 +5,15 @@ the parts share one room. In square rooms a spin is a multiple of 90 degrees, wh
 diagonals, and edges meet exactly. In the others the spin is free, parts tilt a little, and every
 square is made just large enough to cover its side of the room: parts cross instead of gaping, at
 the price of some hidden triangles.
+
+A patch is a square of 128 triangles. The order of its transforms is the published one: turn about
+X, Y, Z, scale per axis, move, halve.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated
 
 import numpy as np
@@ -17,14 +21,78 @@ from numpy.typing import NDArray
 
 from scene_templates.checks import OFFSET, SHIFT, SIZE, Range
 from scene_templates.layout import Plane
-from scene_templates.patches import SIDES, PatchPlacement
+from scene_templates.rotations import rotated, rotation_xyz
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
+
+QUADS = 8
+"""Quads per side of a patch: 8 x 8 x 2 = 128 triangles."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """One side of the nominal room, the cube [-1, 1]^3 before halving."""
+
+    axis: int
+    """The axis that the side is perpendicular to."""
+    sign: int
+    """The end of that axis at which it stands."""
+
+
+SIDES = MappingProxyType(
+    {
+        "floor": Side(axis=2, sign=-1),
+        "wall0": Side(axis=1, sign=1),
+        "wall1": Side(axis=0, sign=1),
+        "wall2": Side(axis=0, sign=-1),
+    }
+)
+"""The parts that a shell may have. -Y and +Z are open in every template."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchPlacement:
+    """How a patch is brought from its side of the nominal room to its place."""
+
+    rotation_deg: tuple[float, float, float]
+    """About X, then Y, then Z, through the middle of the room; the angle about the side's own
+    axis spins the patch in its plane."""
+    reach: float
+    """Half the side of the square; 1 fills the side of the nominal room exactly."""
+    scale: tuple[float, float, float]
+    """Per axis."""
+    translation: tuple[float, float, float]
+    """Translation after scaling."""
+
+
+def patch(side: Side, placement: PatchPlacement) -> NDArray[np.float64]:
+    """Return the vertices [81, 3] of a patch in world units; `PATCH_FACES` joins them."""
+    line = np.linspace(-placement.reach, placement.reach, QUADS + 1)
+    u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
+    local = np.zeros((len(u), 3))
+    # The two axes in the plane, in the order that makes u x v point into the room.
+    first, second = (side.axis + 1) % 3, (side.axis + 2) % 3
+    local[:, first], local[:, second] = (v, u) if side.sign > 0 else (u, v)
+    local[:, side.axis] = side.sign
+    turned = rotated(local, rotation_xyz(placement.rotation_deg))
+    return (turned * placement.scale + placement.translation) / 2
+
+
+def _patch_faces() -> NDArray[np.uint32]:
+    rows = np.arange((QUADS + 1) ** 2, dtype=np.uint32).reshape(QUADS + 1, QUADS + 1)
+    a, b, c, d = (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:])
+    pairs = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)], axis=2)
+    return pairs.reshape(-1, 3)
+
+
+PATCH_FACES = _patch_faces()
+"""[128, 3], counter-clockwise seen from the room."""
+PATCH_FACES.setflags(write=False)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Room:
-    """Where the shell parts stand, and the space between them."""
+    """The places of the shell parts, and the space between them."""
 
     patches: tuple[PatchPlacement, ...]
     """One per shell part."""

@@ -12,20 +12,19 @@ from typing import Annotated
 import numpy as np
 
 from scene_templates.checks import SHIFT, SIZE, Range
-from scene_templates.patches import SIDES, PatchPlacement
-from scene_templates.rooms import Room
+from scene_templates.rooms import SIDES, PatchPlacement, Room
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
 
 @checked("scene settings")
 class SideRanges:
-    """From what the place of one floor or wall is drawn."""
+    """Ranges from which the place of one floor or wall is drawn."""
 
     spin_deg: Annotated[float, Within(0, 180, unit="degrees")] = 0.0
-    """Most turn about its own axis, either way."""
+    """Largest turn about its own axis, in either direction."""
     tilt_deg: Annotated[float, Within(0, 90, unit="degrees")] = 0.0
-    """Most turn about each of the other two axes."""
+    """Largest turn about each of the other two axes."""
     scale: Annotated[Range, SIZE] = (1.0, 1.0)
     """Size per axis, before halving."""
     shift_x: Annotated[Range, SHIFT] = (0.0, 0.0)

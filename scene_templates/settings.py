@@ -3,22 +3,36 @@
 Numbers follow the RenderFormer V1 recipes where they are known and sound; each deviation says why.
 World units throughout: the nominal shell is the cube [-0.5, 0.5]^3, so sizes that the recipes
 state for a cube of side 2 are halved on use (fields that hold such numbers say "before halving").
+
+An excursion takes a scene beyond the usual range along one axis, while all else stays.
 """
 
 import dataclasses
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from scene_templates.cameras import CameraSettings
 from scene_templates.checks import OFFSET, require
-from scene_templates.excursions import Excursion
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from storage.settings.changes import changed
 from storage.settings.described import checked
-from storage.settings.ranges import Share, Within
+from storage.settings.ranges import FLOAT32_MAX, Share, Within
+
+
+@checked("excursion")
+class Excursion:
+    """One value beyond the usual range, and the settings that make it."""
+
+    axis: str
+    """What is varied, such as `fov_deg`; stands in the provenance of its scenes."""
+    value: Annotated[int | float, Within(-FLOAT32_MAX, FLOAT32_MAX)]
+    """The value on the axis; also in the provenance."""
+    changes: tuple[tuple[str, Any], ...]
+    """Dotted names of scene settings with their values (storage.settings.changes)."""
+
 
 MAX_TRIANGLES = 65_535
 """Materials and objects are counted in 16 bits (storage.records.scene); a triangle may be a
@@ -72,7 +86,7 @@ class SceneSettings:
     lights: LightSettings = field(default_factory=LightSettings)
     """What shines on them."""
     cameras: CameraSettings = field(default_factory=CameraSettings)
-    """From where they are seen."""
+    """Cameras of the scenes."""
     views: ViewLaws = field(default_factory=ViewLaws)
     """What a view must show."""
     excursions: tuple[Excursion, ...] = ()

@@ -61,11 +61,11 @@ def remove_leftovers(folder: Path, *, older_than_s: float = 0.0) -> None:
 
     Args:
         folder: where to look, however deep.
-        older_than_s: what was written to within so many seconds stays; for locks that may not reach
+        older_than_s: files that were written to more recently stay; for locks that may not reach
             every machine that writes there.
     """
     for leftover in folder.rglob(f"*{TEMPORARY_SUFFIX}"):
-        with contextlib.suppress(FileNotFoundError):  # its writer is alive, and was done just now
+        with contextlib.suppress(OSError):  # its writer has just finished, or it is not ours
             if time.time() - leftover.stat().st_mtime >= older_than_s:
                 leftover.unlink()
 

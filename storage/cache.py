@@ -1,4 +1,4 @@
-"""Where Trilight keeps what it can make again, outside of any dataset."""
+"""The user's cache: files outside of any dataset that Trilight can make again."""
 
 import os
 import stat

@@ -1,4 +1,7 @@
-"""The ways in which something can be wrong: a user's mistake, the machine, an unusable item."""
+"""Errors: a user's mistake, a failure of the environment, an unusable item."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class TrilightError(ValueError):
@@ -10,7 +13,7 @@ class TrilightError(ValueError):
 
 
 class EnvironmentFailure(TrilightError):
-    """Something outside of us that may pass: a full disk, a lack of memory, a server away.
+    """A failure of the environment that may pass: a full disk, too little memory, no server.
 
     The same call may succeed later, so a scheduler tries it again; any other TrilightError stays.
     """
@@ -36,3 +39,14 @@ class Rejected(Exception):
 
     def __str__(self) -> str:
         return f"{self.reason}: {self.message}"
+
+
+def expected_one_of(name: str, known: Iterable[str]) -> str:
+    """Return the end of a message about an unknown name, with what was probably meant.
+
+    Such as `did you mean smoke? Expected one of smoke, pretrain-256`, without a full stop.
+    """
+    names = list(known)
+    listed = f"xpected one of {', '.join(names)}"
+    close = get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]}? E{listed}" if close else f"e{listed}"

@@ -18,11 +18,10 @@ from types import ModuleType
 from typing import Any, Literal
 
 from storage.digests import sha256_hex
-from storage.errors import TrilightError
-from storage.suggestion import expected_one_of
+from storage.errors import TrilightError, expected_one_of
 
 VARIABLE = "TRILIGHT_EXTEND"
-"""Names the files, as absolute paths with os.pathsep between them, to processes that start."""
+"""Environment variable with the files for child processes: absolute paths joined by os.pathsep."""
 
 Decided = Literal["data", "weights"]
 """What an extension may decide: the bytes of a dataset, or the weights of a network."""
@@ -36,7 +35,7 @@ class Extension:
     """A file that was loaded."""
 
     path: Path
-    """Where it is, absolute."""
+    """Its absolute path."""
     sha256: str
     """Digest of its bytes."""
     module: ModuleType

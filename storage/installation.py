@@ -1,7 +1,7 @@
-"""Where our packages and files are: in a checkout, or below `trilight` where a wheel put them.
+"""Location of our packages and files: in a checkout, or below `trilight` as a wheel installs them.
 
 A wheel moves the packages into `trilight`, so that a user's own `model` or `train` stays the user's
-(infra/setup/wheel_tree.py). Whoever names a module of ours in a command asks here for its name.
+(infra/setup/wheel_tree.py). Commands that name one of our modules take its name from here.
 """
 
 from pathlib import Path

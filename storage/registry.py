@@ -2,16 +2,15 @@
 
 Each kind of thing that can be added from outside has one such table beside its own type: templates,
 families, builds, runs, sizes of networks, object sources, decimations, metrics, scene formats and
-executors. Whoever wants to know what there is lists the table.
+executors. Listing the table shows all of them.
 """
 
 import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar
 
-from storage.errors import TrilightError
+from storage.errors import TrilightError, expected_one_of
 from storage.extensions import Decided, Extension, is_reference, loading, opened, short_name
-from storage.suggestion import expected_one_of
 
 Entry = TypeVar("Entry")
 
@@ -104,7 +103,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return name
 
     def find(self, name: str) -> Entry:
-        """Return an entry; raises TrilightError for a name that nobody has registered."""
+        """Return an entry; raises TrilightError for a name that is not registered."""
         if name not in self._entries:
             raise TrilightError(
                 f"{self.what} {name!r} is unknown; {expected_one_of(name, self._entries)}."

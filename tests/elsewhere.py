@@ -56,7 +56,7 @@ CHOSEN = (
     "tests/pipeline/scenes/test_compose.py",
     "tests/pipeline/scenes/test_shading.py",
     "tests/storage/test_metrics.py",
-    "tests/storage/dataset/test_shards.py",
+    "tests/storage/dataset/test_shard.py",
     "tests/train/data/test_augment.py",
     "tests/train/data/test_stream.py",
     "tests/train/evaluation/test_judge.py",

@@ -15,10 +15,9 @@ from typing import Any
 from model.config import base as base_model
 from model.config import large as large_model
 from model.config import smoke as smoke_model
-from storage.errors import TrilightError
+from storage.errors import TrilightError, expected_one_of
 from storage.registry import Registry
 from storage.settings.changes import changed
-from storage.suggestion import expected_one_of
 from train.data.augmentation import AugmentationSettings
 from train.loss.settings import LossSettings
 from train.settings import TrainSettings

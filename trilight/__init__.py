@@ -11,7 +11,7 @@ before it is used: `import trilight` takes milliseconds, and no torch, Mitsuba, 
 Mistakes are `TrilightError`s, which say what was found, what was expected, and what to do.
 
 World: metres, +Z up, right-handed; networks were trained on scenes within [-0.5, 0.5]^3. Colours
-are linear with Rec.709 primaries. `trilight.extend` is for those who add templates, builds or runs.
+are linear with Rec.709 primaries. `trilight.extend` serves extensions: templates, builds, runs.
 """
 
 from importlib import import_module, metadata
@@ -65,7 +65,7 @@ _NAMES = {
     "scenes": "Scene SceneObject read_scene read_scenes within_budget write_scene",
 }
 """What there is, by the module of this package that has it. No name is one of a package of ours:
-an installed wheel has `trilight.train` and its kin as subpackages."""
+an installed wheel has `trilight.train` and the other packages as subpackages."""
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = sorted(["__version__", *_HOME])  # noqa: PLE0605

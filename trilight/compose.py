@@ -24,7 +24,7 @@ from pipeline.exchange.from_description import SHELL_FOLDER, LoadedMesh, scene_f
 from pipeline.exchange.reader import SceneReader
 from pipeline.objects.generated import builtin_mesh
 from pipeline.objects.licences import USER_PROVIDED
-from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.scene import Scene
@@ -88,7 +88,7 @@ class SceneBuilder:
             licence: SPDX identifier, or `LicenseRef-...`.
 
         Raises:
-            TrilightError: no such file, arrays that are no mesh, or numbers that mean nothing.
+            TrilightError: no such file, arrays that are no mesh, or invalid numbers.
         """
         if isinstance(mesh, tuple):
             name = name or f"object{len(self._objects)}"
@@ -125,7 +125,7 @@ class SceneBuilder:
         """Add a procedural object, such as the 3rd `rock` or `torus_knot` of `builtin:`.
 
         Args:
-            family: a name of pipeline.objects.builtin.families.
+            family: a name of pipeline.objects.generated.
             number: which of the family, from 0.
             material, name, at, size, rotation_deg: as `add_mesh`.
 
@@ -181,7 +181,7 @@ class SceneBuilder:
             towards: the point that it faces.
 
         Raises:
-            TrilightError: numbers that mean nothing.
+            TrilightError: invalid numbers.
         """
         name = self._unused("lamp")
         middle, target = (
@@ -234,7 +234,10 @@ class SceneBuilder:
                 than 1, or there is no lamp, no camera or no surface.
         """
         if not self._objects:
-            raise TrilightError(f"{self._name}: holds no object; expected add_mesh and its kin.")
+            raise TrilightError(
+                f"{self._name}: holds no object; expected at least one. Call add_mesh, add_builtin "
+                "or add_floor."
+            )
         description = SceneDescription(
             file=self._name,
             scene_name=self._name,

@@ -34,20 +34,20 @@ if TYPE_CHECKING:
     from pipeline.making.runners import ThreadRunner as ThreadRunner
     from pipeline.objects.listing import Listing as Listing
     from pipeline.objects.ply import encode_ply as encode_ply
-    from pipeline.objects.registry import SOURCES as SOURCES
-    from pipeline.objects.registry import ObjectSource as ObjectSource
-    from pipeline.objects.registry import SourceQuery as SourceQuery
+    from pipeline.objects.sources import SOURCES as SOURCES
+    from pipeline.objects.sources import ObjectSource as ObjectSource
+    from pipeline.objects.sources import SourceQuery as SourceQuery
     from pipeline.renders.settings import RenderSettings as RenderSettings
-    from scene_templates.default_families import FAMILIES as FAMILIES
-    from scene_templates.family import Family as Family
+    from scene_templates.cameras import Sector as Sector
+    from scene_templates.families import FAMILIES as FAMILIES
+    from scene_templates.families import Family as Family
     from scene_templates.lights import LightSettings as LightSettings
     from scene_templates.rooms import SharedRoom as SharedRoom
-    from scene_templates.sectors import Sector as Sector
     from scene_templates.separate_sides import SeparateSides as SeparateSides
     from scene_templates.separate_sides import SideRanges as SideRanges
     from scene_templates.settings import SceneSettings as SceneSettings
-    from scene_templates.template import Template as Template
     from scene_templates.templates import TEMPLATES as TEMPLATES
+    from scene_templates.templates import Template as Template
     from storage.atomic import write_atomically as write_atomically
     from storage.errors import TrilightError as TrilightError
     from storage.extensions import load_extension as load_extension
@@ -84,17 +84,15 @@ _NAMES = {
     "pipeline.exchange.formats": "FORMATS LoadedScene Pictures SceneFormat SceneSource",
     "pipeline.builds.settings": "BuildSettings NamedBuild",
     "pipeline.objects.listing": "Listing",
-    "pipeline.objects.registry": "SourceQuery ObjectSource SOURCES",
+    "pipeline.objects.sources": "SourceQuery ObjectSource SOURCES",
     "pipeline.renders.settings": "RenderSettings",
     "scene_templates.lights": "LightSettings",
-    "scene_templates.default_families": "FAMILIES",
-    "scene_templates.family": "Family",
+    "scene_templates.families": "FAMILIES Family",
     "scene_templates.settings": "SceneSettings",
     "scene_templates.rooms": "SharedRoom",
     "scene_templates.separate_sides": "SeparateSides SideRanges",
-    "scene_templates.templates": "TEMPLATES",
-    "scene_templates.sectors": "Sector",
-    "scene_templates.template": "Template",
+    "scene_templates.templates": "TEMPLATES Template",
+    "scene_templates.cameras": "Sector",
     "storage.atomic": "write_atomically",
     "storage.settings.changes": "changed",
     "storage.settings.dataset": "SplitSettings StorageSettings",

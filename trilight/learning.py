@@ -55,7 +55,7 @@ def train_network(
         lpips: folder of LPIPS' weights, or `hub`.
         workers: threads that decode samples.
         device: cpu or cuda; by default cuda where there is one.
-        progress: is told how it goes.
+        progress: receives the progress of the run.
 
     Raises:
         TrilightError: PyTorch is not installed, a setting or the data is refused, or the folder

@@ -54,7 +54,7 @@ def render(
         view: row of `scene.c2w`.
         resolution: width and height in pixels, a multiple of 8.
         noise_floor_db: sampling stops when the measured error (psnr_log_db) reaches this.
-        max_spp: or at so many samples per pixel.
+        max_spp: sampling also stops at this many samples per pixel.
         seed: of the samples.
         threads: of the processor; all cores by default.
 

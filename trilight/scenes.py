@@ -20,7 +20,7 @@ __all__ = ["Scene", "SceneObject", "read_scene", "read_scenes", "within_budget",
 def read_scene(source: str | os.PathLike[str]) -> Scene:
     """Return one scene with all of its cameras; it passes `Scene.check`.
 
-    Warns of what of the file means nothing, or could not be carried over. A child process with
+    Warns of unknown parts of the file, and of what could not be carried over. A child process with
     limits reads it, so that no file can crash or fill this one.
 
     Args:
@@ -69,11 +69,11 @@ def write_scene(
 
 
 def within_budget(scene: Scene, max_triangles: int) -> Scene:
-    """Return the scene with at most so many triangles; emitters stay whole. Warns of what it cost.
+    """Return the scene with fewer triangles; emitters stay whole. Warns of what it cost.
 
     Args:
         scene: passes `Scene.check`.
-        max_triangles: such as the 768 of the network that comes with Trilight.
+        max_triangles: the limit, such as the 768 of the network that comes with Trilight.
 
     Raises:
         TrilightError: emitters alone are more, or an object cannot be reduced that far.

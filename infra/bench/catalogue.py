@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from infra.bench import experiments
 from infra.bench.experiment import Experiment
-from storage.errors import TrilightError
-from storage.suggestion import expected_one_of
+from storage.errors import TrilightError, expected_one_of
 
 
 def families() -> Mapping[str, tuple[Experiment, ...]]:

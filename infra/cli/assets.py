@@ -21,7 +21,7 @@ from infra.cli.options import Shown, command
 from pipeline.assets.settings import AssetSettings, Profile
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
-from storage.records.failures import count_by_reason
+from storage.records.objects import count_by_reason
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked, described
 from storage.settings.ranges import Within

@@ -15,7 +15,7 @@ from cyclopts.exceptions import (
 )
 
 from infra.cli.help import Sections
-from storage.suggestion import expected_one_of
+from storage.errors import expected_one_of
 
 COMMANDS = {
     "doctor": "Say what this machine has, what it lacks, what is then slower, and what mends it.",

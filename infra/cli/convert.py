@@ -5,7 +5,7 @@ from typing import Annotated
 
 from infra.cli.console import first_words, note, print_json, print_rows, progress_bars
 from infra.cli.options import Shown, command
-from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.from_description import AlbedoOverOne
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 

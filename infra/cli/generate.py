@@ -11,7 +11,7 @@ from infra.cli.options import Shown, command
 from pipeline.flows.executors import find_executor
 from pipeline.making.order import DatasetOrder
 from pipeline.renders.variant import choose_variant
-from storage.dataset.output import dataset_folder
+from storage.dataset.layout import dataset_folder
 from storage.settings.described import checked
 
 

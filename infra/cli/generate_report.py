@@ -11,8 +11,7 @@ from pipeline.objects.licences import USER_PROVIDED
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, read_manifest
 from storage.dataset.statistics import Statistics
-from storage.records.failures import count_by_reason, read_failures
-from storage.records.objects_lock import read_objects_lock
+from storage.records.objects import count_by_reason, read_failures, read_objects_lock
 
 if TYPE_CHECKING:
     from pipeline.making.dataset_run import Outcome

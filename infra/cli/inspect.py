@@ -15,12 +15,11 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import Shown, command
-from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.files import RemoteDatasetFiles
+from storage.dataset.dataset import Dataset, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.errors import TrilightError
-from storage.records.failures import count_by_reason
+from storage.records.objects import count_by_reason
 from storage.remote.safe_url import safe_url
 from storage.settings.described import checked
 from storage.settings.ranges import Within

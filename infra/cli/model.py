@@ -9,10 +9,9 @@ from rich.table import Table
 from infra.cli.console import console, first_words, print_json, print_rows
 from infra.cli.layer_plot import plot_layer_errors
 from infra.cli.options import Shown, command
-from storage.errors import TrilightError
+from storage.errors import TrilightError, expected_one_of
 from storage.settings.described import checked
 from storage.settings.ranges import Within
-from storage.suggestion import expected_one_of
 
 if TYPE_CHECKING:
     from model.config import ModelConfig

@@ -7,7 +7,7 @@ import time
 from infra.cli.console import look_at, next_step, print_json, print_rows
 from infra.cli.options import Shown, command
 from pipeline.making.price import CorePrice
-from storage.dataset.status import DatasetStatus, read_status
+from storage.dataset.progress import DatasetStatus, read_status
 from storage.settings.described import checked
 
 

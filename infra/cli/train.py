@@ -18,7 +18,7 @@ from infra.cli.options import Shown, command
 from infra.torch_library import require_torch
 from infra.train_order import TrainOrder
 from storage.errors import TrilightError
-from storage.settings.words import option_words
+from storage.settings.described import option_words
 from train.runs import in_proportion, named_run
 from train.settings import TrainSettings
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from infra.rendering.tone_maps import ToneMap
-from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.settings import NoiseFloor, Resolution, Samples
 from storage.errors import TrilightError
 from storage.settings.described import checked

@@ -20,7 +20,7 @@ from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.objects_lock import read_objects_lock
+from storage.records.objects import read_objects_lock
 from train.evaluation.judged_view import NETWORK
 from train.folder import RunFolder
 

@@ -29,7 +29,7 @@ import functools
 
 from pipeline.builds.frozen_v1 import BUILD_V1
 from pipeline.builds.settings import BuildSettings, NamedBuild
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.frozen_v1 import SCENES_V1
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
 from scene_templates.settings import SceneSettings

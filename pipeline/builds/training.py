@@ -26,7 +26,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.builds.settings import BuildSettings, NamedBuild
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.renders.settings import RenderSettings
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.settings.dataset import SplitSettings
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.documents.figures import drawing, encoded, histogram, panels
 from pipeline.documents.html import Markup, element, image, joined, page, png_uri, table
-from storage.records.asset_rows import AssetRow
+from storage.records.asset import AssetRow
 from storage.records.objects import Failure
 
 _STYLE = """

@@ -11,12 +11,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.file_child import file_child
-from pipeline.exchange.formats import FORMATS, LoadedScene, SceneFormat, SceneSource, writable
+from pipeline.exchange.formats import (
+    FORMATS,
+    LoadedScene,
+    SceneFormat,
+    SceneSource,
+    lost_members,
+    writable,
+)
 from pipeline.exchange.open_scene import load_source, source_keys
+from pipeline.exchange.reader import file_child
 from pipeline.isolation import ChildFailed, call_with_retries
 from storage.errors import TrilightError
-from storage.records.carried import lost_members
 from storage.records.scene import Scene
 
 
@@ -24,12 +30,9 @@ from storage.records.scene import Scene
 class Converted:
     """What came of a conversion."""
 
-    files: tuple[Path, ...]
-    """What was written, without the meshes beside a scene JSON."""
-    triangles: int
-    """Of all scenes."""
-    notes: tuple[str, ...]
-    """What could not be carried over, for people."""
+    files: tuple[Path, ...]  # what was written, without the meshes beside a scene JSON
+    triangles: int  # triangles of all scenes
+    notes: tuple[str, ...]  # what could not be carried over, for people
 
 
 def convert_scene(

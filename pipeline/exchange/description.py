@@ -15,12 +15,9 @@ ColourGroups = Literal["per-triangle", "per-shading-group"]
 class DescribedTransform:
     """How a mesh comes to its place."""
 
-    translation: Vector
-    """World units, the last step."""
-    rotation_deg: Vector
-    """Angles about the world's X, then Y, then Z."""
-    scale: Vector
-    """Factors along the world's axes, after the rotation; a negative one mirrors."""
+    translation: Vector  # world units, the last step
+    rotation_deg: Vector  # angles about the world's X, then Y, then Z
+    scale: Vector  # factors along the world's axes, after the rotation; a negative one mirrors
     normalize: bool
     """Whether the mesh is first brought into a sphere of diameter 1 around the origin."""
 
@@ -29,20 +26,15 @@ class DescribedTransform:
 class DescribedMaterial:
     """How an object reflects or emits; colours are linear."""
 
-    diffuse: Vector
-    """Diffuse albedo, unless the object has random colours."""
-    specular: Vector
-    """Specular albedo."""
-    roughness: float
-    """In [0, 1]; the GGX width is its square."""
+    diffuse: Vector  # diffuse albedo, unless the object has random colours
+    specular: Vector  # specular albedo
+    roughness: float  # in [0, 1]; the GGX width is its square
     emissive: Vector
     """Radiance of every triangle, to both sides; the object is an emitter where one is above 0."""
     smooth_shading: bool
     """Whether normals are interpolated across edges of up to 30 degrees; flat otherwise."""
-    random_diffuse_max: float
-    """Bound of the random colours."""
-    random_diffuse_type: ColourGroups
-    """What shares one random colour."""
+    random_diffuse_max: float  # bound of the random colours
+    random_diffuse_type: ColourGroups  # what shares one random colour
     rand_tri_diffuse_seed: int | None
     """Seed of random colours that replace `diffuse`; None for none."""
 
@@ -56,22 +48,16 @@ class DescribedMaterial:
 class DescribedObject:
     """One entry of `objects`."""
 
-    name: str
-    """Its key."""
-    mesh_path: str
-    """Relative to the scene file."""
-    transform: DescribedTransform
-    """Where it stands."""
-    material: DescribedMaterial
-    """What it is made of."""
-    remesh: bool
-    """Whether the mesh is replaced by one of even triangles."""
-    remesh_target_face_num: int
-    """Most triangles of that mesh."""
+    name: str  # its key
+    mesh_path: str  # relative to the scene file
+    transform: DescribedTransform  # how its mesh comes to its place
+    material: DescribedMaterial  # what it is made of
+    remesh: bool  # whether the mesh is replaced by one of even triangles
+    remesh_target_face_num: int  # maximum number of triangles of the remeshed mesh
 
     @property
     def remesh_faces(self) -> int | None:
-        """Most triangles of the remeshed mesh, or None where it stays as it is."""
+        """Maximum number of triangles after remeshing; None where the mesh stays as it is."""
         return self.remesh_target_face_num if self.remesh else None
 
 
@@ -79,27 +65,19 @@ class DescribedObject:
 class DescribedCamera:
     """One entry of `cameras`."""
 
-    position: Vector
-    """World units."""
-    look_at: Vector
-    """The point in the middle of the picture."""
-    up: Vector
-    """Roughly upwards in the picture; neither unit nor orthogonal."""
-    fov_deg: float
-    """Full field of view, horizontal and vertical."""
+    position: Vector  # world units
+    look_at: Vector  # the point in the middle of the picture
+    up: Vector  # roughly upwards in the picture; neither unit nor orthogonal
+    fov_deg: float  # full field of view, horizontal and vertical
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneDescription:
     """One scene file."""
 
-    file: str
-    """Name of the file, for messages and provenance."""
-    scene_name: str
-    """What its author calls it."""
-    objects: tuple[DescribedObject, ...]
-    """In the order of the file."""
-    cameras: tuple[DescribedCamera, ...]
-    """In the order of the file."""
+    file: str  # name of the file, for messages and provenance
+    scene_name: str  # what its author calls it
+    objects: tuple[DescribedObject, ...]  # in the order of the file
+    cameras: tuple[DescribedCamera, ...]  # in the order of the file
     unknown_fields: tuple[str, ...]
-    """Dotted names of fields that mean nothing to us and were left out."""
+    """Dotted names of unknown fields, which were left out."""

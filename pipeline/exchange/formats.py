@@ -1,10 +1,16 @@
-"""The forms in which a file holds scenes, by the suffix that chooses each: one table for all.
+"""The formats of scene files, by the suffix that chooses each: one table for all.
 
-Reading happens in child processes only (pipeline.exchange.file_child), since a file may come from
-anybody; a child loads the extensions that have added a form.
+A file may be hostile, so it is read in child processes only (pipeline.exchange.reader); a child
+loads the extensions that have added a format.
+
+Each format states the members of a scene that it carries. Every other member that is not at its
+default is reported as lost, so that no writer drops one without a word. A member is a field of
+`Scene`, or a part of one: `materials.diffuse` (storage.records.material) and `objects.uid`
+(SceneObject). A format that carries `materials` carries all columns, added ones too.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,29 +18,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange import renderformer_h5, renderformer_json_write
-from pipeline.exchange.described_albedos import AlbedoOverOne
-from pipeline.exchange.from_description import scaled_albedo_notes
-from pipeline.exchange.renderformer_h5 import reflecting_emitters, write_renderformer_h5
-from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
-from pipeline.exchange.renderformer_json_write import described_files
+from pipeline.exchange import renderformer_h5, renderformer_json
+from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
+from pipeline.exchange.renderformer_h5 import (
+    read_renderformer_h5,
+    reflecting_emitters,
+    write_renderformer_h5,
+)
+from pipeline.exchange.renderformer_json import described_files
 from pipeline.exchange.scene_files import build_scene, cameras_by, described_by
 from pipeline.exchange.usd import write as usd
 from pipeline.exchange.usd.read import read_usd, usd_keys
 from pipeline.exchange.usd.write import write_usd, write_usd_shard
 from pipeline.objects.licences import USER_PROVIDED
 from storage.atomic import write_atomically
-from storage.dataset.shard_reader import iterate_samples, read_members
+from storage.dataset.shard import iterate_samples, read_members
 from storage.errors import TrilightError
 from storage.records import scene_file
+from storage.records.material import columns_in_use
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.sample import decode_sample, decode_scene
-from storage.records.scene import Scene
+from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene, read_scene_file
 from storage.registry import Registry
 
 SEPARATOR = "::"
-"""Between a file of many scenes and the key of one."""
+"""Separates the name of a file of many scenes from the key of one."""
 
 _MEMBERS = ("json", PLAIN, PACKED)
 
@@ -44,7 +53,7 @@ Pictures = NDArray[np.float32] | None
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSource:
-    """Where one scene is."""
+    """The place of one scene."""
 
     path: Path
     """The file."""
@@ -53,7 +62,7 @@ class SceneSource:
     usd_folder: Path | None = None
     """A USD file may name files below it; below its own folder by default."""
     albedo_over_one: AlbedoOverOne = "scale"
-    """Of RenderFormer's JSON: what to do where albedos add up to more than 1."""
+    """What to do in RenderFormer's JSON where albedos add up to more than 1."""
 
     @property
     def name(self) -> str:
@@ -68,9 +77,9 @@ class LoadedScene:
     scene: Scene
     """It passes `Scene.check`."""
     notes: tuple[str, ...]
-    """What a person should know: what of a file means nothing, or could not be carried over."""
+    """Notes for people: unknown parts of the file, and what could not be carried over."""
     radiance_rgb: Pictures = None
-    """Of all views, where they were asked for and the source has them."""
+    """Pictures of all views, where they were requested and the source has them."""
 
 
 Cameras = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -84,7 +93,7 @@ class SceneFormat:
     read: Callable[[SceneSource, bool], LoadedScene] | None = None
     """Reads a scene, and its pictures where the second argument says so; raises TrilightError."""
     keys: Callable[[SceneSource], Sequence[str | None]] | None = None
-    """Of a form that may hold many scenes: the key of each, None for a file of one."""
+    """Returns the key of each scene in a file; None stands for the only scene of a file."""
     always_many: bool = False
     """Whether a file is no scene without a key."""
     cameras: Callable[[SceneSource], Cameras] | None = None
@@ -94,7 +103,7 @@ class SceneFormat:
     write_many: Callable[[Path, Iterable[tuple[str, Scene]]], None] | None = None
     """Writes scenes with their keys into one file."""
     carried: Collection[str] = frozenset()
-    """Members of a scene that it holds (storage.records.carried); of others in use the loss is
+    """Members of a scene that it holds (pipeline.exchange.formats); of others in use the loss is
     noted."""
     holds_pictures: bool = False
     """Whether `write` makes use of pictures."""
@@ -221,7 +230,7 @@ FORMATS: Registry[SceneFormat] = Registry(
             read=_read_json,
             cameras=_json_cameras,
             write=_write_json,
-            carried=renderformer_json_write.CARRIED,
+            carried=renderformer_json.CARRIED,
         ),
         ".h5": SceneFormat(
             read=_read_h5,
@@ -235,4 +244,27 @@ FORMATS: Registry[SceneFormat] = Registry(
         ".tar": SceneFormat(read=_read_sample, keys=_shard_keys, always_many=True),
     },
 )
-"""By suffix, in small letters and with its point."""
+"""Formats by suffix, in lower case with the point."""
+
+
+def lost_members(scene: Scene, carried: Collection[str]) -> tuple[str, ...]:
+    """Return what a form that carries these members loses of a scene: one text, or none."""
+    lost = [
+        member
+        for member in _members_in_use(scene)
+        if not {member, member.partition(".")[0]} & set(carried)
+    ]
+    return (", ".join(lost),) if lost else ()
+
+
+def _members_in_use(scene: Scene) -> Iterator[str]:
+    """Yield the members that are not at their defaults."""
+    for field in dataclasses.fields(Scene):
+        if field.name == "materials":
+            yield from (f"materials.{name}" for name in columns_in_use(scene.materials))
+        elif field.name == "objects":
+            for part in dataclasses.fields(SceneObject):
+                if any(getattr(entry, part.name) != part.default for entry in scene.objects):
+                    yield f"objects.{part.name}"
+        elif len(getattr(scene, field.name)):
+            yield field.name

@@ -8,19 +8,18 @@ its vertices. Template files, whose scales and translations are meant to be halv
 
 An emitter's triangles become emitters each. They reflect by the albedos that the file gives them,
 since the published renderer's emitters have a white surface, as its files say. Materials whose
-albedos add up to more than 1 are scaled or refused (pipeline.exchange.described_albedos); what was
-scaled stands in the provenance, by object.
+albedos add up to more than 1 are scaled or refused (`lawful_albedos`); the provenance names the
+scaled ones by object.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.described_albedos import AlbedoOverOne, lawful_albedos
-from pipeline.exchange.described_colours import colour_groups, random_diffuse
 from pipeline.exchange.description import (
     DescribedCamera,
     DescribedMaterial,
@@ -34,36 +33,33 @@ from scene_templates.rotations import rotated, rotation_xyz
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
-from storage.records.scene import ObjectKind, Scene, SceneObject
+from storage.records.scene import ALBEDO_SUM_TOLERANCE, ObjectKind, Scene, SceneObject
+
+AlbedoOverOne = Literal["scale", "refuse"]
+"""What to do with materials whose diffuse and specular albedos add up to more than 1."""
 
 SHELL_FOLDER = "templates/backgrounds/"
 """Meshes below it are floors and walls; the published scene files keep them there."""
 
 SMOOTH_ANGLE_DEG = 30.0
-"""As published."""
+"""Smoothing angle of the published converter."""
 
 MAX_TRIANGLES = 1_000_000
 MAX_EMITTERS = 4096
 MAX_MATERIALS = 1 << 16
-"""Most triangles, emitting triangles and material rows of one scene."""
+"""Maximum numbers of triangles, emitting triangles and material rows in a scene."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoadedMesh:
     """The mesh of an object, as its file has it or remeshed."""
 
-    uid: str
-    """Path of the file below the folder of the scenes, with slashes."""
-    licence: str
-    """SPDX identifier, or `LicenseRef-...`."""
-    positions: NDArray[np.float64]
-    """[V, 3] in the units of the file."""
-    faces: NDArray[np.int64]
-    """[F, 3]."""
-    centre: NDArray[np.float64]
-    """[3] mean of the vertices of the file."""
-    reach: float
-    """Distance of the farthest of them from the centre."""
+    uid: str  # path of the file below the folder of the scenes, with slashes
+    licence: str  # SPDX identifier, or `LicenseRef-...`
+    positions: NDArray[np.float64]  # [V, 3] in the units of the file
+    faces: NDArray[np.int64]  # [F, 3]
+    centre: NDArray[np.float64]  # [3] mean of the vertices of the file
+    reach: float  # distance of the farthest of them from the centre
 
 
 def scene_from_description(
@@ -88,7 +84,7 @@ def scene_from_description(
         triangle.
 
     Raises:
-        TrilightError: an object or a camera that means nothing, named; or too much of something.
+        TrilightError: an unusable object or camera, by its name; or a count above its maximum.
     """
     pieces: list[ScenePiece] = []
     scales: dict[str, float] = {}
@@ -251,3 +247,72 @@ def _check_counts(pieces: Sequence[ScenePiece]) -> None:
 
 def _too_many(what: str, count: int, most: int) -> NoReturn:
     raise TrilightError(f"{count} {what}; expected at most {most} in a scene.")
+
+
+def lawful_albedos(
+    diffuse: NDArray[np.float64], specular: NDArray[np.float64], over_one: AlbedoOverOne
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return albedos that add up to at most 1, and by what the darkened ones were multiplied.
+
+    A surface beyond 1 gives off more light than it gets; published scene files have some (1.1).
+    Both albedos of such a material are multiplied by 1 / their largest sum over the channels. One
+    number for all channels keeps the hue of both, and one for both keeps how glossy the surface is
+    against how coloured; a number for each channel would bleach a red of 1.1 towards white.
+
+    Args:
+        diffuse: [M, 3] of M materials.
+        specular: [3] of all of them.
+        over_one: whether to scale materials beyond 1.
+
+    Returns:
+        Diffuse and specular albedos [M, 3], and the smallest factor of a material; 1.0 where none
+        was beyond 1, and then both are what was given.
+
+    Raises:
+        TrilightError: a material is beyond 1, and that is to be refused.
+    """
+    both = np.broadcast_to(specular, diffuse.shape)
+    sums = (diffuse + both).max(axis=1)
+    beyond = sums > 1 + ALBEDO_SUM_TOLERANCE
+    if not beyond.any():
+        return diffuse, both, 1.0
+    if over_one == "refuse":
+        raise TrilightError(
+            f"diffuse + specular is {sums.max():.4f}; expected at most 1 in every channel: lower "
+            "one, or say --albedo-over-one scale."
+        )
+    factors = np.where(beyond, 1 / np.where(beyond, sums, 1), 1.0)
+    return diffuse * factors[:, None], both * factors[:, None], float(factors.min())
+
+
+def colour_groups(mesh: ShadedMesh, material: DescribedMaterial) -> NDArray[np.int64]:
+    """Return the number of the draw that colours each triangle, [T].
+
+    As published, a flat mesh shares no vertices, so that each of its triangles is a group of its
+    own, whatever the type says.
+    """
+    if material.smooth_shading and material.random_diffuse_type == "per-shading-group":
+        return mesh.groups
+    return np.arange(len(mesh.faces))
+
+
+def random_diffuse(seed: int, bound: float, count: int) -> NDArray[np.float64]:
+    """Return `count` diffuse albedos [count, 3]: whole numbers below ceil(256 bound), over 255.
+
+    The published converter seeds numpy's legacy Mersenne Twister and draws one triple per group, in
+    the order in which trimesh splits the shaded mesh. On flat meshes that is the order of faces,
+    and colours are exactly the published ones. On smooth meshes trimesh has its own order, and its
+    own groups where an object has large flat parts; our groups come in the order of their first
+    faces, and the same numbers may fall on other groups than published.
+
+    The numbers stand in the published tokens as linear albedos, and so they do here. Published
+    renders took them through vertex colours that Blender decodes as sRGB, so the same numbers meant
+    darker surfaces there, which we do not imitate.
+
+    Args:
+        seed: of the legacy generator, 0 to 2^32 - 1. Seed 0 is an ordinary seed.
+        bound: `random_diffuse_max`; a channel may exceed it by at most 1/255.
+        count: how many colours.
+    """
+    generator = np.random.RandomState(seed)
+    return generator.randint(0, max(1, math.ceil(256 * bound)), (count, 3)) / 255

@@ -14,7 +14,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.exchange.described_albedos import AlbedoOverOne
 from pipeline.exchange.formats import (
     FORMATS,
     SEPARATOR,
@@ -24,6 +23,7 @@ from pipeline.exchange.formats import (
     SceneSource,
     readable,
 )
+from pipeline.exchange.from_description import AlbedoOverOne
 from storage.errors import TrilightError
 from storage.remote.safe_url import safe_url
 

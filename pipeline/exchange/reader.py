@@ -1,4 +1,4 @@
-"""Scenes of a user's files, read in a child process with limits; only checked scenes come out."""
+"""Reads scenes of a user's files in a child process with limits; only checked scenes come out."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,13 +7,11 @@ from types import TracebackType
 from typing import Any
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.described_albedos import AlbedoOverOne
-from pipeline.exchange.file_child import file_child
 from pipeline.exchange.formats import Cameras, LoadedScene, SceneSource
-from pipeline.exchange.from_description import LoadedMesh
+from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh
 from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
 from pipeline.exchange.scene_files import load_mesh_file
-from pipeline.isolation import ChildFailed, Result, call_with_retries
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, call_with_retries
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 
@@ -82,3 +80,15 @@ def _within_budget(scene: Scene, max_triangles: int) -> LoadedScene:
 
     reduced, notes = within_budget(scene, max_triangles)
     return LoadedScene(scene=reduced, notes=notes)
+
+
+_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
+
+
+def file_child() -> IsolatedChild:
+    """Return a child with limits that nothing was set up in; close it."""
+    return IsolatedChild(limits=_LIMITS, setup=_no_set_up)
+
+
+def _no_set_up() -> None:
+    pass

@@ -1,4 +1,4 @@
-"""RenderFormer's published HDF5 file of one scene, written: every array with its quirks.
+"""RenderFormer's published HDF5 file of one scene, written and read: every array with its quirks.
 
 | array | dtype, shape | meaning |
 |---|---|---|
@@ -22,36 +22,56 @@
 - `mvp` is OpenGL's, for column vectors; the published training multiplies it by zero.
 
 What a file cannot say: which triangles are one object, names and rights, provenance, shared
-vertices. `pipeline.exchange.renderformer_h5_read` reads it.
+vertices. The reader does not trust the file (pipeline.exchange.safe_h5). Textures may vary in files
+of other tools; a `Scene` has one material a triangle, so the mean of the filled cells is taken, and
+a note says so.
 """
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.safe_h5 import (
+    iterate_blocks,
+    names_in,
+    opened_h5,
+    plain_array,
+    read_whole,
+    require_finite,
+)
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
-from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, REFLECTING, SPECULAR
-from storage.records.scene import Scene
+from storage.records.exr import MAX_RESOLUTION
+from storage.records.material import (
+    DIFFUSE,
+    EMISSION,
+    PUBLISHED_COLUMNS,
+    REFLECTING,
+    SPECULAR,
+    default_rows,
+    distinct_rows,
+)
+from storage.records.scene import ALBEDO_SUM_TOLERANCE, UNIT_NORMAL_TOLERANCE, Scene, SceneObject
 
 CARRIED = frozenset(
     {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg"}
     | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
 )
-"""Of a scene (storage.records.carried)."""
+"""Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 CHANNELS, CELLS = 13, 32
-"""Of a texture; it has CELLS x CELLS cells."""
+"""A texture has CHANNELS channels of CELLS x CELLS cells."""
 TEXTURE_EMISSION = slice(10, 13)
 TEXTURE_NORMAL = slice(7, 10)
 """Channels of a texture row; those before them are REFLECTING (storage.records.material)."""
 FLAT_NORMAL = (0.5, 0.5, 1.0)
 NEAR, FAR = 0.05, 5.0
-"""Of `mvp`, in metres."""
+"""Clip distances of `mvp`, in metres."""
 GZIP_LEVEL = 9
 
 TextureType = Literal["float16", "float32"]
@@ -171,3 +191,175 @@ def _mvp(scene: Scene) -> NDArray[np.float32]:
     clip[:, 3, 2] = -1
     view = np.linalg.inv(scene.c2w.astype(np.float64))
     return np.einsum("vij,vjk->vik", clip, view).astype(np.float32)
+
+
+MAX_TRIANGLES = 1_000_000
+MAX_VIEWS = 1000
+MAX_PICTURE_BYTES = 1 << 30
+"""Maximum size of all pictures of a file as float32."""
+MAX_PALETTE = 1 << 16
+"""Maximum number of material rows and of objects: `Scene` counts them in 16 bits."""
+
+UNKNOWN_LICENCE = "LicenseRef-unknown"
+"""A file names no rights."""
+
+_KNOWN = ("c2w", "fov", "img", "mvp", "texture", "triangles", "vn")
+_ROUNDING = 2.0**-10
+"""Albedos that are meant to add up to 1 may exceed it by this as half floats."""
+_PUBLISHED_EMITTER = np.array([1, 1, 1, 0, 0, 0, 1], np.float32)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RenderFormerFile:
+    """What a file says."""
+
+    scene: Scene
+    """A checked scene: one object of everything that reflects, one for each emitting triangle."""
+    radiance_rgb: NDArray[np.float32] | None
+    """[V, H, W, 3] linear radiance; None where the file has no pictures."""
+    lost: tuple[str, ...]
+    """What could not be carried over, for people."""
+
+
+def read_renderformer_h5(path: Path) -> RenderFormerFile:
+    """Read a file of the published layout.
+
+    Corners with equal position and normal become one vertex, so that flat and smooth shading stay
+    as they are; equal materials become one row, but each emitting triangle has its own.
+
+    Raises:
+        TrilightError: not such a file; behind links, outside of the file, larger than it may be,
+            not finite (pipeline.exchange.safe_h5); or a scene that breaks a law (`Scene.check`).
+    """
+    lost: list[str] = []
+    with opened_h5(path) as file:
+        lost += _unknown(file)
+        triangles = read_whole(plain_array(file, "triangles", (None, 3, 3), MAX_TRIANGLES))
+        count = len(triangles)
+        normals = read_whole(plain_array(file, "vn", (count, 3, 3), MAX_TRIANGLES))
+        rows = _texture_rows(file, count, lost)
+        c2w = read_whole(plain_array(file, "c2w", (None, 4, 4), MAX_VIEWS))
+        fov_deg = read_whole(plain_array(file, "fov", (len(c2w),), MAX_VIEWS))
+        pictures = _pictures(file, len(c2w), lost) if "img" in names_in(file) else None
+        positions, normals, faces = _indexed(triangles, _unit(triangles, normals, lost))
+        scene = Scene(
+            vertex_positions=positions,
+            vertex_normals=normals,
+            faces=faces,
+            **_palette(rows, lost),
+            c2w=c2w,
+            fov_deg=fov_deg,
+            provenance={"template": "renderformer-h5", "file": path.name},
+        )
+        scene.check()
+    return RenderFormerFile(scene=scene, radiance_rgb=pictures, lost=tuple(lost))
+
+
+def _unknown(file: Any) -> list[str]:
+    names = [f"array or group {name!r:.60}" for name in names_in(file) if name not in _KNOWN]
+    names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
+    return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]
+
+
+def _texture_rows(file: Any, count: int, lost: list[str]) -> NDArray[np.float32]:
+    """Return the value [T, 13] of each texture, holding one block of cells at a time."""
+    texture = plain_array(file, "texture", (count, CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
+    filled = filled_cells()
+    low = np.full((count, CHANNELS), np.inf, np.float32)
+    high, total = -low, np.zeros((count, CHANNELS))
+    for where, block in iterate_blocks(texture):
+        rows, cells = where[:2], filled[where[2:]]
+        if cells.any():
+            require_finite(texture, block[:, :, cells])
+            values = block[:, :, cells].astype(np.float32)
+            low[rows] = np.minimum(low[rows], values.min(axis=2))
+            high[rows] = np.maximum(high[rows], values.max(axis=2))
+            total[rows] += values.sum(axis=2, dtype=np.float64)
+    varies = (low != high).any(axis=1)
+    if varies.any():
+        lost.append(f"textures that vary, of {varies.sum()} triangles: their mean was taken")
+    bumpy = (low[:, TEXTURE_NORMAL] != np.array(FLAT_NORMAL, np.float32)).any(axis=1)
+    if bumpy.any():
+        lost.append(f"normal textures of {bumpy.sum()} triangles")
+    mean = (total / filled.sum()).astype(np.float32)
+    return np.where(low == high, low, mean)
+
+
+def _pictures(file: Any, num_views: int, lost: list[str]) -> NDArray[np.float32]:
+    array = plain_array(file, "img", (num_views, None, None, 4), MAX_RESOLUTION)
+    rgba = read_whole(array, MAX_PICTURE_BYTES)
+    if (rgba[..., 3] != 1).any():
+        lost.append("alpha of pictures: they stand before black")
+    return rgba[..., :3].copy()
+
+
+def _unit(
+    triangles: NDArray[np.float32], normals: NDArray[np.float32], lost: list[str]
+) -> NDArray[np.float32]:
+    """Return normals [T, 3, 3] of unit length; the face's own where there is none."""
+    length = np.linalg.norm(normals.astype(np.float64), axis=2, keepdims=True)
+    off = np.abs(length - 1) > UNIT_NORMAL_TOLERANCE
+    if not off.any():
+        return normals
+    lost.append(f"lengths of {off.sum()} normals that were not 1")
+    edges = np.diff(triangles.astype(np.float64), axis=1)
+    face = np.cross(edges[:, 0], edges[:, 1])[:, None]
+    chosen = np.where(length > 0, normals, face)
+    size = np.linalg.norm(chosen, axis=2, keepdims=True)
+    if not (size > 0).all():
+        at = int(np.argwhere(size[..., 0] <= 0)[0, 0])
+        raise TrilightError(f"vn[{at}] is zero, and so is the area of triangle {at}.")
+    return np.where(off, chosen / size, normals).astype(np.float32)
+
+
+def _indexed(
+    triangles: NDArray[np.float32], normals: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
+    """Return vertices and faces; vertices are in the order in which they are first used."""
+    corners = np.concatenate([triangles, normals], axis=2).reshape(-1, 6)
+    first, rows = distinct_rows(corners)
+    kept = corners[first]
+    faces = rows.astype(np.uint32).reshape(-1, 3)
+    return kept[:, :3].copy(), kept[:, 3:].copy(), faces
+
+
+def _palette(rows: NDArray[np.float32], lost: list[str]) -> dict[str, Any]:
+    emits = (rows[:, TEXTURE_EMISSION] > 0).any(axis=1)
+    materials = default_rows(len(rows))
+    materials[:, REFLECTING] = rows[:, REFLECTING]
+    materials[:, EMISSION] = rows[:, TEXTURE_EMISSION]
+    if (materials[emits, REFLECTING] != _PUBLISHED_EMITTER).any():
+        lost.append("what emitters reflect: ours reflect nothing")
+    materials[emits, REFLECTING] = [0, 0, 0, 0, 0, 0, 1]
+    _within_one(materials, lost)
+    order = np.where(emits, np.cumsum(emits), 0)  # emitters stay apart, even of equal radiance
+    first, index = distinct_rows(np.column_stack([materials, order.astype(np.float32)]))
+    if len(first) > MAX_PALETTE or emits.sum() >= MAX_PALETTE:
+        raise TrilightError(
+            f"texture: {len(first)} materials and {emits.sum()} emitters; expected at most "
+            f"{MAX_PALETTE} of each."
+        )
+    surface = () if emits.all() else (SceneObject(name="surfaces", kind="object"),)
+    emitters = tuple(SceneObject(name=f"emitter{i}", kind="emitter") for i in range(emits.sum()))
+    entries = [_of_unknown_rights(entry) for entry in (*surface, *emitters)]
+    return {
+        "materials": materials[first],
+        "material_index": index.astype(np.uint16),
+        "object_index": (np.where(emits, order - 1 + len(surface), 0)).astype(np.uint16),
+        "objects": tuple(entries),
+    }
+
+
+def _of_unknown_rights(entry: SceneObject) -> SceneObject:
+    return SceneObject(name=entry.name, kind=entry.kind, licence=UNKNOWN_LICENCE)
+
+
+def _within_one(materials: NDArray[np.float32], lost: list[str]) -> None:
+    """Lower specular albedos where rounding took the sum over 1; `Scene.check` refuses more."""
+    excess = materials[:, DIFFUSE] + materials[:, SPECULAR] - 1
+    rounded = (excess > ALBEDO_SUM_TOLERANCE) & (excess <= _ROUNDING)
+    if rounded.any():
+        lost.append("specular albedos lowered where rounding took diffuse + specular above 1")
+        materials[:, SPECULAR] = np.where(
+            rounded, np.maximum(1 - materials[:, DIFFUSE], 0), materials[:, SPECULAR]
+        )

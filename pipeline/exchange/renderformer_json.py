@@ -1,13 +1,24 @@
-"""Reads RenderFormer's scene JSON (version 1.0): text to a checked `SceneDescription`.
+"""RenderFormer's scene JSON (version 1.0), read as a `SceneDescription`, written from a `Scene`.
 
-Which fields may be missing, and what then holds, follows the published reader. Unlike it, fields
-that mean nothing to us are named and left out. Only the fields of the published example scenes are
-known: no templates, whose values would have to be halved, no textures, no environment.
+Which fields may be missing, and their defaults, follow the published reader. Unlike it, unknown
+fields are named and left out. Only the fields of the published example scenes are known: no
+templates, whose values would have to be halved, no textures, no environment.
+
+A written file names one OBJ file per mesh, in world space and not normalised. An object of the file
+has one material, so an object of ours becomes one for each of its materials. `CARRIED` lists what
+the format holds; of that, `DescribedFiles.lost` lists what does not come back whole: which
+triangles of several colours were one object; shading normals other than flat ones and those that
+its readers make (smooth across edges of up to 30 degrees).
 """
 
 import json
+import re
 from collections import Counter
+from dataclasses import dataclass
 from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.exchange.description import (
     ColourGroups,
@@ -17,17 +28,23 @@ from pipeline.exchange.description import (
     DescribedTransform,
     SceneDescription,
 )
+from pipeline.exchange.from_description import SHELL_FOLDER, SMOOTH_ANGLE_DEG
 from pipeline.exchange.json_fields import Fields
+from pipeline.scenes.posing import without_slivers
+from pipeline.scenes.shading import face_normals, smooth_shaded
+from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
+from storage.records.material import DIFFUSE, EMISSION, PUBLISHED_COLUMNS, ROUGHNESS, SPECULAR
+from storage.records.scene import ARRAY_FIELDS, Scene
 
 MAX_BYTES = 4 << 20
 """Largest accepted file; an object takes about 1 KiB."""
 
 MAX_OBJECTS = 8192
-"""Of one file: where every triangle has a colour of its own, each is an object there."""
+"""Maximum number of objects in a file; a triangle with its own colour counts as an object."""
 
 MAX_CAMERAS = 1000
-"""Of one file."""
+"""Maximum number of cameras in a file."""
 
 _VERSION = "1.0"
 _MAX_LENGTH = 1e6
@@ -160,3 +177,190 @@ def _camera(fields: Fields) -> DescribedCamera:
     )
     fields.end()
     return camera
+
+
+CARRIED = frozenset(
+    {*ARRAY_FIELDS, "objects.name", "objects.kind"} - {"materials"}
+    | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
+)
+"""Members of a scene that the file holds (pipeline.exchange.formats)."""
+
+_FLAT = 1e-5
+"""Largest difference between a flat face's float32 normal and its geometric normal."""
+_CLOSE = 1e-2
+"""How far a normal may lie from the one that a reader makes before it counts as lost: 0.6 deg."""
+_NAME_LETTERS = 48
+"""Length limit of object names; the published converter makes files of them (255 bytes)."""
+_NO_FILE_LETTERS = '/\\:*?"<>|'
+"""Letters that a name of a file must not have, on some system."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedFiles:
+    """The files of one scene."""
+
+    json: bytes  # the scene file
+    meshes: dict[str, bytes]  # OBJ files by path relative to it
+    lost: tuple[str, ...]  # what of the members in CARRIED does not come back, for people
+
+
+def described_files(scene: Scene, stem: str) -> DescribedFiles:
+    """Return a scene as the files that the published tools read.
+
+    Args:
+        scene: that passes `Scene.check`.
+        stem: of the scene file; its meshes stand in folders of that name.
+
+    Raises:
+        TrilightError: more objects or cameras than a file may have, a number beyond its range, or
+            no emitter with an area.
+    """
+    scene.check()
+    lost: list[str] = []
+    meshes: dict[str, bytes] = {}
+    objects: dict[str, Any] = {}
+    taken: set[str] = set()
+    for row, material, faces in _parts(scene):
+        if len(without_slivers(scene.vertex_positions, scene.faces[faces])) == 0:
+            continue  # readers refuse a mesh of which nothing is left
+        name = _unique(_name(scene, row, material), taken)
+        normals = scene.vertex_normals[scene.faces[faces]]
+        path = _mesh_path(scene, row, material, stem)
+        meshes[path] = _obj(scene, faces)
+        smooth = _is_smooth(scene, faces, normals)
+        objects[name] = _object_entry(path, scene.materials[material], smooth)
+        if smooth and not _comes_back(scene, faces, normals):
+            lost.append(f"{name}: shading normals; readers make their own")
+    if not any(max(entry["material"]["emissive"]) > 0 for entry in objects.values()):
+        raise TrilightError("scene: no emitter has an area; a scene file needs at least one.")
+    data = json.dumps(
+        {
+            "scene_name": _printable(stem),
+            "version": "1.0",
+            "objects": objects,
+            "cameras": [_camera_entry(scene, view) for view in range(scene.num_views)],
+        }
+    ).encode()
+    _require_size(scene, data, len(objects))
+    read_description(data, f"{stem}.json")  # nothing is written that its readers would refuse
+    return DescribedFiles(json=data, meshes=meshes, lost=(*_losses(scene), *lost))
+
+
+def _parts(scene: Scene) -> list[tuple[int, int, NDArray[np.intp]]]:
+    """Return (object, material, its triangles) in the order of objects and then of materials."""
+    keys = scene.object_index.astype(np.int64) * len(scene.materials) + scene.material_index
+    order = np.argsort(keys, kind="stable")
+    found, starts = np.unique(keys[order], return_index=True)
+    return [
+        (*divmod(int(key), len(scene.materials)), faces)
+        for key, faces in zip(found, np.split(order, starts[1:]), strict=True)
+    ]
+
+
+def _name(scene: Scene, row: int, material: int) -> str:
+    own = scene.material_index[scene.object_index == row]
+    name = _printable(scene.objects[row].name).lstrip(".") or f"object{row}"
+    return name if (own == material).all() else f"{name}.material{material}"
+
+
+def _printable(text: str) -> str:
+    legal = (c if c.isprintable() and c not in _NO_FILE_LETTERS else "_" for c in text)
+    return "".join(legal)[:_NAME_LETTERS]
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    """Return a name that no other has, capitals or not, since it becomes that of a file."""
+    chosen, count = name, 1
+    while chosen.casefold() in taken:
+        count += 1
+        chosen = f"{name}.{count}"
+    taken.add(chosen.casefold())
+    return chosen
+
+
+def _mesh_path(scene: Scene, row: int, material: int, stem: str) -> str:
+    plain = re.sub(r"[^0-9A-Za-z_\-]", "_", scene.objects[row].name)[:40]
+    folder = SHELL_FOLDER if scene.objects[row].kind == "shell" else "objects/"
+    safe_stem = re.sub(r"[^0-9A-Za-z_.\-]", "_", stem)[:60].strip(".") or "scene"
+    return f"{folder}{safe_stem}/{row}_{plain}_{material}.obj"
+
+
+def _obj(scene: Scene, faces: NDArray[np.intp]) -> bytes:
+    """Return triangles as an OBJ file whose numbers come back as the same single floats."""
+    rows, corners = np.unique(scene.faces[faces], return_inverse=True)
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in scene.vertex_positions[rows].tolist()]
+    lines += [f"vn {x:.9g} {y:.9g} {z:.9g}" for x, y, z in scene.vertex_normals[rows].tolist()]
+    triangles = corners.reshape(-1, 3) + 1
+    lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in triangles.tolist()]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _object_entry(path: str, values: NDArray[np.float32], smooth: bool) -> dict[str, Any]:
+    return {
+        "mesh_path": path,
+        "transform": {
+            "translation": [0.0, 0.0, 0.0],
+            "rotation": [0.0, 0.0, 0.0],
+            "scale": [1.0, 1.0, 1.0],
+            "normalize": False,
+        },
+        "material": {
+            "diffuse": values[DIFFUSE].tolist(),
+            "specular": values[SPECULAR].tolist(),
+            "roughness": float(values[ROUGHNESS]),
+            "emissive": values[EMISSION].tolist(),
+            "smooth_shading": smooth,
+            "rand_tri_diffuse_seed": None,
+        },
+    }
+
+
+def _camera_entry(scene: Scene, view: int) -> dict[str, Any]:
+    pose = scene.c2w[view].astype(np.float64)
+    return {
+        "position": pose[:3, 3].tolist(),
+        "look_at": (pose[:3, 3] - pose[:3, 2]).tolist(),
+        "up": pose[:3, 1].tolist(),
+        "fov": float(scene.fov_deg[view]),
+    }
+
+
+def _is_smooth(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        own = face_normals(scene.vertex_positions, scene.faces[faces])
+    off = np.abs(normals - own[:, None])
+    return bool((off[np.isfinite(off)] > _FLAT).any())
+
+
+def _comes_back(scene: Scene, faces: NDArray[np.intp], normals: NDArray[np.float32]) -> bool:
+    """Return whether a reader that smooths makes the same normals."""
+    rows, corners = np.unique(scene.faces[faces], return_inverse=True)
+    positions, triangles = scene.vertex_positions[rows], corners.reshape(-1, 3).astype(np.uint32)
+    if len(without_slivers(positions, triangles)) < len(triangles):
+        return False
+    made = smooth_shaded(positions, triangles, SMOOTH_ANGLE_DEG)
+    return bool((np.abs(made.normals[made.faces] - normals) <= _CLOSE).all())
+
+
+def _losses(scene: Scene) -> list[str]:
+    found: list[str] = []
+    parts = np.bincount([row for row, _, _ in _parts(scene)])
+    whole, split = int((parts > 1).sum()), int(parts[parts > 1].sum())
+    if whole:
+        found.append(f"that {split} of its objects were {whole}, of several materials")
+    solid = len(without_slivers(scene.vertex_positions, scene.faces))
+    if solid < scene.num_triangles:
+        found.append(f"{scene.num_triangles - solid} triangles without an area, which readers drop")
+    if (scene.materials[:, EMISSION] > HALF_FLOAT_MAX).any():
+        found.append(f"emission over {HALF_FLOAT_MAX:.0f}, which the published converter cuts off")
+    return found
+
+
+def _require_size(scene: Scene, data: bytes, objects: int) -> None:
+    for what, count, most in (
+        ("objects of one material", objects, MAX_OBJECTS),
+        ("cameras", scene.num_views, MAX_CAMERAS),
+        ("bytes", len(data), MAX_BYTES),
+    ):
+        if count > most:
+            raise TrilightError(f"scene: {count} {what}; a scene file holds at most {most}.")

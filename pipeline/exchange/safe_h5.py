@@ -3,8 +3,8 @@
 An HDF5 file can point out of itself (external links, external storage, virtual datasets), have a
 filter loaded as a plug-in, claim shapes that nothing backs, and hold chunks that inflate without
 end. So only plain arrays are read, and chunks are unpacked here and not by the library's filters.
-The library still parses the structure of the file: whoever opens files of strangers does so in a
-child process with limits (pipeline.isolation).
+The library still parses the structure of the file, so untrusted files are opened in a child process
+with limits (pipeline.isolation).
 """
 
 import contextlib
@@ -23,10 +23,10 @@ from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
 
 MAX_BLOCK_BYTES = 64 << 20
-"""Most memory that one block of an array may take."""
+"""Maximum memory of one block of an array."""
 
 MAX_CHUNKS = 1 << 22
-"""Most chunks of one array; 4096 triangles with textures, written as published, take 22528."""
+"""Maximum number of chunks in an array; 4096 triangles with published textures take 22528."""
 
 _FLOATS = ("<f2", "<f4", "<f8")
 _DEFLATE, _SHUFFLE = 1, 2
@@ -37,14 +37,10 @@ _DEFLATE, _SHUFFLE = 1, 2
 class H5Array:
     """A plain array of a file, not yet read."""
 
-    name: str
-    """For messages."""
-    shape: tuple[int, ...]
-    """What it claims; its blocks are counted against it."""
-    dtype: np.dtype
-    """Of its elements in the file."""
-    dataset: Any
-    """The h5py dataset."""
+    name: str  # for messages
+    shape: tuple[int, ...]  # what it claims; its blocks are counted against it
+    dtype: np.dtype  # type of its elements in the file
+    dataset: Any  # the h5py dataset
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Fewer triangles for a scene that somebody brings: each object gives up the same share.
+"""Reduces the triangles of a user's scene: each object gives up the same share.
 
 Emitters stay as they are. What becomes of an object is what the mesh stage makes of it; a triangle
 takes the material of the nearest old one, and normals are made anew where they were smooth.

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.described_albedos import AlbedoOverOne
 from pipeline.exchange.description import DescribedObject, SceneDescription
 from pipeline.exchange.from_description import (
+    AlbedoOverOne,
     LoadedMesh,
     described_cameras,
     scene_from_description,
@@ -34,20 +34,14 @@ TEMPLATE = "renderformer-json"
 class SceneFiles:
     """What a render child needs to build any scene of the folder."""
 
-    root: Path
-    """The folder, without links."""
-    names: tuple[str, ...]
-    """The scene files; the position is the index of the scene."""
-    sha256: Mapping[str, str]
-    """Digest of every locked file by its path below `root`."""
+    root: Path  # the folder, without links
+    names: tuple[str, ...]  # the scene files; the position is the index of the scene
+    sha256: Mapping[str, str]  # digest of every locked file by its path below `root`
     unusable: Mapping[str, str]
     """What is wrong with each file of which no scene can be made, by its name."""
-    licence: str
-    """Of every object."""
-    albedo_over_one: AlbedoOverOne = "scale"
-    """What to do where albedos add up to more than 1."""
-    notes: tuple[str, ...] = ()
-    """What a person should know of the scenes that were built."""
+    licence: str  # licence of every object
+    albedo_over_one: AlbedoOverOne = "scale"  # what to do where albedos add up to more than 1
+    notes: tuple[str, ...] = ()  # what a person should know of the scenes that were built
 
     def scene(self, scene_index: int, assets: AssetSettings, *, num_views: int, seed: int) -> Scene:
         """Build a scene; only children come here, since it reads meshes.

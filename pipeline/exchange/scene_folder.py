@@ -8,32 +8,28 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.exchange.described_albedos import AlbedoOverOne
 from pipeline.exchange.description import SceneDescription
+from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.exchange.scene_files import described_by
 from storage.errors import EnvironmentFailure, TrilightError
 
 MAX_SCENES = 100_000
-"""Most scene files of one folder."""
+"""Maximum number of scene files in a folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFolder:
     """The scene files of one folder."""
 
-    root: Path
-    """The folder, without links; nothing outside of it is read."""
+    root: Path  # the folder, without links; nothing outside of it is read
     names: tuple[str, ...]
     """Every scene file, sorted; the position is the index of the scene, usable or not."""
-    descriptions: tuple[SceneDescription, ...]
-    """What each usable file describes, in the same order."""
-    unusable: Mapping[str, str]
-    """What is wrong with each of the others, by its name."""
-    albedo_over_one: AlbedoOverOne
-    """What to do where albedos add up to more than 1."""
+    descriptions: tuple[SceneDescription, ...]  # what each usable file describes, in the same order
+    unusable: Mapping[str, str]  # what is wrong with each of the others, by its name
+    albedo_over_one: AlbedoOverOne  # what to do where albedos add up to more than 1
 
     def views(self, wanted: int | None) -> int:
-        """Return how many views every scene gets: `wanted`, or as many as every file has.
+        """Return how many views every scene gets: `wanted`, or the fewest cameras of any file.
 
         No camera is ever invented: the pictures show what the files say.
 

@@ -12,7 +12,7 @@ from pipeline.flows.generate_scenes import generate_scenes
 from pipeline.flows.orders import DATASET_FORMS, DatasetInRuns, dataset_in_runs, run_name
 from pipeline.flows.prepare_assets import prepare_assets
 from pipeline.making.order import DatasetOrder
-from storage.dataset.status import read_status
+from storage.dataset.progress import read_status
 
 
 @flow(name="build-dataset", flow_run_name=run_name, persist_result=False)

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.making.order import DatasetOrder
-from storage.errors import TrilightError
+from storage.errors import TrilightError, expected_one_of
 from storage.registry import Registry
-from storage.suggestion import expected_one_of
 
 if TYPE_CHECKING:
     from pipeline.making.dataset_run import Outcome

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from pipeline.builds.named import BUILDS
 from pipeline.builds.settings import BuildSettings
-from pipeline.objects.registry import SOURCES
+from pipeline.objects.sources import SOURCES
 from storage.settings.described import described
 
 Returned = TypeVar("Returned")

@@ -15,7 +15,7 @@ from pipeline.making.dataset_run import Outcome
 from pipeline.making.make_task import close_idle_children
 from pipeline.making.order import DatasetOrder
 from storage.atomic import write_atomically
-from storage.dataset.output import dataset_folder
+from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:

@@ -27,9 +27,9 @@ from pipeline.making.dataset_run import Outcome, Run
 from pipeline.making.make_task import TaskOutcome
 from pipeline.making.order import DatasetOrder
 from pipeline.making.price import PRICES, USD_PER_CORE_HOUR
-from storage.dataset.output import dataset_folder
+from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
-from storage.records.failures import count_by_reason, read_failures
+from storage.records.objects import count_by_reason, read_failures
 from storage.remote.safe_url import safe_text
 
 _EVERY_S = 15.0

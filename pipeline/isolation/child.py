@@ -26,14 +26,14 @@ from storage.extensions import load_same, loaded_files
 _START_UP_S = 180.0
 _LAUNCHES = 3
 _CRASHES = (signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV, signal.SIGTRAP)
-"""Signals by which native code ends itself. Every other one comes from somebody else, also SIGBUS:
+"""Signals by which native code ends itself. All others come from outside, SIGBUS too:
 a file that cannot be read or a disk that is full behind a memory map."""
 _one_start = threading.Lock()
 """Threads start children one after another: `__main__` is hidden meanwhile."""
 
 
 class ChildClosed(Exception):
-    """The owner of a child has closed it while somebody was still calling: the run is over."""
+    """The owner of a child closed it during a call: the run is over."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +96,7 @@ class IsolatedChild:
         self._stop()
 
     def close(self) -> None:
-        """End the child at once and for good; safe to call while another thread waits in `call`."""
+        """End the child at once and permanently; safe while another thread waits in `call`."""
         self._closed = True
         if self._process is not None:
             self._process.kill()

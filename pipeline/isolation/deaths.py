@@ -34,9 +34,9 @@ ENDS: Mapping[str, End] = {
     # again.
     "timeout_cpu": End(tries=1, is_verdict=True),
     # Native code that fails on an item fails on it again. Once may be the fault of a child that
-    # has leaked, or of an allocation that failed and was not looked at.
+    # has leaked, or of an unchecked failed allocation.
     "crashed_signal": End(tries=2, is_verdict=True),
-    # Somebody else did it: the system for want of memory, an operator, a scheduler.
+    # The signal came from outside: the system for want of memory, an operator, a scheduler.
     "killed": End(tries=3, is_verdict=False),
     "stopped": End(tries=3, is_verdict=False),
     # How much address space an item needs depends on threads and libraries, thus on the machine,
@@ -44,12 +44,12 @@ ENDS: Mapping[str, End] = {
     "out_of_memory": End(tries=3, is_verdict=False),
     # The machine was busy, or a file did not come. Two, since each costs the whole time.
     "timeout_wall": End(tries=2, is_verdict=False),
-    # An exit or a Python error that nobody foresaw: our mistake, or a file or thread that was not
-    # to be had. Neither breaks a law of the item.
+    # An unforeseen exit or Python error: our mistake, or a missing file
+    # or thread. Neither breaks a law of the item.
     "crashed": End(tries=3, is_verdict=False),
     "exception": End(tries=3, is_verdict=False),
 }
-"""By reason, without the number of a signal."""
+"""Ends by reason; the keys carry no signal number."""
 
 
 class ChildFailed(Exception):

@@ -29,7 +29,7 @@ def _die_with_owner() -> None:
     """Ask the kernel to kill this child when the process that owns it ends.
 
     A child's direct parent is the fork server, which lives on while it has children, so that
-    `die_with_parent` would wait for ever. What ends with the owner is the sentinel pipe that
+    `die_with_parent` would wait forever. What ends with the owner is the sentinel pipe that
     multiprocessing gives every child: its end sends SIGIO, which is turned into SIGKILL here.
     Elsewhere than on Linux a child only notices its owner's end when its call returns.
     """
@@ -61,7 +61,7 @@ def serve(connection: Connection, memory_bytes: int, cpu_s: int | None) -> None:
         try:
             function, args = connection.recv()
         except EOFError:
-            os._exit(0)  # the parent is gone: nobody waits for destructors of native libraries
+            os._exit(0)  # the parent has died: skip the destructors of native libraries
         _allow_cpu(cpu_s)
         connection.send(_answer(function, args))
 

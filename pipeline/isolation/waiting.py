@@ -1,6 +1,6 @@
-"""Waiting for the answer of a child: not for ever, and not for one that somebody has stopped.
+"""Waits for the answer of a child, within a time limit that does not run while it is stopped.
 
-Time is counted in looks, not by a clock, and nobody looks while this process itself stands still.
+Time is counted in polls, not by a clock, and this process does not poll while it stands still.
 So Ctrl-Z, which stops a command and all of its children together, and a laptop that sleeps take
 nothing of a child's time, however long they last.
 """
@@ -14,12 +14,12 @@ from pipeline.isolation.deaths import ChildFailed
 log = logging.getLogger("trilight.children")
 
 LOOK_S = 1.0
-"""Between two looks at a child that has not answered yet."""
+"""Pause between two polls of a child that has not answered."""
 LOOKS_BEFORE_WORDS = 3
 """Looks at which a child was stopped before that is said. One may see a child that is about to
 continue together with this process."""
 LOOKS_BEFORE_KILL = 60
-"""Looks at which a child was stopped before it is given up: time to continue it by hand."""
+"""Polls that may find a child stopped before it is given up: time to continue it by hand."""
 
 
 def wait_for_answer(connection: Connection, process_id: int, wall_s: float) -> None:
@@ -55,7 +55,7 @@ def wait_for_answer(connection: Connection, process_id: int, wall_s: float) -> N
 
 
 def _is_stopped(process_id: int) -> bool:
-    """Say whether a process stands still until it is continued; always no where /proc is not."""
+    """Return whether a process is stopped until it is continued; False without /proc."""
     try:
         line = Path(f"/proc/{process_id}/stat").read_text()
     except OSError:

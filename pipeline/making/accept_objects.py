@@ -15,9 +15,7 @@ from storage.conventions import SPLITS
 from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.records.failures import count_by_reason
-from storage.records.objects import Failure, LockedObject
-from storage.records.objects_lock import read_objects_lock
+from storage.records.objects import Failure, LockedObject, count_by_reason, read_objects_lock
 from storage.remote.safe_url import safe_url
 
 log = logging.getLogger("trilight.objects")

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.builds.settings import BuildSettings
-from pipeline.exchange.described_albedos import AlbedoOverOne
-from pipeline.exchange.from_description import scaled_albedo_notes
+from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.scene_files import SceneFiles, build_scene
 from pipeline.exchange.scene_folder import SceneFolder, require_usable
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries

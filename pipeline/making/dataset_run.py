@@ -1,7 +1,7 @@
 """A run: from an order to a dataset, or to a part of one. Resumable at any moment, by anybody.
 
 Files are the truth. A run looks at what is there, makes what is missing, and leaves each shard as
-it is done; several runs on one folder share the work (storage.dataset.claims), and those on one
+it is done; several runs on one folder share the work (storage.claims), and those on one
 bucket what is finished (pipeline.shards.mirror). Who runs the tasks is not known here: `trilight
 generate` uses threads, the flows Prefect.
 """
@@ -29,8 +29,7 @@ from pipeline.making.runners import Runner
 from pipeline.objects.sources import look_at_source
 from pipeline.renders.variant import choose_variant
 from storage.dataset.asked import write_asked
-from storage.dataset.layout import DatasetFolder
-from storage.dataset.output import dataset_folder
+from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.file_child import file_child
 from pipeline.exchange.open_scene import SceneSource, load_source
+from pipeline.exchange.reader import file_child
 from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate, choose_variant

@@ -27,10 +27,8 @@ from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json
 from storage.errors import TrilightError
-from storage.records.asset import Level, decode_asset
-from storage.records.asset_rows import AssetRow
-from storage.records.failures import write_failures
-from storage.records.objects import Failure
+from storage.records.asset import AssetRow, Level, decode_asset
+from storage.records.objects import Failure, write_failures
 
 _PICTURES = 4
 """Objects in each of the groups worst, median and best."""

@@ -10,7 +10,7 @@ from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.making.make_scene import MAX_ATTEMPTS, SceneAttempt, attempt_scene
 from pipeline.making.pieces import Piece
 from pipeline.shards.pack import pack_shard
-from storage.dataset.claims import claimed
+from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder, numbered
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.splits import scenes_of_shard, shard_name, split_of_shard

@@ -19,7 +19,7 @@ from pipeline.making.pieces import Piece
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.scene_log import log_scene
+from storage.dataset.progress import log_scene
 from storage.dataset.splits import shard_of_scene
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions

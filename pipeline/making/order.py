@@ -6,9 +6,9 @@ from dataclasses import field
 from typing import Annotated, Any
 
 from pipeline.builds.named import BUILDS
-from pipeline.exchange.described_albedos import AlbedoOverOne
+from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.settings import NoiseFloor, Resolution
-from storage.dataset.output import dataset_folder
+from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
 from storage.extensions import function_name
 from storage.settings.dataset import MOST_SCENES

@@ -2,7 +2,7 @@
 
 from pipeline.making.order import DatasetOrder
 from storage.remote.safe_url import safe_url
-from storage.settings.words import option_words
+from storage.settings.described import option_words
 
 _ELSEWHERE = ("build", "out", "shards", "workers")
 """What another machine says otherwise: where, which part, with how many processes."""

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from pipeline.builds.settings import BuildSettings, differences
-from pipeline.shards.notes import forget_note, note_shard, noted_shard
-from pipeline.shards.pack import rejections_of_shard
+from pipeline.shards.pack import forget_note, note_shard, noted_shard, rejections_of_shard
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
@@ -17,9 +16,14 @@ from storage.dataset.splits import planned_scenes, scenes_of_shard, shard_name, 
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
-from storage.records.failures import read_failures, write_failures
-from storage.records.objects import Failure, LockedObject
-from storage.records.objects_lock import encode_objects_lock, write_objects_lock
+from storage.records.objects import (
+    Failure,
+    LockedObject,
+    encode_objects_lock,
+    read_failures,
+    write_failures,
+    write_objects_lock,
+)
 from storage.settings.dataset import SplitSettings
 from storage.settings.described import from_record, settings_record
 

@@ -10,10 +10,10 @@ from storage.records.objects import Failure, ObjectRecord
 from storage.remote.safe_url import printable
 
 USER_PROVIDED = "LicenseRef-user-provided"
-"""Of files that a user names without a catalogue: theirs to use, as far as we can know."""
+"""Licence of files that a user names without a catalogue; we assume that they may use them."""
 
 UNKNOWN = "LicenseRef-unknown"
-"""Of objects whose source states no licence."""
+"""Licence of objects whose source states none."""
 
 DEFAULT_ALLOWED: tuple[str, ...] = (
     "CC0-1.0",
@@ -38,7 +38,7 @@ DEFAULT_ALLOWED: tuple[str, ...] = (
 with the object. Not here: unknown, non-commercial (NC) and no-derivatives (ND) licences."""
 
 BY_USER = "stated by the user (--licence)"
-"""Who says so, where `--licence` did."""
+"""The licence source recorded for `--licence`."""
 
 _IDENTIFIER = re.compile(r"[A-Za-z0-9.+-]{1,64}")
 _COMPOUND = re.compile(r"(?i)\s(?:AND|OR|WITH)\s")
@@ -55,7 +55,7 @@ class StatedLicence:
     licence: str
     """SPDX identifier, or `LicenseRef-...`."""
     licence_source: str
-    """Who says so."""
+    """Where the licence is stated."""
 
 
 def stated_licence(licence: str | None) -> StatedLicence:

@@ -1,9 +1,13 @@
-"""What a source says that it holds, before a licence is judged and before anything is fetched."""
+"""What a source lists: its objects before licences are checked, their uids, their downloads."""
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 
 from storage.records.objects import Failure, ObjectRecord
+from storage.remote.safe_url import printable
+from storage.remote.tries import TransferFailed
 
 Fetched = tuple[list[ObjectRecord], list[Failure]]
 CountDone = Callable[[int, int], None]
@@ -23,9 +27,91 @@ class Listing:
     """Objects that cannot be used, whatever their licence."""
     fetch: Callable[[list[ObjectRecord], CountDone], Fetched] = _here_already
     """Brings objects to this machine; returns them with their paths, and a failure for each that
-    could not be had. Files of this machine are left where they are."""
+    could not be fetched. Files of this machine are left where they are."""
 
 
 def failure(uid: str, reason: str, message: str) -> Failure:
     """Return the row of an object that this stage refuses."""
     return Failure(stage="objects", item=uid, reason=reason, message=message)
+
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+"""Suffixes of object files, compared in lower case."""
+
+
+def is_object_file(name: str) -> bool:
+    """Return whether a path names an object and none of its parts is hidden."""
+    return name.lower().endswith(SUFFIXES) and not any(
+        part.startswith(".") for part in name.split("/")
+    )
+
+
+def assign_uids(names: Iterable[str]) -> tuple[dict[str, str], list[Failure]]:
+    """Return the uid of every file, and a failure for each that can have none of its own.
+
+    The uid is the path within the folder, made printable, without its suffixes: `banner.gltf.glb`
+    is `banner`. Where that is taken, by the order of the names, it is the full name: of `a.obj` and
+    `a.stl`, `a` and `a.stl`. So a new file may take the uid of an older one that differs in its
+    suffix only; a catalogue keeps uids fixed. Two names that print alike (a line break, and a
+    backslash with an n) cannot be told apart: the later one fails.
+    """
+    uids: dict[str, str] = {}
+    failures = []
+    taken: set[str] = set()
+    for name in sorted(names):
+        full = printable(name)
+        short = _without_suffixes(full)
+        uid = full if short in taken or not short.rpartition("/")[2].strip() else short
+        if uid in taken:
+            message = "another file has a name that prints alike; rename one of them"
+            failures.append(failure(uid, "name_clash", message))
+            continue
+        taken.add(uid)
+        uids[name] = uid
+    return uids, failures
+
+
+def _without_suffixes(name: str) -> str:
+    while name.lower().endswith(SUFFIXES):
+        name = name[: name.rindex(".")]
+    return name
+
+
+def fetch_all(
+    records: list[ObjectRecord],
+    fetch: Callable[[ObjectRecord], ObjectRecord],
+    downloaded: CountDone,
+    *,
+    threads: int,
+    stop: threading.Event,
+) -> Fetched:
+    """Fetch every object; a TransferFailed of `fetch` is a failure of that object alone.
+
+    Args:
+        records: what to fetch.
+        fetch: returns the record with its path; called in threads, at most `threads` at a time.
+        downloaded: called in this thread with how many are done, failed ones included, and with
+            how many there are.
+        threads: at least 1.
+        stop: set where the run ends early, so that `fetch` may give up.
+
+    Raises:
+        Exception: any other error of `fetch`; fetches that have not begun are cancelled.
+    """
+    here: list[ObjectRecord] = []
+    failures: list[Failure] = []
+    downloaded(0, len(records))
+    with ThreadPoolExecutor(threads) as pool:
+        waiting = {pool.submit(fetch, record): record for record in records}
+        try:
+            for done, future in enumerate(as_completed(waiting), start=1):
+                try:
+                    here.append(future.result())
+                except TransferFailed as error:
+                    failures.append(failure(waiting[future].uid, error.reason, error.message))
+                downloaded(done, len(records))
+        except BaseException:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return here, failures

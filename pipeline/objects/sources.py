@@ -1,6 +1,7 @@
-"""Where objects come from, as one list of records: folders, catalogues, servers, Objaverse, ours.
+"""The sources of objects by the word before their colon, and the objects that one holds.
 
-Nothing is loaded here: a record names a file, and the mesh stage finds out whether it is any good.
+Sources are folders, catalogues, servers, Objaverse and our own. Nothing is loaded here: a record
+names a file, and the mesh stage finds out whether it is usable.
 """
 
 import contextlib
@@ -12,18 +13,106 @@ from operator import attrgetter
 from pathlib import Path
 
 from pipeline.objects.generated import PREFIX as BUILTIN
-from pipeline.objects.licences import check_allowed, refuse_licences, stated_licence
-from pipeline.objects.listing import Listing
-from pipeline.objects.registry import SourceQuery, source_of
-from pipeline.objects.uids import SUFFIXES
+from pipeline.objects.generated import generate_objects, num_builtin
+from pipeline.objects.licences import (
+    check_allowed,
+    refuse_licences,
+    require_unstated,
+    stated_licence,
+)
+from pipeline.objects.listing import SUFFIXES, Listing
+from pipeline.objects.local.folder import list_folder
+from pipeline.objects.objaverse.source import list_objaverse
+from pipeline.objects.remote.source import list_remote
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
+from storage.registry import Registry
 from storage.remote.safe_url import printable, safe_url
+from storage.remote.url import PACKAGES, parse_url
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceQuery:
+    """What a person asks a source for."""
+
+    source: str
+    """The source as it was written, such as `objaverse:category/chair`."""
+    work_dir: Path
+    """Folder for files that a source makes."""
+    licence: str | None
+    """Licence that the user states for files without a statement of their own."""
+    allowed_licences: Sequence[str]
+    """For sources that need not list what would be refused; the others are refused later."""
+
+    @property
+    def after_colon(self) -> str:
+        """What the source is asked for, without its name."""
+        return self.source.partition(":")[2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectSource:
+    """A source of objects."""
+
+    list: Callable[[SourceQuery], Listing]
+    """Returns what the source holds; raises TrilightError where it is missing or malformed."""
+    look: Callable[[SourceQuery], object] | None = None
+    """Raises the same errors and writes nothing, where `list` would be dear."""
+    states_licences: bool = True
+    """Whether the source states the licence of every object; `--licence` is then refused."""
+    is_place: bool = False
+    """Whether the name is the scheme of a URL, which may hold a secret."""
+
+    def asked(self, asked: SourceQuery, *, only_look: bool) -> Listing | None:
+        """Return what `list` does, or have a look; raises TrilightError as they do."""
+        if self.states_licences:
+            require_unstated(asked.licence, f"{asked.source.partition(':')[0]}:")
+        if only_look and self.look:
+            self.look(asked)
+            return None
+        return self.list(asked)
+
+
+def _list_place(asked: SourceQuery) -> Listing:
+    place = parse_url(asked.source, what="objects")
+    if isinstance(place, Path):
+        return list_folder(place, asked.licence)
+    return list_remote(place, asked.licence)
+
+
+PLACE = ObjectSource(list=_list_place, states_licences=False, is_place=True)
+"""A folder, here or on a server; also what has no name before a colon."""
+
+SOURCES: Registry[ObjectSource] = Registry(
+    "object source",
+    ObjectSource,
+    {
+        "builtin": ObjectSource(
+            list=lambda asked: Listing(
+                records=generate_objects(asked.source, asked.work_dir), failures=[]
+            ),
+            look=lambda asked: num_builtin(asked.source),
+        ),
+        "objaverse": ObjectSource(
+            list=lambda asked: list_objaverse(asked.source, asked.allowed_licences)
+        ),
+        **dict.fromkeys(("file", *PACKAGES, "pipe", "env"), PLACE),
+    },
+    decides=("data",),
+)
+"""Sources by the word before the colon."""
+
+
+def source_of(text: str) -> ObjectSource:
+    """Return what lists a source: that of the word before its colon, or else a folder."""
+    name, colon, _ = text.partition(":")
+    return SOURCES.get(name, PLACE) if colon else PLACE
+
 
 ENVIRONMENT = "env:"
-"""Begins a source that names an environment variable: the way for URLs that hold a secret."""
+"""Prefix of a source that an environment variable holds, for URLs with a secret."""
 VARIABLES = "TRILIGHT_SOURCE_"
-"""Begins the names that may follow: who may start a run is not to read any other variable."""
+"""Prefix of the variables that may be named: starting a run must not reveal any other."""
 
 _QUOTED = re.compile(r"^objects (?:is )?(?:'[^']*'|\"[^\"]*\")")
 """How messages about a source begin."""
@@ -79,8 +168,8 @@ def find_objects(
 
     Raises:
         TrilightError: the source is malformed, missing or empty; its catalogue has a mistake; a
-            licence has no form of one, or is stated where the source states its own; a package is
-            missing; a server does not answer, or nothing could be downloaded.
+            licence identifier is malformed, or is stated where the source states its own; a package
+            is missing; a server does not answer, or nothing could be downloaded.
     """
     with _said_by(source) as value:
         return _find(value, work_dir, allowed_licences, licence, downloaded)
@@ -89,7 +178,7 @@ def find_objects(
 def look_at_source(source: str, *, allowed_licences: Sequence[str], licence: str | None) -> None:
     """Find out whether a source is there and holds anything, before a dataset of it is begun.
 
-    Nothing is written beside what a server's listing leaves in the cache.
+    Writes nothing except the cached listing of a server.
 
     Raises:
         TrilightError: as `find_objects`, as far as listing the source tells.
@@ -119,7 +208,7 @@ def _find(
 
 @contextlib.contextmanager
 def _said_by(source: str) -> Iterator[str]:
-    """Lend the source that is meant; where a variable says it, no message shows what it says."""
+    """Yield the source, or what its environment variable holds; no message quotes that."""
     value = _value(source)
     try:
         yield value
@@ -130,7 +219,7 @@ def _said_by(source: str) -> Iterator[str]:
 
 
 def _value(source: str) -> str:
-    """Return the source that is meant, where an environment variable says it."""
+    """Return the source, read from the environment variable where one is named."""
     if not source.startswith(ENVIRONMENT):
         return source
     name, shown = source.removeprefix(ENVIRONMENT), printable(source)

@@ -18,8 +18,7 @@ from pipeline.scenes.shapes import MeshShape
 from pipeline.scenes.subdivision import filled
 from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
-from scene_templates.layout_rand import layout_rand
-from scene_templates.plans import ScenePlan, scene_plan
+from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
 from scene_templates.settings import SceneSettings
 from storage.errors import TrilightError
 from storage.records.scene import Scene, SceneObject

@@ -25,13 +25,18 @@ from pipeline.shards.plans import (
 from storage.dataset.derived import Derivation, common, derived_settings, source_record
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, write_manifest
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.dataset.splits import named_shard
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.records.failures import read_failures, write_failures
-from storage.records.objects import Failure, LockedObject
-from storage.records.objects_lock import encode_objects_lock, write_objects_lock
+from storage.records.objects import (
+    Failure,
+    LockedObject,
+    encode_objects_lock,
+    read_failures,
+    write_failures,
+    write_objects_lock,
+)
 
 Operation = Literal["merge", "select", "reshard"]
 
@@ -43,10 +48,8 @@ _SAME = ("renders.resolution", "renders.per_light")
 class Derive:
     """What to make of finished datasets."""
 
-    operation: Operation
-    """What it is called."""
-    selection: Selection = dataclasses.field(default_factory=Selection)
-    """Which scenes are taken."""
+    operation: Operation  # what it is called
+    selection: Selection = dataclasses.field(default_factory=Selection)  # which scenes are taken
     scenes_per_shard: int | None = None
     """Scenes of each new shard; `merge` keeps shards, `select` fills them as its source does."""
 

@@ -7,27 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
-from storage.dataset.splits import shards_for
+from storage.dataset.progress import planned_shards
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject
-from storage.records.objects_lock import read_objects_lock
+from storage.records.objects import LockedObject, read_objects_lock
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
 from storage.remote.safe_url import safe_url
-from storage.settings.dataset import SplitSettings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FinishedDataset:
     """A dataset that is whole."""
 
-    folder: DatasetFolder
-    """Where it is."""
-    manifest: Manifest
-    """What it says of itself."""
+    folder: DatasetFolder  # its folder
+    manifest: Manifest  # what it says of itself
     objects: Mapping[str, list[LockedObject]]
     """Its locked objects by uid; a merged dataset may know several under one."""
 
@@ -36,18 +31,12 @@ class FinishedDataset:
 class SceneFacts:
     """What decides whether a scene is taken, and where it goes."""
 
-    shard: ShardEntry
-    """The shard that it is in."""
-    key: str
-    """Its key there."""
-    template: str
-    """Layout of the scene."""
-    noise_floor_db: float
-    """Of its worst view, as psnr_log_db."""
-    uids: tuple[str, ...]
-    """Objects that stand in it."""
-    arrays_sha256: str
-    """Digest of its unpacked arrays: equal for equal scenes."""
+    shard: ShardEntry  # the shard that it is in
+    key: str  # its key there
+    template: str  # layout of the scene
+    noise_floor_db: float  # noise floor of its worst view, as psnr_log_db
+    uids: tuple[str, ...]  # objects that stand in it
+    arrays_sha256: str  # digest of its unpacked arrays: equal for equal scenes
 
 
 def open_finished(place: str) -> FinishedDataset:
@@ -61,7 +50,7 @@ def open_finished(place: str) -> FinishedDataset:
         raise TrilightError(f"{safe_url(place)}: expected the folder of a dataset on this machine.")
     folder = DatasetFolder(Path(place))
     manifest = read_manifest(folder.manifest)
-    planned = _planned_shards(manifest)
+    planned = len(planned_shards(manifest))
     if len(manifest.shards) < planned:
         raise TrilightError(
             f"{place}: {len(manifest.shards)} of {planned} shards are there; expected a finished "
@@ -85,8 +74,8 @@ def read_facts(dataset: FinishedDataset, *, shard_done: Callable[[], None]) -> I
     Memory is that of one scene. Pictures are hashed with the shard and not decoded.
 
     Raises:
-        TrilightError: a shard is missing or its bytes are not those of the manifest, or a scene
-            lacks what is asked of it.
+        TrilightError: a shard is missing or its bytes are not those of the manifest, or the record
+            of a scene is incomplete.
     """
     for shard in dataset.manifest.shards:
         path = dataset.folder.shard(shard.name)
@@ -147,13 +136,3 @@ def _facts(shard: ShardEntry, key: str, members: Mapping[str, bytes]) -> SceneFa
         raise TrilightError(
             f"{shard.name}: sample {key} is not as expected ({error!r}); run `trilight verify`."
         ) from error
-
-
-def _planned_shards(manifest: Manifest) -> int:
-    """Return how many shards the dataset has when it is finished."""
-    if derivation_of(manifest.settings):
-        return len(manifest.shards)  # it only ever appears whole
-    try:
-        return shards_for(manifest.num_scenes, SplitSettings(**manifest.settings["splits"]))
-    except (KeyError, TypeError) as error:
-        raise TrilightError(f"manifest: settings.splits is not readable ({error!r}).") from error

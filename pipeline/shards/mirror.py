@@ -1,13 +1,13 @@
-"""A dataset in a bucket, whose makers meet nowhere else: each has a folder of its own before it.
+"""A dataset in a bucket that several machines make: each has a local folder of its own.
 
 The bucket holds what a folder would hold. The manifest is begun once, the objects are frozen once,
 and each shard is put there once: the server refuses a second writer, who takes what is there.
 Below `.staging` stand for each shard the rejections of its scenes and a note with its manifest
 entry. A shard is finished when it and its note are there, or the manifest lists it. The manifest
-follows from what it was begun with and from the notes, so anybody may write it at any time.
+follows from what it was begun with and from the notes, so any worker may write it at any time.
 
-Claims do not reach from one machine to another: two that are told to make the same shards make
-scenes twice, and the first writer of a shard wins. That is wasted work, never wrong.
+Claims do not reach from one machine to another: two machines with the same shards make scenes
+twice, and the first writer of a shard wins. That is wasted work, never wrong.
 """
 
 import dataclasses
@@ -16,12 +16,10 @@ import shutil
 from collections.abc import Collection
 from pathlib import Path
 
-from pipeline.shards.notes import note_of, note_shard, noted_shard
-from pipeline.shards.pack import rejections_of_shard
+from pipeline.shards.pack import note_of, note_shard, noted_shard, rejections_of_shard
 from storage.atomic import write_atomically
-from storage.dataset.claims import claimed
-from storage.dataset.dataset import Dataset
-from storage.dataset.files import RemoteDatasetFiles
+from storage.claims import claimed
+from storage.dataset.dataset import Dataset, RemoteDatasetFiles
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import (
     SHARD_NAME,
@@ -33,20 +31,20 @@ from storage.dataset.manifest import (
     shard_of_row,
     write_manifest,
 )
-from storage.dataset.scene_log import log_name
+from storage.dataset.progress import log_name
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.failures import decode_failures, read_failures, write_failures
+from storage.records.objects import decode_failures, read_failures, write_failures
 from storage.remote.bucket import Bucket
 from storage.remote.cache import shard_cache
 from storage.remote.url import RemoteUrl, parse_url
 
 _PLANNED = ".staging/planned/"
-"""Below it stands a file for each number of scenes that was asked for; the largest counts."""
+"""Folder with one file for each requested number of scenes; the largest counts."""
 
 
 class Mirror:
-    """What a machine's folder and the bucket tell each other."""
+    """Exchange between a machine's folder and the bucket."""
 
     def __init__(self, folder: DatasetFolder) -> None:
         url = parse_url(folder.bucket, what="out")
@@ -64,10 +62,10 @@ class Mirror:
         return Dataset(self._files, manifest)
 
     def adopt(self) -> None:
-        """Make the folder say what the bucket says, as far as that was published.
+        """Bring the folder's published files in line with the bucket.
 
         Scenes that wait for their shard stay where they are of the same dataset; where the folder
-        is of another one, or the bucket is empty, they go. Call while nobody else has the folder.
+        is of another one, or the bucket is empty, they go. Call while no other process holds it.
 
         Raises:
             TrilightError: the bucket cannot be read.
@@ -84,11 +82,11 @@ class Mirror:
         write_manifest(folder.manifest, theirs)
 
     def begin(self) -> bool:
-        """Put the folder's manifest into the bucket; say whether it is ours that is there."""
+        """Create the bucket's manifest from the folder's; return whether ours came first."""
         return self._bucket.create("manifest.json", self._folder.manifest)
 
     def plan(self, num_scenes: int) -> None:
-        """Tell all makers for how many scenes the dataset is meant."""
+        """Tell all workers how many scenes the dataset is to have."""
         self._bucket.write(f"{_PLANNED}{num_scenes:012d}", b"\n")
 
     def freeze(self, lock: bytes) -> None:
@@ -97,7 +95,7 @@ class Mirror:
         What others have rejected in the meantime stays.
 
         Raises:
-            TrilightError: somebody else has frozen others in the meantime.
+            TrilightError: another worker has frozen other objects in the meantime.
         """
         name = self._folder.objects_lock.name
         theirs = self._files.read(name)
@@ -109,30 +107,30 @@ class Mirror:
             theirs = self._files.read(name)
         if theirs not in (None, lock):
             raise TrilightError(
-                f"{self._folder.shown}: another maker has frozen other objects in the meantime; "
+                f"{self._folder.shown}: another worker has frozen other objects in the meantime; "
                 "expected the same --objects everywhere. Give that, or choose another --out."
             )
 
     def receive(self, listed: Collection[str]) -> tuple[int, int]:
-        """Learn what other makers have finished and planned.
+        """Read what other workers have finished and planned.
 
         Args:
             listed: names of the shards that the folder's manifest lists.
 
         Returns:
-            How many shards were news, and the scenes of the dataset.
+            The number of new shards, and of the scenes of the dataset.
         """
-        names, news = self.names(), 0
+        names, new = self.names(), 0
         for name in sorted(filter(SHARD_NAME.fullmatch, names)):
             note = self._name(note_of(self._folder, name))
             if self._folder.is_sent(name) or not (name in listed or note in names):
                 continue
             if name not in listed:
                 self._take_note(name, note)
-                news += 1
+                new += 1
             self._mark(name)
         planned = [name.removeprefix(_PLANNED) for name in names if name.startswith(_PLANNED)]
-        return news, max((int(text) for text in planned if text.isdecimal()), default=0)
+        return new, max((int(text) for text in planned if text.isdecimal()), default=0)
 
     def send(self, name: str, made: ShardEntry | None = None) -> ShardEntry | None:
         """Bring a shard of the folder into the bucket; the cache keeps its bytes.
@@ -142,8 +140,8 @@ class Mirror:
             made: its entry, where that is known.
 
         Returns:
-            The entry of the shard that is in the bucket then, ours or that of who was first; None
-            where another process of this machine sends it, or has sent it.
+            The entry of the shard that is in the bucket then, ours or that of the first writer;
+            None where another process of this machine sends it, or has sent it.
         """
         folder, path = self._folder, self._folder.shard(name)
         with claimed(folder.staging / "sending" / f"{name}.claim") as ours:
@@ -161,8 +159,8 @@ class Mirror:
     def _put(self, made: ShardEntry) -> ShardEntry:
         """Put a shard and what stands beside it into the bucket; return the entry of what is there.
 
-        Who was not first takes the rejections of who was, and writes none, unless they are lacking:
-        then the first writer was killed, and ours are the best that there are.
+        A worker that was not first takes over the first writer's rejections. Where those are
+        missing, the first writer was killed, and ours are stored instead.
         """
         folder, name = self._folder, made.name
         log, rejections = folder.root / log_name(name), rejections_of_shard(folder, name)
@@ -189,7 +187,7 @@ class Mirror:
             self._bucket.write("manifest.json", self._folder.manifest)
 
     def send_documents(self) -> None:
-        """Put what people and hubs look at into the bucket, the card last."""
+        """Put the documents for people and hubs into the bucket, the card last."""
         folder = self._folder
         documents = [
             *(folder.attribution, folder.licences, folder.contact_sheet, folder.report),
@@ -210,7 +208,7 @@ class Mirror:
         return dataclasses.replace(manifest, objects_lock_sha256=sha256_hex(lock) if lock else "")
 
     def _take_failures(self) -> None:
-        """Add what the bucket lists as rejected to what the folder does."""
+        """Merge the bucket's rejections into the folder's."""
         theirs = decode_failures(self._files.read("failures.jsonl") or b"")
         known = read_failures(self._folder.failures)
         write_failures(self._folder.failures, [*known, *theirs])
@@ -222,7 +220,7 @@ class Mirror:
             return None
 
     def _take_note(self, name: str, note: str) -> None:
-        """Copy what another maker says of a shard into the folder."""
+        """Copy another worker's note on a shard into the folder."""
         try:
             entry = shard_of_row(json.loads(self._files.read(note) or b""))
             if entry.name != name:
@@ -261,7 +259,7 @@ def _identity(manifest: Manifest | None) -> object:
 
 
 def _clear(folder: DatasetFolder) -> None:
-    """Delete all that is in a folder but the locks of those who work in it."""
+    """Delete everything in a folder except the locks of its workers."""
     kept = {folder.staging, folder.staging / "lock", folder.staging / "turns"}
     for path in {*folder.root.iterdir(), *folder.staging.iterdir()} - kept:
         if path.is_dir() and not path.is_symlink():

@@ -18,12 +18,10 @@ from storage.records.sample import sample_key
 class Selection:
     """Which scenes are taken; by default all."""
 
-    split: str | None = None
-    """Of this split only."""
-    template: str | None = None
-    """Of this layout only."""
+    split: str | None = None  # take only scenes of this split
+    template: str | None = None  # take only scenes of this layout
     min_noise_floor_db: float | None = None
-    """Whose every view has at least this noise floor (psnr_log_db)."""
+    """Take only scenes whose views all have at least this noise floor (psnr_log_db)."""
 
     def __post_init__(self) -> None:
         if self.split not in (None, *SPLITS):
@@ -41,12 +39,9 @@ class Selection:
 class Taken:
     """One scene of the new dataset."""
 
-    source: int
-    """Which of the sources it is from."""
-    facts: SceneFacts
-    """Where it is there."""
-    key: str
-    """Its new key."""
+    source: int  # which of the sources it is from
+    facts: SceneFacts  # its place in the source
+    key: str  # its new key
 
 
 def taken_scenes(

@@ -23,7 +23,7 @@ def write_asked(folder: DatasetFolder, words: Sequence[str]) -> None:
 def read_asked(dataset: Dataset) -> list[str] | None:
     """Return what was written down; None where nothing is, or nothing that may be shown.
 
-    Whoever hands out a dataset may have written it: only words of `generate` that print come back,
+    The file may come from the dataset's publisher: only words of `generate` that print come back,
     and none that would run a file when they are repeated.
     """
     try:

@@ -1,11 +1,12 @@
-"""Where things are in a dataset folder, and how several makers of it stay out of each other's way.
+"""Paths of a dataset folder, and the locks by which several workers share it.
 
-What stands beside the shards is the dataset. `.staging` holds what is not finished; it may be
-deleted at any time, and then it is made again.
+The shards and the files beside them are the dataset. `.staging` holds unfinished work; it may be
+deleted at any time, and is then made again.
 
 No folder holds more than 5,000 entries: of files that are numbered, the first 4,096 stand in their
-folder, and each following 4,096 in one of its `part-0001`, `part-0002`, ... Where a file stands
-follows from its number alone, so nothing moves when a dataset grows.
+folder, and each following 4,096 in one of its `part-0001`, `part-0002`, ... The place of a file
+follows from its number alone, so nothing moves when a dataset grows. A dataset in a bucket has a
+folder of this machine before it.
 """
 
 import contextlib
@@ -15,13 +16,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.atomic import remove_leftovers, write_error
-from storage.dataset.claims import claimed
+from storage.atomic import remove_leftovers
+from storage.cache import cache_folder
+from storage.claims import claimed, flock_now, open_lock
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.remote.bucket import WRITABLE
+from storage.remote.safe_url import printable, safe_url
+from storage.remote.url import parse_url
 
 _LEFT_S = 3600.0
-"""What nobody has written to for so long was left by a kill. Not all file systems carry locks
-between machines, so who seems to be alone may not be; no file is an hour in the writing."""
+"""Age at which a temporary file counts as left by a kill. Not all file systems carry locks between
+machines, so a worker that seems alone may not be; no file takes an hour to write."""
 
 FILES_PER_FOLDER = 4096
 """Numbered files of one folder; with their sub-folders and what else lies there, below 5,000."""
@@ -33,98 +39,56 @@ def numbered(number: int, name: str) -> str:
     return f"part-{part:04d}/{name}" if part else name
 
 
+class _Below:
+    """A path below the folder of a dataset."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, folder: "DatasetFolder", owner: type) -> Path:
+        return folder.root / self._name
+
+
 @dataclass(frozen=True)
 class DatasetFolder:
     """The paths of one dataset, or of this machine's part of one that is made in a bucket."""
 
     root: Path
-    """The folder that users name; for a bucket, one in the cache (storage.dataset.output)."""
+    """The folder that users name; for a bucket, one in the cache (storage.dataset.layout)."""
     bucket: str = ""
     """URL of the bucket that the dataset is made in, where it is; without secrets."""
+
+    manifest = _Below("manifest.json")
+    objects_lock = _Below("objects.lock.jsonl")
+    failures = _Below("failures.jsonl")
+    attribution = _Below("attribution.csv")
+    card = _Below("README.md")
+    """The dataset card, which is what hubs and people open first."""
+    licences = _Below("LICENSE.md")
+    croissant = _Below("croissant.json")
+    contact_sheet = _Below("contact_sheet.png")
+    template_sheet = _Below("templates.png")
+    report = _Below("report.html")
+    report_pages = _Below("report")
+    """Folder of the report's pages, one per scene that it shows."""
+    logs = _Below("logs")
+    staging = _Below(".staging")
+    staged_objects = _Below(".staging/objects")
+    """Built-in objects, written out as files."""
+    staged_failures = _Below(".staging/failures")
+    """Rejections of shards that are packed but not yet in the manifest."""
+    staged_entries = _Below(".staging/entries")
+    """What the manifest will say of shards that are packed but not yet in it."""
+    staged_samples = _Below(".staging/samples")
+    """Finished samples of unfinished shards, in a folder for each shard."""
+    staged_sent = _Below(".staging/sent")
+    """An empty file for each shard that is known to be in the bucket."""
+    _lock = _Below(".staging/lock")
 
     @property
     def shown(self) -> str:
         """What people call the dataset."""
         return self.bucket or str(self.root)
-
-    @property
-    def manifest(self) -> Path:
-        return self.root / "manifest.json"
-
-    @property
-    def objects_lock(self) -> Path:
-        return self.root / "objects.lock.jsonl"
-
-    @property
-    def failures(self) -> Path:
-        return self.root / "failures.jsonl"
-
-    @property
-    def attribution(self) -> Path:
-        return self.root / "attribution.csv"
-
-    @property
-    def card(self) -> Path:
-        """The dataset card, which is what hubs and people open first."""
-        return self.root / "README.md"
-
-    @property
-    def licences(self) -> Path:
-        return self.root / "LICENSE.md"
-
-    @property
-    def croissant(self) -> Path:
-        return self.root / "croissant.json"
-
-    @property
-    def contact_sheet(self) -> Path:
-        return self.root / "contact_sheet.png"
-
-    @property
-    def template_sheet(self) -> Path:
-        return self.root / "templates.png"
-
-    @property
-    def report(self) -> Path:
-        return self.root / "report.html"
-
-    @property
-    def report_pages(self) -> Path:
-        """Folder of the report's pages, one per scene that it shows."""
-        return self.root / "report"
-
-    @property
-    def logs(self) -> Path:
-        return self.root / "logs"
-
-    @property
-    def staging(self) -> Path:
-        return self.root / ".staging"
-
-    @property
-    def staged_objects(self) -> Path:
-        """Built-in objects, written out as files."""
-        return self.staging / "objects"
-
-    @property
-    def staged_failures(self) -> Path:
-        """Rejections of shards that are packed but not yet in the manifest."""
-        return self.staging / "failures"
-
-    @property
-    def staged_entries(self) -> Path:
-        """What the manifest will say of shards that are packed but not yet in it."""
-        return self.staging / "entries"
-
-    @property
-    def staged_samples(self) -> Path:
-        """Finished samples of unfinished shards, in a folder for each shard."""
-        return self.staging / "samples"
-
-    @property
-    def staged_sent(self) -> Path:
-        """An empty file for each shard that is known to be in the bucket."""
-        return self.staging / "sent"
 
     def staged_shard(self, name: str) -> Path:
         """Folder of the finished samples of an unfinished shard."""
@@ -148,39 +112,34 @@ class DatasetFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the folder for one maker; the lock dies with the process that holds it.
+        """Hold the folder exclusively; the lock ends with the process that holds it.
 
         Raises:
             TrilightError: the folder cannot be written, or another process is at work in it.
         """
-        descriptor = self._open_lock()
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise TrilightError(
-                f"{self.root}: another process is making this dataset. Wait for it, or choose "
-                "another --out."
-            ) from error
-        else:
+        with claimed(self._lock) as ours:
+            if not ours:
+                raise TrilightError(
+                    f"{self.root}: another process is making this dataset. Wait for it, or choose "
+                    "another --out."
+                )
             yield
-        finally:
-            os.close(descriptor)
 
     @contextlib.contextmanager
     def joined(self, when_alone: Callable[[], None] = lambda: None) -> Iterator[None]:
-        """Take part in the making, with any number of others.
+        """Join the workers that make the dataset.
 
-        Whoever is alone at first clears away what killed writers have left for an hour.
+        A worker that is alone at first removes what killed writers left more than an hour ago.
 
         Args:
-            when_alone: called by whoever is alone at first, before anybody else can join.
+            when_alone: called by a worker that is alone at first, before another one can join.
 
         Raises:
             TrilightError: the folder cannot be written; or as `when_alone`.
         """
-        descriptor = self._open_lock()
+        descriptor = open_lock(self._lock)
         try:
-            if _lock_alone(descriptor):
+            if flock_now(descriptor):
                 remove_leftovers(self.root, older_than_s=_LEFT_S)
                 when_alone()
             fcntl.flock(descriptor, fcntl.LOCK_SH)
@@ -189,21 +148,35 @@ class DatasetFolder:
             os.close(descriptor)
 
     def turn(self, what: str) -> "contextlib.AbstractContextManager[bool]":
-        """Wait for one's turn at what one maker does at a time, such as `manifest`."""
+        """Hold the lock of a step that one worker does at a time, such as `manifest`."""
         return claimed(self.staging / "turns" / what, wait=True)
 
-    def _open_lock(self) -> int:
-        lock = self.staging / "lock"
-        try:
-            self.staging.mkdir(parents=True, exist_ok=True)
-            return os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise write_error(lock, error) from error
+
+_ADMITTED = f"expected a folder, or a URL of {' or '.join(WRITABLE)}"
 
 
-def _lock_alone(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+def dataset_folder(out: str) -> DatasetFolder:
+    """Return the folder of a dataset that is to be made.
+
+    For a bucket that is a folder of the cache, the same one whenever the same URL is named, with
+    the scenes that are not in a shard yet and a copy of the files beside the shards.
+
+    Args:
+        out: a folder, or a URL of WRITABLE.
+
+    Raises:
+        TrilightError: the URL is refused (storage.remote.url), is none that can be written to only
+            once, or has a query.
+    """
+    if "://" not in out and not out.startswith("pipe:"):
+        return DatasetFolder(Path(out))
+    place = parse_url(out, what="out")
+    if isinstance(place, Path):
+        return DatasetFolder(place)
+    shown = printable(safe_url(out))
+    if place.scheme not in WRITABLE:
+        raise TrilightError(f"out {shown!r} has the scheme {place.scheme!r}; {_ADMITTED}.")
+    if "?" in place.root or "#" in place.root:
+        raise TrilightError(f"out {shown!r} has a query or fragment; {_ADMITTED}, without one.")
+    name = sha256_hex(place.shown.encode())[:16]
+    return DatasetFolder(cache_folder("outputs") / name, place.shown)

@@ -8,25 +8,72 @@ over the shards, the object lock and the settings; "the same bytes" always means
 import dataclasses
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, overload
+
+import numpy as np
+from numpy.typing import NDArray
 
 from storage.atomic import atomic_writer
 from storage.conventions import SCHEMA_VERSION, SPLITS, require_readable
 from storage.dataset.json_pieces import entries
 from storage.dataset.layout import numbered
-from storage.dataset.member_table import MemberTable
-from storage.dataset.shard_reader import MAX_MEMBER_BYTES, MEMBER_NAME, scan_samples
+from storage.dataset.shard import MAX_MEMBER_BYTES, MEMBER_NAME, scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
+
+Row = tuple[str, int, int]
+"""Name, offset of the first byte, number of bytes."""
+
+
+class MemberTable(Sequence[Row]):
+    """Rows that are unpacked when they are asked for: ask for all of them at once."""
+
+    __slots__ = ("_names", "_places")
+
+    def __init__(self, rows: Iterable[Row] = ()) -> None:
+        """Pack rows; names hold no line break, numbers are whole ones from 0 to below 2^63."""
+        held = list(rows)
+        self._names = "\n".join(name for name, _, _ in held).encode()
+        self._places: NDArray[np.int64] = np.array(
+            [(offset, num_bytes) for _, offset, num_bytes in held], np.int64
+        ).reshape(-1, 2)
+
+    def __iter__(self) -> Iterator[Row]:
+        names = self._names.decode().split("\n") if len(self) else []
+        return zip(names, *self._places.T.tolist(), strict=True)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, at: int) -> Row: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> Sequence[Row]: ...
+
+    def __getitem__(self, at: int | slice) -> Row | Sequence[Row]:
+        return list(self)[at]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, MemberTable):
+            return NotImplemented
+        return self._names == other._names and np.array_equal(self._places, other._places)
+
+    def __hash__(self) -> int:
+        return hash((self._names, self._places.tobytes()))
+
+    def __repr__(self) -> str:
+        return f"MemberTable({list(self)!r})"
+
 
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
 
 _MOST_BYTES = 1 << 62
-"""Of a shard; what fits into a MemberTable."""
+"""Maximum size of a shard, which fits into a MemberTable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +118,7 @@ class Manifest:
     settings: Mapping[str, Any]
     """All settings of the build; a dataset keeps them for life."""
     environment: Mapping[str, Any]
-    """What the bytes depend on beside the settings: variant, processor, library versions."""
+    """What the bytes depend on besides the settings: variant, processor, library versions."""
     num_scenes: int
     """How many scenes were asked for so far; more extend the dataset."""
     num_views: int
@@ -83,8 +130,8 @@ class Manifest:
     schema_version: int = SCHEMA_VERSION
     """Version of the formats."""
     extensions: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """The sha256 of each file of the makers' own that had part in it, by its name; nothing that is
-    read from here is ever imported (storage.extensions)."""
+    """The sha256 of each extension that took part in making it, by its file name; nothing that is
+    named here is ever imported (storage.extensions)."""
 
     @property
     def num_samples(self) -> int:

@@ -1,23 +1,33 @@
-"""How far a dataset is, from its files alone: anybody may look, from any process."""
+"""Progress of a dataset, from its files alone: counts, the rate of the last scenes, time left.
+
+Any process may read it. `logs/<shard>.jsonl` holds what must not be in a dataset, one row per
+scene: times, hosts, retries.
+"""
 
 import contextlib
 import functools
 import json
+import os
+import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically, write_error
+from storage.dataset.asked import read_asked
+from storage.dataset.dataset import Dataset, LocalFiles, open_dataset
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder, numbered
 from storage.dataset.manifest import Manifest, read_manifest
 from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.errors import TrilightError
+from storage.records.objects import count_by_reason, decode_failures
+from storage.records.sample import sample_key
 from storage.settings.dataset import SplitSettings
 
 _AT_WORK_S = 600.0
-"""What is told of a scene is not older than a pass of samples takes; else a kill has left it."""
+"""Older notes on unfinished views were left by a kill: a pass of samples takes less time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,18 +53,18 @@ class Progress:
 
 
 def announce_downloads(folder: DatasetFolder, done: int, total: int) -> None:
-    """Write down how many object files have come from a server."""
+    """Record how many object files have been downloaded."""
     write_atomically(_downloads(folder), json.dumps([done, total]).encode())
 
 
 def announce_objects(folder: DatasetFolder, num_objects: int) -> None:
-    """Write down how many objects the asset stage will look at, and that none is done."""
+    """Record how many objects the asset stage has to do, and that none is done."""
     write_atomically(_done(folder), b"")
     write_atomically(_plan(folder), json.dumps({"objects": num_objects}).encode())
 
 
 def count_object(folder: DatasetFolder) -> None:
-    """Write down that one more object is prepared or rejected: a byte, from any thread."""
+    """Record that one more object is prepared or rejected: one byte, from any thread."""
     path = _done(folder)
     try:
         with path.open("ab") as stream:
@@ -64,9 +74,9 @@ def count_object(folder: DatasetFolder) -> None:
 
 
 def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
-    """Write down how many views of a scene at work are finished, the one at hand in part.
+    """Record how many views of an unfinished scene are done; the current one counts in part.
 
-    It is for people alone, so that where it cannot be written nothing is said.
+    The note only shows progress, so failing to write it is no error.
     """
     with contextlib.suppress(OSError):
         path = _at_work(folder) / numbered(scene_index, f"{scene_index:09d}")
@@ -75,7 +85,7 @@ def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
 
 
 def forget_views(folder: DatasetFolder, scene_index: int) -> None:
-    """Take back what `tell_views` wrote: the scene is finished, or begun anew."""
+    """Delete the note of `tell_views`: the scene is finished, or begun anew."""
     with contextlib.suppress(OSError):
         (_at_work(folder) / numbered(scene_index, f"{scene_index:09d}")).unlink()
 
@@ -107,14 +117,14 @@ def read_progress(folder: DatasetFolder) -> Progress:
 
 
 def _views_at_work(folder: DatasetFolder) -> float:
-    """Return how many views are told of that a kill has not left long ago."""
+    """Return how many views are in progress, without old notes that a kill has left."""
     since = time.time() - _AT_WORK_S
-    told = 0.0
+    views = 0.0
     for path in _at_work(folder).rglob("[0-9]*"):
         with contextlib.suppress(OSError, ValueError):  # it is gone, or half written
             if path.is_file() and path.stat().st_mtime > since:
-                told += float(path.read_text())
-    return told
+                views += float(path.read_text())
+    return views
 
 
 @functools.lru_cache(maxsize=4)
@@ -125,10 +135,17 @@ def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, int, M
 
 
 def planned_shards(manifest: Manifest) -> dict[str, int]:
-    """Return the names of the shards of the finished dataset, with their numbers of scenes."""
-    if derivation_of(manifest.settings):
+    """Return the names of the shards of the finished dataset, with their numbers of scenes.
+
+    Raises:
+        TrilightError: the settings in the manifest do not say how the dataset is divided.
+    """
+    if derivation_of(manifest.settings):  # it only ever appears whole
         return {entry.name: entry.num_samples for entry in manifest.shards}
-    splits = SplitSettings(**manifest.settings["splits"])
+    try:
+        splits = SplitSettings(**manifest.settings["splits"])
+    except (KeyError, TypeError) as error:
+        raise TrilightError(f"manifest: settings.splits is not readable ({error!r}).") from error
     return {
         shard_name(index, splits): len(scenes_of_shard(index, splits))
         for index in range(shards_for(manifest.num_scenes, splits))
@@ -170,3 +187,193 @@ def _downloads(folder: DatasetFolder) -> Path:
 
 def _done(folder: DatasetFolder) -> Path:
     return folder.staging / "objects_done"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneLog:
+    """Log row of one finished scene."""
+
+    seconds: float
+    """Wall time."""
+    cores: int
+    """Cores that the worker used for it."""
+    finished_unix_s: float
+    """Time of completion by the worker's clock."""
+
+
+def log_scene(
+    folder: DatasetFolder,
+    shard: str,
+    scene_index: int,
+    *,
+    seconds: float,
+    cores: int,
+    num_rejected: int,
+) -> None:
+    """Append the row of a scene that is made.
+
+    Raises:
+        TrilightError: the disk is full or the folder cannot be written.
+    """
+    row = {
+        "scene": sample_key(scene_index),
+        "seconds": round(seconds, 3),
+        "cores": cores,
+        "rejected_attempts": num_rejected,
+        "host": socket.gethostname(),
+        "pid": os.getpid(),
+        "finished_unix_s": round(time.time(), 1),
+    }
+    path = folder.root / log_name(shard)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as stream:
+            stream.write(json.dumps(row) + "\n")
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+def read_scene_logs(folder: DatasetFolder) -> Iterator[SceneLog]:
+    """Yield the rows of a dataset's logs; rows that a kill has cut are left out."""
+    for path in sorted(folder.logs.rglob("*.jsonl")):
+        yield from decode_scene_log(path.read_text())
+
+
+def log_name(shard: str) -> str:
+    """Return the name of a shard's log, relative to the dataset."""
+    return f"logs/{shard}.jsonl"
+
+
+def decode_scene_log(text: str) -> Iterator[SceneLog]:
+    """Yield the rows of a log; those that a kill has cut are left out."""
+    for line in text.splitlines():
+        try:
+            row = json.loads(line)
+            yield SceneLog(
+                seconds=float(row["seconds"]),
+                cores=int(row.get("cores", 1)),  # earlier versions did not say
+                finished_unix_s=float(row["finished_unix_s"]),
+            )
+        except (ValueError, KeyError, TypeError, AttributeError):
+            continue
+
+
+_RATE_SCENES = 200
+"""The rate of a local dataset is taken over this many last scenes of all workers."""
+
+_LOGS_READ = 64
+"""Maximum number of logs fetched from a remote dataset, evenly spaced over its shards."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetStatus:
+    """Status of a dataset, finished or not."""
+
+    shown: str
+    """Its place, without secrets."""
+    build: str
+    """Name of its build."""
+    shards_done: int
+    """Shards that are there."""
+    shards_planned: int
+    """Shards of the finished dataset."""
+    scenes_done: int
+    """Scenes in shards or waiting for theirs; given-up ones count."""
+    scenes_planned: int
+    """Scenes of the finished dataset."""
+    num_views: int
+    """Views of a scene."""
+    finished: bool
+    """Every shard is listed, and the documents are there."""
+    views_per_hour: float | None
+    """Rate over the last scenes; of a remote dataset over all scenes, pauses included. None without
+    enough log rows."""
+    remaining_s: float | None
+    """Time until all scenes are made at that rate."""
+    core_hours: float | None
+    """Core hours spent on finished scenes; killed workers are not counted. None without logs."""
+    last_scene_unix_s: float | None
+    """When the last scene was made."""
+    failures: Sequence[tuple[str, str, int]]
+    """Stage, reason and number of rejections, the most frequent first."""
+    digest: str
+    """The dataset digest, of the listed shards."""
+
+    asked: Sequence[str] | None
+    """Words of the command that makes it, without its place; None where they were not recorded."""
+
+    @property
+    def next_words(self) -> Sequence[str] | None:
+        """The words of the command to run next, if it is known."""
+        if self.finished:
+            return ("verify", self.shown)
+        return None if self.asked is None else (*self.asked, "--out", self.shown)
+
+
+def read_status(url: str) -> DatasetStatus:
+    """Return the status of a dataset.
+
+    Raises:
+        TrilightError: there is no readable manifest, or the URL is refused.
+    """
+    dataset = open_dataset(url)
+    manifest = dataset.manifest
+    local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
+    planned = planned_shards(manifest)
+    names = shards_there(local) if local else {entry.name for entry in manifest.shards}
+    names &= planned.keys()
+    done = num_scenes_done(local, planned) if local else sum(planned[name] for name in names)
+    logs, share = (list(read_scene_logs(local)), 1.0) if local else _sampled_logs(dataset)
+    last = sorted(logs, key=lambda row: row.finished_unix_s)[-_RATE_SCENES if local else 0 :]
+    views_per_hour, remaining_s = _rate(last, share, manifest, manifest.num_scenes - done)
+    return DatasetStatus(
+        shown=dataset.shown,
+        build=manifest.build,
+        shards_done=len(names),
+        shards_planned=len(planned),
+        scenes_done=done,
+        scenes_planned=manifest.num_scenes,
+        num_views=manifest.num_views,
+        finished=len(manifest.shards) >= len(planned) and _has_card(dataset),
+        views_per_hour=views_per_hour,
+        remaining_s=remaining_s,
+        core_hours=sum(row.seconds * row.cores for row in logs) / share / 3600 if share else None,
+        last_scene_unix_s=max((row.finished_unix_s for row in logs), default=None),
+        failures=count_by_reason(decode_failures(dataset.files.read("failures.jsonl") or b"")),
+        digest=dataset.digest,
+        asked=read_asked(dataset),
+    )
+
+
+def _sampled_logs(dataset: Dataset) -> tuple[list[SceneLog], float]:
+    """Return rows of logs on a server, and of what share of the listed scenes; none and 0 without.
+
+    A sample of the logs stands for all; where the first is missing, the dataset has none.
+    """
+    shards = dataset.manifest.shards
+    rows: list[SceneLog] = []
+    scenes = 0
+    for entry in shards[:: -(-len(shards) // _LOGS_READ)] if shards else ():
+        data = dataset.files.read(log_name(entry.name))
+        if data is None and not rows:
+            return [], 0.0
+        if data is not None:
+            rows += decode_scene_log(data.decode(errors="replace"))
+            scenes += entry.num_samples
+    return rows, scenes / max(dataset.manifest.num_samples, 1)
+
+
+def _rate(
+    last: Sequence[SceneLog], share: float, manifest: Manifest, left: int
+) -> tuple[float | None, float | None]:
+    """Return views per hour and seconds left, from rows by time that are a share of the scenes."""
+    if left <= 0 or len(last) < 2:
+        return None, 0.0 if left <= 0 else None
+    # from the start of the first to the end of the last, over all who worked at the same time
+    span_s = last[-1].finished_unix_s - (last[0].finished_unix_s - last[0].seconds)
+    per_s = len(last) / share / max(span_s, 1e-3)
+    return 3600 * per_s * manifest.num_views, left / per_s
+
+
+def _has_card(dataset: Dataset) -> bool:
+    return dataset.files.read("README.md") is not None

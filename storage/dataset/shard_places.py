@@ -1,4 +1,4 @@
-"""Where single shards are: paths and URLs, one by one or as brace patterns."""
+"""Places of single shards: paths and URLs, one by one or as brace patterns."""
 
 import itertools
 import re
@@ -15,7 +15,7 @@ from storage.remote.safe_url import printable, safe_text
 from storage.remote.url import RemoteUrl, parse_url
 
 MAX_SHARDS = 100_000
-"""Of one list; a pattern may not name more either, however few characters it has."""
+"""Maximum number of shards in a list, and of names that one brace pattern expands to."""
 
 _GROUP = re.compile(r"\{([^{}]*)\}")
 _RANGE = re.compile(r"(\d+)\.\.(\d+)")
@@ -24,7 +24,7 @@ _WHAT = "shard"
 
 @dataclass(frozen=True, kw_only=True)
 class ShardPlace:
-    """Where one shard is."""
+    """The place of one shard."""
 
     place: Path | RemoteUrl
     """A file of this machine, or one on a server."""
@@ -41,7 +41,7 @@ class ShardPlace:
         return next((split for split in SPLITS if name.startswith(f"{split}-")), "train")
 
     def open(self) -> BinaryIO:
-        """Open the shard; raises TrilightError where it cannot be had."""
+        """Open the shard; raises TrilightError where it cannot be read."""
         if isinstance(self.place, RemoteUrl):
             return shard_cache().open(self.place, num_bytes=None, sha256=None)
         try:

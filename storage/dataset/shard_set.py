@@ -1,4 +1,4 @@
-"""The shards of one split for whoever draws samples from them in an order of its own.
+"""The shards of one split, from which samples are drawn in any order.
 
 A set knows its shards by number and opens each when it is wanted. An open shard gives any of its
 samples, in any order and from several threads at once; nothing of it stays in memory but the names
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.shard import Member, scan_samples
 from storage.dataset.shard_places import ShardPlace
-from storage.dataset.shard_reader import Member, scan_samples
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.sample import Sample, decode_sample
@@ -27,7 +27,7 @@ class OpenShard:
     """A shard that is being read."""
 
     def __init__(self, name: str, stream: BinaryIO) -> None:
-        """Look at the headers; raises TrilightError as `storage.dataset.shard_reader`."""
+        """Look at the headers; raises TrilightError as `storage.dataset.shard`."""
         self.name = name
         self._stream = stream
         self._samples: list[tuple[str, Mapping[str, Member]]] = list(scan_samples(stream, name))
@@ -84,7 +84,7 @@ class ShardSet(ABC):
         """Open a shard, fetched and checked.
 
         Raises:
-            TrilightError: it cannot be had, or is not what it should be; names it.
+            TrilightError: it cannot be read, or is not what it should be; the message names it.
         """
 
 

@@ -10,10 +10,8 @@ from pathlib import Path
 
 from storage.atomic import write_atomically
 from storage.dataset.layout import numbered
-from storage.dataset.shard_reader import iterate_samples
-from storage.dataset.shard_writer import write_tar
-from storage.records.failures import decode_failures, encode_failures
-from storage.records.objects import Failure
+from storage.dataset.shard import iterate_samples, write_tar
+from storage.records.objects import Failure, decode_failures, encode_failures
 from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample, sample_key
 

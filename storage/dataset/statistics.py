@@ -9,8 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.dataset.damage import reading
-from storage.dataset.dataset import Dataset
+from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -95,7 +94,7 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
 
 @dataclass(kw_only=True, eq=False)
 class _Tally:
-    """Counts in the making."""
+    """Running counts."""
 
     splits: Counter[str] = field(default_factory=Counter)
     templates: Counter[str] = field(default_factory=Counter)

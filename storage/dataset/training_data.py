@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import SPLITS
 from storage.dataset.dataset import open_dataset
-from storage.dataset.manifest import Manifest, ShardEntry
-from storage.dataset.member_table import MemberTable
+from storage.dataset.manifest import Manifest, MemberTable, ShardEntry
 from storage.dataset.shard_places import listed_shards
 from storage.dataset.shard_set import (
     KeysSeen,
@@ -35,11 +34,11 @@ class TrainingData:
     """The shards of every split that holds a sample."""
 
     shown: str
-    """Where they are, for people."""
+    """Their place, for messages."""
     digest: str
     """What a checkpoint remembers: the dataset digest; of a list, a digest of its names only."""
     splits: Mapping[str, ShardSet]
-    """By split; those without a shard are left out."""
+    """Shards by split; splits without a shard are left out."""
     num_views: int | None
     """Pictures per scene, where a manifest says it."""
     build: str | None = None

@@ -1,4 +1,4 @@
-"""Is a dataset what its manifest says? Every hash, member and law, and a list of what is wrong."""
+"""Checks a dataset against its manifest: every hash, every member, and the laws of every sample."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -8,19 +8,19 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
 
-from storage.dataset.check_sample import check_sample
-from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.files import LocalFiles, RemoteDatasetFiles
+import numpy as np
+
+from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, index_stream
-from storage.dataset.member_table import MemberTable
+from storage.dataset.manifest import Manifest, MemberTable, ShardEntry, index_stream
 from storage.dataset.progress import planned_shards
-from storage.dataset.shard_reader import samples_of, scan_members
+from storage.dataset.shard import samples_of, scan_members
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject
-from storage.records.objects_lock import decode_objects_lock
-from storage.records.sample import decode_sample
+from storage.licences import mixed_share_alike
+from storage.records.lights import sum_of_lights
+from storage.records.objects import LockedObject, decode_objects_lock
+from storage.records.sample import Sample, decode_sample
 from storage.remote.fetch import download
 from storage.remote.tries import TransferFailed
 
@@ -37,7 +37,7 @@ class Verification:
     problems: Sequence[str]
     """One line per fault, naming shard and sample; empty where the dataset is whole."""
     num_samples: int
-    """Samples that were looked at."""
+    """Samples that were checked."""
     bad_shards: Sequence[str]
     """Names of the shards that are missing or not what they should be."""
     num_shards_planned: int
@@ -65,14 +65,14 @@ def verify_dataset(
 ) -> Verification:
     """Check a dataset, in a folder or on a server, against its manifest.
 
-    Several shards are looked at side by side in threads: hashing and unpacking leave Python's lock.
+    Several shards are checked at once in threads: hashing and unpacking release Python's lock.
     Shards of a server are fetched anew, past the cache, and not kept.
 
     Args:
         root: the dataset, opened, or its path or URL.
         fast: compare only sizes, and in a folder also the members' names and places; reads no
             picture. A changed byte is not seen.
-        shard_done: called with the name of each shard that was looked at.
+        shard_done: called with the name of each checked shard.
 
     Raises:
         TrilightError: there is no readable manifest, so there is nothing to check against, or the
@@ -83,7 +83,7 @@ def verify_dataset(
     lock = dataset.files.read("objects.lock.jsonl")
     problems = list(_check_lock(lock, manifest))
     locked = {} if problems or lock is None else _by_uid(lock)
-    problems += [f"{name}: not in the manifest" for name in _strangers(dataset)]
+    problems += [f"{name}: not in the manifest" for name in _unlisted(dataset)]
     where: dict[str, str] = {}
     bad: list[str] = []
     threads = os.cpu_count() or 1 if isinstance(dataset.files, LocalFiles) else REMOTE_THREADS
@@ -117,12 +117,12 @@ def _num_planned(manifest: Manifest) -> int:
     """Return how many shards there will be; of settings that do not say, those that are there."""
     try:
         return len(planned_shards(manifest))
-    except (KeyError, TypeError, TrilightError):
+    except TrilightError:
         return len(manifest.shards)
 
 
-def _strangers(dataset: Dataset) -> list[str]:
-    """Return shards in the folder that nobody lists; a server's folder is not listed."""
+def _unlisted(dataset: Dataset) -> list[str]:
+    """Return shard files that the manifest does not list; of a remote dataset, none."""
     if isinstance(dataset.files, RemoteDatasetFiles):
         return []
     listed = {shard.name for shard in dataset.manifest.shards}
@@ -220,3 +220,49 @@ def _check_content(
             found.faults.append(str(error))
             continue
         found.faults += check_sample(sample, shard.split, manifest, locked)
+
+
+def check_sample(
+    sample: Sample, split: str, manifest: Manifest, locked: Mapping[str, LockedObject]
+) -> Iterator[str]:
+    """Yield the faults of one sample: laws of the scene, pictures, and rights of its objects."""
+    try:
+        sample.scene.check()
+    except TrilightError as error:
+        yield f"sample {sample.key}: {error}"
+    renders = manifest.settings.get("renders")
+    renders = renders if isinstance(renders, Mapping) else {}
+    resolution = renders.get("resolution")
+    expected = (manifest.num_views, resolution, resolution, 3)
+    if sample.radiance_rgb.shape != expected or sample.scene.num_views != manifest.num_views:
+        yield f"sample {sample.key}: pictures {sample.radiance_rgb.shape}; expected {expected}"
+    if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
+        yield f"sample {sample.key}: a picture holds a value that is not finite or negative"
+    yield from _check_lights(sample, apart=bool(renders.get("per_light")))
+    if mixed := mixed_share_alike(entry.licence for entry in sample.scene.objects):
+        yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
+    for entry in sample.scene.objects:
+        if entry.kind != "object":
+            continue
+        lock = locked.get(entry.uid)
+        if lock is None:
+            yield f"sample {sample.key}: object {entry.uid!r} is not in objects.lock.jsonl"
+        elif lock.split != split:
+            yield f"sample {sample.key}: object {entry.uid!r} belongs to split {lock.split}"
+
+
+def _check_lights(sample: Sample, *, apart: bool) -> Iterator[str]:
+    """Yield the faults of the pictures of single lights; older manifests know no such setting."""
+    if (sample.lights_rgb is not None) != apart:
+        found = "lacks" if apart else "has"
+        yield f"sample {sample.key}: {found} pictures by light; renders.per_light is {apart}"
+    if sample.lights_rgb is None:
+        return
+    for view, lights in enumerate(sample.lights_rgb):
+        differs = (sum_of_lights(lights) != sample.radiance_rgb[view]).any(axis=-1)
+        if differs.any():
+            row, column = (int(index) for index in np.argwhere(differs)[0])
+            yield (
+                f"sample {sample.key}: view {view} is not the sum of its lights in "
+                f"{int(differs.sum())} pixels, first in ({row}, {column})"
+            )

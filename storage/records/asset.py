@@ -3,17 +3,22 @@
 The file holds, per level, `positions_<budget>` f32 [V, 3] and `faces_<budget>` u32 [F, 3], and in
 its metadata what is known of the source and of each level. Positions are in the unit box: the
 bounding box of the cleaned source is centred on the origin and its longest side is 1.
+
+`AssetRow` is what `trilight assets` reports of one object. The rows of the accepted objects are a
+catalogue (`objects.jsonl`), so that the output folder is itself a source of objects.
 """
 
 import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+from storage.records.objects import NamedObject
 from storage.records.safe_read import read_safetensors
 
 
@@ -155,3 +160,26 @@ def decode_asset(data: bytes) -> Asset:
         for record in records
     )
     return Asset(levels=levels, source=SourceFacts(**header.pop("source")), **header)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssetRow(NamedObject):
+    """An accepted object."""
+
+    path: str
+    """Its mesh, below the folder."""
+    num_faces: int
+    """Triangles of the mesh."""
+    method: str
+    """How it was made; `source` where nothing had to be left out."""
+    quality: LevelQuality
+    """How it compares with the source."""
+    source: SourceFacts
+    """What the file held."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the row as JSON values, with the two judgements that readers ask for."""
+        row = dataclasses.asdict(self)
+        row["repaired"] = self.source.repaired
+        row["source"]["watertight"] = self.source.watertight
+        return row

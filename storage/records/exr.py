@@ -22,8 +22,8 @@ MAX_RESOLUTION = 8192
 """A larger window in a file from outside is refused before any memory is taken."""
 
 _MAX_BYTES = 3 << 30
-"""And so are more bytes of pixels: 64 lights of 2048 x 2048, the most that is ever written, take
-this much at the 4 bytes which a value has at most."""
+"""Maximum bytes of pixels: 64 lights of 2048 x 2048, the most that is ever written, take this much
+at 4 bytes a value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,12 +34,12 @@ class ExrCodec:
     """OpenEXR's name, such as ZIP or DWAB; of what the library offers, this is all that can be
     chosen but for DWA's level: deflate, zstd and lossy JPEG 2000 have their default levels."""
     dwa_level: float | None = None
-    """Of DWAA and DWAB: greater is coarser; None is the library's 45."""
+    """Level of DWAA and DWAB: greater is coarser; None is the library's 45."""
 
 
 INT32 = Within(-(2**31), 2**31 - 1)
 FLOAT32 = Within(-FLOAT32_MAX, FLOAT32_MAX)
-"""What numbers of a header are."""
+"""Ranges of the numbers in a header."""
 
 ZIP = ExrCodec(compression="ZIP")
 """Exact on half floats, and known to every reader of OpenEXR."""
@@ -49,7 +49,7 @@ _LOSSY = frozenset(
 )
 
 _MOST_LISTED = 6
-"""Names of channels in a message."""
+"""Maximum number of channel names in a message."""
 
 _HALF = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
 _NOT_NEGATIVE = np.where(_HALF < 0, np.float32(0), _HALF)

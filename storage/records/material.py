@@ -1,6 +1,6 @@
 """Columns of a material row, declared once: readers, writers, symmetries and networks iterate them.
 
-The four published columns stand first. Another one is declared by whoever needs it:
+The four published columns stand first. Another one is declared by the extension that needs it:
 
     COLUMNS.register("coat", MaterialColumn(name="coat", width=1, within=Within(0, 1), means="..."))
 
@@ -22,7 +22,7 @@ from storage.registry import Registry
 from storage.settings.ranges import FLOAT32_MAX, Within
 
 MAX_WIDTH = 64
-"""Most numbers of one column."""
+"""Maximum width of a column."""
 
 
 class UndeclaredColumn(TrilightError):
@@ -151,7 +151,7 @@ def declared_column(name: str) -> MaterialColumn:
 
 
 def default_rows(count: int) -> NDArray[np.float32]:
-    """Return so many material rows [count, width] with every declared column at its default."""
+    """Return `count` material rows [count, width] with every declared column at its default."""
     row = np.concatenate([np.full(each.width, each.default) for each in material_columns()])
     return np.tile(row.astype(np.float32), (count, 1))
 
@@ -166,7 +166,7 @@ def columns_in_use(materials: NDArray[np.float32]) -> tuple[str, ...]:
 
 
 def unread_columns(materials: NDArray[np.float32], read: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns in use that somebody who reads those in `read` does not see."""
+    """Return the columns in use that a reader of the columns `read` ignores."""
     return tuple(name for name in columns_in_use(materials) if name not in read)
 
 
@@ -238,7 +238,18 @@ def _wrong(name: str, got: str, expected: str) -> None:
 _PLACES = {column.name: part for column, part in laid_out()}
 
 DIFFUSE, SPECULAR, EMISSION = (_PLACES[name] for name in ("diffuse", "specular", "emission"))
-"""Where the published columns stand in a material row, for code that means exactly them."""
+"""Places of the published columns in a material row, for code that means exactly them."""
 ROUGHNESS = _PLACES["roughness"].start
 REFLECTING = slice(0, EMISSION.start)
 """Albedos and roughness: what stands before the emission."""
+
+
+def distinct_rows(rows: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where each distinct row first stands, in that order, and which one each row is.
+
+    Rows [N, K] are compared by their bytes.
+    """
+    keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * 4))).ravel()
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first, kind="stable"), kind="stable")
+    return np.sort(first), rank[inverse]

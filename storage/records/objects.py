@@ -1,16 +1,27 @@
-"""What one stage hands to the next: rows of plain values, each with the rights of its object."""
+"""Rows that stages hand on: objects with their rights, the lock of a dataset, and rejections.
 
+`objects.lock.jsonl` lists the objects of a dataset and is frozen before its first scene.
+`failures.jsonl` lists every object, scene and view that was rejected, with its reason.
+"""
+
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
+
+from storage.atomic import write_atomically
+from storage.digests import canonical_json
+from storage.errors import TrilightError
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectRecord:
-    """One 3D object as it was found: a readable file and the rights to it."""
+class NamedObject:
+    """What every row about an object says: which one it is, and the rights to it."""
 
     uid: str
     """Unique in its source, and stable: it names the object in every later record."""
-    path: str
-    """The file, absolute, on this machine; never published."""
     title: str
     """For people."""
     licence: str
@@ -24,25 +35,21 @@ class ObjectRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LockedObject:
+class ObjectRecord(NamedObject):
+    """One 3D object as it was found: a readable file and the rights to it."""
+
+    path: str
+    """The file, absolute, on this machine; never published."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LockedObject(NamedObject):
     """One accepted object of a dataset, as `objects.lock.jsonl` freezes it."""
 
-    uid: str
-    """As in ObjectRecord."""
     asset_sha256: str
     """Digest of the prepared asset file: the exact triangles that scenes use."""
     split: str
     """train, validation or test, by a hash of the cleaned geometry: copies stay together."""
-    licence: str
-    """SPDX identifier, or `LicenseRef-...`."""
-    licence_source: str
-    """Where the licence is stated, and as of when."""
-    title: str
-    """For people."""
-    attribution: str
-    """Whom to name."""
-    source_url: str
-    """Where the object came from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,3 +66,76 @@ class Failure:
     """One sentence for a person."""
     attempt: int = 0
     """Which attempt at the item this was, from 0."""
+
+
+def encode_objects_lock(objects: Iterable[LockedObject]) -> bytes:
+    """Return the file of a lock: one line per object, sorted by uid."""
+    rows = sorted(objects, key=lambda entry: entry.uid)
+    return _lines(rows)
+
+
+def write_objects_lock(path: Path, objects: Iterable[LockedObject]) -> None:
+    """Write the lock atomically."""
+    write_atomically(path, encode_objects_lock(objects))
+
+
+def read_objects_lock(path: Path) -> list[LockedObject]:
+    """Return the objects of a lock.
+
+    Raises:
+        TrilightError: missing, or a line that is not a locked object.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise TrilightError(f"{path}: cannot be read ({error.strerror}).") from error
+    return decode_objects_lock(data, str(path))
+
+
+def decode_objects_lock(data: bytes, place: str) -> list[LockedObject]:
+    """Return the objects of the bytes of a lock; raises as `read_objects_lock`, naming `place`."""
+    objects = []
+    for number, line in enumerate(data.splitlines(), start=1):
+        try:
+            objects.append(LockedObject(**json.loads(line)))
+        except (TypeError, ValueError) as error:
+            raise TrilightError(f"{place}:{number}: not a locked object ({error}).") from error
+    return objects
+
+
+def encode_failures(failures: Iterable[Failure]) -> bytes:
+    """Return one line per failure, each once, sorted by stage, item and attempt."""
+    rows = sorted(set(failures), key=lambda row: (row.stage, row.item, row.attempt, row.reason))
+    return _lines(rows)
+
+
+def decode_failures(data: bytes) -> list[Failure]:
+    """Return the failures of a file that `encode_failures` made.
+
+    Raises:
+        TrilightError: a line is not a failure.
+    """
+    try:
+        return [Failure(**json.loads(line)) for line in data.splitlines()]
+    except (TypeError, ValueError) as error:
+        raise TrilightError(f"failures.jsonl: a line is not a failure ({error}).") from error
+
+
+def read_failures(path: Path) -> list[Failure]:
+    """Return the failures of a file; none where there is no file."""
+    return decode_failures(path.read_bytes()) if path.exists() else []
+
+
+def write_failures(path: Path, failures: Iterable[Failure]) -> None:
+    """Write the failures atomically."""
+    write_atomically(path, encode_failures(failures))
+
+
+def count_by_reason(failures: Iterable[Failure]) -> list[tuple[str, str, int]]:
+    """Return (stage, reason, how many), the most frequent first."""
+    counts = Counter((failure.stage, failure.reason) for failure in failures)
+    return [(stage, reason, count) for (stage, reason), count in counts.most_common()]
+
+
+def _lines(rows: Iterable[LockedObject | Failure]) -> bytes:
+    return b"".join(canonical_json(dataclasses.asdict(row)) + b"\n" for row in rows)

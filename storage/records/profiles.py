@@ -28,7 +28,7 @@ Profile = Literal["lossless", "compact"]
 PROFILES: tuple[Profile, ...] = get_args(Profile)
 
 LAW_DB = 10.0
-"""By how much a codec must be better than the noise floor: a tenth of its mean square."""
+"""Margin of a codec over the noise floor: a tenth of its mean square."""
 
 DWA_LEVELS = (200.0, 100.0, 45.0, 20.0, 10.0)
 """What `compact` tries, from coarse to fine. Coarser ones flatten what the eye sees, though the law
@@ -38,7 +38,7 @@ PLAIN, PACKED = "scene.safetensors", "scene.safetensors.gz"
 """Suffixes of the member with a scene's arrays. WebDataset undoes `.gz` by itself."""
 
 MAX_ARRAY_BYTES = 1 << 28
-"""Of a scene's arrays unpacked; a million triangles take 68 MB."""
+"""Maximum size of a scene's unpacked arrays; a million triangles take 68 MB."""
 
 _GZIP = 31
 """zlib's name for a gzip stream; its header then holds no time."""

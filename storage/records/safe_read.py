@@ -22,7 +22,7 @@ def open_plain(path: Path) -> BinaryIO:
     """Open a regular file for reading.
 
     Raises:
-        OSError: as `open`, or it is something else: opening a FIFO would wait for ever.
+        OSError: as `open`, or it is something else: opening a FIFO would block forever.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # of regular files, it changes nothing
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):

@@ -35,7 +35,7 @@ from storage.records.scene_file import (
 )
 
 _FAR = 1000.0
-"""Beyond any noise floor in dB and any share."""
+"""A bound beyond any noise floor in dB and any share."""
 
 _EXPECTED: Mapping[Any, str] = {
     int: "a whole number",
@@ -154,7 +154,7 @@ def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
 
     Raises:
         TrilightError: a member is missing, unreadable or of another schema version. Laws are not
-            checked here; `Sample.check` does that for whoever learns from a sample.
+            checked here; `Sample.check` does that before a network learns from it.
     """
     record = decode_scene(key, members)
     try:

@@ -45,10 +45,10 @@ network for positions so far out to half a thousandth of a radian, and path trac
 to 0.06 mm. Far beyond, both make wrong pictures without a word."""
 
 POSITION = Within(-MAX_POSITION_M, MAX_POSITION_M, unit="m")
-"""Of a vertex along an axis."""
+"""Range of a vertex coordinate."""
 
 COMPONENT = Within(-1 - UNIT_NORMAL_TOLERANCE, 1 + UNIT_NORMAL_TOLERANCE)
-"""Of a unit vector."""
+"""Range of a component of a unit vector."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ writes several in any order.) Equal scenes give equal bytes.
 
 Such a file comes from anywhere. Its size, its header and every shape are checked before an array is
 made, names and types must be exactly those of a scene, and the laws of `Scene.check` hold for
-whatever is returned.
+every scene that is returned.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ MAX_HEADER_BYTES = 8 << 20
 """An object takes 150 bytes and its attribution; there are at most 65,536."""
 
 CARRIED = frozenset({*ARRAY_FIELDS, "objects", "provenance"})
-"""Of a scene (storage.records.carried): all, whatever a material or an object may come to hold."""
+"""What the form holds of a scene (pipeline.exchange.formats): all of it, added columns too."""
 
 _METADATA, _COLUMNS = "trilight_scene", "material_columns"
 _DTYPE_NAMES: Mapping[type, str] = {np.float32: "F32", np.uint32: "U32", np.uint16: "U16"}

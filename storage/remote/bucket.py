@@ -2,7 +2,7 @@
 
 A bucket shows a file when all of it has come, however large it is, so a kill leaves nothing half
 written; parts of an upload that was cut off are invisible, and a rule of the bucket may delete them
-(AbortIncompleteMultipartUpload). "Only once" is a condition that the server itself looks at.
+(AbortIncompleteMultipartUpload). "Only once" is a condition that the server itself checks.
 """
 
 from collections.abc import Callable
@@ -17,9 +17,9 @@ WRITABLE = ("s3", "gs")
 """Schemes of servers that can be told to write a file only where there is none."""
 _PART_BYTES = 32 << 20
 _PARTS_AT_ONCE = 4
-"""Together they bound what an upload holds in memory."""
+"""Part size and concurrency together bound the memory of an upload."""
 _PROBE = ".staging/once"
-"""Says whether the server creates a file only once; it may stay."""
+"""Test file that shows whether the server creates a file only once; it may stay."""
 
 
 class Bucket:
@@ -58,9 +58,9 @@ class Bucket:
         self._tried(lambda: self._put(name, content, mode="overwrite"), "written")
 
     def create(self, name: str, content: Path | bytes) -> bool:
-        """Write a file unless there is one, and say whether it was written; else as `write`.
+        """Write a file unless it exists, and return whether it was written; otherwise as `write`.
 
-        Where the answer to a write that succeeded is lost, the file counts as one of somebody else.
+        Where the answer to a successful write is lost, another worker counts as its writer.
         """
 
         def put() -> bool:
@@ -79,7 +79,7 @@ class Bucket:
         if self.create(_PROBE, b"\n") and self.create(_PROBE, b"\n"):
             raise TrilightError(
                 f"{self.url.what} {self.url.shown!r}: the server does not know conditional writes "
-                "(If-None-Match, or ifGenerationMatch), so two makers could replace each other's "
+                "(If-None-Match, or ifGenerationMatch), so two workers could replace each other's "
                 "files; expected one that refuses to create a file twice. Use another server, or "
                 "a folder."
             )

@@ -1,7 +1,7 @@
 """Shards of servers on this machine: fetched whole, checked on arrival, bounded, shared.
 
 Any number of processes may use the same folder. A shard appears by rename, when all of it has come
-and its hash is right. Who reads one holds a shared lock on it; what is locked is never removed. One
+and its hash is right. A reader holds a shared lock on its shard, which is then never removed. One
 process fetches a shard while the others wait for it. Locks die with the process that holds them.
 """
 
@@ -9,12 +9,12 @@ import contextlib
 import fcntl
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_error
+from storage.atomic import TEMPORARY_SUFFIX, atomic_writer
 from storage.cache import cache_folder
+from storage.claims import claimed
 from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.remote.fetch import download, facts_of, unreadable
@@ -52,25 +52,25 @@ class ShardCache:
             url: the shard.
             num_bytes: its size, where a manifest says it.
             sha256: its digest, where a manifest says it; without one, the shard is known by what
-                the server says of it, and whatever arrives is taken.
+                the server says of it, and its bytes are not checked.
 
         Raises:
-            TrilightError: it cannot be had, has another size, its bytes are wrong twice in a row,
-                or the disk is full.
+            TrilightError: it cannot be fetched, has another size, twice has the wrong bytes, or
+                the disk is full.
         """
         try:
             path = self.root / _name(url, sha256)
             while True:
                 if (stream := _open_shared(path)) is not None:
                     return stream
-                with self._only_fetcher_of(path):
+                with claimed(self._lock_of(path), wait=True):
                     if not path.exists():
                         self._fetch(url, path, num_bytes, sha256)
         except TransferFailed as error:
             raise unreadable(url, error) from error
 
     def keep(self, path: Path, url: RemoteUrl, sha256: str) -> None:
-        """Take over a shard of this machine that is on the server too: nobody has to fetch it.
+        """Move a shard of this machine into the cache, since it is on the server too.
 
         The file is gone afterwards, also where the cache has no room for it.
 
@@ -103,7 +103,7 @@ class ShardCache:
         )
 
     def _make_room(self, num_bytes: int) -> None:
-        """Remove what was not read for longest, until so many bytes more are within the limit."""
+        """Remove the least recently read shards, until `num_bytes` more fit within the limit."""
         found = []
         for path in self.root.glob("*"):
             with contextlib.suppress(OSError):
@@ -119,20 +119,9 @@ class ShardCache:
             if _remove_unread(path):
                 taken -= size
 
-    @contextlib.contextmanager
-    def _only_fetcher_of(self, path: Path) -> Iterator[None]:
-        folder = self.root.with_name(f"{self.root.name}-locks")
-        lock = folder / f"{int(sha256_hex(path.name.encode())[:8], 16) % _LOCKS:02d}"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise write_error(lock, error) from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-            yield
-        finally:
-            os.close(descriptor)
+    def _lock_of(self, path: Path) -> Path:
+        number = int(sha256_hex(path.name.encode())[:8], 16) % _LOCKS
+        return self.root.with_name(f"{self.root.name}-locks") / f"{number:02d}"
 
 
 class _WrongBytes(Exception):
@@ -177,7 +166,7 @@ def _open_shared(path: Path) -> BinaryIO | None:
 
 
 def _remove_unread(path: Path) -> bool:
-    """Remove a shard unless somebody reads it; returns whether its bytes are free."""
+    """Remove a shard unless a process reads it; return whether its bytes are free."""
     try:
         with path.open("rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from storage.errors import TrilightError
-from storage.remote.pace import PATIENCE, Pace
-from storage.remote.tries import Interrupted, TransferFailed, with_tries
+from storage.remote.tries import PATIENCE, Interrupted, Pace, TransferFailed, with_tries
 from storage.remote.url import RemoteUrl, shared_driver, transfer_timeout
 
 PIECE_BYTES = 8 << 20
@@ -20,7 +19,7 @@ _VERSION_FIELDS = (
     "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "updated",
     "md5Hash", "Content-MD5", "blob_id",
 )  # fmt: skip
-"""Under which names the drivers say when a file changed."""
+"""Names under which the drivers report the version of a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +68,7 @@ def download(url: RemoteUrl, stream: BinaryIO, *, num_bytes: int | None, max_byt
 
     Raises:
         TransferFailed: as `facts_of`, it has another size than `num_bytes`, it breaks off again and
-            again without moving on, or comes too slowly (storage.remote.pace).
+            again without moving on, or comes too slowly (storage.remote.tries).
         TrilightError: the driver's package is missing, or the disk is full.
     """
     driver = shared_driver(url)
@@ -101,7 +100,7 @@ class _Expected:
             raise TransferFailed("too_large_bytes", message)
 
     def is_same(self, version: Mapping[str, str]) -> bool:
-        """Say whether the file is still the one that the bytes so far came from."""
+        """Return whether the file is still the one that the bytes so far came from."""
         before, self.version = self.version, dict(version)
         return before in (None, self.version)
 
@@ -176,7 +175,7 @@ def _start_over(stream: BinaryIO) -> None:
 
 
 def unreadable(url: RemoteUrl, error: TransferFailed) -> TrilightError:
-    """Return the user's view of a file that cannot be had."""
+    """Return the user's view of a file that cannot be read."""
     hint = " Public buckets need FSSPEC_S3_ANON=true." if url.scheme == "s3" else ""
     return TrilightError(
         f"{url.what} {url.shown!r}: cannot be read ({error.message}); expected a file that can be "

@@ -1,33 +1,31 @@
-"""Trying again what may pass by itself, and saying what went wrong without secrets."""
+"""Retries of remote requests, the least rate of a transfer, and error messages without secrets."""
 
 import errno
 import os
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
 
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote.safe_url import printable, safe_text
 
-if TYPE_CHECKING:
-    from storage.remote.pace import Pace
-
 Result = TypeVar("Result")
 
 TRIES = 5
-"""In a row without progress at the least rate (storage.remote.pace)."""
+"""Number of tries in a row without progress at the least rate (`Patience`)."""
 PAUSE_S = 0.5
-"""Before the second try; doubled before each further one, up to MAX_PAUSE_S."""
+"""Pause before the second try; doubled before each further one, up to MAX_PAUSE_S."""
 MAX_PAUSE_S = 20.0
 _MOST_TRIES = 1000
-"""Of a transfer that moves on a little each time."""
+"""Maximum number of tries of a transfer that progresses a little each time."""
 _MAX_MESSAGE = 200
 _MAY_PASS_STATUS = (408, 409, 425, 429)
-"""Among them: two who create one file at the same time, of whom one is told to ask again."""
+"""HTTP statuses worth a retry; 409: concurrent creation, the loser retries."""
 
 
 class TransferFailed(Exception):
-    """Something cannot be had, for good.
+    """A permanent transfer failure.
 
     Attributes:
         reason: a stable code in snake_case.
@@ -45,7 +43,7 @@ class Interrupted(Exception):
 
 
 def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) -> Result:
-    """Call a function again while what goes wrong may pass by itself, after longer and longer.
+    """Retry a function after transient errors, with growing pauses.
 
     The pause before try n is PAUSE_S 2^(n-1), at most MAX_PAUSE_S, times a random factor between a
     half and one and a half, so that many readers of one server do not come back all at once.
@@ -83,31 +81,31 @@ def with_tries(function: Callable[[], Result], *, pace: "Pace | None" = None) ->
 
 
 def root_error(error: BaseException) -> BaseException:
-    """Return what went wrong: the HTTP driver reports every error of a question as a lack."""
+    """Return the cause: the HTTP driver reports every error of a request as a missing file."""
     while isinstance(error, FileNotFoundError | Interrupted) and error.__cause__ is not None:
         error = error.__cause__
     return error
 
 
 def is_missing(error: BaseException) -> bool:
-    """Say whether a server answered that there is no such file."""
+    """Return whether a server answered that there is no such file."""
     cause = root_error(error)
     return isinstance(cause, FileNotFoundError) or _status(cause) in (404, 410)
 
 
 def is_absent(error: BaseException) -> bool:
-    """Say whether a server answered that there is no such file, or none that we may see."""
+    """Return whether a server answered that there is no such file, or none that we may see."""
     cause = root_error(error)
     return is_missing(error) or isinstance(cause, PermissionError) or _status(cause) in (401, 403)
 
 
 def is_taken(error: BaseException) -> bool:
-    """Say whether a server answered that there is such a file already."""
+    """Return whether a server answered that there is such a file already."""
     return isinstance(error, FileExistsError) or 412 in (_status(error), _status(error.__cause__))
 
 
 def may_pass(error: BaseException) -> bool:
-    """Say whether the same request may succeed a little later."""
+    """Return whether the same request may succeed a little later."""
     status = _status(error)
     if status is not None:
         return status >= 500 or status in _MAY_PASS_STATUS
@@ -144,3 +142,65 @@ def _status(error: BaseException | None) -> int | None:
 def _chance() -> float:
     """Return a number in [0, 1) that no two processes share; it decides nothing but a pause."""
     return int.from_bytes(os.urandom(4), "little") / 2**32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Patience:
+    """How long a file is waited for."""
+
+    least_bytes_per_s: float = 10_000.0
+    """Mean rate below which a transfer ends: a shard of 100 MB would take three hours. The slowest
+    links that people work over, mobile ones at the edge of a cell, give twice that."""
+    window_s: float = 300.0
+    """Seconds over which the mean is taken; a link may be gone for nearly as long."""
+    file_s: float = 86_400.0
+    """Seconds for all of one file, tries and beginnings anew included: a day, in which the least
+    rate brings 864 MB."""
+
+
+PATIENCE = Patience()
+
+
+class Pace:
+    """Watches one file on its way, over all tries."""
+
+    def __init__(
+        self, position: Callable[[], int], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Begin to watch.
+
+        Args:
+            position: how many bytes have come; falls where a transfer begins anew.
+            clock: seconds.
+        """
+        self._position = position
+        self._clock = clock
+        self._patience = PATIENCE
+        self._begun = self._window = self._tried = (clock(), position())
+
+    def require(self) -> None:
+        """Raise TransferFailed where the file comes too slowly, or took too long altogether.
+
+        To be called at every arrival and after every try: what is slow ends within two windows.
+        """
+        now_s, reached = self._clock(), self._position()
+        if now_s - self._begun[0] > self._patience.file_s:
+            message = f"it did not come within {self._patience.file_s:.0f} s"
+            raise TransferFailed("download_failed", message)
+        passed_s, moved = now_s - self._window[0], reached - self._window[1]
+        if passed_s < self._patience.window_s:
+            return
+        if moved < self._patience.least_bytes_per_s * passed_s:
+            raise TransferFailed(
+                "download_failed",
+                f"it is too slow, {max(moved, 0)} bytes in {passed_s:.0f} s; expected at least "
+                f"{self._patience.least_bytes_per_s:.0f} a second",
+            )
+        self._window = (now_s, reached)
+
+    def has_moved_on(self) -> bool:
+        """Return whether the file came at the least rate since this was asked last."""
+        before_s, before = self._tried
+        self._tried = now_s, reached = self._clock(), self._position()
+        least = self._patience.least_bytes_per_s * (now_s - before_s)
+        return reached - before > max(least, 0)

@@ -52,7 +52,7 @@ class RemoteUrl:
 
     @property
     def is_http(self) -> bool:
-        """Names of files in URLs of http are quoted; those of buckets are as they are."""
+        """Whether the scheme is http or https; file names in such URLs are quoted."""
         return self.scheme in ("http", "https")
 
     @property
@@ -135,7 +135,7 @@ def _driver_of(access: RemoteUrl, process: int) -> Any:
 
 
 def transfer_timeout() -> Any:
-    """Return the limits of a request for a file, which storage.remote.pace bounds as a whole."""
+    """Return the limits of a request for a file, which storage.remote.tries bounds as a whole."""
     import aiohttp
 
     return aiohttp.ClientTimeout(connect=_CONNECT_S, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)

@@ -11,9 +11,8 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from storage.errors import TrilightError
+from storage.errors import TrilightError, expected_one_of
 from storage.settings.described import field_value, settings_record
-from storage.suggestion import expected_one_of
 
 Settings = TypeVar("Settings")
 

@@ -8,7 +8,7 @@ from storage.settings.described import checked
 from storage.settings.ranges import Within
 
 MOST_SCENES = 1_000_000_000
-"""Of a dataset: a sample's name holds nine digits."""
+"""Maximum number of scenes in a dataset: a sample's name has nine digits."""
 
 
 @checked()

@@ -25,9 +25,8 @@ from typing import Annotated, Any, Literal, TypeVar, dataclass_transform, get_ar
 import pydantic
 from pydantic.dataclasses import dataclass
 
-from storage.errors import TrilightError
+from storage.errors import TrilightError, expected_one_of
 from storage.settings.ranges import Within, declared_ranges
-from storage.suggestion import expected_one_of
 
 Settings = TypeVar("Settings")
 
@@ -83,9 +82,9 @@ class Described:
     hint: Any
     """Its type, with its notes."""
     default: Any
-    """Its value where nobody gives one; dataclasses.MISSING where it must be given."""
+    """Its default; dataclasses.MISSING where a value must be given."""
     sentence: str
-    """What stands under it, in one line."""
+    """The sentence under it, in one line."""
     within: Within | None
     """The range of its numbers."""
     expected: str
@@ -118,7 +117,7 @@ def described(kind: type) -> tuple[Described, ...]:
 def field_sentences(kind: type) -> dict[str, str]:
     """Return what stands under each field of a dataclass, its bases' included, by name.
 
-    Read from the source when somebody asks: pydantic would read it whenever settings are imported.
+    Read from the source on demand: pydantic would read it whenever settings are imported.
     """
     sentences: dict[str, str] = {}
     for cls in reversed(kind.__mro__[:-1]):
@@ -282,3 +281,42 @@ def _groups(hint: Any) -> Iterator[type]:
         yield hint
     for part in get_args(hint):
         yield from _groups(part)
+
+
+def option_words(settings: Any, *, leave_out: tuple[str, ...] = ()) -> list[str]:
+    """Return the options of a command that state settings, but for those at their default.
+
+    Args:
+        settings: an instance of a class of settings.
+        leave_out: fields that are not stated.
+    """
+    kind: Any = type(settings)
+    return [
+        word
+        for field in described(kind)
+        if field.name not in leave_out and getattr(settings, field.name) != field.default
+        for word in _words(option_of(field.name), getattr(settings, field.name))
+    ]
+
+
+def _words(option: str, value: Any) -> Iterator[str]:
+    if isinstance(value, bool):
+        yield option
+    elif isinstance(value, Mapping):
+        for name, new in value.items():
+            yield from (option, f"{name}={_json_or_word(new)}")
+    elif isinstance(value, tuple):
+        for entry in value:
+            yield from (option, str(entry))
+    else:
+        yield from (option, str(value))
+
+
+def _json_or_word(value: Any) -> str:
+    """Return a value as the command line reads it: a word that is no JSON stands for itself."""
+    if isinstance(value, str):
+        try:
+            json.loads(value)
+        except json.JSONDecodeError:
+            return value
+    return json.dumps(value)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Within:
-    """Least and greatest value; both are admitted, but for an end that is open."""
+    """Lowest and highest value; both are admitted unless that end is open."""
 
     low: float
     """The least value."""
@@ -40,7 +40,7 @@ class Within:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Let pydantic check the range after the type: of a number, or of each in a tuple."""
-        from pydantic_core import core_schema  # whoever only reads scenes has no need of it
+        from pydantic_core import core_schema  # readers of scenes do without pydantic
 
         return core_schema.no_info_after_validator_function(self._checked, handler(source))
 
@@ -86,12 +86,12 @@ class Within:
 
 
 _EXACT = 2**53
-"""Beyond it forms show other numbers than were meant: JavaScript has no larger integers."""
+"""Largest integer of JavaScript; forms would show larger ones rounded."""
 
 
 @dataclass(frozen=True)
 class LowFirst:
-    """Of a pair: the first number is at most the second."""
+    """Law of a pair: the first number is at most the second."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Let pydantic check the order after the type."""
@@ -114,9 +114,9 @@ class Columns:
     name: str
     """What the columns hold."""
     columns: slice
-    """Of the last axis."""
+    """The columns, as a slice of the last axis."""
     within: Within
-    """Where every number of them lies."""
+    """Range of every value."""
 
 
 Share = Annotated[float, Within(0, 1)]
@@ -145,7 +145,7 @@ class Declared:
     """What a field, or some columns of one, may hold."""
 
     name: str
-    """Of the field."""
+    """Name of the field."""
     kind: type
     """int or float; a float may be given as an int."""
     shape: Shape
@@ -153,7 +153,7 @@ class Declared:
     optional: bool
     """Whether None is admitted."""
     within: Within
-    """Where every number lies."""
+    """Range of every value."""
     ordered: bool = False
     """Whether the lower number of a pair must come first."""
     part: Columns | None = None

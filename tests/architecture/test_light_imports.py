@@ -23,7 +23,7 @@ def _loaded_by(statement: str) -> set[str]:
     "statement",
     [
         "import storage",
-        "from storage.dataset import dataset, verify, staging, shard_writer",
+        "from storage.dataset import dataset, verify, staging, shard",
         "import scene_templates.templates, scene_templates.settings",
     ],
 )

@@ -21,7 +21,7 @@ from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.making.inspect_scene import _facts
 from pipeline.making.render_scene import PathTracer
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import open_training_data

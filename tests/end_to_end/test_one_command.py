@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from storage.dataset.dataset import open_dataset
-from storage.records.failures import read_failures
+from storage.records.objects import read_failures
 from tests.end_to_end.conftest import Trilight
 
 SMALL = ("--resolution", "32", "--noise-floor", "20", "--scenes", "12")

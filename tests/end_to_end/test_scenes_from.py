@@ -10,7 +10,7 @@ import pytest
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.staging import stage_scene
-from storage.records.failures import read_failures
+from storage.records.objects import read_failures
 from tests.end_to_end.conftest import Trilight
 
 SMALL = (

@@ -18,15 +18,14 @@ from pipeline.flows.orders import DatasetInRuns
 from pipeline.making.price import CorePrice
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from scene_templates.cameras import CameraSettings
-from scene_templates.excursions import Excursion
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.separate_sides import SideRanges
-from scene_templates.settings import MAX_TRIANGLES, SceneSettings, ViewLaws
+from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
 from storage.records.scene import Scene
 from storage.settings.dataset import SplitSettings
 from storage.settings.ranges import Declared, declared_ranges

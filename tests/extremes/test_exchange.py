@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from infra.bench.subjects.cost_scene import cost_scene
-from pipeline.exchange.renderformer_json_write import described_files
+from pipeline.exchange.renderformer_json import described_files
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import MAX_POSITION_M, Scene, SceneObject

@@ -17,7 +17,7 @@ from pipeline.renders.settings import MAX_SPP, RenderSettings
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from scene_templates.cameras import CameraSettings
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings

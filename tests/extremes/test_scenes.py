@@ -10,7 +10,7 @@ import pytest
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.records.scene import Scene

@@ -13,8 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
-from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_exr

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.exchange.renderformer_json_write import described_files
+from pipeline.exchange.renderformer_json import described_files
 from tests.scenes_by_hand import tiny_scene
 
 Make = Callable[[Path], object]

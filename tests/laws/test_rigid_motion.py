@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.scenes.sight import Sight
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.rotations import uniform_rotation
 from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene

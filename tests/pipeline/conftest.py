@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene
 from tests.pipeline.scenes.small_pool import first_scene, pooled, small_pool

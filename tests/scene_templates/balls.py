@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.layout import Layout, Pose
-from scene_templates.layout_rand import layout_rand
-from scene_templates.plans import ScenePlan, scene_plan
+from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.seeds import rng_for

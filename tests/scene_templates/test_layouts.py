@@ -5,13 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from scene_templates.cameras import CameraSettings, camera_rand
+from scene_templates.cameras import CameraSettings, Sector, camera_rand
 from scene_templates.layout import Layout, Pose
 from scene_templates.materials import MaterialSettings, surface_rand
 from scene_templates.placement import TOUCHING
 from scene_templates.renderformer_v1 import stage_1_families
 from scene_templates.rooms import plane_of
-from scene_templates.sectors import Sector
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected

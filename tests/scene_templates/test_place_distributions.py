@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scene_templates.cameras import CameraSettings, camera_rand
+from scene_templates.cameras import CameraSettings, Sector, camera_rand
 from scene_templates.layout import CameraPose
 from scene_templates.lights import LightSettings, emitters_rand
-from scene_templates.patches import SIDES, PatchPlacement
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
-from scene_templates.rooms import SharedRoom, plane_of
-from scene_templates.sectors import Sector
+from scene_templates.rooms import SIDES, PatchPlacement, SharedRoom, plane_of
 from scene_templates.templates import TEMPLATES
 from tests.scene_templates.balls import DEFAULTS, MANY, Drawn, drawn, drawn_once, template_settings
 from tests.scene_templates.published import side_row

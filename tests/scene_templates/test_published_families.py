@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from scene_templates.default_families import DEFAULT_FAMILIES
-from scene_templates.family import Family
+from scene_templates.families import DEFAULT_FAMILIES, Family
 from scene_templates.layout import ShellPart
-from scene_templates.patches import SIDES, PatchPlacement, patch
 from scene_templates.renderformer_v1 import Policy, stage_1_families, stage_2_families
-from scene_templates.rooms import plane_of
+from scene_templates.rooms import SIDES, PatchPlacement, patch, plane_of
 from scene_templates.separate_sides import SeparateSides
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES

@@ -7,8 +7,15 @@ import pytest
 from numpy.typing import NDArray
 
 from scene_templates.layout import ShellPart
-from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
-from scene_templates.rooms import Room, SharedRoom, plane_of
+from scene_templates.rooms import (
+    PATCH_FACES,
+    SIDES,
+    PatchPlacement,
+    Room,
+    SharedRoom,
+    patch,
+    plane_of,
+)
 from scene_templates.templates import TEMPLATES
 from tests.scene_templates.balls import drawn, template_settings
 

@@ -8,15 +8,14 @@ from typing import Any
 import pytest
 
 from scene_templates.cameras import CameraSettings
-from scene_templates.excursions import Excursion
-from scene_templates.family import Family
+from scene_templates.families import Family
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.separate_sides import SideRanges
-from scene_templates.settings import SceneSettings, ViewLaws
+from scene_templates.settings import Excursion, SceneSettings, ViewLaws
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.settings.changes import changed

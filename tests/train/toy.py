@@ -16,7 +16,7 @@ from storage.conventions import camera_rays, look_at_c2w
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR, completed_rows
 from storage.records.material import EMISSION as EMITTED
 from storage.records.sample import Sample, ViewRecord, encode_sample, sample_key

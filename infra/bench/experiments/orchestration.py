@@ -22,7 +22,7 @@ from infra.bench.sides import prefect_process
 from infra.bench.workshop import Workshop
 from pipeline.making.pieces import MOST_TASKS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.scene_log import SceneLog, read_scene_logs
+from storage.dataset.progress import SceneLog, read_scene_logs
 
 WINDOW = 8
 RENDERING, WAITING = (1, 2, 4), (1, 2, 4, 8, 16)

@@ -5,9 +5,8 @@ import sys
 from pathlib import Path
 
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, index_shard, write_manifest
-from storage.dataset.member_table import MemberTable
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.manifest import Manifest, MemberTable, ShardEntry, index_shard, write_manifest
+from storage.dataset.shard import write_shard
 from storage.installation import IMPORT_ROOT, module_name
 from storage.records.sample import sample_key
 

@@ -20,8 +20,7 @@ from pipeline.scenes.pieces import joined
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
 from pipeline.scenes.views import with_first_cameras
-from scene_templates.layout_rand import layout_rand
-from scene_templates.plans import scene_plan
+from scene_templates.layout_rand import layout_rand, scene_plan
 from scene_templates.settings import SceneSettings
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene

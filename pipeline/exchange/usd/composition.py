@@ -14,19 +14,19 @@ from typing import Any
 from storage.errors import TrilightError
 
 MAX_PRIMS = 500_000
-"""That composition may make; instances of one prototype count once."""
+"""Maximum number of composed prims; instances of one prototype count once."""
 MAX_DEPTH = 150
-"""Of prims within prims."""
+"""Maximum nesting of prims."""
 MAX_COMPOSITION_S = 20.0
-"""Processor seconds for all prims: 500,000 of few arcs each take 4 to 10, chains of thousands of
-references or prims of thousands of sites take hours."""
+"""Maximum processor seconds for all prims: 500,000 of few arcs each take 4 to 10;
+chains of thousands of references or prims of thousands of sites take hours."""
 
 
 def composition_errors(root: Any, context: Any, name: str) -> Sequence[Any]:
     """Compose all prims below a root layer, payloads too, and return USD's errors.
 
     Args:
-        root: the layer; whatever it names must have been looked at (pipeline.exchange.usd.stage).
+        root: the layer; every file it names must have been checked (pipeline.exchange.usd.stage).
         context: resolver context of the stage that will be opened.
         name: of the file, for messages.
 

@@ -11,7 +11,7 @@ from pipeline.exchange.usd.foreign_placed import Placed
 from storage.conventions import look_at_c2w
 
 _FOV_DEG = 40.0
-"""Of the camera that is made where a stage has none."""
+"""Field of view of the camera that is added to a stage without cameras."""
 
 
 def cameras(

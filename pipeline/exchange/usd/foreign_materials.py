@@ -67,12 +67,9 @@ _LOST = {
 class MeshToShade:
     """A mesh whose triangles get materials."""
 
-    prim: Any
-    """The mesh."""
-    soup: TriangleSoup
-    """Its triangles."""
-    indices: NDArray[np.int64]
-    """Point of each of its corners."""
+    prim: Any  # the mesh
+    soup: TriangleSoup  # its triangles
+    indices: NDArray[np.int64]  # point of each of its corners
 
 
 def material_rows(surface: MeshToShade, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from storage.errors import TrilightError
 
 MAX_PLACED = 100_000
-"""Most prims that are looked at, instances counted each."""
+"""Maximum number of visited prims; every instance counts."""
 MAX_NESTED = 150
-"""Most prims within prims, through prototypes too."""
+"""Maximum nesting of prims, through prototypes too."""
 
 _READ = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight")
 _SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "SkelRoot", "")
@@ -23,10 +23,8 @@ _SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "S
 class Placed:
     """A prim in its place."""
 
-    prim: Any
-    """The USD prim; several places may share one."""
-    to_world: NDArray[np.float64]
-    """[4, 4], for column vectors, into metres with +Z up."""
+    prim: Any  # the USD prim; several places may share one
+    to_world: NDArray[np.float64]  # [4, 4], for column vectors, into metres with +Z up
 
 
 def placed_prims(stage: Any, time: Any, lost: list[str]) -> list[Placed]:

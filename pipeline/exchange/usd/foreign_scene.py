@@ -1,4 +1,4 @@
-"""From the placed prims of a stage to a `Scene`."""
+"""Makes a `Scene` of the placed prims of a stage."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,13 +16,12 @@ from pipeline.exchange.usd.stage import OpenedUsd
 from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.shading import ShadedMesh, flat_shaded
 from storage.errors import TrilightError
-from storage.records.material import EMISSION, ROUGHNESS, default_rows
-from storage.records.rows import distinct_rows
+from storage.records.material import EMISSION, ROUGHNESS, default_rows, distinct_rows
 from storage.records.scene import ObjectKind, Scene, SceneObject
 
 MAX_TRIANGLES = 1_000_000
 MAX_ROWS = 1 << 16
-"""Most objects and most materials of a scene."""
+"""Maximum number of objects and of materials in a scene."""
 
 
 def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Scene:

@@ -18,7 +18,7 @@ from storage.errors import TrilightError
 
 MAX_BYTES = 256 << 20
 MAX_PIXELS = 64 << 20
-"""Of one picture."""
+"""Maximum size of one picture."""
 
 _STEPS = 8
 """Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""
@@ -28,18 +28,12 @@ _STEPS = 8
 class Texture:
     """A picture as a material uses it."""
 
-    linear: NDArray[np.float32]
-    """[H, W, C] linear values, row 0 on top."""
-    wrap: tuple[str, str]
-    """USD's wrap modes along s and t."""
-    scale: NDArray[np.float32]
-    """[4]."""
-    bias: NDArray[np.float32]
-    """[4]."""
-    primvar: str
-    """Name of the texture coordinates."""
-    output: str
-    """rgb, r, g, b or a: what is connected."""
+    linear: NDArray[np.float32]  # [H, W, C] linear values, row 0 on top
+    wrap: tuple[str, str]  # USD's wrap modes along s and t
+    scale: NDArray[np.float32]  # [4]
+    bias: NDArray[np.float32]  # [4]
+    primvar: str  # name of the texture coordinates
+    output: str  # rgb, r, g, b or a: what is connected
 
     def means(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.float32], float]:
         """Return the mean [T, 3] over triangles with coordinates [T, 3, 2], and the deviation.
@@ -68,7 +62,7 @@ class Texture:
 
 
 def read_texture(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Texture | None:
-    """Return the texture of a UsdUVTexture shader, or None where it cannot be had (it is noted).
+    """Return the texture of a UsdUVTexture shader, or None, with a note, if unreadable.
 
     Raises:
         TrilightError: its file is outside of the folder or on the network.

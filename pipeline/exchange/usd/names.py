@@ -1,4 +1,4 @@
-"""Where a scene stands in a USD stage: paths, and attributes for what USD has no word for.
+"""Paths of a scene in a USD stage, and attributes for what USD has no word for.
 
     /Scene                        Xform, the default prim: provenance and digest
     /Scene/Materials/material_<m> one per material row: UsdPreviewSurface and OpenPBR
@@ -21,7 +21,7 @@ PROVENANCE = NAMESPACE + "provenance"
 UNUSED_ROWS = NAMESPACE + "unusedVertexRows"
 UNUSED_POSITIONS = NAMESPACE + "unusedPositions"
 UNUSED_NORMALS = NAMESPACE + "unusedNormals"
-"""On `/Scene`. Vertices without a triangle belong to no mesh, and stand there."""
+"""Attributes of `/Scene`, which also keeps the vertices that belong to no triangle."""
 
 INDEX = NAMESPACE + "index"
 VERTEX_ROWS = NAMESPACE + "vertexRows"
@@ -35,25 +35,21 @@ OBJECT_TEXTS = {
     "attribution": NAMESPACE + "attribution",
     "source_url": NAMESPACE + "sourceUrl",
 }
-"""On a mesh: row of the object, rows of its vertices and faces, and the fields of SceneObject."""
+"""Attributes of a mesh: row of its object, rows of vertices and faces, fields of SceneObject."""
 
-DIFFUSE_ALBEDO = NAMESPACE + "diffuseAlbedo"
-SPECULAR_ALBEDO = NAMESPACE + "specularAlbedo"
-ROUGHNESS_VALUE = NAMESPACE + "roughness"
-EMITTED_RADIANCE = NAMESPACE + "emittedRadiance"
 MATERIAL_ATTRIBUTES = {
-    "diffuse": DIFFUSE_ALBEDO,
-    "specular": SPECULAR_ALBEDO,
-    "roughness": ROUGHNESS_VALUE,
-    "emission": EMITTED_RADIANCE,
+    "diffuse": NAMESPACE + "diffuseAlbedo",
+    "specular": NAMESPACE + "specularAlbedo",
+    "roughness": NAMESPACE + "roughness",
+    "emission": NAMESPACE + "emittedRadiance",
 }
-"""On a material, by the names of its columns (storage.records.material)."""
+"""Attributes of a material, by the names of its columns (storage.records.material)."""
 
 _ADDED_COLUMN = NAMESPACE + "column:"
-"""Begins the attribute of a column that was added to the published ones."""
+"""Prefix of the attribute of a column that was added to the published ones."""
 
 FOV_DEG = NAMESPACE + "fovDeg"
-"""On a camera; its pose is the transform, in doubles that hold single precision exactly."""
+"""Attribute of a camera; its pose is the transform, in doubles that hold floats exactly."""
 
 
 def column_attribute(column: str) -> str:

@@ -10,31 +10,26 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.exchange.usd.diagnostics import quietly
 from pipeline.exchange.usd.foreign_scene import scene_of_stage
 from pipeline.exchange.usd.read_ours import is_marked, read_exact, scene_keys
-from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.exchange.usd.stage import OpenedUsd, quietly
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 
 MAX_FRAMES = 10_000
-"""Most scenes of a stage with time samples."""
+"""Maximum number of scenes in a stage with time samples."""
 MAX_NOTES = 40
-"""Most notes on one scene; what follows is counted."""
+"""Maximum number of notes on one scene; further notes are only counted."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UsdScene:
     """A scene and what could not be carried over."""
 
-    key: str
-    """Of a shard's sample, or the time code of a frame; empty where the file has one scene."""
-    scene: Scene
-    """It passes `Scene.check`."""
-    lost: tuple[str, ...]
-    """For people."""
-    exact: bool
-    """Whether Trilight wrote the file, and nothing has been changed since."""
+    key: str  # key of a shard's sample, or time code of a frame; empty where the file has one scene
+    scene: Scene  # it passes `Scene.check`
+    lost: tuple[str, ...]  # for people
+    exact: bool  # whether Trilight wrote the file, and nothing has been changed since
 
 
 def usd_keys(path: Path, folder: Path | None = None) -> list[str]:

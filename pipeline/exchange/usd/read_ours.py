@@ -1,9 +1,9 @@
 """A scene that Trilight wrote, read back from its layer bit for bit, without composing a stage.
 
-A file that somebody has changed - a mesh moved, a colour picked, a light added - is no longer what
-its exact attributes say. So everything that export writes is compared with what is there, and the
-geometry with its digest; where anything differs, this reader gives the file up and it is read like
-a stranger's (pipeline.scenes.usd).
+After an edit - a mesh moved, a colour picked, a light added - the exact attributes of a file are
+stale. So everything that export writes is compared with the file, and the geometry with its digest;
+where anything differs, this reader returns None and the file is read as a foreign one
+(pipeline.exchange.usd.foreign_scene).
 """
 
 import json
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import as_expected
-from pipeline.exchange.usd.write_cameras import camera_attributes
+from pipeline.exchange.usd.write import camera_attributes
 from pipeline.exchange.usd.write_materials import OPENPBR, PREVIEW, material_tables
 from pipeline.exchange.usd.write_meshes import MESH, SUBSET, object_attributes
 from storage.conventions import require_readable

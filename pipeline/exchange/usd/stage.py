@@ -1,30 +1,30 @@
-"""Opening a USD file of a stranger: which files may be read.
+"""Opens an untrusted USD file, and decides which other files it may read.
 
 A USD file can name other files, and the network. Which of them composition opens depends on all of
-them together; so nothing is foretold. Every file that any layer names for composition, used or
-not, is looked at by the path that USD's own resolver gives, is refused outside of the folder, and
-is opened here first: the closure of all names holds whatever composition can ask for. The layers of
-the stage are compared with the folder once more when it stands, and before anything of it is used.
-How large the stage may be is for `pipeline.exchange.usd.composition` to say. The bytes are still
-parsed by native code: whoever opens files of strangers does so in a child process with limits
-(pipeline.isolation).
+them together; so none is predicted. Every file that any layer names for composition, used or
+not, is checked by the path that USD's own resolver gives, is refused outside of the folder, and is
+opened here first: the closure of all names holds every file that composition can ask for. When the
+stage stands, its layers are compared with the folder once more, before anything of it is used.
+`pipeline.exchange.usd.composition` bounds the size of the stage. The bytes are still parsed by
+native code, so untrusted files are opened in a child process with limits (pipeline.isolation).
+`quietly` turns USD's own errors into one line that names the file and no folder of this machine.
 """
 
 import re
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from pipeline.exchange.usd.composition import composition_errors
-from pipeline.exchange.usd.diagnostics import said
 from storage.errors import TrilightError
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 MAX_FILE_BYTES = 1 << 30
-"""Of one file; a million triangles take about 70 MB."""
+"""Maximum size of a file; a million triangles take about 70 MB."""
 MAX_LAYERS = 1000
 MAX_MEMBERS = 10_000
-"""Of a usdz archive."""
+"""Maximum number of members in a usdz archive."""
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 
@@ -79,12 +79,12 @@ class OpenedUsd:
             self._refuse(plain, ", which is a link without an end")
         if not target.is_relative_to(self.folder) or ".." in Path(plain.partition("[")[2]).parts:
             self._refuse(plain, ", which is outside of its folder; copy it there")
-        if found and not target.is_file():  # opening a FIFO would wait for ever
+        if found and not target.is_file():  # opening a FIFO would block forever
             self._refuse(plain, ", which is no plain file")
         return found or None
 
     def compose(self) -> Any:
-        """Return the composed stage, of files that have all been looked at.
+        """Return the composed stage; all of its files have been checked.
 
         Raises:
             TrilightError: a file outside, the network, value clips, a circle, or too much of
@@ -210,3 +210,43 @@ def _check_package(path: Path, size: int) -> None:
             )
         if member.filename.startswith("/") or ".." in Path(member.filename).parts:
             raise TrilightError(f"{path.name}: member {member.filename!r:.80} leads outside.")
+
+
+Read = TypeVar("Read")
+
+_MAX_LETTERS = 300
+
+
+def quietly(path: Path, read: Callable[[], Read]) -> Read:
+    """Return what `read` makes of a file, without USD's own warnings on standard error.
+
+    Raises:
+        TrilightError: as `read`, or it met what is broken, or of another type than USD states.
+    """
+    from pxr import Tf, UsdUtils
+
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        return read()
+    except TrilightError:
+        raise
+    except Tf.ErrorException as error:
+        raise TrilightError(f"{path.name}: not readable as USD ({said(error, path)}).") from error
+    except (TypeError, ValueError, AttributeError, LookupError, OverflowError) as error:
+        raise TrilightError(
+            f"{path.name}: holds a value of another kind than USD states ({said(error, path)})."
+        ) from error
+    finally:
+        delegate.TakeUncoalescedDiagnostics()
+        del delegate
+
+
+def said(error: Exception, path: Path) -> str:
+    """Return what an error says, without USD's own source files and the folder of `path`."""
+    try:
+        text = " ".join(str(error).split())
+    except UnicodeDecodeError:  # it cites the file
+        return "bytes that are no text"
+    found = re.findall(r"\.(?:cpp|h|yy) : '(.*?)'?(?= Error in |$)", text)
+    text = (found[-1] if found else text).replace(f"{path.resolve().parent}/", "")
+    return "".join(letter if letter.isprintable() else "?" for letter in text)[:_MAX_LETTERS]

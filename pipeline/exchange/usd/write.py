@@ -1,20 +1,26 @@
 """`Scene` to USD: `.usda`, `.usdc` or `.usdz`, one scene or the scenes of a whole shard.
 
 Z up, metres, a default prim, nothing that names a file. Equal scenes give equal bytes.
-`pipeline.exchange.usd.names` says what stands where, `pipeline.exchange.usd.read_ours` reads it
-back.
+`pipeline.exchange.usd.names` lists the paths; `pipeline.exchange.usd.read_ours` reads it back. A
+camera has a pose and a lens, in tenths of a metre, on a square film of 36 mm. A `.usdz` file is a
+zip archive of plainly stored members that begin at multiples of 64 bytes.
 """
 
+import io
+import math
 import tempfile
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.names import (
     DIGEST,
+    FOV_DEG,
     OBJECT_TEXTS,
     PROVENANCE,
     ROOT,
@@ -24,9 +30,8 @@ from pipeline.exchange.usd.names import (
     UNUSED_ROWS,
     VARIANT_SET,
     VERSION,
+    camera_name,
 )
-from pipeline.exchange.usd.package import packaged
-from pipeline.exchange.usd.write_cameras import add_cameras
 from pipeline.exchange.usd.write_materials import add_materials
 from pipeline.exchange.usd.write_meshes import add_objects
 from storage.atomic import write_atomically
@@ -39,7 +44,7 @@ from storage.records.scene_file import scene_digest
 SUFFIXES = (".usda", ".usdc", ".usdz")
 
 CARRIED = frozenset({*ARRAY_FIELDS, "provenance"} | {f"objects.{field}" for field in OBJECT_TEXTS})
-"""Of a scene (storage.records.carried)."""
+"""Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 
 def write_usd(path: Path, scene: Scene) -> None:
@@ -78,7 +83,7 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
 
 
 def root_attributes(scene: Scene) -> Attributes:
-    """Return what stands on the prim of a scene."""
+    """Return the attributes of the prim of a scene."""
     unused = np.ones(len(scene.vertex_positions), np.bool_)
     unused[scene.faces] = False
     rows = np.flatnonzero(unused)
@@ -131,3 +136,54 @@ def _save(path: Path, layer: Any) -> None:
             raise TrilightError(f"{path.name}: USD could not write the scene.")
         data = plain.read_bytes()
     write_atomically(path, packaged(data) if path.suffix.lower() == ".usdz" else data)
+
+
+APERTURE = 0.36
+"""Width and height of the film in tenths of a metre."""
+
+CLIP_METRES = (1e-3, 1e4)
+
+
+def add_cameras(layer: Any, folder: str, scene: Scene) -> None:
+    """Write a prim for each camera below `folder`."""
+    add_prim(layer, folder, "Scope")
+    for row in range(scene.num_views):
+        camera = add_prim(layer, f"{folder}/{camera_name(row)}", "Camera")
+        add_attributes(camera, camera_attributes(scene.c2w[row], float(scene.fov_deg[row])))
+
+
+def camera_attributes(c2w: NDArray[np.float32], fov_deg: float) -> Attributes:
+    """Return the attributes of a camera's prim: pose [4, 4], and full field of view in degrees."""
+    focal = APERTURE / (2 * math.tan(math.radians(fov_deg) / 2))
+    rows = c2w.astype(np.float64).T.tolist()  # USD multiplies rows from the left
+    return {
+        "xformOp:transform": ("matrix4d", rows),
+        "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
+        "projection": ("token", "perspective"),
+        "focalLength": ("float", float(np.float32(focal))),
+        "horizontalAperture": ("float", float(np.float32(APERTURE))),
+        "verticalAperture": ("float", float(np.float32(APERTURE))),
+        "clippingRange": ("float2", CLIP_METRES),
+        FOV_DEG: ("float", fov_deg),
+    }
+
+
+ALIGNMENT = 64
+LAYER_NAME = "scene.usdc"
+
+_HEADER_BYTES = 30
+_PADDING_ID = 0x1986
+"""Identifier of the extra field that aligns a member's bytes; readers skip it."""
+
+
+def packaged(layer: bytes) -> bytes:
+    """Return the `.usdz` of one `.usdc` layer; no clock and no host is in it."""
+    entry = zipfile.ZipInfo(LAYER_NAME, date_time=(1980, 1, 1, 0, 0, 0))
+    begin = _HEADER_BYTES + len(LAYER_NAME)
+    padding = -(begin + 4) % ALIGNMENT
+    entry.extra = _PADDING_ID.to_bytes(2, "little") + padding.to_bytes(2, "little") + bytes(padding)
+    entry.external_attr = 0o644 << 16
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(entry, layer)
+    return stream.getvalue()

@@ -4,7 +4,7 @@ Our BRDF is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface i
 workflow takes the same albedos and roughness, but lets its specular albedo rise to 1 at grazing
 angles. OpenPBR's base has one index of refraction: it is chosen so that the strongest channel
 reflects our specular albedo head-on, and the tint gives the others. So both look alike and neither
-is equal; whoever wants it exactly reads the attributes (infra/blender does).
+is equal; the exact values are in the attributes, which our Blender script reads.
 
 OpenPBR counts emission in nits and UsdPreviewSurface as a plain colour: both get our radiance.
 """
@@ -24,17 +24,12 @@ from pipeline.exchange.usd.authoring import (
     usd_value,
 )
 from pipeline.exchange.usd.names import (
-    DIFFUSE_ALBEDO,
-    EMITTED_RADIANCE,
-    ROUGHNESS_VALUE,
-    SPECULAR_ALBEDO,
     column_attribute,
     material_name,
 )
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
-    PUBLISHED_COLUMNS,
     ROUGHNESS,
     SPECULAR,
     laid_out,
@@ -42,7 +37,7 @@ from storage.records.material import (
 )
 
 PREVIEW, OPENPBR = "Preview", "OpenPBR"
-"""Names of the two shaders below a material."""
+"""Names of the two shaders of a material."""
 
 _MOST_REFLECTING = 0.98
 """Head-on reflectance beyond which no index of refraction is sought: 0.98 needs 199."""
@@ -83,13 +78,7 @@ def material_tables(values: NDArray[np.float32], columns: Sequence[str]) -> dict
     head_on, luminance = max(specular), max(emission)
     root = math.sqrt(min(head_on, _MOST_REFLECTING))
     return {
-        "": {
-            DIFFUSE_ALBEDO: ("color3f", diffuse),
-            SPECULAR_ALBEDO: ("color3f", specular),
-            ROUGHNESS_VALUE: ("float", roughness),
-            EMITTED_RADIANCE: ("color3f", emission),
-            **_added_columns(values, columns),
-        },
+        "": _exact(values, columns),
         f"/{PREVIEW}": {
             "info:id": ("uniform token", "UsdPreviewSurface"),
             "inputs:useSpecularWorkflow": ("int", 1),
@@ -113,11 +102,11 @@ def material_tables(values: NDArray[np.float32], columns: Sequence[str]) -> dict
     }
 
 
-def _added_columns(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
-    """Return the exact attributes of the columns beyond the published ones."""
+def _exact(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
+    """Return the attributes that hold the columns exactly."""
     found: dict[str, tuple[str, Any]] = {}
     for column, part in laid_out():
-        if column.name in columns and column.name not in PUBLISHED_COLUMNS:
+        if column.name in columns:
             kind = "color3f" if column.is_colour else "float" if column.width == 1 else "float[]"
             value = _rgb(values[part]) if column.is_colour else values[part]
             found[column_attribute(column.name)] = (

@@ -72,7 +72,7 @@ def prim_names(scene: Scene) -> list[str]:
 
 
 def object_attributes(scene: Scene, row: int) -> Attributes:
-    """Return what stands on the prim of an object beside its arrays."""
+    """Return the attributes of an object's prim other than its arrays."""
     entry = scene.objects[row]
     return {
         INDEX: ("int", row),

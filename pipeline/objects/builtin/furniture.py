@@ -16,32 +16,19 @@ from pipeline.objects.builtin.solids import beam, box, join, lathe, moved
 class FurnitureParams:
     """Shape of one piece of furniture; lengths are in about metres."""
 
-    kind: str
-    """`table`, `round` (a round top), `chair` (a seat with a back) or `shelf`."""
-    width: float
-    """Along x."""
-    depth: float
-    """Along y; unused for round tops."""
-    height: float
-    """Of the top, the seat or the shelf."""
-    board: float
-    """Thickness of boards."""
-    leg: float
-    """Half thickness of legs at the top."""
-    leg_style: str
-    """`square`, `tapered` or `turned`."""
-    splay: float
-    """How far feet stand outside the tops of their legs."""
-    stretchers: bool
-    """Whether bars join the legs near the floor."""
-    back: float
-    """Height of a chair's back over its seat."""
-    slats: int
-    """Boards of a chair's back or of a bench-like top; 1 is a plain one."""
-    level_slats: bool
-    """Whether the back's boards lie level rather than upright."""
-    boards: int
-    """Boards of a shelf between its top and bottom."""
+    kind: str  # `table`, `round` (a round top), `chair` (a seat with a back) or `shelf`
+    width: float  # along x
+    depth: float  # along y; unused for round tops
+    height: float  # of the top, the seat or the shelf
+    board: float  # thickness of boards
+    leg: float  # half thickness of legs at the top
+    leg_style: str  # `square`, `tapered` or `turned`
+    splay: float  # how far feet stand outside the tops of their legs
+    stretchers: bool  # whether bars join the legs near the floor
+    back: float  # height of a chair's back over its seat
+    slats: int  # boards of a chair's back or of a bench-like top; 1 is a plain one
+    level_slats: bool  # whether the back's boards lie level rather than upright
+    boards: int  # boards of a shelf between its top and bottom
     books: tuple[tuple[float, float], ...]
     """Thickness and height of what stands on a shelf, from its lowest board upwards."""
 

@@ -19,28 +19,18 @@ _TOOTH = np.array([0.0, 0.0, 0.6, 1.0, 1.0, 0.6])
 class GearParams:
     """Shape of one gear; lengths are in radii of its tips."""
 
-    teeth: int
-    """Number of teeth."""
-    tooth_depth: float
-    """From tip to root, in (0, 0.4)."""
-    half_thickness: float
-    """Of the rim."""
-    chamfer: float
-    """How far the edges of the teeth are cut back."""
+    teeth: int  # number of teeth
+    tooth_depth: float  # from tip to root, in (0, 0.4)
+    half_thickness: float  # of the rim
+    chamfer: float  # how far the edges of the teeth are cut back
     bore: float
     """Radius of the hole; with `hub_width` and `rim_width` it must stay inside the roots."""
-    hub_width: float
-    """Width of the ring around the bore."""
-    hub_height: float
-    """Half height of that ring, over `half_thickness`."""
-    rim_width: float
-    """Width of the ring below the roots."""
-    web_height: float
-    """Half height between hub and rim, over `half_thickness`."""
-    helix_rad: float
-    """Turn of the teeth from the middle to the top."""
-    cone: float
-    """Relative growth of the outline from the middle to the top: a bevel gear."""
+    hub_width: float  # width of the ring around the bore
+    hub_height: float  # half height of that ring, over `half_thickness`
+    rim_width: float  # width of the ring below the roots
+    web_height: float  # half height between hub and rim, over `half_thickness`
+    helix_rad: float  # turn of the teeth from the middle to the top
+    cone: float  # relative growth of the outline from the middle to the top: a bevel gear
 
 
 def gear(params: GearParams) -> Mesh:

@@ -15,26 +15,16 @@ from pipeline.objects.builtin.grids import Mesh
 class LatticeParams:
     """Shape of one lattice."""
 
-    cells: tuple[int, int, int]
-    """Holes along x, y and z; 0 is a grille, one bar thick that way."""
-    half_sizes: tuple[float, float, float]
-    """Half extents along x, y and z, before it is warped."""
-    bar: float
-    """Thickness of a bar, in steps of the lattice, in (0, 1)."""
-    hollow: bool
-    """Whether bars are on the outside only, as in a crate."""
-    crate: bool
-    """Whether the lowest layer is a plate and the highest a mere rim."""
-    splits: int
-    """Pieces of a bar between two crossings; more bend better."""
-    roundness: float
-    """From 0, a box, to 1, a ball."""
-    taper: float
-    """Relative growth of width from the middle to the top, in (-1, 1)."""
-    twist_rad: float
-    """Turn about z from the middle to the top."""
-    bend_rad: float
-    """Angle of the arc about z that x is laid along; 0 is straight."""
+    cells: tuple[int, int, int]  # holes along x, y and z; 0 is a grille, one bar thick that way
+    half_sizes: tuple[float, float, float]  # half extents along x, y and z, before it is warped
+    bar: float  # thickness of a bar, in steps of the lattice, in (0, 1)
+    hollow: bool  # whether bars are on the outside only, as in a crate
+    crate: bool  # whether the lowest layer is a plate and the highest a mere rim
+    splits: int  # pieces of a bar between two crossings; more bend better
+    roundness: float  # from 0, a box, to 1, a ball
+    taper: float  # relative growth of width from the middle to the top, in (-1, 1)
+    twist_rad: float  # turn about z from the middle to the top
+    bend_rad: float  # angle of the arc about z that x is laid along; 0 is straight
 
 
 def lattice(params: LatticeParams) -> Mesh:

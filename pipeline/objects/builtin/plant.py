@@ -17,48 +17,30 @@ from pipeline.objects.builtin.solids import join, lathe, tube
 class LeafParams:
     """Shape of one leaf; lengths are shares of its own length."""
 
-    length: float
-    """From base to tip, along the midrib."""
-    width: float
-    """Largest width."""
-    widest: float
-    """Where along the midrib that is, in (0, 1)."""
-    base: float
-    """Width of the base, as a share of the largest."""
-    arch_rad: float
-    """How far the midrib turns downwards from base to tip."""
-    fold_rad: float
-    """How far each half is raised from the plane of the midrib."""
-    teeth: int
-    """Notches along each edge; 0 is a smooth one."""
-    tooth_depth: float
-    """Depth of the notches as a share of the width there, in [0, 1)."""
-    rows: int
-    """Rows of vertices from base to tip; at least twice the teeth."""
+    length: float  # from base to tip, along the midrib
+    width: float  # largest width
+    widest: float  # where along the midrib that is, in (0, 1)
+    base: float  # width of the base, as a share of the largest
+    arch_rad: float  # how far the midrib turns downwards from base to tip
+    fold_rad: float  # how far each half is raised from the plane of the midrib
+    teeth: int  # notches along each edge; 0 is a smooth one
+    tooth_depth: float  # depth of the notches as a share of the width there, in [0, 1)
+    rows: int  # rows of vertices from base to tip; at least twice the teeth
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlantParams:
     """Shape of one plant; the pot's rim has about radius 0.3."""
 
-    leaf: LeafParams
-    """The largest leaf."""
-    leaves: int
-    """Their number."""
-    stem: float
-    """Height of the stem above the pot; 0 is a rosette."""
-    stalk: float
-    """Length of each leaf's own stalk; 0 is none."""
-    steepest_rad: float
-    """Rise of the uppermost leaf."""
-    flattest_rad: float
-    """Rise of the lowest leaf."""
-    smallest: float
-    """Size of the uppermost leaf, as a share of the largest."""
-    pot_height: float
-    """Height of the pot."""
-    pot_foot: float
-    """Radius of its foot over that of its rim."""
+    leaf: LeafParams  # the largest leaf
+    leaves: int  # their number
+    stem: float  # height of the stem above the pot; 0 is a rosette
+    stalk: float  # length of each leaf's own stalk; 0 is none
+    steepest_rad: float  # rise of the uppermost leaf
+    flattest_rad: float  # rise of the lowest leaf
+    smallest: float  # size of the uppermost leaf, as a share of the largest
+    pot_height: float  # height of the pot
+    pot_foot: float  # radius of its foot over that of its rim
 
 
 def plant(params: PlantParams) -> Mesh:

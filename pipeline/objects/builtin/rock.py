@@ -18,20 +18,14 @@ class RockParams:
 
     cuts: tuple[tuple[float, float, float, float], ...]
     """Planes that cut the ball: a direction (of length 1) and the distance from the centre."""
-    sharpness: float
-    """Of the edges between cuts: 6 is a pebble, 30 a broken stone."""
+    sharpness: float  # of the edges between cuts: 6 is a pebble, 30 a broken stone
     bumps: tuple[tuple[float, float, float, float], ...]
     """Waves over the surface: three numbers of waves per radius, and a phase."""
-    bump_height: float
-    """Of all bumps together, in radii; below 0.5."""
-    layers: float
-    """Layers per radius of height; 0 is none."""
-    layer_depth: float
-    """How far the joints between layers are cut back, in radii; below 0.3."""
-    half_sizes: tuple[float, float, float]
-    """Stretch along x, y and z."""
-    frequency: int
-    """Divisions of the icosahedron's edges."""
+    bump_height: float  # of all bumps together, in radii; below 0.5
+    layers: float  # layers per radius of height; 0 is none
+    layer_depth: float  # how far the joints between layers are cut back, in radii; below 0.3
+    half_sizes: tuple[float, float, float]  # stretch along x, y and z
+    frequency: int  # divisions of the icosahedron's edges
 
 
 def rock(params: RockParams) -> Mesh:

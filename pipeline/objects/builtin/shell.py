@@ -15,34 +15,20 @@ from pipeline.objects.builtin.grids import Mesh, sphere_faces
 class ShellParams:
     """Shape of one shell; lengths are in distances of the mouth's centre from the axis."""
 
-    turns: float
-    """Turns about the axis."""
-    growth: float
-    """Size over that one turn before; above 1."""
-    drop: float
-    """How far the mouth lies below the tip: 0 is a flat spiral, 4 a turret."""
-    tube: float
-    """Radius of the mouth across; about 1 fills the middle."""
-    stretch: float
-    """Height of the mouth over its width."""
-    ribs: int
-    """Ribs across the tube per turn; 0 is none."""
-    rib_height: float
-    """In radii of the tube."""
-    cords: int
-    """Ridges along the tube, around its section; 0 is none."""
-    cord_height: float
-    """In radii of the tube."""
-    spines: float
-    """How much higher the ribs are at the shoulder than elsewhere."""
-    wall: float
-    """Thickness at the mouth, in radii of the tube; below 1."""
-    lean_rad: float
-    """Turn of the axis from upright: pi / 2 is a shell that lies on the ground."""
-    rings_per_turn: int
-    """Rings of vertices in a turn."""
-    columns: int
-    """Vertices of a ring."""
+    turns: float  # turns about the axis
+    growth: float  # size over that one turn before; above 1
+    drop: float  # how far the mouth lies below the tip: 0 is a flat spiral, 4 a turret
+    tube: float  # radius of the mouth across; about 1 fills the middle
+    stretch: float  # height of the mouth over its width
+    ribs: int  # ribs across the tube per turn; 0 is none
+    rib_height: float  # in radii of the tube
+    cords: int  # ridges along the tube, around its section; 0 is none
+    cord_height: float  # in radii of the tube
+    spines: float  # how much higher the ribs are at the shoulder than elsewhere
+    wall: float  # thickness at the mouth, in radii of the tube; below 1
+    lean_rad: float  # turn of the axis from upright: pi / 2 is a shell that lies on the ground
+    rings_per_turn: int  # rings of vertices in a turn
+    columns: int  # vertices of a ring
 
 
 def shell(params: ShellParams) -> Mesh:

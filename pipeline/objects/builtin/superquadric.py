@@ -18,18 +18,12 @@ class SuperquadricParams:
 
     exponent_profile: float
     """Roundness of the upright outline: 0.1 a box, 1 an ellipse, 2 a rhomb, above 2 a star."""
-    exponent_plan: float
-    """Roundness seen from above, likewise."""
-    half_sizes: tuple[float, float, float]
-    """Half extents along x, y and z, before taper and twist."""
-    taper: float
-    """Relative growth of width from the middle to the top, in (-1, 1)."""
-    twist_rad: float
-    """Turn about z from the middle to the top."""
-    rings: int
-    """Rings between the poles."""
-    columns: int
-    """Vertices of a ring; a multiple of 8 puts some on the edges of a box."""
+    exponent_plan: float  # roundness seen from above, likewise
+    half_sizes: tuple[float, float, float]  # half extents along x, y and z, before taper and twist
+    taper: float  # relative growth of width from the middle to the top, in (-1, 1)
+    twist_rad: float  # turn about z from the middle to the top
+    rings: int  # rings between the poles
+    columns: int  # vertices of a ring; a multiple of 8 puts some on the edges of a box
 
 
 def superquadric(params: SuperquadricParams) -> Mesh:

@@ -20,22 +20,14 @@ class TorusKnotParams:
 
     windings: tuple[int, int]
     """How often the strand runs around the axis, and through the hole; coprime."""
-    minor_radius: float
-    """Of the torus that the strand lies on, whose major radius is 1; in (0, 1)."""
-    fill: float
-    """Thickness as a share of the thickest tube that neither meets itself nor folds."""
-    ribs: int
-    """Ridges of the cross section; 0 is round."""
-    rib_depth: float
-    """Depth of the ridges as a share of the tube's radius, in [0, 1)."""
-    rib_turns: int
-    """How often the ridges wind around the strand."""
-    flatten: float
-    """Width of the cross section across the torus, over its height; at most 1."""
-    segments: int
-    """Vertices along the strand."""
-    sides: int
-    """Vertices around it; a multiple of the ribs makes them all alike."""
+    minor_radius: float  # of the torus that the strand lies on, whose major radius is 1; in (0, 1)
+    fill: float  # thickness as a share of the thickest tube that neither meets itself nor folds
+    ribs: int  # ridges of the cross section; 0 is round
+    rib_depth: float  # depth of the ridges as a share of the tube's radius, in [0, 1)
+    rib_turns: int  # how often the ridges wind around the strand
+    flatten: float  # width of the cross section across the torus, over its height; at most 1
+    segments: int  # vertices along the strand
+    sides: int  # vertices around it; a multiple of the ribs makes them all alike
 
 
 def torus_knot(params: TorusKnotParams) -> Mesh:

@@ -26,26 +26,17 @@ _TIER = np.array([[0.2, 0.12], [0.7, 0.02], [1.0, -0.1], [0.62, 0.2], [0.3, 0.55
 class TreeParams:
     """Shape of one tree; the trunk is about 1 high."""
 
-    crown: str
-    """`masses`, `tiers` or `bare`."""
+    crown: str  # `masses`, `tiers` or `bare`
     children: tuple[int, ...]
     """Branches of each branch: of the trunk, of its branches, and so on; at most three numbers."""
-    spread_rad: float
-    """Angle between a branch and the one it grows from."""
-    shrink: float
-    """Length of a branch over that of the one it grows from."""
-    thickness: float
-    """Radius of the trunk's foot."""
-    rise: float
-    """How strongly branches bend upwards: 0 is straight, negative ones droop."""
-    mass: float
-    """Radius of a mass of leaves at the end of a branch; unused without."""
-    tiers: int
-    """Number of tiers; unused without."""
-    folds: int
-    """Folds around a tier; unused without."""
-    variant: int
-    """Picks the irregularities; trees that differ in it alone are of one kind."""
+    spread_rad: float  # angle between a branch and the one it grows from
+    shrink: float  # length of a branch over that of the one it grows from
+    thickness: float  # radius of the trunk's foot
+    rise: float  # how strongly branches bend upwards: 0 is straight, negative ones droop
+    mass: float  # radius of a mass of leaves at the end of a branch; unused without
+    tiers: int  # number of tiers; unused without
+    folds: int  # folds around a tier; unused without
+    variant: int  # picks the irregularities; trees that differ in it alone are of one kind
 
 
 def tree(params: TreeParams) -> Mesh:

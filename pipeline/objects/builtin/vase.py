@@ -15,22 +15,15 @@ from pipeline.objects.builtin.grids import Mesh, sphere_faces
 class VaseParams:
     """Shape of one vase."""
 
-    height: float
-    """From foot to lip."""
+    height: float  # from foot to lip
     radii: tuple[float, ...]
     """Outer radii at equal heights from foot to lip, joined by a smooth curve; all positive."""
-    wall: float
-    """Thickness of wall and bottom; smaller than every radius."""
-    flutes: int
-    """Folds around the vase; 0 is plain."""
-    flute_depth: float
-    """Depth of the folds as a share of the radius, in [0, 1)."""
-    swirl_rad: float
-    """Turn of the folds from foot to lip."""
-    rings: int
-    """Rings from foot to lip."""
-    columns: int
-    """Vertices of a ring; a multiple of the flutes makes them all alike."""
+    wall: float  # thickness of wall and bottom; smaller than every radius
+    flutes: int  # folds around the vase; 0 is plain
+    flute_depth: float  # depth of the folds as a share of the radius, in [0, 1)
+    swirl_rad: float  # turn of the folds from foot to lip
+    rings: int  # rings from foot to lip
+    columns: int  # vertices of a ring; a multiple of the flutes makes them all alike
 
 
 def vase(params: VaseParams) -> Mesh:

@@ -1,12 +1,11 @@
-"""The `objaverse` package, with its rough edges held: one call at a time, bounded, silent.
+"""The `objaverse` package, wrapped: one call at a time, bounded in time, silent.
 
 The package keeps its files in a place of its own (`~/.objaverse`), which other programs use too. It
 fetches metadata without a temporary name, so that a broken transfer leaves a broken file; waits for
-a dead server for ever; prints; and reads its list of all objects anew for each object.
+a dead server forever; prints; and reads its list of all objects anew for each object.
 """
 
 import contextlib
-import fcntl
 import importlib
 import re
 import socket
@@ -15,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from storage.atomic import write_error
+from storage.claims import claimed
 from storage.errors import TrilightError
 from storage.remote.tries import TransferFailed, with_tries
 
@@ -34,7 +33,7 @@ class ObjaversePackage:
         """Import the package.
 
         Raises:
-            TrilightError: it is not installed, or the list of all objects cannot be had.
+            TrilightError: it is not installed, or the list of all objects cannot be downloaded.
         """
         try:
             self._package: ModuleType = importlib.import_module("objaverse")
@@ -46,11 +45,11 @@ class ObjaversePackage:
         self._paths: dict[str, str] = self._listing(_PATHS, self._package._load_object_paths)
 
     def __contains__(self, uid: str) -> bool:
-        """Say whether Objaverse has an object, in the place where the package looks for it."""
+        """Return whether Objaverse has an object, in the place where the package looks for it."""
         return bool(_PLACE.fullmatch(str(self._paths.get(uid))))
 
     def categories(self) -> dict[str, list[str]]:
-        """Return the uids of every LVIS category; raises TrilightError where they cannot be had."""
+        """Return the uids of every LVIS category; raises TrilightError as `__init__`."""
         return self._listing(_CATEGORIES, self._package.load_lvis_annotations)
 
     def groups(self, uids: Sequence[str]) -> list[list[str]]:
@@ -64,7 +63,7 @@ class ObjaversePackage:
         """Return what is known of the uids of one group, by uid; some may be missing.
 
         Raises:
-            TransferFailed: the file that describes them cannot be had.
+            TransferFailed: the file that describes them cannot be downloaded.
         """
         name = f"metadata/{self._paths[group[0]].split('/')[1]}.json.gz"
         return self._metadata(name, lambda: self._package.load_annotations(group))
@@ -73,7 +72,7 @@ class ObjaversePackage:
         """Bring a known object here, unless it is here already.
 
         Raises:
-            TransferFailed: it cannot be had.
+            TransferFailed: it cannot be downloaded.
         """
 
         def load() -> Path:
@@ -88,8 +87,8 @@ class ObjaversePackage:
             return self._metadata(name, load)
         except TransferFailed as error:
             raise TrilightError(
-                f"objects objaverse: {name} cannot be had ({error.message}); expected it to be "
-                "downloaded. Check the network and try again."
+                f"objects objaverse: {name} cannot be downloaded ({error.message}); expected "
+                "Objaverse to be reachable. Check the network and try again."
             ) from error
 
     def _metadata(self, name: str, load: Callable[[], Result]) -> Result:
@@ -113,7 +112,7 @@ class ObjaversePackage:
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Hold the package's folder, its output and its patience while it works.
+        """Lock the package's folder, silence its output and bound its waiting while it works.
 
         Only names of the package are replaced, not `sys.stdout`, so that a progress bar of ours
         goes on. The limit of time holds for all sockets that are opened meanwhile.
@@ -124,7 +123,7 @@ class ObjaversePackage:
             replaced["_load_object_paths"] = lambda: self._paths
         missing = object()
         kept = {name: self._package.__dict__.get(name, missing) for name in replaced}
-        with self._locked():
+        with claimed(self._root / ".trilight.lock", wait=True):
             socket.setdefaulttimeout(_SILENCE_S)
             self._package.__dict__.update(replaced)
             try:
@@ -136,19 +135,6 @@ class ObjaversePackage:
                         del self._package.__dict__[name]
                     else:
                         self._package.__dict__[name] = value
-
-    @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Keep other runs from writing the same unfinished files; the kernel frees the lock."""
-        path = self._root / ".trilight.lock"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            stream = path.open("wb")
-        except OSError as error:
-            raise write_error(path, error) from error
-        with stream:
-            fcntl.flock(stream, fcntl.LOCK_EX)
-            yield
 
 
 def _print_nothing(*values: object, **options: object) -> None:

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.objects.licences import UNKNOWN, refuse_licences
-from pipeline.objects.listing import CountDone, Fetched, Listing, failure
+from pipeline.objects.listing import CountDone, Fetched, Listing, failure, fetch_all
 from pipeline.objects.objaverse.package import ObjaversePackage
-from pipeline.objects.transfer import fetch_all
 from storage.errors import TrilightError
 from storage.records.objects import Failure, ObjectRecord
 from storage.remote.safe_url import printable

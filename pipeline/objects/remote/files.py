@@ -2,30 +2,29 @@
 
 A file lies below `files` under its own name, since the parts of a glTF name each other. Beside it,
 below `versions`, stands what the server said about it then: while the server says the same, the
-file is not fetched again.
+file is not fetched again. The files that a glTF names are fetched with it.
 """
 
 import errno
-import hashlib
 import json
 import os
+import posixpath
 import threading
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from fsspec.asyn import sync
 from fsspec.callbacks import Callback
 
 from pipeline.objects.remote.folder import RemoteFolder
-from pipeline.objects.remote.gltf_buffers import buffer_names
-from storage.atomic import TEMPORARY_SUFFIX, atomic_writer, write_atomically
+from storage.atomic import atomic_writer, remove_leftovers, write_atomically
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.remote.fetch import version_of
-from storage.remote.pace import Pace
 from storage.remote.safe_url import printable
-from storage.remote.tries import Interrupted, TransferFailed, with_tries
+from storage.remote.tries import Interrupted, Pace, TransferFailed, with_tries
 from storage.remote.url import transfer_timeout
 
 _MAX_NAME_BYTES = 220
@@ -34,6 +33,7 @@ _MAX_PATH_BYTES = 2000
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 _NAME_ERRORS = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.EILSEQ)
 _MAX_BUFFERS = 100
+_MAX_JSON_BYTES = 64_000_000
 _STALE_S = 24 * 3600.0
 
 
@@ -55,7 +55,8 @@ class RemoteFiles:
         self._max_bytes = max_bytes
         self._lock = threading.Lock()
         self._outcomes: dict[str, _Outcome] = {}
-        _remove_stale(self.files)
+        # what is younger may belong to a run that is at work
+        remove_leftovers(self.files, older_than_s=_STALE_S)
 
     def path(self, name: str) -> Path:
         """Return where a file goes; raises TransferFailed `unsafe_name` for names that lead out."""
@@ -120,7 +121,7 @@ class RemoteFiles:
         version = version_of(facts)
         if size is not None:
             version["size"] = str(size)
-        note = self._versions / f"{hashlib.sha256(os.fsencode(name)).hexdigest()}.json"
+        note = self._versions / f"{sha256_hex(os.fsencode(name))}.json"
         if version and _is_here(path, note, version):
             return
         self._transfer(name, path, size, limit)
@@ -200,11 +201,42 @@ def _is_here(path: Path, note: Path, version: dict[str, str]) -> bool:
         return False
 
 
-def _remove_stale(files: Path) -> None:
-    """Delete what killed runs left; what is younger may belong to a run that is at work."""
-    for leftover in files.rglob(f"*{TEMPORARY_SUFFIX}"):
-        try:
-            if time.time() - leftover.stat().st_mtime > _STALE_S:
-                leftover.unlink()
-        except OSError:
-            continue
+def buffer_names(path: Path, name: str) -> list[str]:
+    """Return the files that the buffers of a `.gltf` name, each once, in their order.
+
+    Whatever is not a relative URI to below the folder of the file is left out, and so is everything
+    of a file that is not a glTF: the mesh stage reads it again, and says what is wrong.
+
+    Args:
+        path: the file on this machine.
+        name: its path below the remote folder; the results are such paths too.
+    """
+    try:
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            return []
+        tree = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return []
+    buffers = tree.get("buffers") if isinstance(tree, dict) else None
+    folder = posixpath.dirname(name)
+    found: dict[str, None] = {}
+    for buffer in buffers if isinstance(buffers, list) else ():
+        uri = buffer.get("uri") if isinstance(buffer, dict) else None
+        inner = _inner(uri) if isinstance(uri, str) else None
+        if inner is not None:
+            found[posixpath.join(folder, inner)] = None
+    return list(found)
+
+
+def _inner(uri: str) -> str | None:
+    """Return the path that a relative URI names below its folder, or None."""
+    try:
+        parts = urlsplit(uri)
+    except ValueError:
+        return None
+    inner = posixpath.normpath(unquote(uri))
+    if parts.scheme or parts.netloc or not uri or "\x00" in inner or "\n" in inner:
+        return None
+    if inner.startswith("/") or inner in (".", "..") or inner.startswith("../"):
+        return None
+    return inner

@@ -11,7 +11,7 @@ from storage.remote.url import RemoteUrl, open_driver
 
 _MAX_FOLDERS = 10_000
 _MAX_DEPTH = 32
-"""A server that answers every address with the same page would otherwise be walked for ever."""
+"""Maximum depth; a server that answers every address with one page has no end otherwise."""
 
 
 class RemoteFolder:
@@ -39,7 +39,7 @@ class RemoteFolder:
         return dict(self.driver.info(self.address(name)))
 
     def has(self, name: str) -> bool:
-        """Say whether there is a file; `no` also where the server does not let us see it.
+        """Return whether a file exists; False also where the server denies access.
 
         Raises:
             TrilightError: the server gives no answer.

@@ -5,13 +5,19 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.objects.licences import StatedLicence, require_unstated, stated_licence
-from pipeline.objects.listing import CountDone, Fetched, Listing, failure
+from pipeline.objects.listing import (
+    CountDone,
+    Fetched,
+    Listing,
+    assign_uids,
+    failure,
+    fetch_all,
+    is_object_file,
+)
 from pipeline.objects.local.catalogue import CATALOGUE_NAMES, only_catalogue, read_catalogue
 from pipeline.objects.local.folder import file_record
 from pipeline.objects.remote.files import RemoteFiles
 from pipeline.objects.remote.folder import RemoteFolder
-from pipeline.objects.transfer import fetch_all
-from pipeline.objects.uids import assign_uids, is_object_file
 from storage.cache import cache_folder
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -76,8 +82,8 @@ def _uncatalogued(
     for catalogue in set(CATALOGUE_NAMES) & set(names):
         # it would rule, so that going on without it could use what it forbids
         raise TrilightError(
-            f"objects {folder.url.shown!r}: {catalogue} is listed but not given out; expected a "
-            "catalogue that can be read. Check your access to it."
+            f"objects {folder.url.shown!r}: {catalogue} is listed but cannot be fetched; expected "
+            "a readable catalogue. Check your access to it."
         )
     uids, failures = assign_uids(name for name in names if is_object_file(name))
     records = []

@@ -12,10 +12,9 @@ import pytest
 
 from pipeline.exchange import convert as convert_scene
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
-from pipeline.exchange.renderformer_json_write import described_files
-from storage.dataset.shard_writer import write_shard
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
+from pipeline.exchange.renderformer_json import described_files
+from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
 from storage.records.profiles import Profile
 from storage.records.sample import encode_sample

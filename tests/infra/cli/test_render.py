@@ -17,7 +17,7 @@ from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.making import render_scene
 from storage.conventions import preview_srgb8
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.records.profiles import Profile

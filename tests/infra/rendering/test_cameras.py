@@ -14,7 +14,7 @@ from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.isolation import Result
 from storage.conventions import look_at_c2w
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample
 from storage.records.scene_file import encode_scene

@@ -13,7 +13,7 @@ from model.neural_renderer import NeuralRenderer
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.exchange.usd.write import write_usd
 from storage.conventions import look_at_c2w, preview_srgb8
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.metrics import psnr_log_db
 from storage.records.exr import decode_exr
 from storage.records.sample import encode_sample

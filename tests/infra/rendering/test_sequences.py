@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from pxr import Usd, UsdGeom
 
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.records.exr import decode_exr
 from storage.records.sample import encode_sample
 from storage.records.scene_file import encode_scene

@@ -17,7 +17,7 @@ from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.renderformer import RENDERFORMER_BUILDS
 from scene_templates import lights, placement
 from scene_templates.cameras import camera_rand
-from scene_templates.patches import PATCH_FACES, QUADS, SIDES
+from scene_templates.rooms import PATCH_FACES, QUADS, SIDES
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.digests import sha256_hex
@@ -123,7 +123,7 @@ def test_a_layout_that_is_registered_later_changes_no_build() -> None:
         from storage.extensions import load_extension
         for name in ("template", "family", "object_source"):
             load_extension(f"examples/{name}.py")
-        from scene_templates.family import TEMPLATES, Family
+        from scene_templates.families import TEMPLATES, Family
         assert "corridor" in TEMPLATES and "crowd" in Family.PRESETS
         from pipeline.builds.named import BUILDS
         """)
@@ -137,12 +137,11 @@ def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
         from pipeline.builds import settings as builds
         from pipeline.renders import settings as renders
         from scene_templates import settings as scenes
-        from scene_templates import excursions
-        from scene_templates import family
+        from scene_templates import families
         from scene_templates import rooms
         from scene_templates import separate_sides
         from storage.settings import dataset as dataset_settings
-        modules = (assets, builds, renders, scenes, excursions, family, rooms, separate_sides)
+        modules = (assets, builds, renders, scenes, families, rooms, separate_sides)
         kinds = {kind for module in (*modules, dataset_settings) for kind in vars(module).values()
                  if hasattr(kind, "__pydantic_fields__")}
         assert len(kinds) > 14

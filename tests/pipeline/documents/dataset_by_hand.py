@@ -15,10 +15,8 @@ import numpy as np
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
-from storage.dataset.shard_writer import write_shard
-from storage.records.failures import write_failures
-from storage.records.objects import Failure, LockedObject
-from storage.records.objects_lock import write_objects_lock
+from storage.dataset.shard import write_shard
+from storage.records.objects import Failure, LockedObject, write_failures, write_objects_lock
 from storage.records.sample import Sample, encode_sample, sample_key
 from storage.records.scene import Scene, SceneObject
 from tests.scenes_by_hand import tiny_sample, tiny_scene

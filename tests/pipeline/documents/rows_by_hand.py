@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from storage.records.asset_rows import AssetRow
+from storage.records.asset import AssetRow
 from tests.pipeline.scenes.small_pool import QUALITY, SOURCE
 
 

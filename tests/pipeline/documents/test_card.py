@@ -17,7 +17,7 @@ from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.markdown import code, front_matter, plain, text
 from pipeline.documents.rights import encode_licences, rights_of
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.records.objects_lock import read_objects_lock, write_objects_lock
+from storage.records.objects import read_objects_lock, write_objects_lock
 from storage.records.profiles import Profile
 from tests.pipeline.documents.dataset_by_hand import (
     edit_manifest,

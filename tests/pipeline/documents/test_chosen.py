@@ -5,8 +5,7 @@ import itertools
 import pytest
 
 from pipeline.documents.chosen import choose_scenes
-from storage.dataset.manifest import Manifest, ShardEntry
-from storage.dataset.member_table import MemberTable
+from storage.dataset.manifest import Manifest, MemberTable, ShardEntry
 
 
 def manifest(**counts: int) -> Manifest:

@@ -9,7 +9,7 @@ import pytest
 from pipeline.documents.croissant import encode_croissant
 from pipeline.documents.rights import rights_of
 from storage.dataset.dataset import open_dataset
-from storage.records.objects_lock import read_objects_lock
+from storage.records.objects import read_objects_lock
 from tests.pipeline.documents.dataset_by_hand import five_scenes, locked
 
 mlcroissant = pytest.importorskip(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.documents.quality_page import Pair, encode_quality_page
-from storage.records.asset_rows import AssetRow
+from storage.records.asset import AssetRow
 from storage.records.objects import Failure
 from tests.pipeline.documents.pages_read import HARM, Tags, read
 from tests.pipeline.documents.rows_by_hand import row

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from pxr import Usd
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
-from pipeline.exchange.renderformer_json_write import described_files
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
+from pipeline.exchange.renderformer_json import described_files
 from pipeline.exchange.scene_files import build_scene
 from pipeline.exchange.usd.read import read_usd
 from pipeline.exchange.usd.write import write_usd

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.exchange import formats
 from pipeline.exchange.convert import write_scene
+from pipeline.exchange.formats import lost_members
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.errors import TrilightError
-from storage.records import carried
-from storage.records.carried import lost_members
 from storage.records.material import PUBLISHED_COLUMNS, columns_in_use, laid_out
 from storage.records.scene import Scene, SceneObject
 from tests.columns_kit import COAT, TINT, WAVES, declared
@@ -145,4 +145,4 @@ def test_the_names_of_members_are_those_of_a_scene() -> None:
     known |= {field.name for field in dataclasses.fields(Scene)}
     for form in FORMATS.values():
         assert set(form.carried) <= known
-    assert carried.lost_members(tiny_scene(), known) == ()
+    assert formats.lost_members(tiny_scene(), known) == ()

@@ -16,7 +16,7 @@ import trimesh
 
 from pipeline.exchange.convert import convert_scene
 from pipeline.exchange.open_scene import scene_source
-from pipeline.exchange.renderformer_json_write import described_files
+from pipeline.exchange.renderformer_json import described_files
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene
 from tests.pipeline.scenes.example_scenes import EXAMPLES, example_scene

@@ -7,8 +7,13 @@ import h5py
 import numpy as np
 import pytest
 
-from pipeline.exchange.renderformer_h5 import FAR, NEAR, TextureType, write_renderformer_h5
-from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
+from pipeline.exchange.renderformer_h5 import (
+    FAR,
+    NEAR,
+    TextureType,
+    read_renderformer_h5,
+    write_renderformer_h5,
+)
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene

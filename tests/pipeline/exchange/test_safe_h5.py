@@ -12,8 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.exchange.renderformer_h5_read import read_renderformer_h5
+from pipeline.exchange.renderformer_h5 import read_renderformer_h5, write_renderformer_h5
 from storage.errors import TrilightError
 from tests.conftest import ROOT
 from tests.scenes_by_hand import tiny_sample
@@ -224,7 +223,7 @@ def test_nothing_runs_and_little_memory_is_taken(path: Path) -> None:
     code = (
         "import sys, pathlib\n"
         "import h5py, h5py.h5ds, numpy\n"
-        "from pipeline.exchange.renderformer_h5_read import read_renderformer_h5\n"
+        "from pipeline.exchange.renderformer_h5 import read_renderformer_h5\n"
         "from storage.errors import TrilightError\n"
         f"read_renderformer_h5(pathlib.Path({str(path)!r}))\n"
         "bad = ('os.system', 'subprocess.Popen', 'os.exec', 'exec', 'import', 'ctypes.dlopen')\n"

@@ -27,7 +27,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
 from storage.dataset.splits import scenes_of_shard, shard_name
 from storage.errors import Rejected, TrilightError
-from storage.records.objects_lock import read_objects_lock
+from storage.records.objects import read_objects_lock
 from storage.records.scene import Scene
 
 CAMERA = {"position": [0, -2, 0], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}

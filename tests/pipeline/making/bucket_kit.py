@@ -10,7 +10,7 @@ import pytest
 from pipeline.builds.named import named_build
 from pipeline.making.bucket_publication import begin_dataset, joined
 from pipeline.making.publication import Publication
-from storage.dataset.output import dataset_folder
+from storage.dataset.layout import dataset_folder
 from storage.remote import tries
 from storage.remote import url as remote_url
 from tests.pipeline.making.test_publication import ENVIRONMENT, _build

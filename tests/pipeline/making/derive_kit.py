@@ -6,11 +6,15 @@ from pathlib import Path
 
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, index_shard, write_manifest
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.digests import sha256_hex
-from storage.records.failures import write_failures
-from storage.records.objects import Failure, LockedObject
-from storage.records.objects_lock import encode_objects_lock, write_objects_lock
+from storage.records.objects import (
+    Failure,
+    LockedObject,
+    encode_objects_lock,
+    write_failures,
+    write_objects_lock,
+)
 from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene

@@ -13,8 +13,7 @@ from storage.dataset.dataset import open_dataset
 from storage.dataset.staging import stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.records.failures import decode_failures
-from storage.records.objects import Failure
+from storage.records.objects import Failure, decode_failures
 from storage.records.sample import sample_key
 from tests.pipeline.making.bucket_kit import OUT, Machines
 from tests.pipeline.making.test_publication import _dataset, _locked, make_tiny_shard

@@ -147,7 +147,7 @@ def test_other_objects_and_other_settings_are_refused(bucket: Any, machines: Mac
         machines.use("a")
         first.lock_objects([_locked()])
         machines.use("b")
-        with pytest.raises(TrilightError, match=rf"{OUT}: another maker has frozen other objects"):
+        with pytest.raises(TrilightError, match=rf"{OUT}: another worker has frozen other objects"):
             second.lock_objects([dataclasses.replace(_locked(), uid="b")])
         second.lock_objects([_locked()])
     changed = {"renders.resolution": 32}

@@ -15,9 +15,7 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.verify import verify_dataset
-from storage.records.failures import read_failures
-from storage.records.objects import Failure
-from storage.records.objects_lock import read_objects_lock
+from storage.records.objects import Failure, read_failures, read_objects_lock
 from storage.records.sample import Sample, encode_sample, sample_key
 from tests.pipeline.making.derive_kit import finished, scenes
 

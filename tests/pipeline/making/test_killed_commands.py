@@ -16,7 +16,7 @@ from pipeline.making.inspect_scene import inspect_scene
 from pipeline.making.render_scene import PathTracer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, choose_variant
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.records.profiles import PROFILES
 from storage.records.sample import encode_sample, sample_key
 from storage.records.scene_file import encode_scene

@@ -19,7 +19,7 @@ from pipeline.making.make_assets import AssetFolder, AssetReport, make_assets
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.sources import find_objects
 from storage.errors import TrilightError
-from storage.records.failures import read_failures
+from storage.records.objects import read_failures
 from tests.conftest import ROOT
 from tests.pipeline.assets.meshes_by_hand import cube, sphere, write_obj
 

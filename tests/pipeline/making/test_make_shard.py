@@ -17,11 +17,11 @@ from pipeline.making import make_shard
 from pipeline.making.make_scene import SceneAttempt
 from pipeline.making.make_shard import is_free, make_piece
 from pipeline.making.pieces import Piece
-from pipeline.shards.notes import note_shard, noted_shard
-from storage.dataset.claims import claimed
+from pipeline.shards.pack import note_shard, noted_shard
+from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.dataset.staging import is_staged, read_staged_scene
 from storage.records.sample import sample_key
 from tests.scenes_by_hand import tiny_sample

@@ -17,8 +17,7 @@ from storage.dataset.splits import scenes_of_shard, shard_name
 from storage.dataset.staging import stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.records.failures import read_failures
-from storage.records.objects import Failure, LockedObject
+from storage.records.objects import Failure, LockedObject, read_failures
 from storage.records.sample import Sample, sample_key
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 

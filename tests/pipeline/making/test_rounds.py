@@ -15,7 +15,7 @@ from pipeline.making.make_task import ShardJob, TaskOutcome
 from pipeline.making.order import DatasetOrder
 from pipeline.making.pieces import Piece
 from pipeline.shards.pack import pack_shard
-from storage.dataset.claims import claimed
+from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.staging import stage_scene
 from storage.dataset.statistics import Statistics

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from pipeline.assets.reading.source_file import SUFFIXES as READABLE
-from pipeline.objects.builtin.families import FAMILIES
+from pipeline.objects.generated import FAMILIES
 from pipeline.objects.licences import DEFAULT_ALLOWED, USER_PROVIDED
+from pipeline.objects.listing import SUFFIXES
 from pipeline.objects.sources import FoundObjects, find_objects
-from pipeline.objects.uids import SUFFIXES
 from storage.errors import TrilightError
 from storage.records.objects import ObjectRecord
 from storage.remote.safe_url import printable

@@ -14,8 +14,8 @@ from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
-from storage.dataset.check_sample import check_sample
 from storage.dataset.manifest import Manifest
+from storage.dataset.verify import check_sample
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
 from storage.records.exr import decode_exr, encode_exr

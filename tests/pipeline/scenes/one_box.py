@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from pipeline.exchange.described_albedos import AlbedoOverOne
 from pipeline.exchange.description import SceneDescription
-from pipeline.exchange.from_description import LoadedMesh, scene_from_description
+from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh, scene_from_description
 from pipeline.exchange.renderformer_json import read_description
 from storage.records.scene import Scene
 

@@ -9,8 +9,8 @@ import pytest
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.default_families import DEFAULT_FAMILIES
-from scene_templates.plans import scene_plan
+from scene_templates.families import DEFAULT_FAMILIES
+from scene_templates.layout_rand import scene_plan
 from scene_templates.settings import SceneSettings
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected, TrilightError

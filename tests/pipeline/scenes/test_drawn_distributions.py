@@ -16,9 +16,8 @@ from pipeline.scenes.pieces import object_piece, shell_piece
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.shapes import MeshShape
 from scene_templates.layout import ShellPart, SurfaceLook
-from scene_templates.layout_rand import layout_rand
-from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
-from scene_templates.plans import scene_plan
+from scene_templates.layout_rand import layout_rand, scene_plan
+from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
 from storage.records.material import DIFFUSE
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.posing import posed
 from pipeline.scenes.shapes import MeshShape
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.layout import Pose
-from scene_templates.plans import scene_plan
+from scene_templates.layout_rand import scene_plan
 from scene_templates.rotations import uniform_rotation
 from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene

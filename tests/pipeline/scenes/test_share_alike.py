@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.scenes.budget import drawn_within
 from pipeline.scenes.pool import PooledAsset
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.errors import Rejected
 from storage.licences import share_alike_camp

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.scenes.pieces import ScenePiece, emitter_piece, object_piece, shell_piece
 from pipeline.scenes.subdivision import filled, subdivided
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
-from scene_templates.patches import PATCH_FACES, SIDES, PatchPlacement, patch
+from scene_templates.rooms import PATCH_FACES, SIDES, PatchPlacement, patch
 from storage.records.scene import SceneObject
 
 ROUNDING = 1e-6

@@ -11,7 +11,7 @@ from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.sight import Sight
 from pipeline.scenes.views import CAMERA_ATTEMPTS, complaint, next_camera
-from scene_templates.default_families import DEFAULT_FAMILIES
+from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings, ViewLaws
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import Rejected

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from infra.bench.subjects.manifests import memory_of_opening, write_manifest_of
 from storage.dataset import json_pieces
 from storage.dataset.json_pieces import entries
-from storage.dataset.member_table import MemberTable
+from storage.dataset.manifest import MemberTable
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from storage.dataset.dataset import Dataset
+from storage.dataset.shard import write_shard
 from storage.dataset.shard_places import expanded, listed_shards
-from storage.dataset.shard_writer import write_shard
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample

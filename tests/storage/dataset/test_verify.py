@@ -9,7 +9,7 @@ import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.manifest import index_shard, write_manifest
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.records.sample import encode_sample
@@ -106,3 +106,14 @@ def test_sizes_counts_and_members_are_compared(dataset: Dataset, fast: bool) -> 
     assert "member index differs" in text
     assert f"{shards[2]['name']}: missing" in text
     assert "train-000007.tar: not in the manifest" in text
+
+
+@pytest.mark.parametrize("renders", [None, 3, {}])
+def test_a_manifest_that_does_not_say_what_its_pictures_are_is_a_fault(
+    dataset: Dataset, renders: object
+) -> None:
+    settings = {**dataset.manifest.settings, "renders": renders}
+    manifest = dataclasses.replace(dataset.manifest, settings=settings)
+    write_manifest(dataset.folder.manifest, manifest)
+    problems = verify_dataset(dataset.folder.root).problems
+    assert any("pictures (" in problem for problem in problems)

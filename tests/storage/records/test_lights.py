@@ -12,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 from storage.conventions import HALF_FLOAT_MAX
-from storage.dataset.check_sample import check_sample
 from storage.dataset.manifest import Manifest
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
+from storage.dataset.verify import check_sample
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import index_shard, write_manifest
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.dataset.statistics import dataset_statistics
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.making.bucket_publication import begin_dataset, joined
 from storage.dataset.dataset import Dataset, open_dataset
-from storage.dataset.output import dataset_folder
+from storage.dataset.layout import dataset_folder
 from storage.dataset.training_data import open_training_data
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError

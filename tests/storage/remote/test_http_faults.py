@@ -9,8 +9,8 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.shard_places import listed_shards
 from storage.errors import TrilightError
 from storage.records.sample import Sample, encode_sample
-from storage.remote import pace
-from storage.remote.pace import Patience
+from storage.remote import tries
+from storage.remote.tries import Patience
 from tests.http_server import Fault, Site
 
 SHARD = "train-000000.tar"
@@ -68,7 +68,7 @@ def test_what_passes_by_itself_is_outlived(
 ) -> None:
     if len(faults) > 4 and not ranges:
         pytest.skip("without ranges, a line that always breaks gets nowhere")
-    monkeypatch.setattr(pace, "PATIENCE", Patience(least_bytes_per_s=0.0))  # of a busy machine
+    monkeypatch.setattr(tries, "PATIENCE", Patience(least_bytes_per_s=0.0))  # of a busy machine
     server.faults[PATH], server.ranges = list(faults), ranges
     assert [encode_sample(sample) for sample in read(server.url)] == expected(local)
     assert not server.faults[PATH]

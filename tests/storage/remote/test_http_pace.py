@@ -7,9 +7,8 @@ import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.errors import TrilightError
-from storage.remote import pace
-from storage.remote.pace import Pace, Patience
-from storage.remote.tries import TRIES, TransferFailed
+from storage.remote import tries
+from storage.remote.tries import TRIES, Pace, Patience, TransferFailed
 from tests.http_server import Fault, Site
 
 SHARD = "train-000000.tar"
@@ -17,7 +16,7 @@ PATH = f"/{SHARD}"
 
 
 def patience(monkeypatch: pytest.MonkeyPatch, **limits: float) -> None:
-    monkeypatch.setattr(pace, "PATIENCE", Patience(**limits))
+    monkeypatch.setattr(tries, "PATIENCE", Patience(**limits))
 
 
 def read(url: str) -> int:

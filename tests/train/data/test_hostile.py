@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import load, save
 
+from storage.dataset.shard import write_shard
 from storage.dataset.shard_set import OpenShard
-from storage.dataset.shard_writer import write_shard
 from storage.dataset.training_data import open_training_data
 from storage.errors import TrilightError
 from storage.records.exr import encode_exr

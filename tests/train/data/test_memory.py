@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.records.sample import Sample, encode_sample, sample_key
 from tests.conftest import ROOT
 from tests.train.toy import toy_sample

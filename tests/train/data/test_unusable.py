@@ -9,7 +9,7 @@ import pytest
 
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import index_shard, write_manifest
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import write_shard
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from storage.records.sample import encode_sample

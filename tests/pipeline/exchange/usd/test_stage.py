@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.exchange.usd import stage as opening
-from pipeline.exchange.usd.diagnostics import quietly
-from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.exchange.usd.stage import OpenedUsd, quietly
 from pipeline.exchange.usd.write import write_usd
 from storage.errors import TrilightError
 from tests.scenes_by_hand import tiny_scene

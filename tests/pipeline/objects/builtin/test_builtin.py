@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.objects.builtin.families import FAMILIES
 from pipeline.objects.builtin.grids import Mesh
+from pipeline.objects.generated import FAMILIES
 from storage.seeds import rng_for
 
 SAMPLES = [(family, number) for family in FAMILIES for number in range(12)]

@@ -80,7 +80,7 @@ def test_a_transfer_that_breaks_leaves_nothing_broken(site: Site, place: Path) -
 
 def test_no_server_at_all(site: Site, place: Path) -> None:
     site.always = {"/object-paths.json.gz": Fault(status=503)}
-    with pytest.raises(TrilightError, match=r"object-paths\.json\.gz cannot be had .*503"):
+    with pytest.raises(TrilightError, match=r"object-paths\.json\.gz cannot be downloaded .*503"):
         find(UID["a"])
     site.always = {glb("a"): Fault(status=503)}
     with pytest.raises(TrilightError, match=r"none of 1 objects could be downloaded.*503"):

@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.objects.remote import source as remote_source
 from storage.errors import TrilightError
-from storage.remote import pace
+from storage.remote import tries
 from storage.remote import url as remote_url
-from storage.remote.pace import Patience
+from storage.remote.tries import Patience
 from tests.http_server import Fault, Site
 from tests.pipeline.objects.find_kit import find, reasons
 
@@ -69,7 +69,7 @@ def test_one_dead_link_costs_one_object(
 
 
 def test_an_object_that_trickles_costs_itself(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pace, "PATIENCE", Patience(window_s=0.5, least_bytes_per_s=1000.0))
+    monkeypatch.setattr(tries, "PATIENCE", Patience(window_s=0.5, least_bytes_per_s=1000.0))
     site.put("a.obj", "content of a")
     site.put("b.obj", "v 0 0 0\n" * 1000)
     site.always["/b.obj"] = Fault(trickle=(1, 0.02))
@@ -124,7 +124,7 @@ def test_a_catalogue_that_is_kept_from_us_still_rules(site: Site) -> None:
     site.put("objects.jsonl", '{"uid": "a", "path": "a.obj", "licence": "LicenseRef-shop"}')
     site.put("a.obj")
     site.forbidden.add("/objects.jsonl")
-    with pytest.raises(TrilightError, match="objects.jsonl is listed but not given out"):
+    with pytest.raises(TrilightError, match="objects.jsonl is listed but cannot be fetched"):
         find(site.url)
 
 

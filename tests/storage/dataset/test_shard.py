@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.dataset.manifest import index_shard
-from storage.dataset.shard_reader import iterate_samples, scan_members
-from storage.dataset.shard_writer import write_shard
+from storage.dataset.shard import iterate_samples, scan_members, write_shard
 from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.records.profiles import PROFILES, Profile, keeps_law

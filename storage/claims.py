@@ -1,6 +1,6 @@
-"""Claims: who is at work on what, among processes that share a folder.
+"""Claims: locks that tell processes in a shared folder which work is taken.
 
-A claim is a lock on a small file. It ends with the process that holds it, whatever ends that, so
+A claim is a lock on a small file. It ends with the process that holds it, however that ends, so
 nothing has to be cleaned up after a kill. Claims spare work; they are not what keeps files right.
 Where a file system does not carry locks between machines, two of them may make the same scene, of
 the same bytes, and the first writer of a shard wins (storage.atomic).
@@ -17,10 +17,10 @@ from storage.atomic import write_error
 
 @contextlib.contextmanager
 def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
-    """Hold a claim for the block, and say whether it is ours.
+    """Hold a claim for the block; yield whether it is ours.
 
     Args:
-        path: the file of the claim; it is made, and may be deleted by whoever holds it.
+        path: the file of the claim; it is created here, and its holder may delete it.
         wait: until the claim is free, so that it always becomes ours.
 
     Raises:
@@ -34,12 +34,16 @@ def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
             os.close(descriptor)
 
 
-def _locked(path: Path, wait: bool) -> int | None:
-    """Return the descriptor that holds the lock, or None where somebody else holds it."""
+def open_lock(path: Path) -> int:
+    """Return the descriptor of a lock's file, which is created where it is missing.
+
+    Raises:
+        TrilightError: the folder cannot be written.
+    """
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            return os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         except FileNotFoundError:  # the folder went between the two calls: its owner was done
             continue
         except OSError as error:
@@ -47,9 +51,24 @@ def _locked(path: Path, wait: bool) -> int | None:
             if isinstance(error, FileExistsError) and not path.parent.is_file():
                 continue
             raise write_error(path, error) from error
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
+
+
+def flock_now(descriptor: int) -> bool:
+    """Take an exclusive lock without waiting; return whether it is ours."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _locked(path: Path, wait: bool) -> int | None:
+    """Return the descriptor that holds the lock, or None where another process holds it."""
+    while True:
+        descriptor = open_lock(path)
+        if wait:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        elif not flock_now(descriptor):
             os.close(descriptor)
             return None
         if _is(path, descriptor):

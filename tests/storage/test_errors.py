@@ -1,6 +1,6 @@
 """A name that nobody knows brings the near one, and all that are known."""
 
-from storage.suggestion import expected_one_of
+from storage.errors import expected_one_of
 
 
 def test_the_near_name_comes_first() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.builds.named import named_build
 from scene_templates.frozen_v1 import ONE_FAMILY_EACH
-from scene_templates.plans import scene_plan
+from scene_templates.layout_rand import scene_plan
 from scene_templates.settings import SceneSettings
 from tests.scene_templates.balls import DEFAULTS
 

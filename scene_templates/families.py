@@ -1,12 +1,17 @@
-"""A family: one layout with how many objects of which size it holds, and how often it is drawn."""
+"""Families: a layout, how many objects of which size it holds, and how often it is drawn.
+
+Trilight's own draw every layout equally often, with 1, 2 or 3 objects equally often.
+"""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Annotated, ClassVar
 
 from scene_templates.checks import SIZE, Counts, Range, require
 from scene_templates.rooms import SharedRoom
 from scene_templates.separate_sides import SeparateSides
 from scene_templates.templates import TEMPLATES
+from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Share, Within
 
@@ -42,3 +47,48 @@ class Family:
     def shell_triangles(self) -> int:
         """Triangles of floor and walls: 128 each."""
         return TEMPLATES[self.template].shell_triangles
+
+
+LAYOUTS = ("plane", "wall", "corner", "open_box")
+"""A template that is registered later joins a build when its name is written here."""
+
+DEFAULT_FAMILIES = tuple(
+    family
+    for name in LAYOUTS
+    for family in (
+        Family(
+            name=f"{name}-single",
+            template=name,
+            weight=1.0,
+            shell=SharedRoom(),
+            num_objects=(1, 1),
+            object_scale=(1.2, 2.2),
+        ),
+        Family(
+            name=f"{name}-multi",
+            template=name,
+            weight=2.0,
+            shell=SharedRoom(),
+            num_objects=(2, 3),
+            object_scale=(0.8, 1.8),
+        ),
+    )
+)
+"""The sizes are the published ones of most families."""
+
+
+def _itself(family: Family) -> Family:
+    return family
+
+
+FAMILIES: Registry[Callable[[], Family]] = Registry(
+    "family",
+    Callable,
+    {family.name: partial(_itself, family) for family in DEFAULT_FAMILIES},
+    decides=("data",),
+)
+"""Functions that return a family, by its name. A build states its families in full and asks for no
+list of all, so that registering one changes no build: `--set 'scenes.families=["plane-single"]'`
+and a build's own function choose from them."""
+
+Family.PRESETS = FAMILIES

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from storage.atomic import atomic_writer, write_error
-from storage.dataset.claims import claimed
+from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
 from storage.errors import EnvironmentFailure
 from tests.conftest import ROOT
@@ -21,7 +21,7 @@ from tests.conftest import ROOT
 HOLD = """
 import sys, time
 from pathlib import Path
-from storage.dataset.claims import claimed
+from storage.claims import claimed
 with claimed(Path(sys.argv[1])) as ours:
     print(ours, flush=True)
     time.sleep(60)

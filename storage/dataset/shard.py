@@ -1,18 +1,43 @@
-"""Reading tar shards without trusting them: plain members, sane names, whole samples.
+"""Shards: byte-reproducible tar files, and a reader that does not trust them.
 
-The headers are walked here, 512 bytes at a time: whatever is not a plain file is refused before any
-of it is read, and no number in a header makes anybody take memory.
+Written members are sorted and have no clock and no owner. The reader walks the headers itself, 512
+bytes at a time: anything that is not a plain file is refused before it is read, and no number in a
+header decides how much memory is taken.
 """
 
 import re
 import tarfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from storage.atomic import atomic_writer
 from storage.errors import TrilightError
 from storage.records.safe_read import open_plain
+
+
+def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
+    """Write samples, given as (key, members by suffix) in order of keys, as one tar file.
+
+    Equal samples give equal bytes. The file appears under its name only when it is complete, and
+    never in the place of another: the first writer of a shard wins.
+
+    Raises:
+        TrilightError: the disk is full or the folder cannot be written.
+    """
+    with atomic_writer(path, replace=False) as stream:
+        write_tar(stream, samples)
+
+
+def write_tar(stream: BinaryIO, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
+    """Write samples to an open file with WebDataset's own writer, and with fixed metadata."""
+    from webdataset.writer import TarWriter  # not at the top: it is slow to import
+
+    with TarWriter(stream, encoder=False, mtime=0, user="trilight", group="trilight") as writer:
+        for key, members in samples:
+            writer.write({"__key__": key, **members})
+
 
 MAX_MEMBER_BYTES = 1 << 30
 """A 512 x 512 picture takes about 1 MiB; a gigabyte is a mistake or an attack."""
@@ -29,14 +54,10 @@ _BINARY = 0x80
 class Member:
     """One file in a shard."""
 
-    key: str
-    """Of its sample."""
-    suffix: str
-    """What it is in the sample."""
-    offset: int
-    """Of its first byte in the shard."""
-    num_bytes: int
-    """Its size."""
+    key: str  # key of its sample
+    suffix: str  # what it is in the sample
+    offset: int  # offset of its first byte in the shard
+    num_bytes: int  # its size
 
 
 def scan_members(stream: BinaryIO, name: str) -> Iterator[Member]:
