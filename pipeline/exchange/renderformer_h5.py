@@ -46,7 +46,7 @@ from pipeline.exchange.safe_h5 import (
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
-from storage.records.exr import MAX_RESOLUTION
+from storage.records.exr import MAX_RESOLUTION, to_half
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
@@ -173,14 +173,8 @@ def _write_texture(file: Any, rows: NDArray[np.floating]) -> None:
 
 
 def _rgba(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
-    legal = np.isfinite(radiance_rgb) & (radiance_rgb >= 0) & (radiance_rgb <= HALF_FLOAT_MAX)
-    if not legal.all():
-        raise TrilightError(
-            f"picture: holds {radiance_rgb[~legal][0]}; expected values in [0, "
-            f"{HALF_FLOAT_MAX:.0f}]."
-        )
     opaque = np.ones((*radiance_rgb.shape[:3], 1), np.float16)
-    return np.concatenate([radiance_rgb.astype(np.float16), opaque], axis=3)
+    return np.concatenate([to_half(radiance_rgb), opaque], axis=3)
 
 
 def _mvp(scene: Scene) -> NDArray[np.float32]:

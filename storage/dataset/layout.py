@@ -83,6 +83,14 @@ class DatasetFolder:
     """Finished samples of unfinished shards, in a folder for each shard."""
     staged_sent = _Below(".staging/sent")
     """An empty file for each shard that is known to be in the bucket."""
+    staged_at_work = _Below(".staging/at_work")
+    """Notes on how far unfinished scenes are."""
+    staged_plan = _Below(".staging/plan.json")
+    """How many objects the asset stage has to do."""
+    staged_downloads = _Below(".staging/downloads.json")
+    """How many object files are downloaded, and of how many."""
+    staged_done = _Below(".staging/objects_done")
+    """A byte for each object that is prepared or rejected."""
     _lock = _Below(".staging/lock")
 
     @property

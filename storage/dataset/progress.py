@@ -54,18 +54,18 @@ class Progress:
 
 def announce_downloads(folder: DatasetFolder, done: int, total: int) -> None:
     """Record how many object files have been downloaded."""
-    write_atomically(_downloads(folder), json.dumps([done, total]).encode())
+    write_atomically(folder.staged_downloads, json.dumps([done, total]).encode())
 
 
 def announce_objects(folder: DatasetFolder, num_objects: int) -> None:
     """Record how many objects the asset stage has to do, and that none is done."""
-    write_atomically(_done(folder), b"")
-    write_atomically(_plan(folder), json.dumps({"objects": num_objects}).encode())
+    write_atomically(folder.staged_done, b"")
+    write_atomically(folder.staged_plan, json.dumps({"objects": num_objects}).encode())
 
 
 def count_object(folder: DatasetFolder) -> None:
     """Record that one more object is prepared or rejected: one byte, from any thread."""
-    path = _done(folder)
+    path = folder.staged_done
     try:
         with path.open("ab") as stream:
             stream.write(b".")
@@ -79,7 +79,7 @@ def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
     The note only shows progress, so failing to write it is no error.
     """
     with contextlib.suppress(OSError):
-        path = _at_work(folder) / numbered(scene_index, f"{scene_index:09d}")
+        path = folder.staged_at_work / numbered(scene_index, f"{scene_index:09d}")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"{views:.3f}")
 
@@ -87,7 +87,7 @@ def tell_views(folder: DatasetFolder, scene_index: int, views: float) -> None:
 def forget_views(folder: DatasetFolder, scene_index: int) -> None:
     """Delete the note of `tell_views`: the scene is finished, or begun anew."""
     with contextlib.suppress(OSError):
-        (_at_work(folder) / numbered(scene_index, f"{scene_index:09d}")).unlink()
+        (folder.staged_at_work / numbered(scene_index, f"{scene_index:09d}")).unlink()
 
 
 def read_progress(folder: DatasetFolder) -> Progress:
@@ -100,15 +100,13 @@ def read_progress(folder: DatasetFolder) -> Progress:
         scenes_done = num_scenes_done(folder, planned)
     except (TrilightError, OSError):
         scenes_planned = num_views = scenes_done = 0
-    plan = json.loads(_plan(folder).read_bytes()) if _plan(folder).exists() else {"objects": 0}
-    done, total = (
-        json.loads(_downloads(folder).read_bytes()) if _downloads(folder).exists() else (0, 0)
-    )
+    plan, downloads = folder.staged_plan, folder.staged_downloads
+    done, total = json.loads(downloads.read_bytes()) if downloads.exists() else (0, 0)
     return Progress(
         downloads_done=done,
         downloads_planned=total,
-        objects_done=_done(folder).stat().st_size if _done(folder).exists() else 0,
-        objects_planned=plan["objects"],
+        objects_done=folder.staged_done.stat().st_size if folder.staged_done.exists() else 0,
+        objects_planned=json.loads(plan.read_bytes())["objects"] if plan.exists() else 0,
         scenes_done=scenes_done,
         scenes_planned=scenes_planned,
         num_views=num_views,
@@ -120,7 +118,7 @@ def _views_at_work(folder: DatasetFolder) -> float:
     """Return how many views are in progress, without old notes that a kill has left."""
     since = time.time() - _AT_WORK_S
     views = 0.0
-    for path in _at_work(folder).rglob("[0-9]*"):
+    for path in folder.staged_at_work.rglob("[0-9]*"):
         with contextlib.suppress(OSError, ValueError):  # it is gone, or half written
             if path.is_file() and path.stat().st_mtime > since:
                 views += float(path.read_text())
@@ -171,22 +169,6 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
     there = shards_there(folder) & planned.keys()
     unpacked = sum(path.is_file() for path in folder.staged_samples.rglob("*.tar"))
     return sum(planned[name] for name in there) + unpacked
-
-
-def _at_work(folder: DatasetFolder) -> Path:
-    return folder.staging / "at_work"
-
-
-def _plan(folder: DatasetFolder) -> Path:
-    return folder.staging / "plan.json"
-
-
-def _downloads(folder: DatasetFolder) -> Path:
-    return folder.staging / "downloads.json"
-
-
-def _done(folder: DatasetFolder) -> Path:
-    return folder.staging / "objects_done"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,7 +316,8 @@ def read_status(url: str) -> DatasetStatus:
         scenes_done=done,
         scenes_planned=manifest.num_scenes,
         num_views=manifest.num_views,
-        finished=len(manifest.shards) >= len(planned) and _has_card(dataset),
+        finished=len(manifest.shards) >= len(planned)
+        and dataset.files.read("README.md") is not None,
         views_per_hour=views_per_hour,
         remaining_s=remaining_s,
         core_hours=sum(row.seconds * row.cores for row in logs) / share / 3600 if share else None,
@@ -373,7 +356,3 @@ def _rate(
     span_s = last[-1].finished_unix_s - (last[0].finished_unix_s - last[0].seconds)
     per_s = len(last) / share / max(span_s, 1e-3)
     return 3600 * per_s * manifest.num_views, left / per_s
-
-
-def _has_card(dataset: Dataset) -> bool:
-    return dataset.files.read("README.md") is not None
