@@ -45,11 +45,11 @@ def print_outcome(outcome: RenderOutcome, seconds: float, *, as_json: bool) -> N
         _print_one(plan, outcome.shots[0], seconds)
 
 
-def _shot_json(shot: FinishedShot) -> dict[str, Any]:
+def _shot_json(done: FinishedShot) -> dict[str, Any]:
     """Return the figures of one shot; with one engine they stand beside those of the scene."""
     of_engines: Mapping[str, Any] = {
         name: {**picture.facts, "exr": str(picture.path), "kept": picture.was_kept}
-        for name, picture in shot.pictures.items()
+        for name, picture in done.pictures.items()
     }
     for facts in of_engines.values():
         if "at_cap" in facts:
@@ -57,21 +57,21 @@ def _shot_json(shot: FinishedShot) -> dict[str, Any]:
     if len(of_engines) == 1:
         (of_engines,) = of_engines.values()
     else:
-        of_engines = {**of_engines, "psnr_log_db": round(shot.psnr_log_db or 0, 3)}
-        if shot.flicker is not None:
-            flicker = dataclasses.asdict(shot.flicker)
+        of_engines = {**of_engines, "psnr_log_db": round(done.psnr_log_db or 0, 3)}
+        if done.flicker is not None:
+            flicker = dataclasses.asdict(done.flicker)
             of_engines["flicker"] = {name: round(value, 3) for name, value in flicker.items()}
     return {
-        "lights": shot.scene.num_lights,
-        "png": str(shot.png),
-        "scene_sha256": shot.scene.digest,
-        "triangles": shot.scene.num_triangles,
+        "lights": done.scene.num_lights,
+        "png": str(done.shot.png),
+        "scene_sha256": done.scene.digest,
+        "triangles": done.scene.num_triangles,
         **of_engines,
     }
 
 
-def _print_one(plan: RenderPlan, shot: FinishedShot, seconds: float) -> None:
-    scene, width = shot.scene, plan.resolution
+def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
+    scene, width = done.scene, plan.resolution
     factor = enlargement(width)
     enlarged = "" if factor == 1 else f"; in the PNG a pixel is {factor} x {factor}"
     rows: Rows = [
@@ -83,13 +83,13 @@ def _print_one(plan: RenderPlan, shot: FinishedShot, seconds: float) -> None:
         ("picture", f"{width} x {width}, linear radiance{enlarged}"),
     ]
     for engine in plan.engines:
-        rows += _engine(engine, shot.pictures[engine.name].facts)
-    if shot.psnr_log_db is not None:
-        rows.append(("agreement", f"{shot.psnr_log_db:.1f} dB (psnr_log_db)"))
+        rows += _engine(engine, done.pictures[engine.name].facts)
+    if done.psnr_log_db is not None:
+        rows.append(("agreement", f"{done.psnr_log_db:.1f} dB (psnr_log_db)"))
     rows += [("wall time", f"{seconds:.1f} s"), ("scene digest", scene.digest)]
     print_rows("Rendered", rows)
-    measure = " and ".join(str(picture.path) for picture in shot.pictures.values())
-    console.print(f"\nLook at {shot.png}; measure with {measure}", style="bold")
+    measure = " and ".join(str(picture.path) for picture in done.pictures.values())
+    console.print(f"\nLook at {done.shot.png}; measure with {measure}", style="bold")
 
 
 def _engine(engine: EnginePlan, facts: Facts) -> Rows:

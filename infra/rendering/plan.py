@@ -128,11 +128,8 @@ def shots(
     """
     for index, (source, camera) in enumerate(pairs):
         stem = where.stem_of(index)
-        exrs = (
-            {names[0]: Path(f"{stem}.exr")}
-            if len(names) == 1
-            else {name: Path(f"{stem}.{name}.exr") for name in names}
-        )
+        suffixes = {name: f".{name}.exr" if len(names) > 1 else ".exr" for name in names}
+        exrs = {name: Path(f"{stem}{suffix}") for name, suffix in suffixes.items()}
         yield Shot(source=source, camera=camera, exrs=exrs, png=Path(f"{stem}.png"))
 
 

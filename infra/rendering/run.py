@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from infra.rendering.asked import Asked
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
 class SceneIdentity:
     """What there is to say of a scene."""
 
-    name: str
-    """Its file, without folders."""
     digest: str
     """storage.records.scene_file.scene_digest."""
     num_triangles: int
@@ -51,11 +48,10 @@ class SceneIdentity:
 class FinishedShot:
     """What came of one shot."""
 
+    shot: Shot
     scene: SceneIdentity
     pictures: Mapping[str, PictureFile]
     """By engine."""
-    png: Path
-    """What people look at."""
     psnr_log_db: float | None
     """Of the network's picture against the traced one, where there are both."""
     flicker: Flicker | None
@@ -114,7 +110,7 @@ def carry_out(plan: RenderPlan, reader: SceneReader, watcher: RenderWatcher) -> 
             notes |= dict.fromkeys(scene.notes)
             watcher.pictures(len(finished), len(plan.shots))
     if plan.place.video is not None:
-        write_video(plan.place.video, [shot.png for shot in finished], plan.fps)
+        write_video(plan.place.video, [done.shot.png for done in finished], plan.fps)
     return RenderOutcome(plan=plan, shots=finished, notes=[*notes, *_caveats(plan, finished)])
 
 
@@ -135,7 +131,6 @@ def _with_scenes(shots: Sequence[Shot], reader: SceneReader) -> Iterator[tuple[_
     for source, same_scene in itertools.groupby(shots, key=lambda shot: shot.source):
         loaded = reader.load(source)
         identity = SceneIdentity(
-            name=source.name,
             digest=scene_digest(loaded.scene),
             num_triangles=loaded.scene.num_triangles,
             num_lights=num_lights(loaded.scene),
@@ -156,7 +151,7 @@ def _picture(
     wanted = Request(
         engine=name,
         identity=engine.identity,
-        source=at_hand.identity.name,
+        source=shot.source.name,
         scene_sha256=at_hand.identity.digest,
         camera=camera,
         view=view,
@@ -165,7 +160,7 @@ def _picture(
     if kept is not None:
         return kept
     if name not in at_hand.opened:
-        at_hand.opened[name] = engine.open(at_hand.scene, at_hand.identity.name)
+        at_hand.opened[name] = engine.open(at_hand.scene, shot.source.name)
         at_hand.notes.extend(at_hand.opened[name].notes)
     rendered = at_hand.opened[name].render(camera, shot.name)
     return write_picture(shot.exrs[name], wanted, rendered)
@@ -196,9 +191,9 @@ def _finish(
         )
     write_atomically(shot.png, encode_png(pixels))
     finished = FinishedShot(
+        shot=shot,
         scene=scene,
         pictures=files,
-        png=shot.png,
         psnr_log_db=agreement,
         flicker=flicker(before, now) if now else None,
     )

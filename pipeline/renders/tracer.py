@@ -30,14 +30,12 @@ class PassSum(Protocol):
 
     def add(self, *, seed: int, spp: int) -> None:
         """Add all samples of one pass: `Tracer.radiance` times `spp`. It may return before."""
-        ...
 
     def read(self) -> NDArray[np.float64]:
         """Return the sum over all samples, [R, R, 3]; not finite where any sample was not.
 
         It waits until they are traced, and equals the sum in float64 of the passes, one by one.
         """
-        ...
 
 
 class Tracer(Protocol):
@@ -51,7 +49,6 @@ class Tracer(Protocol):
         Raises:
             Rejected: "unlit_scene" where it has no area.
         """
-        ...
 
     def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
         """Return the mean of one pass of samples, linear radiance [R, R, 3].
@@ -63,19 +60,15 @@ class Tracer(Protocol):
             seed: 31 bits; passes with different seeds are independent.
             spp: samples per pixel, a square of a power of two.
         """
-        ...
 
     def pass_sum(self, camera: Camera) -> PassSum:
         """Return an empty sum of passes of a view."""
-        ...
 
     def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
         """Return the albedo and normal pictures."""
-        ...
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
         """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
-        ...
 
 
 class HostSum:

@@ -20,7 +20,6 @@ from pipeline.renders.emitter_table import EmitterTable
 from pipeline.renders.film import Film
 from pipeline.renders.kernel_scene import KernelScene
 from pipeline.renders.light_kernel import trace_light
-from pipeline.renders.light_starts import even_numbers
 from pipeline.renders.path_kernel import trace
 from pipeline.renders.splats import Splats, splat_unit
 from pipeline.renders.surface_table import SurfaceTable
@@ -31,6 +30,9 @@ from storage.seeds import seed_for
 LIGHT_PATHS = 0.25
 """Light paths for each camera path: a quarter has most of the gain, and the whole then takes 1.1 to
 1.4 times as long (docs/log)."""
+
+_GOLDEN = 1.1673039782614187
+"""The root of x^5 = x + 1, for points that fill four dimensions."""
 
 
 class VectorTracer:
@@ -51,7 +53,6 @@ class VectorTracer:
             max_depth=max_depth,
             rr_depth=rr_depth,
         )
-
         self._unit = splat_unit(scene)
 
     def only_light(self, row: int) -> "VectorTracer":
@@ -124,6 +125,21 @@ class _DeviceSum:
 
     def read(self) -> NDArray[np.float64]:
         return _picture(self._camera, self._total)
+
+
+def even_numbers(count: int, seed: int) -> list[Any]:
+    """Return 4 arrays of `count` uniform numbers (Float, [0, 1)): points that fill 4 dimensions.
+
+    Multiples of the 4 inverse powers of a generalised golden ratio (Roberts 2018), shifted by the
+    seed. Any first part of them is spread evenly, so that any count will do.
+    """
+    lane = dr.arange(mi.UInt32, count)
+    numbers = []
+    for axis in range(4):
+        stride = round(2**32 / _GOLDEN ** (axis + 1))
+        shift = dr.opaque(mi.UInt32, 2 * seed_for(seed, "light paths", axis))
+        numbers.append(mi.Float((lane * stride + shift) >> 8) * 2.0**-24)
+    return numbers
 
 
 def _load(scene: Scene, triangles: NDArray[np.intp], beside: Any = None) -> Any:
