@@ -43,7 +43,7 @@ STATISTICS = ("count", "min", "p5", "median", "mean", "p95", "max")
 
 
 def summary(values: ArrayLike) -> dict[str, float]:
-    """Return STATISTICS of the finite values; only the count where there is none."""
+    """Return STATISTICS of the finite values; without any, only the count 0."""
     array = np.asarray(values, np.float64).ravel()
     finite = array[np.isfinite(array)]
     if not finite.size:

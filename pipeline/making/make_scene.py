@@ -123,10 +123,7 @@ def assets_of(split: str) -> Sequence[PooledAsset]:
     if split not in _state.pool:
         source = _state.source
         _state.pool[split] = [
-            PooledAsset(
-                locked=locked,
-                asset=decode_asset(path.read_bytes()),
-            )
+            PooledAsset(locked=locked, asset=decode_asset(path.read_bytes()))
             for locked, path in sorted(source.objects, key=lambda pair: pair[0].uid)
             if locked.split == split
         ]

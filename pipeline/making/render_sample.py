@@ -4,9 +4,7 @@ Choosing a camera wraps rendering. A `SceneRenderer` makes the picture of one ca
 and knows of no other camera; `cameras_of_view` knows of no picture.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -56,25 +54,23 @@ def render_sample(
     """
     renderer, sight = SceneRenderer(scene, settings.renders), Sight(scene)
 
-    def take(view: int, camera: ViewCamera) -> _TakenView:
-        seed = seed_for(settings.seed, "samples", int(key), view, camera.attempt)
-        steps = renderer.view_steps(camera.c2w, float(camera.fov_deg), seed)
-        return _TakenView(camera=camera, seed=seed, rendered=told.view(view, steps))
+    def take(view: int) -> _TakenView:
+        for camera in cameras_of_view(scene, sight, settings.scenes, view):
+            seed = seed_for(settings.seed, "samples", int(key), view, camera.attempt)
+            try:
+                steps = renderer.view_steps(camera.c2w, float(camera.fov_deg), seed)
+                return _TakenView(camera=camera, seed=seed, rendered=told.view(view, steps))
+            except Rejected as rejection:
+                reason, message = rejection.reason, rejection.message
+            if keeps_cameras:
+                raise Rejected(reason, f"view {view}: {message}")
+            item, attempt = f"{key}.{view}", camera.attempt
+            failures.append(
+                Failure(stage="renders", item=item, reason=reason, message=message, attempt=attempt)
+            )
+        raise AssertionError("cameras_of_view ends by raising Rejected")
 
-    def refuse(view: int, camera: ViewCamera, rejection: Rejected) -> None:
-        reason, message = rejection.reason, rejection.message
-        if keeps_cameras:
-            raise Rejected(reason, f"view {view}: {message}") from None
-        item = f"{key}.{view}"
-        row = Failure(
-            stage="renders", item=item, reason=reason, message=message, attempt=camera.attempt
-        )
-        failures.append(row)
-
-    views = []
-    for view in range(scene.num_views):
-        cameras = cameras_of_view(scene, sight, settings.scenes, view)
-        views.append(_first_accepted(cameras, partial(take, view), partial(refuse, view)))
+    views = [take(view) for view in range(scene.num_views)]
     seen = with_cameras(scene, [view.camera for view in views])
     seen.check()
     lights = [view.rendered.lights_rgb for view in views if view.rendered.lights_rgb is not None]
@@ -85,20 +81,6 @@ def render_sample(
         views=tuple(_record(view, sight, settings.scenes.views.coverage_grid) for view in views),
         lights_rgb=np.stack(lights) if lights else None,
     )
-
-
-def _first_accepted(
-    cameras: Iterator[ViewCamera],
-    take: Callable[[ViewCamera], _TakenView],
-    refuse: Callable[[ViewCamera, Rejected], None],
-) -> _TakenView:
-    """Return the picture of the first camera that is not refused; `cameras` raises at its end."""
-    while True:
-        camera = next(cameras)
-        try:
-            return take(camera)
-        except Rejected as rejection:
-            refuse(camera, rejection)
 
 
 def _record(view: _TakenView, sight: Sight, coverage_grid: int) -> ViewRecord:

@@ -29,7 +29,10 @@ class PassSum(Protocol):
     """The growing sum of the passes of one view, in the memory where they are traced."""
 
     def add(self, *, seed: int, spp: int) -> None:
-        """Add all samples of one pass: `Tracer.radiance` times `spp`. It may return before."""
+        """Add all samples of one pass: `Tracer.radiance` times `spp`.
+
+        It may return before they are traced.
+        """
 
     def read(self) -> NDArray[np.float64]:
         """Return the sum over all samples, [R, R, 3]; not finite where any sample was not.
@@ -72,7 +75,7 @@ class Tracer(Protocol):
 
 
 class HostSum:
-    """A `PassSum` in numpy's memory, of a tracer whose passes come there anyway."""
+    """A `PassSum` in numpy's memory, for a tracer that returns its passes there anyway."""
 
     def __init__(self, tracer: Tracer, camera: Camera) -> None:
         self._tracer, self._camera = tracer, camera

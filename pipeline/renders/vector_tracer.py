@@ -75,14 +75,14 @@ class VectorTracer:
         return traced + self._landed(camera, light_paths, seed=seed, count=int(light_paths * spp))
 
     def _traced(self, camera: Camera, light_paths: float, *, seed: int, spp: int) -> Any:
-        """Return what camera paths leave to themselves beside so many light paths per sample."""
+        """Return the camera paths' share of the light (Color3f), beside so many light paths."""
         sampler = _sampler(camera, seed, spp)
         film, beside = Film(camera), dr.opaque(mi.Float, light_paths)
         ray = film.rays(*_jittered(camera, sampler, spp))
         return _pixel_means(spp, trace(self._scene, film, beside, sampler, ray))
 
     def _landed(self, camera: Camera, light_paths: float, *, seed: int, count: int) -> Any:
-        """Return the rest, from `count` light paths."""
+        """Return the share of the light (Color3f) that `count` light paths find."""
         splats, beside = Splats(camera.resolution, self._unit), dr.opaque(mi.Float, light_paths)
         u = even_numbers(count, seed)
         emitter = self._scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
@@ -112,7 +112,7 @@ class VectorTracer:
 
 
 class _DeviceSum:
-    """A `PassSum` in the memory of the device, in double precision: passes do not wait for us."""
+    """A `PassSum` in float64 in the memory of the device, so that no pass waits for Python."""
 
     def __init__(self, tracer: VectorTracer, camera: Camera) -> None:
         self._tracer, self._camera = tracer, camera
@@ -145,9 +145,9 @@ def even_numbers(count: int, seed: int) -> list[Any]:
 def _load(scene: Scene, triangles: NDArray[np.intp], beside: Any = None) -> Any:
     """Return a mi.Scene of one mesh, whose triangle numbers are places in `triangles`.
 
-    Rays of one kernel may meet it and the mi.Scene `beside`: on a graphics card Dr.Jit lets rays of
-    a kernel meet one OptiX shader binding table, and what has another one is empty space for them.
-    A scene that is given another one as a child shares its table.
+    One kernel may trace rays into this scene and into `beside`. On a graphics card all rays of a
+    kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
+    has another scene as a child shares its table.
     """
     mesh = mi.Mesh("triangles", len(scene.vertex_positions), len(triangles))
     parameters = mi.traverse(mesh)
