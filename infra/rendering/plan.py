@@ -14,7 +14,7 @@ from infra.rendering.sources import scene_sources
 from infra.torch_library import require_torch
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.renders.settings import one_picture
+from pipeline.renders.settings import RenderSettings, one_picture
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
 
@@ -73,36 +73,16 @@ def plan_render(asked: Asked, reader: SceneReader) -> RenderPlan:
         TrilightError: an option that means nothing, a source, camera or checkpoint that is
             unusable, or a place that cannot be written.
     """
-    checkpoint, resolution = _network(asked) if asked.engine != "mitsuba" else ("", _RESOLUTION)
+    checkpoint, resolution = _network_and_width(asked)
     settings = one_picture(
-        resolution=asked.resolution or resolution,
-        noise_floor_db=asked.noise_floor_db,
-        max_spp=asked.max_spp,
+        resolution=resolution, noise_floor_db=asked.noise_floor_db, max_spp=asked.max_spp
     )
     look = Look(tone_map=asked.tone_map, exposure_ev=asked.exposure_ev)
     if asked.out.suffix.lower() == ".exr":
         scene_source(asked.source)  # a wrong name is said before any library is loaded
     where = place(asked.out)
     pairs = _pairs(asked, reader) if where.is_sequence else _one_pair(asked)
-    engines = list[EnginePlan]()
-    if asked.engine != "neural":
-        mitsuba = MitsubaPlan(
-            settings=settings,
-            seed=asked.seed,
-            threads=asked.threads or os.cpu_count() or 1,
-            variant=choose_variant(),
-        )
-        engines.append(mitsuba)
-    if asked.engine != "mitsuba":
-        neural = NeuralPlan(
-            checkpoint=checkpoint,
-            precision=asked.precision,
-            resolution=settings.resolution,
-            lights_per_pass=asked.lights_per_pass,
-            skip_empty_bundles=asked.skip_empty_bundles,
-            threads=asked.threads,
-        )
-        engines.append(neural)
+    engines = _engines(asked, settings, checkpoint)
     return RenderPlan(
         source=asked.source,
         view=asked.view,
@@ -133,8 +113,10 @@ def shots(
         yield Shot(source=source, camera=camera, exrs=exrs, png=Path(f"{stem}.png"))
 
 
-def _network(asked: Asked) -> tuple[str, int]:
-    """Return the checkpoint, and the width of pictures that is taken where none is asked for."""
+def _network_and_width(asked: Asked) -> tuple[str | None, int]:
+    """Return the checkpoint, if a network renders, and the width of pictures in pixels."""
+    if asked.engine == "mitsuba":
+        return None, asked.resolution or _RESOLUTION
     require_torch("--engine neural")
     from model.open import BUILTIN, find_network
     from train.networks import network_of_run
@@ -143,6 +125,29 @@ def _network(asked: Asked) -> tuple[str, int]:
     if asked.resolution is not None:
         return checkpoint, asked.resolution
     return checkpoint, find_network(checkpoint, network_of_run).trained.resolution or _RESOLUTION
+
+
+def _engines(asked: Asked, settings: RenderSettings, checkpoint: str | None) -> list[EnginePlan]:
+    engines = list[EnginePlan]()
+    if asked.engine != "neural":
+        mitsuba = MitsubaPlan(
+            settings=settings,
+            seed=asked.seed,
+            threads=asked.threads or os.cpu_count() or 1,
+            variant=choose_variant(),
+        )
+        engines.append(mitsuba)
+    if checkpoint is not None:
+        neural = NeuralPlan(
+            checkpoint=checkpoint,
+            precision=asked.precision,
+            resolution=settings.resolution,
+            lights_per_pass=asked.lights_per_pass,
+            skip_empty_bundles=asked.skip_empty_bundles,
+            threads=asked.threads,
+        )
+        engines.append(neural)
+    return engines
 
 
 def _one_pair(asked: Asked) -> list[tuple[SceneSource, ShotCamera | int]]:
