@@ -33,6 +33,8 @@ class Shot:
     """What is measured: a file for each engine, by its name."""
     png: Path
     """What people look at."""
+    keep: bool
+    """Whether files of this very picture that are there already are kept."""
 
     @property
     def name(self) -> str:
@@ -59,7 +61,7 @@ class RenderPlan:
     look: Look
     """Of the PNG files."""
     place: PicturePlaces
-    """Where the pictures are. Many are kept if they are there already; a single one never is."""
+    """Where the pictures are."""
     shots: Sequence[Shot]
     """Picture by picture; shots of one scene follow each other."""
     fps: int
@@ -110,7 +112,8 @@ def shots(
         stem = where.stem_of(index)
         suffixes = {name: f".{name}.exr" if len(names) > 1 else ".exr" for name in names}
         exrs = {name: Path(f"{stem}{suffix}") for name, suffix in suffixes.items()}
-        yield Shot(source=source, camera=camera, exrs=exrs, png=Path(f"{stem}.png"))
+        png = Path(f"{stem}.png")
+        yield Shot(source=source, camera=camera, exrs=exrs, png=png, keep=where.is_sequence)
 
 
 def _network_and_width(asked: Asked) -> tuple[str | None, int]:

@@ -80,7 +80,7 @@ class RenderWatcher(Protocol):
 
 
 def render_asked(asked: Asked, watcher: RenderWatcher) -> RenderOutcome:
-    """Render what was asked for and write its files; raises TrilightError as its two steps."""
+    """Plan what was asked for and carry it out; raises TrilightError as these two do."""
     with SceneReader(asked.albedo_over_one) as reader:
         return carry_out(plan_render(asked, reader), reader, watcher)
 
@@ -101,10 +101,7 @@ def carry_out(plan: RenderPlan, reader: SceneReader, watcher: RenderWatcher) -> 
         }
         watcher.pictures(0, len(plan.shots))
         for scene, shot in _with_scenes(plan.shots, reader):
-            made = {
-                name: _picture(shot, name, engine, scene, keep=plan.place.is_sequence)
-                for name, engine in engines.items()
-            }
+            made = {name: _picture(shot, name, engine, scene) for name, engine in engines.items()}
             done, before = _finish(shot, scene.identity, made, plan.look, before)
             finished.append(done)
             notes |= dict.fromkeys(scene.notes)
@@ -121,9 +118,9 @@ class _SceneAtHand:
     scene: Scene
     identity: SceneIdentity
     notes: list[str]
-    """Of its file, and then of each engine that opened it."""
+    """Those on its file, and then those of each engine that opened it."""
     opened: dict[str, OpenedScene]
-    """By engine: an engine opens a scene when the first picture of it is missing."""
+    """By engine. An engine opens the scene for the first picture that is not kept."""
 
 
 def _with_scenes(shots: Sequence[Shot], reader: SceneReader) -> Iterator[tuple[_SceneAtHand, Shot]]:
@@ -143,7 +140,7 @@ def _with_scenes(shots: Sequence[Shot], reader: SceneReader) -> Iterator[tuple[_
 
 
 def _picture(
-    shot: Shot, name: str, engine: Engine, at_hand: _SceneAtHand, *, keep: bool
+    shot: Shot, name: str, engine: Engine, at_hand: _SceneAtHand
 ) -> tuple[PictureFile, Radiance]:
     """Return the picture of one engine, which is kept or made."""
     view = shot.camera if isinstance(shot.camera, int) else None
@@ -156,7 +153,7 @@ def _picture(
         camera=camera,
         view=view,
     )
-    kept = kept_picture(shot.exrs[name], wanted) if keep else None
+    kept = kept_picture(shot.exrs[name], wanted) if shot.keep else None
     if kept is not None:
         return kept
     if name not in at_hand.opened:
