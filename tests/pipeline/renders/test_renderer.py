@@ -60,7 +60,7 @@ def test_the_same_bits_for_any_number_of_threads_and_in_any_process() -> None:
         "import numpy as np\n"
         "from pipeline.renders.variant import activate, choose_variant\n"
         "activate(choose_variant())\n"
-        "from tests.renders import test_renderer as t\n"
+        "from tests.pipeline.renders import test_renderer as t\n"
         "from tests.pipeline.renders.scene_kit import sampled_like_scene\n"
         "t.set_threads(1)\n"
         "t._render(t.simple_scene())\n"
