@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture
 def bare_reports(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the figures out of reports: they take seconds, and tests.documents looks at them."""
-    monkeypatch.setattr("pipeline.documents.report._SECTIONS", ())
+    monkeypatch.setattr("pipeline.documents.report._SECTIONS", {})
 
 
 @pytest.fixture(scope="session")

@@ -68,9 +68,7 @@ def inspect(asked: Inspected, shown: Shown) -> None:
         found = dataset_distributions(opened, shard_done=lambda _: bars.advance(task))
     folder = _folder_of_documents(opened, asked.out)
     if folder is not None:
-        _write(opened, statistics, found, folder, max_scenes=asked.scenes)
-        if asked.by_template is not None:
-            _write_templates(opened, folder, per_template=asked.by_template)
+        _write(opened, statistics, found, folder, asked)
     if shown.json:
         print_json(_as_json(opened, statistics, found))
         return
@@ -120,20 +118,15 @@ def _write(
     statistics: Statistics,
     found: "Distributions",
     folder: DatasetFolder,
-    *,
-    max_scenes: int,
+    asked: Inspected,
 ) -> None:
-    from pipeline.documents.contact_sheet import write_contact_sheet
     from pipeline.documents.report import write_report
+    from pipeline.documents.sheets import write_contact_sheet, write_template_sheet
 
-    write_contact_sheet(opened, statistics, max_scenes=max_scenes, out=folder)
+    write_contact_sheet(opened, statistics, max_scenes=asked.scenes, out=folder)
     write_report(opened, found, out=folder)
-
-
-def _write_templates(opened: Dataset, folder: DatasetFolder, *, per_template: int) -> None:
-    from pipeline.documents.template_sheet import write_template_sheet
-
-    write_template_sheet(opened, per_template=per_template, out=folder)
+    if asked.by_template is not None:
+        write_template_sheet(opened, per_template=asked.by_template, out=folder)
 
 
 def _as_json(opened: Dataset, statistics: Statistics, found: "Distributions") -> dict[str, object]:

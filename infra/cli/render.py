@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @command("source")
 def render(asked: Asked, shown: Shown) -> None:
     from infra.cli.rendered import print_outcome
-    from infra.rendering.session import render_asked
+    from infra.rendering.run import render_asked
 
     started = time.monotonic()
     with progress_bars() as bars:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from infra.rendering.tone_maps import ToneMap
+from infra.rendering.look import ToneMap
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.settings import NoiseFloor, Resolution, Samples
 from storage.errors import TrilightError

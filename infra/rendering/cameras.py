@@ -22,37 +22,24 @@ class ShotCamera:
     """Full field of view in degrees."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Shot:
-    """One picture that is wanted."""
+def paired(
+    sources: Sequence[SceneSource], cameras: Sequence[ShotCamera | int]
+) -> list[tuple[SceneSource, ShotCamera | int]]:
+    """Return which scene is seen by which camera, in the order of the pictures.
 
-    source: SceneSource
-    """The scene."""
-    camera: ShotCamera | None
-    """From where; None for the camera of the scene that `--view` names."""
-
-
-def shots(sources: Sequence[SceneSource], cameras: Sequence[ShotCamera] | None) -> list[Shot]:
-    """Return the pictures of scenes by cameras, in order.
-
-    One scene is seen by all cameras, many scenes each by its own camera or by the only one that is
-    given; as many cameras as scenes go together in pairs.
+    One scene is seen by all cameras, many scenes each by the only one; as many cameras as scenes go
+    together in pairs. A number is the row of a scene's own camera.
 
     Raises:
         TrilightError: many of both, but not as many.
     """
-    if cameras is None:
-        return [Shot(source=source, camera=None) for source in sources]
     if len(sources) > 1 and len(cameras) > 1 and len(sources) != len(cameras):
         raise TrilightError(
             f"{len(sources)} scenes and {len(cameras)} cameras; expected one of either, or as many "
             "cameras as scenes."
         )
     count = max(len(sources), len(cameras))
-    return [
-        Shot(source=sources[at % len(sources)], camera=cameras[at % len(cameras)])
-        for at in range(count)
-    ]
+    return [(sources[at % len(sources)], cameras[at % len(cameras)]) for at in range(count)]
 
 
 def own_camera(scene: Scene, view: int, named: str = "--view") -> ShotCamera:

@@ -1,6 +1,10 @@
-"""The two ways to a picture behind one face: path tracing, and a trained network."""
+"""The two ways to a picture behind one face: path tracing, and a trained network.
 
-from collections.abc import Mapping
+A plan of an engine is what a command decided about it; `start` loads what it needs. A started
+engine opens one scene after the other, and an opened scene gives the pictures of its cameras.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -8,6 +12,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from infra.rendering.cameras import ShotCamera
+from pipeline.renders.settings import FIRST_SPP, RenderSettings
+from pipeline.renders.variant import Variant
 from storage.conventions import HALF_FLOAT_MAX
 from storage.records.material import PUBLISHED_COLUMNS, unread_columns
 from storage.records.scene import Scene
@@ -15,8 +22,11 @@ from storage.records.scene import Scene
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
     from pipeline.making.render_scene import PathTracer
+    from pipeline.renders.renderer import Sampling
 
 Fact = str | int | float
+Facts = Mapping[str, Fact]
+"""What an engine says of a picture, by name; it stands in the picture's header."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,44 +35,98 @@ class Rendered:
 
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance that half floats can hold."""
-    facts: Mapping[str, Fact]
-    """What there is to say of it, by name; stands in the picture's header."""
+    facts: Facts
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OpenedScene:
+    """A scene that an engine has taken, until the engine opens the next one."""
+
+    notes: tuple[str, ...]
+    """What a person should know of this scene with this engine."""
+    render: Callable[[ShotCamera, str], Rendered]
+    """Returns the picture of a camera. Its name stands in the TrilightError of a failure."""
 
 
 class Engine(Protocol):
-    """Renders one scene after another."""
+    """A started engine."""
 
-    name: str
-    """As the user calls it."""
     identity: Mapping[str, Any]
     """All that decides a picture beside scene and camera, as JSON values."""
 
-    def open(self, scene: Scene, name: str) -> tuple[str, ...]:
-        """Take the scene that is rendered from now on; return what a person should know."""
-
-    def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> Rendered:
-        """Return the picture of one camera; raises TrilightError, with `name`, if there is none."""
+    def open(self, scene: Scene, name: str) -> OpenedScene:
+        """Take the next scene; raises TrilightError, with `name`, where it cannot be rendered."""
 
     def close(self) -> None:
-        """Let go of what it holds."""
+        """End what the engine holds."""
+
+
+class EnginePlan(Protocol):
+    """All that a command decided about one engine."""
+
+    @property
+    def name(self) -> str:
+        """The engine as the user calls it."""
+
+    def start(self, sampled: "Callable[[Sampling], None]") -> Engine:
+        """Load what the engine needs; raises TrilightError where that is unusable.
+
+        Args:
+            sampled: a path tracer calls this after each pass of samples.
+        """
+
+    def caveats(self, pictures: Sequence[Facts]) -> list[str]:
+        """Return what a person should know of all pictures together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MitsubaPlan:
+    """Path tracing to a measured noise floor."""
+
+    settings: RenderSettings
+    seed: int
+    """Of the samples."""
+    threads: int
+    variant: Variant
+    """What Mitsuba runs on."""
+    name: str = "mitsuba"
+
+    def start(self, sampled: "Callable[[Sampling], None]") -> "MitsubaEngine":
+        from pipeline.making.render_scene import PathTracer
+
+        tracer = PathTracer(
+            self.settings,
+            seed=self.seed,
+            variant=self.variant,
+            threads=self.threads,
+            sampled=sampled,
+        )
+        return MitsubaEngine(tracer)
+
+    def caveats(self, pictures: Sequence[Facts]) -> list[str]:
+        found = []
+        if any(int(facts["spp"]) < FIRST_SPP for facts in pictures):
+            found.append(f"below {FIRST_SPP} samples the measured noise floor may flatter")
+        if self.variant.note:
+            found.append(f"{self.variant.note}; see trilight doctor")
+        return found
 
 
 class MitsubaEngine:
-    """Path tracing to a measured noise floor."""
-
-    name = "mitsuba"
+    """A path tracer in a child process."""
 
     def __init__(self, tracer: "PathTracer") -> None:
         self._tracer = tracer
         self.identity = tracer.identity
 
-    def open(self, scene: Scene, name: str) -> tuple[str, ...]:
+    def open(self, scene: Scene, name: str) -> OpenedScene:
         self._tracer.open(scene, name)
-        unread = unread_columns(scene.materials, PUBLISHED_COLUMNS)
-        return (f"{name}: the path tracer does not read {', '.join(unread)}",) if unread else ()
+        unread = ", ".join(unread_columns(scene.materials, PUBLISHED_COLUMNS))
+        notes = (f"{name}: the path tracer does not read {unread}",) if unread else ()
+        return OpenedScene(notes=notes, render=self._render)
 
-    def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> Rendered:
-        view = self._tracer.render(c2w, fov_deg, name)
+    def _render(self, camera: ShotCamera, name: str) -> Rendered:
+        view = self._tracer.render(camera.c2w, camera.fov_deg, name)
         facts: dict[str, Fact] = {
             "spp": view.spp,
             "noise_floor_db": round(view.noise_floor_db, 3),
@@ -76,71 +140,85 @@ class MitsubaEngine:
         self._tracer.close()
 
 
-class NeuralEngine:
-    """A trained network."""
+@dataclass(frozen=True, kw_only=True)
+class NeuralPlan:
+    """A trained network, and how it renders."""
 
-    name = "neural"
+    checkpoint: str
+    """Where the network is; only the last part of this is published."""
+    precision: str
+    """In which it is loaded (model.precision)."""
+    resolution: int
+    """Width of pictures."""
+    lights_per_pass: int
+    """Most emitting triangles of a group (model.light_groups)."""
+    skip_empty_bundles: bool
+    """Whether what no triangle reaches stays black (model.empty_bundles)."""
+    threads: int | None
+    """Of the processor; None for as many as torch takes."""
+    name: str = "neural"
 
-    def __init__(
-        self,
-        renderer: "NeuralRenderer",
-        *,
-        checkpoint: str,
-        precision: str,
-        resolution: int,
-        lights_per_pass: int,
-        skip_empty_bundles: bool,
-    ) -> None:
-        """Take a network.
-
-        Args:
-            renderer: the network.
-            checkpoint: where it came from; only its last part is published.
-            precision: in which it was loaded (model.precision).
-            resolution: width of pictures.
-            lights_per_pass: most emitting triangles of a group (model.light_groups).
-            skip_empty_bundles: whether what no triangle reaches stays black (model.empty_bundles).
-
-        Raises:
-            TrilightError: the resolution is none for this network.
-        """
+    def start(self, sampled: "Callable[[Sampling], None]") -> "NeuralEngine":
         import torch
 
-        renderer.require_resolution(resolution)
-        self._renderer = renderer
-        self._resolution, self._lights_per_pass = resolution, lights_per_pass
-        self._skip_empty_bundles = skip_empty_bundles
+        from model.neural_renderer import NeuralRenderer
+        from train.networks import network_of_run
+
+        if self.threads is not None:
+            torch.set_num_threads(self.threads)
+        renderer = NeuralRenderer.load(
+            self.checkpoint, precision=self.precision, finders=[network_of_run]
+        )
+        return NeuralEngine(renderer, self)
+
+    def caveats(self, pictures: Sequence[Facts]) -> list[str]:
+        return []
+
+
+class NeuralEngine:
+    """A network in this process."""
+
+    def __init__(self, renderer: "NeuralRenderer", plan: NeuralPlan) -> None:
+        """Take a network; raises TrilightError where the resolution is none for it."""
+        import torch
+
+        renderer.require_resolution(plan.resolution)
+        self._renderer, self._plan = renderer, plan
         self.identity: Mapping[str, Any] = {
-            "checkpoint": Path(checkpoint).name,
+            "checkpoint": Path(plan.checkpoint).name,
             "network_sha256": renderer.digest,
             "settings": {
-                "precision": precision,
-                "resolution": resolution,
-                "lights_per_pass": lights_per_pass,
-                "skip_empty_bundles": skip_empty_bundles,
+                "precision": plan.precision,
+                "resolution": plan.resolution,
+                "lights_per_pass": plan.lights_per_pass,
+                "skip_empty_bundles": plan.skip_empty_bundles,
             },
             "environment": {"torch": torch.__version__, "device": renderer.device.type},
         }
 
-    def open(self, scene: Scene, name: str) -> tuple[str, ...]:
-        self._prepared = self._renderer.prepare(scene, lights_per_pass=self._lights_per_pass)
-        of_scene = tuple(f"{name}: {note}" for note in self._prepared.notes)
-        return of_scene + self._renderer.resolution_notes(self._resolution)
+    def open(self, scene: Scene, name: str) -> OpenedScene:
+        renderer, plan = self._renderer, self._plan
+        prepared = renderer.prepare(scene, lights_per_pass=plan.lights_per_pass)
 
-    def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> Rendered:
-        picture = self._renderer.view(
-            self._prepared,
-            c2w,
-            fov_deg,
-            self._resolution,
-            skip_empty_bundles=self._skip_empty_bundles,
+        def render(camera: ShotCamera, name: str) -> Rendered:
+            picture = renderer.view(
+                prepared,
+                camera.c2w,
+                camera.fov_deg,
+                plan.resolution,
+                skip_empty_bundles=plan.skip_empty_bundles,
+            )
+            too_bright = int((picture > HALF_FLOAT_MAX).any(axis=-1).sum())
+            facts: dict[str, Fact] = {
+                "passes": len(prepared.groups),
+                "clipped_pixels": too_bright,  # a network may say anything; files end at 65504
+            }
+            return Rendered(radiance_rgb=np.minimum(picture, HALF_FLOAT_MAX), facts=facts)
+
+        of_scene = tuple(f"{name}: {note}" for note in prepared.notes)
+        return OpenedScene(
+            notes=of_scene + renderer.resolution_notes(plan.resolution), render=render
         )
-        too_bright = int((picture > HALF_FLOAT_MAX).any(axis=-1).sum())
-        facts: dict[str, Fact] = {
-            "passes": len(self._prepared.groups),
-            "clipped_pixels": too_bright,  # a network may say anything; files end at 65504
-        }
-        return Rendered(radiance_rgb=np.minimum(picture, HALF_FLOAT_MAX), facts=facts)
 
     def close(self) -> None:
-        """Nothing is held that must be ended."""
+        """Do nothing: the network goes with this process."""

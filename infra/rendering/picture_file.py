@@ -11,7 +11,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from infra.rendering.cameras import ShotCamera
-from infra.rendering.engines import Engine, Fact, Rendered
+from infra.rendering.engines import Fact, Facts, Rendered
 from storage.atomic import write_atomically
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
@@ -25,7 +25,7 @@ _PREFIX = "trilight."
 _REQUEST = "request_sha256"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Request:
     """All that decides a picture."""
 
@@ -37,17 +37,19 @@ class Request:
     """Name of the scene's file, without its folders."""
     scene_sha256: str
     """Digest of the scene."""
-    camera: Mapping[str, Any]
-    """Pose and angle as JSON values."""
+    camera: ShotCamera
+    view: int | None
+    """Row of the camera among the scene's own; None if the camera is none of these."""
 
     @property
     def header(self) -> dict[str, Fact]:
         """What a picture says about itself: nothing of the clock, and no folder."""
+        camera: dict[str, Any] = {"c2w": self.camera.c2w.tolist(), "fov_deg": self.camera.fov_deg}
         values = {
             "engine": self.engine,
             "source": self.source,
             "scene_sha256": self.scene_sha256,
-            "camera": self.camera,
+            "camera": camera if self.view is None else {**camera, "view": self.view},
             **self.identity,
         }
         plain = {
@@ -63,26 +65,12 @@ class PictureFile:
 
     path: Path
     """The EXR file."""
-    facts: Mapping[str, Fact]
+    facts: Facts
     """What its engine says of it."""
     was_kept: bool
     """Whether it was there already."""
     is_black: bool
     """Whether it shows nothing at all."""
-
-
-def request(
-    engine: Engine, *, source: str, scene_sha256: str, camera: ShotCamera, view: int | None
-) -> Request:
-    """Return what is asked of an engine; `view` is the row of the scene's own camera, or None."""
-    pose: dict[str, Any] = {"c2w": camera.c2w.tolist(), "fov_deg": camera.fov_deg}
-    return Request(
-        engine=engine.name,
-        identity=engine.identity,
-        source=source,
-        scene_sha256=scene_sha256,
-        camera=pose if view is None else {**pose, "view": view},
-    )
 
 
 def kept_picture(path: Path, wanted: Request) -> tuple[PictureFile, Radiance] | None:
@@ -120,9 +108,7 @@ def write_picture(path: Path, wanted: Request, rendered: Rendered) -> tuple[Pict
     return _remembered(path, rendered.facts, radiance_rgb, was_kept=False), radiance_rgb
 
 
-def _remembered(
-    path: Path, facts: Mapping[str, Fact], radiance_rgb: Radiance, *, was_kept: bool
-) -> PictureFile:
+def _remembered(path: Path, facts: Facts, radiance_rgb: Radiance, *, was_kept: bool) -> PictureFile:
     return PictureFile(
         path=path, facts=dict(facts), was_kept=was_kept, is_black=not radiance_rgb.any()
     )

@@ -1,39 +1,41 @@
-"""Shots to files: every picture by every engine, those that are there already kept."""
+"""One call of `trilight render`: a plan, and then every picture of it, made or kept."""
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
-from numpy.typing import NDArray
-
-from infra.rendering.cameras import Shot, own_camera
-from infra.rendering.comparison import comparison_sheet
-from infra.rendering.engines import Engine
-from infra.rendering.flicker import flicker_db, log_error, noise_flicker_db
+from infra.rendering.asked import Asked
+from infra.rendering.cameras import own_camera
+from infra.rendering.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
+from infra.rendering.engines import Engine, OpenedScene
 from infra.rendering.look import Look, shown
 from infra.rendering.picture_file import (
     PictureFile,
     Radiance,
+    Request,
     kept_picture,
-    request,
     write_picture,
 )
-from infra.rendering.places import PicturePlaces
+from infra.rendering.plan import RenderPlan, Shot, plan_render
+from infra.rendering.video import write_video
 from pipeline.documents.png import encode_png
-from pipeline.exchange.formats import FORMATS, LoadedScene, SceneSource
 from pipeline.exchange.reader import SceneReader
 from storage.atomic import write_atomically
 from storage.metrics import psnr_log_db
 from storage.records.lights import num_lights
+from storage.records.scene import Scene
 from storage.records.scene_file import scene_digest
+
+if TYPE_CHECKING:
+    from pipeline.renders.renderer import Sampling
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneIdentity:
     """What there is to say of a scene."""
 
-    name: str
-    """Its file, without folders."""
     digest: str
     """storage.records.scene_file.scene_digest."""
     num_triangles: int
@@ -42,36 +44,14 @@ class SceneIdentity:
     """Emitter objects."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Flicker:
-    """Of the network's error between two pictures in a row (infra.rendering.flicker)."""
-
-    db: float
-    """Higher is calmer."""
-    noise_db: float
-    """What the noise of the traced pictures alone would show."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Frame:
-    """What the next picture is compared with."""
-
-    error_RR3: NDArray
-    """infra.rendering.flicker.log_error."""
-    noise_floor_db: float
-    """Of the traced picture."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FinishedShot:
     """What came of one shot."""
 
+    shot: Shot
     scene: SceneIdentity
-    """The scene."""
     pictures: Mapping[str, PictureFile]
     """By engine."""
-    png: Path
-    """What people look at."""
     psnr_log_db: float | None
     """Of the network's picture against the traced one, where there are both."""
     flicker: Flicker | None
@@ -79,120 +59,155 @@ class FinishedShot:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _OpenScene:
+class RenderOutcome:
+    """What came of a plan."""
+
+    plan: RenderPlan
+    shots: Sequence[FinishedShot]
+    """Picture by picture."""
+    notes: Sequence[str]
+    """What a person should know."""
+
+
+class RenderWatcher(Protocol):
+    """Is told how far a render is."""
+
+    def pictures(self, done: int, total: int) -> None:
+        """So many pictures are finished."""
+
+    def sampled(self, now: "Sampling") -> None:
+        """The path tracer has finished a pass."""
+
+
+def render_asked(asked: Asked, watcher: RenderWatcher) -> RenderOutcome:
+    """Plan what was asked for and carry it out; raises TrilightError as these two do."""
+    with SceneReader(asked.albedo_over_one) as reader:
+        return carry_out(plan_render(asked, reader), reader, watcher)
+
+
+def carry_out(plan: RenderPlan, reader: SceneReader, watcher: RenderWatcher) -> RenderOutcome:
+    """Make every picture of a plan, and the video.
+
+    Raises:
+        TrilightError: a network or a scene that cannot be loaded or rendered, or a file that
+            cannot be written.
+    """
+    finished, notes = list[FinishedShot](), dict[str, None]()
+    before: Frame | None = None
+    with ExitStack() as stack:
+        engines = {
+            each.name: stack.enter_context(closing(each.start(watcher.sampled)))
+            for each in plan.engines
+        }
+        watcher.pictures(0, len(plan.shots))
+        for scene, shot in _with_scenes(plan.shots, reader):
+            made = {name: _picture(shot, name, engine, scene) for name, engine in engines.items()}
+            done, before = _finish(shot, scene.identity, made, plan.look, before)
+            finished.append(done)
+            notes |= dict.fromkeys(scene.notes)
+            watcher.pictures(len(finished), len(plan.shots))
+    if plan.place.video is not None:
+        write_video(plan.place.video, [done.shot.png for done in finished], plan.fps)
+    return RenderOutcome(plan=plan, shots=finished, notes=[*notes, *_caveats(plan, finished)])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SceneAtHand:
     """The scene of the shots at hand."""
 
-    loaded: LoadedScene
-    facts: SceneIdentity
-    opened_by: set[str]
-    """Engines that have taken it."""
+    scene: Scene
+    identity: SceneIdentity
+    notes: list[str]
+    """Those on its file, and then those of each engine that opened it."""
+    opened: dict[str, OpenedScene]
+    """By engine. An engine opens the scene for the first picture that is not kept."""
 
 
-def _is_next_frame(source: SceneSource, before: SceneSource) -> bool:
-    """Return whether two sources are moments of one stage; a shard's scenes are strangers."""
-    return source.path == before.path and not FORMATS[source.path.suffix.lower()].always_many
-
-
-class ShotRun:
-    """Renders shots one after the other; scenes are read once for shots in a row."""
-
-    def __init__(
-        self, engines: Sequence[Engine], place: PicturePlaces, *, view: int, look: Look
-    ) -> None:
-        """Remember how.
-
-        Args:
-            engines: one or both.
-            place: where files go.
-            view: which of a scene's own cameras is meant.
-            look: of the PNG.
-        """
-        self._engines, self._place = engines, place
-        self._view, self._look = view, look
-        self._before: _Frame | None = None
-        self.notes: dict[str, None] = {}
-        """What a person should know, each once, in order."""
-
-    def run(
-        self, wanted: Sequence[Shot], reader: SceneReader, done: Callable[[int], None]
-    ) -> list[FinishedShot]:
-        """Render; `done` hears how many shots are finished. Raises TrilightError."""
-        finished, scene = list[FinishedShot](), None
-        for index, shot in enumerate(wanted):
-            if scene is None or shot.source != wanted[index - 1].source:
-                scene = self._read(shot, reader)
-                if index and not _is_next_frame(shot.source, wanted[index - 1].source):
-                    self._before = None
-            finished.append(self._finish(index, shot, scene))
-            done(index + 1)
-        return finished
-
-    def _read(self, shot: Shot, reader: SceneReader) -> _OpenScene:
-        loaded = reader.load(shot.source)
-        self.notes |= dict.fromkeys(loaded.notes)
-        facts = SceneIdentity(
-            name=shot.source.name,
+def _with_scenes(shots: Sequence[Shot], reader: SceneReader) -> Iterator[tuple[_SceneAtHand, Shot]]:
+    """Yield shots with their scenes; a scene is read once for all shots in a row."""
+    for source, same_scene in itertools.groupby(shots, key=lambda shot: shot.source):
+        loaded = reader.load(source)
+        identity = SceneIdentity(
             digest=scene_digest(loaded.scene),
             num_triangles=loaded.scene.num_triangles,
             num_lights=num_lights(loaded.scene),
         )
-        return _OpenScene(loaded=loaded, facts=facts, opened_by=set())
-
-    def _finish(self, index: int, shot: Shot, scene: _OpenScene) -> FinishedShot:
-        stem = self._place.stem_of(index)
-        files, radiances = dict[str, PictureFile](), dict[str, Radiance]()
-        for engine in self._engines:
-            found = self._picture(engine, stem, shot, scene)
-            files[engine.name], radiances[engine.name] = found
-        agreement, flicker = None, None
-        if len(self._engines) == 1:
-            (radiance_rgb,) = radiances.values()
-            pixels = shown(radiance_rgb, self._look)
-        else:
-            traced, neural = radiances["mitsuba"], radiances["neural"]
-            agreement = psnr_log_db(neural, traced)
-            floor_db = float(files["mitsuba"].facts["noise_floor_db"])
-            flicker = self._flicker(log_error(neural, traced), floor_db)
-            pixels = comparison_sheet(traced, neural, self._look)
-        png = Path(f"{stem}.png")
-        write_atomically(png, encode_png(pixels))
-        return FinishedShot(
-            scene=scene.facts, pictures=files, png=png, psnr_log_db=agreement, flicker=flicker
+        at_hand = _SceneAtHand(
+            scene=loaded.scene, identity=identity, notes=list(loaded.notes), opened={}
         )
+        for shot in same_scene:
+            yield at_hand, shot
 
-    def _flicker(self, error_RR3: NDArray, noise_floor_db: float) -> Flicker | None:
-        """Compare with the picture before, and be what the next one is compared with."""
-        before = self._before
-        self._before = _Frame(error_RR3=error_RR3, noise_floor_db=noise_floor_db)
-        if before is None:
-            return None
-        return Flicker(
-            db=flicker_db(before.error_RR3, error_RR3),
-            noise_db=noise_flicker_db(before.noise_floor_db, noise_floor_db),
+
+def _picture(
+    shot: Shot, name: str, engine: Engine, at_hand: _SceneAtHand
+) -> tuple[PictureFile, Radiance]:
+    """Return the picture of one engine, which is kept or made."""
+    view = shot.camera if isinstance(shot.camera, int) else None
+    camera = own_camera(at_hand.scene, shot.camera) if isinstance(shot.camera, int) else shot.camera
+    wanted = Request(
+        engine=name,
+        identity=engine.identity,
+        source=shot.source.name,
+        scene_sha256=at_hand.identity.digest,
+        camera=camera,
+        view=view,
+    )
+    kept = kept_picture(shot.exrs[name], wanted) if shot.keep else None
+    if kept is not None:
+        return kept
+    if name not in at_hand.opened:
+        at_hand.opened[name] = engine.open(at_hand.scene, shot.source.name)
+        at_hand.notes.extend(at_hand.opened[name].notes)
+    rendered = at_hand.opened[name].render(camera, shot.name)
+    return write_picture(shot.exrs[name], wanted, rendered)
+
+
+def _finish(
+    shot: Shot,
+    scene: SceneIdentity,
+    made: Mapping[str, tuple[PictureFile, Radiance]],
+    look: Look,
+    before: Frame | None,
+) -> tuple[FinishedShot, Frame | None]:
+    """Write what people look at; return the shot, and the frame if there are both engines."""
+    files = {name: file for name, (file, _) in made.items()}
+    radiances = {name: radiance_rgb for name, (_, radiance_rgb) in made.items()}
+    now, agreement = None, None
+    if len(made) == 1:
+        (radiance_rgb,) = radiances.values()
+        pixels = shown(radiance_rgb, look)
+    else:
+        traced, neural = radiances["mitsuba"], radiances["neural"]
+        pixels = comparison_sheet(traced, neural, look)
+        agreement = psnr_log_db(neural, traced)
+        now = Frame(
+            source=shot.source,
+            error_RR3=log_error(neural, traced),
+            noise_floor_db=float(files["mitsuba"].facts["noise_floor_db"]),
         )
+    write_atomically(shot.png, encode_png(pixels))
+    finished = FinishedShot(
+        shot=shot,
+        scene=scene,
+        pictures=files,
+        psnr_log_db=agreement,
+        flicker=flicker(before, now) if now else None,
+    )
+    return finished, now
 
-    def _exr(self, stem: Path, engine: Engine) -> Path:
-        return Path(f"{stem}.exr" if len(self._engines) == 1 else f"{stem}.{engine.name}.exr")
 
-    def _picture(
-        self, engine: Engine, stem: Path, shot: Shot, scene: _OpenScene
-    ) -> tuple[PictureFile, Radiance]:
-        path = self._exr(stem, engine)
-        camera = shot.camera or own_camera(scene.loaded.scene, self._view)
-        wanted = request(
-            engine,
-            source=scene.facts.name,
-            scene_sha256=scene.facts.digest,
-            camera=camera,
-            view=None if shot.camera else self._view,
-        )
-        kept = kept_picture(path, wanted) if self._place.is_sequence else None
-        if kept is not None:
-            return kept
-        if engine.name not in scene.opened_by:
-            notes = engine.open(scene.loaded.scene, scene.facts.name)
-            self.notes |= dict.fromkeys(notes)
-            scene.opened_by.add(engine.name)
-        which = f"view {self._view}" if shot.camera is None else f"picture {stem.name}"
-        name = f"{scene.facts.name}, {which}"
-        return write_picture(path, wanted, engine.render(camera.c2w, camera.fov_deg, name))
+def _caveats(plan: RenderPlan, finished: Sequence[FinishedShot]) -> list[str]:
+    """Return what a person should know of all pictures together."""
+    notes = []
+    for engine in plan.engines:
+        pictures = [shot.pictures[engine.name] for shot in finished]
+        black = sum(picture.is_black for picture in pictures)
+        if black:
+            which = "the picture is" if len(pictures) == 1 else f"{black} pictures are"
+            notes.append(f"{engine.name}: {which} black: the camera sees nothing that is lit")
+        if any(int(picture.facts.get("clipped_pixels", 0)) for picture in pictures):
+            notes.append(f"{engine.name}: pixels beyond what half floats hold were clipped")
+    for engine in plan.engines:
+        notes += engine.caveats([shot.pictures[engine.name].facts for shot in finished])
+    return notes

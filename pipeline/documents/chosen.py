@@ -11,7 +11,7 @@ from storage.dataset.manifest import Manifest, ShardEntry
 from storage.records.sample import Sample
 
 _LEAST_SHARE = 8
-"""A split with few scenes is given up to this part of the places."""
+"""A split with few scenes gets up to one place in this many."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,9 +19,8 @@ class Chosen:
     """One scene to show."""
 
     key: str
-    """Its key."""
     shard: ShardEntry
-    """Where it is."""
+    """The shard that holds the scene."""
 
     @property
     def split(self) -> str:

@@ -107,7 +107,7 @@ SURFACE_COUNTS = ("all", "smooth", "many_colours")
 
 @dataclass(kw_only=True, eq=False)
 class _Tally:
-    """Counts in the making."""
+    """Counts of the scenes that were read so far."""
 
     values: dict[str, list[Mapping[str, Values]]] = field(default_factory=dict)
     scenes: Counter[tuple[str, str]] = field(default_factory=Counter)

@@ -56,7 +56,7 @@ _STYLE: dict[str, Any] = {
 
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
-    """Draw in the style of all figures within the block."""
+    """Give everything that is drawn within the block the style of all figures."""
     style = matplotlib.style.context(["default", _STYLE], after_reset=True)
     with style, warnings.catch_warnings():
         # a name from outside may need a script that the font lacks: it shows boxes

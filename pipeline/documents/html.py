@@ -1,4 +1,4 @@
-"""Pages without scripts and without anything from elsewhere; text from outside never is markup.
+"""HTML pages that run no script and load nothing; text from outside never becomes markup.
 
 Every function here escapes what it is given, unless it is `Markup`, which only these functions and
 the documents themselves make.

@@ -1,4 +1,4 @@
-"""Markdown and YAML in which text from outside is text and nothing else."""
+"""Markdown and YAML in which text from outside never becomes markup."""
 
 import json
 import re

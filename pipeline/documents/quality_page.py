@@ -77,32 +77,18 @@ def _summary(rows: Sequence[AssetRow], failures: Sequence[Failure]) -> Markup:
 
 def _histograms(rows: Sequence[AssetRow], budget: int) -> Markup:
     """Draw error, triangle quality and budget as one picture."""
-    changed = [row.quality for row in rows if row.method != "source"]
+    changed = [100 * row.quality.error_p99 for row in rows if row.method != "source"]
+    angles = [row.quality.min_angle_p5_deg for row in rows]
+    areas = [row.quality.area_variation for row in rows]
+    faces = [row.num_faces for row in rows]
+    distances = f"p99 distance, % of the diagonal\n({len(changed)} decimated objects)"
+    smallest = "smallest angles, 5th percentile, degrees\n(60: equilateral)"
     with drawing():
         figure, axes = panels(4, columns=4)
-        histogram(
-            axes[0],
-            [100 * quality.error_p99 for quality in changed],
-            f"p99 distance, % of the diagonal\n({len(changed)} decimated objects)",
-            ylabel="objects",
-        )
-        histogram(
-            axes[1],
-            [row.quality.min_angle_p5_deg for row in rows],
-            "smallest angles, 5th percentile, degrees\n(60: equilateral)",
-            bounds=(0, 60),
-        )
-        histogram(
-            axes[2],
-            [row.quality.area_variation for row in rows],
-            "variation of triangle areas\n(0: all equal)",
-        )
-        histogram(
-            axes[3],
-            [row.num_faces for row in rows],
-            f"triangles\n(budget {budget})",
-            bounds=(0, budget),
-        )
+        histogram(axes[0], changed, distances, ylabel="objects")
+        histogram(axes[1], angles, smallest, bounds=(0, 60))
+        histogram(axes[2], areas, "variation of triangle areas\n(0: all equal)")
+        histogram(axes[3], faces, f"triangles\n(budget {budget})", bounds=(0, budget))
         return encoded(figure, "histograms")
 
 

@@ -1,14 +1,13 @@
 """The quantities whose distributions a report shows, and how a distribution becomes numbers."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 
-@dataclass(frozen=True, kw_only=True)
-class Quantity:
+class Quantity(NamedTuple):
     """Something that is measured once or more in every scene."""
 
     label: str
@@ -17,38 +16,34 @@ class Quantity:
     """Decimals that are shown."""
 
 
-def _quantity(label: str, digits: int) -> Quantity:
-    return Quantity(label=label, digits=digits)
-
-
 QUANTITIES: Mapping[str, Quantity] = {
-    "objects_per_scene": _quantity("objects in a scene", 0),
-    "triangles_per_scene": _quantity("triangles of a scene", 0),
-    "triangles_per_object": _quantity("triangles of an object", 0),
-    "diffuse": _quantity("diffuse albedo", 3),
-    "specular": _quantity("specular albedo", 3),
-    "albedo_sum": _quantity("diffuse + specular", 3),
-    "roughness": _quantity("roughness", 3),
-    "lights_per_scene": _quantity("lights in a scene", 0),
-    "total_emission": _quantity("radiance, sum over the lights", 0),
-    "light_distance": _quantity("distance from the origin, m", 3),
-    "light_size": _quantity("size (root of the area), m", 3),
-    "camera_distance": _quantity("distance from the origin, m", 3),
-    "elevation_deg": _quantity("elevation, degrees", 1),
-    "azimuth_deg": _quantity("azimuth, degrees", 1),
-    "fov_deg": _quantity("field of view, degrees", 1),
-    "coverage": _quantity("share of the view on objects", 3),
-    "noise_floor_db": _quantity("noise floor, dB", 1),
-    "object_noise_floor_db": _quantity("noise floor over geometry, dB", 1),
-    "spp": _quantity("samples per pixel", 0),
-    "camera_attempt": _quantity("cameras rejected before", 0),
+    "objects_per_scene": Quantity("objects in a scene", 0),
+    "triangles_per_scene": Quantity("triangles of a scene", 0),
+    "triangles_per_object": Quantity("triangles of an object", 0),
+    "diffuse": Quantity("diffuse albedo", 3),
+    "specular": Quantity("specular albedo", 3),
+    "albedo_sum": Quantity("diffuse + specular", 3),
+    "roughness": Quantity("roughness", 3),
+    "lights_per_scene": Quantity("lights in a scene", 0),
+    "total_emission": Quantity("radiance, sum over the lights", 0),
+    "light_distance": Quantity("distance from the origin, m", 3),
+    "light_size": Quantity("size (root of the area), m", 3),
+    "camera_distance": Quantity("distance from the origin, m", 3),
+    "elevation_deg": Quantity("elevation, degrees", 1),
+    "azimuth_deg": Quantity("azimuth, degrees", 1),
+    "fov_deg": Quantity("field of view, degrees", 1),
+    "coverage": Quantity("share of the view on objects", 3),
+    "noise_floor_db": Quantity("noise floor, dB", 1),
+    "object_noise_floor_db": Quantity("noise floor over geometry, dB", 1),
+    "spp": Quantity("samples per pixel", 0),
+    "camera_attempt": Quantity("cameras rejected before", 0),
 }
 
 STATISTICS = ("count", "min", "p5", "median", "mean", "p95", "max")
 
 
 def summary(values: ArrayLike) -> dict[str, float]:
-    """Return STATISTICS of the finite values; only the count where there is none."""
+    """Return STATISTICS of the finite values; without any, only the count 0."""
     array = np.asarray(values, np.float64).ravel()
     finite = array[np.isfinite(array)]
     if not finite.size:

@@ -30,21 +30,18 @@ pre { columns: 2; font-size: .8rem; line-height: 1.45; background: #f6f6f6; padd
   white-space: pre-wrap;  overflow-wrap: anywhere }
 """
 
-_SECTIONS = (
-    report_sections.scenes_section,
-    report_sections.objects_section,
-    report_sections.triangles_section,
-    report_sections.materials_section,
-    report_sections.lights_section,
-    report_sections.cameras_section,
-    report_sections.pictures_section,
-    report_sections.rejections_section,
-    report_sections.licences_section,
-)
-_ANCHORS = (
-    "scenes", "objects", "triangles", "materials", "lights", "cameras", "pictures", "rejections",
-    "licences", "gallery", "settings",
-)  # fmt: skip
+_SECTIONS = {
+    "scenes": report_sections.scenes_section,
+    "objects": report_sections.objects_section,
+    "triangles": report_sections.triangles_section,
+    "materials": report_sections.materials_section,
+    "lights": report_sections.lights_section,
+    "cameras": report_sections.cameras_section,
+    "pictures": report_sections.pictures_section,
+    "rejections": report_sections.rejections_section,
+    "licences": report_sections.licences_section,
+}
+"""What makes each section, by the name that links to it."""
 
 
 def write_report(
@@ -67,11 +64,12 @@ def write_report(
     """
     folder = out or dataset.folder
     cards = write_gallery(dataset, found.failures, folder, max_scenes)
-    sections = [section(found) for section in _SECTIONS] if found.scenes else []
+    sections = [section(found) for section in _SECTIONS.values()] if found.scenes else []
+    anchors = [*_SECTIONS, "gallery", "settings"]
     body = [
         element("h1", f"Dataset {dataset.manifest.build}"),
         _overview(dataset, found),
-        element("p", *(element("a", name, href=f"#{name}") for name in _ANCHORS), class_="toc"),
+        element("p", *(element("a", name, href=f"#{name}") for name in anchors), class_="toc"),
         *sections,
         element("h2", "Gallery", id="gallery"),
         cards,

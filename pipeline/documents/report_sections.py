@@ -45,12 +45,7 @@ def objects_section(found: Distributions) -> Markup:
     uses = np.array(found.uses_per_object())
     with drawing():
         figure, axes = panels(2)
-        histogram(
-            axes[0],
-            found.all("objects_per_scene"),
-            "objects in a scene",
-            ylabel="scenes",
-        )
+        histogram(axes[0], found.all("objects_per_scene"), "objects in a scene", ylabel="scenes")
         histogram(axes[1], uses, "places of an object in scenes", ylabel="objects")
         picture = encoded(figure, "objects of a scene, and places of an object")
     numbers = _summaries(found, "objects_per_scene", extra=[("places of an object", 0, uses)])
@@ -122,23 +117,14 @@ def cameras_section(found: Distributions) -> Markup:
 def pictures_section(found: Distributions) -> Markup:
     """Return the measured errors of the pictures and what they cost."""
     target, cap = found.targets["noise_floor_db"], found.targets["max_spp"]
+    at_target = {f"target {target:g} dB": target} if target is not None else None
+    at_cap = {f"cap {cap:g}": cap} if cap is not None else None
+    floors, spp = found.all("noise_floor_db"), found.all("spp")
     with drawing():
         figure, axes = panels(4)
-        floors = found.all("noise_floor_db")
-        histogram(
-            axes[0],
-            floors,
-            "noise floor, dB (psnr_log_db)",
-            ylabel="views",
-            marks={f"target {target:g} dB": target} if target is not None else None,
-        )
-        histogram(
-            axes[1],
-            found.all("spp"),
-            "samples per pixel",
-            ylabel="views",
-            marks={f"cap {cap:g}": cap} if cap is not None else None,
-        )
+        label = "noise floor, dB (psnr_log_db)"
+        histogram(axes[0], floors, label, ylabel="views", marks=at_target)
+        histogram(axes[1], spp, "samples per pixel", ylabel="views", marks=at_cap)
         for panel, name in zip(axes[2:], ("object_noise_floor_db", "coverage"), strict=True):
             histogram(panel, found.all(name), QUANTITIES[name].label, ylabel="views")
         picture = encoded(figure, "noise floors, samples per pixel and coverage")

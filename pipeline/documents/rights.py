@@ -23,7 +23,7 @@ _HUB_SPELLING: Mapping[str, str] = {
     **{f"{name}-{kind}": name for name in ("gpl-2.0", "gpl-3.0", "lgpl-2.1", "lgpl-3.0", "agpl-3.0")
        for kind in ("only", "or-later")},
 }  # fmt: skip
-"""Those that it spells otherwise."""
+"""Identifiers that Hugging Face spells differently."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ class SurfaceFacts:
     kind: str
     """object or shell."""
     num_triangles: int
-    """Triangles of it."""
+    """Number of its triangles."""
     smooth: bool
     """Whether triangles share vertices, and with them normals; a flat face has its own three."""
     num_colours: int
@@ -112,13 +112,9 @@ def lights(scene: Scene) -> list[Light]:
         weights = areas if areas.sum() > 0 else np.ones_like(areas)
         centre = np.average(corners.mean(axis=1), axis=0, weights=weights)
         radiance = scene.materials[scene.material_index[mine], EMISSION].mean(axis=0)
+        area = float(areas.sum())
         found.append(
-            Light(
-                row=row,
-                radiance_rgb=_three(radiance),
-                centre=_three(centre),
-                area=float(areas.sum()),
-            )
+            Light(row=row, radiance_rgb=_three(radiance), centre=_three(centre), area=area)
         )
     return found
 

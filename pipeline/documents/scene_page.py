@@ -1,4 +1,4 @@
-"""The page of one scene: its pictures, and what stands behind them, in tables."""
+"""The HTML page of one scene: its pictures, and tables of what they show."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -5,25 +5,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
+from pipeline.making.render_sample import render_sample
 from pipeline.making.view_progress import ViewProgress
-from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
+from pipeline.renders.renderer import set_threads
 from pipeline.renders.variant import Variant, activate
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
-from pipeline.scenes.sight import Sight, ViewFacts
-from pipeline.scenes.views import next_camera
 from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected
 from storage.records.asset import decode_asset
 from storage.records.objects import Failure, LockedObject
-from storage.records.sample import Sample, ViewRecord, sample_key
+from storage.records.sample import Sample, sample_key
 from storage.records.scene import Scene
-from storage.seeds import seed_for
 
 MAX_ATTEMPTS = 16
 """Attempts at a scene before it is given up."""
@@ -89,9 +84,18 @@ def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
     try:
         scene = _scene(split, scene_index, attempt)
         stage = "renders"
-        sample = _render_sample(key, scene, settings, failures, told)
+        from_file = _state.source.files is not None
+        sample = render_sample(key, scene, settings, failures, told, keeps_cameras=from_file)
     except Rejected as rejection:
-        failures.append(_failure(stage, key, rejection, attempt))
+        failures.append(
+            Failure(
+                stage=stage,
+                item=key,
+                reason=rejection.reason,
+                message=rejection.message,
+                attempt=attempt,
+            )
+        )
         return SceneAttempt(sample=None, failures=failures)
     finally:
         told.end()
@@ -119,82 +123,8 @@ def assets_of(split: str) -> Sequence[PooledAsset]:
     if split not in _state.pool:
         source = _state.source
         _state.pool[split] = [
-            PooledAsset(
-                locked=locked,
-                asset=decode_asset(path.read_bytes()),
-            )
+            PooledAsset(locked=locked, asset=decode_asset(path.read_bytes()))
             for locked, path in sorted(source.objects, key=lambda pair: pair[0].uid)
             if locked.split == split
         ]
     return _state.pool[split]
-
-
-def _render_sample(
-    key: str,
-    scene: Scene,
-    settings: BuildSettings,
-    failures: list[Failure],
-    told: ViewProgress,
-) -> Sample:
-    """Render every view, replacing the cameras of rejected ones by their next attempts.
-
-    The cameras of a scene that was read from a file are what they are: a rejected one is fatal.
-    """
-    renderer, sight = SceneRenderer(scene, settings.renders), Sight(scene)
-    pictures, records = [], []
-    lights: list[NDArray[np.float32]] = []
-    for view in range(scene.num_views):
-        while True:
-            camera_attempt = int(scene.provenance["camera_attempts"][view])
-            seed = seed_for(settings.seed, "samples", int(key), view, camera_attempt)
-            try:
-                steps = renderer.view_steps(scene.c2w[view], float(scene.fov_deg[view]), seed)
-                rendered = told.view(view, steps)
-                break
-            except Rejected as rejection:
-                if _state.source.files is not None:
-                    raise Rejected(rejection.reason, f"view {view}: {rejection.message}") from None
-                failures.append(_failure("renders", f"{key}.{view}", rejection, camera_attempt))
-                scene = next_camera(scene, settings.scenes, view=view)
-        pictures.append(rendered.radiance_rgb)
-        if rendered.lights_rgb is not None:
-            lights.append(rendered.lights_rgb)
-        camera = (scene.c2w[view], float(scene.fov_deg[view]))
-        facts = sight.facts(*camera, settings.scenes.views.coverage_grid)
-        records.append(_record(rendered, facts, seed, camera_attempt))
-    scene.check()
-    return Sample(
-        key=key,
-        scene=_with_digest(scene, settings),
-        radiance_rgb=np.stack(pictures),
-        views=tuple(records),
-        lights_rgb=np.stack(lights) if lights else None,
-    )
-
-
-def _with_digest(scene: Scene, settings: BuildSettings) -> Scene:
-    provenance = {**scene.provenance, "settings_sha256": settings.digest}
-    return scene.with_provenance(provenance)
-
-
-def _record(rendered: RenderedView, facts: ViewFacts, seed: int, camera_attempt: int) -> ViewRecord:
-    return ViewRecord(
-        spp=rendered.spp,
-        noise_floor_db=round(rendered.noise_floor_db, 3),
-        noise_floor_linear_db=round(rendered.noise_floor_linear_db, 3),
-        object_noise_floor_db=round(rendered.object_noise_floor_db, 3),
-        coverage=round(facts.coverage, 6),
-        at_cap=rendered.at_cap,
-        seed=seed,
-        camera_attempt=camera_attempt,
-    )
-
-
-def _failure(stage: str, item: str, rejection: Rejected, attempt: int) -> Failure:
-    return Failure(
-        stage=stage,
-        item=item,
-        reason=rejection.reason,
-        message=rejection.message,
-        attempt=attempt,
-    )

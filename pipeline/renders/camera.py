@@ -1,4 +1,4 @@
-"""`Camera`: one pinhole and its pixel grid, the only thing about a view that a tracer is told."""
+"""`Camera`: one pinhole and its pixel grid, which is all that a tracer knows of a view."""
 
 from dataclasses import dataclass
 

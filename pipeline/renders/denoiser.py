@@ -21,13 +21,13 @@ _QUALITIES = {"high": "OIDN_QUALITY_HIGH", "fast": "OIDN_QUALITY_FAST"}
 _INPUTS = ("color", "albedo", "normal")
 
 DenoiserDevice = Literal["CPU", "CUDA"]
-"""What Open Image Denoise runs on. It knows other makers' cards, but Mitsuba renders on none."""
+"""What Open Image Denoise runs on. It supports more cards, but Mitsuba renders on CUDA alone."""
 
 _threads = 0
 """Threads of filters made from now on; 0 is all cores."""
 
 _device: DenoiserDevice = "CPU"
-"""What filters run on that are made from now on."""
+"""The device of filters that are made from now on."""
 
 
 def set_denoiser_threads(count: int) -> None:
@@ -37,7 +37,7 @@ def set_denoiser_threads(count: int) -> None:
 
 
 def set_denoiser_device(device: DenoiserDevice) -> None:
-    """Denoise every picture from now on there."""
+    """Denoise every picture from now on with this device."""
     global _device
     _device = device
 
@@ -45,9 +45,7 @@ def set_denoiser_device(device: DenoiserDevice) -> None:
 def denoise(
     radiance_rgb: NDArray[np.float32], features: Features, quality: Quality
 ) -> NDArray[np.float32]:
-    """Return the picture without noise, and exactly black where no ray met anything.
-
-    A picture without any light stays black.
+    """Return the picture without noise, exactly black where no ray met anything.
 
     Args:
         radiance_rgb: [R, R, 3] finite and at least 0. Values that are not finite vanish in the

@@ -34,7 +34,7 @@ class Film:
         return mi.Ray3f(self.origin, dr.normalize(right + up - self._backward * self._focal))
 
     def pixel(self, point: Any) -> tuple[Any, Any]:
-        """Return the pixel (UInt32) that a point shows in, and whether the picture has it."""
+        """Return the pixel (UInt32) in which a point shows, and whether the picture contains it."""
         local = point - self.origin
         scale = self._focal / -dr.dot(local, self._backward)
         x = self._half + scale * dr.dot(local, self._right)

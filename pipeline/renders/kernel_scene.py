@@ -12,13 +12,13 @@ from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.surface_table import SurfacePoint, SurfaceTable
 
 MAX_SURVIVAL = 0.95
-"""A path never survives roulette for sure, so that bright loops end."""
+"""Largest probability to survive roulette, so that paths between bright surfaces end."""
 
 SMALLEST_COSINE = 1e-9
 """Cosines that weights divide by are at least this: a path along a surface carries no light."""
 
 MOST_ODDS = 1e18
-"""Ratios of densities stop here, so that no square is infinite, and 0 times that not a number."""
+"""Ratios of densities are capped here: their squares stay finite, and 0 times those is not NaN."""
 
 _OFFSET = 1500 * 2.0**-24
 """Relative distance of a ray's start from its surface, as in Mitsuba: 1500 float32 roundings."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
 
 _OUTLIER_FACTOR = 4.0
-"""A raw value beyond this many times the denoised one is an outlier by the rest."""
+"""What a raw value has beyond this many times the denoised one is outlying light."""
 
 _HARMLESS_SHARE = 0.005
 """Up to this share of outlying light, PSNR(A, B) was no more than 1 dB too good in any view."""
@@ -27,17 +27,17 @@ _DB_PER_DECADE = 3.0
 """Taken off for each factor of 10 of outlying light beyond the harmless share."""
 
 _MOST_DB = 4.0
-"""Taken off at most, from _MATURE_SPP samples a half on; twice and three times that at a half and a
-quarter of them."""
+"""The most that is taken off where a half has _MATURE_SPP samples or more. With half as many it is
+twice this, with a quarter three times."""
 
 _MATURE_SPP = 64
 
 _DB_PER_DOUBLING = 1.2
-"""The true error falls by 0.9 to 2.0 dB per doubling of the samples, not by 3; taken low, until
-the view itself has been measured twice."""
+"""The true error falls by 0.9 to 2.0 dB per doubling of the samples, not by 3. This low guess is
+used until the view itself has been measured twice."""
 
 _SLOWEST_DB, _FASTEST_DB = 0.6, 3.0
-"""Bounds of what two floors of a view may say of its next doubling: each has noise of its own."""
+"""Bounds of the gain per doubling that is read off two floors of a view, which are noisy."""
 
 _MAX_GROWTH = 4.0
 """The samples grow at most by this between two measurements."""

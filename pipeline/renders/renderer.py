@@ -1,4 +1,7 @@
-"""From a `Scene` to pictures with a measured error: the render stage itself.
+"""`SceneRenderer`: pictures of a scene with a measured error.
+
+It renders the camera that it is given, or refuses its picture; who chooses cameras, and which one
+comes next, is not known here (pipeline.making.render_sample).
 
 A picture is sampled as two halves that share nothing. They are denoised apart to measure the floor
 (pipeline.renders.noise_floor), until it reaches the target or the samples reach the cap. The
@@ -60,19 +63,20 @@ class RenderedView:
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """How far a view is."""
+    """How far the sampling of a view has come."""
 
     spp: int
     """Samples per pixel so far."""
     expected_spp: int
-    """Samples at which the floor should reach its target, or the cap; a guess that is mended."""
+    """Samples at which the floor should reach its target, or the cap; a guess that improves."""
     noise_floor_db: float | None
     """The floor when it was measured last, or None."""
 
 
 _MAX_RAW = 1e13
-"""Spread by the denoiser over all of 8192 x 8192 pixels, one of this radiance still is more than
-half floats hold. From some 5e36 on the denoiser returns a black picture instead."""
+"""Raw pixels from this radiance on are refused: half floats could not hold the picture even if the
+denoiser spread one of them over 8192 x 8192 pixels. From about 5e36 on the denoiser returns black,
+which would hide the overflow."""
 
 
 class SceneRenderer:

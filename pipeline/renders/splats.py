@@ -21,7 +21,7 @@ _LARGEST = 2.0**54
 """A splat in units, a million times that radiance: a thousand of them fit into 64 bits."""
 
 _SMALLEST_EXPONENT = -90
-"""Of the brightest emitter: units must stay ordinary float32 numbers."""
+"""Least exponent of the brightest emitter's radiance: units must stay normal float32 numbers."""
 
 
 def splat_unit(scene: Scene) -> float:
@@ -47,11 +47,11 @@ class Splats:
 
     def add(self, value: Any, pixel: Any, active: Any) -> None:
         """Add colours of at least 0 (Color3f) to pixels (UInt32)."""
-        # Atomic. By default each thread sums small pictures apart, in a kernel of their own.
+        # Atomic. By default each thread would sum a picture of its own, in a separate kernel.
         add, direct = dr.ReduceOp.Add, dr.ReduceMode.Direct
         units = value * self._per_unit
         fits = dr.max(units) < _LARGEST
-        fits &= dr.all(dr.isfinite(units))  # the largest of numbers and no numbers is a number
+        fits &= dr.all(dr.isfinite(units))  # dr.max passes over NaN
         for channel, total in zip(units, self._sums, strict=True):
             rounded = mi.UInt64(dr.select(fits, channel, 0) + 0.5)
             dr.scatter_reduce(add, total, rounded, pixel, active & fits, mode=direct)

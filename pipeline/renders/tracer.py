@@ -29,15 +29,16 @@ class PassSum(Protocol):
     """The growing sum of the passes of one view, in the memory where they are traced."""
 
     def add(self, *, seed: int, spp: int) -> None:
-        """Add all samples of one pass: `Tracer.radiance` times `spp`. It may return before."""
-        ...
+        """Add all samples of one pass: `Tracer.radiance` times `spp`.
+
+        It may return before they are traced.
+        """
 
     def read(self) -> NDArray[np.float64]:
         """Return the sum over all samples, [R, R, 3]; not finite where any sample was not.
 
         It waits until they are traced, and equals the sum in float64 of the passes, one by one.
         """
-        ...
 
 
 class Tracer(Protocol):
@@ -51,7 +52,6 @@ class Tracer(Protocol):
         Raises:
             Rejected: "unlit_scene" where it has no area.
         """
-        ...
 
     def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
         """Return the mean of one pass of samples, linear radiance [R, R, 3].
@@ -63,23 +63,19 @@ class Tracer(Protocol):
             seed: 31 bits; passes with different seeds are independent.
             spp: samples per pixel, a square of a power of two.
         """
-        ...
 
     def pass_sum(self, camera: Camera) -> PassSum:
         """Return an empty sum of passes of a view."""
-        ...
 
     def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
         """Return the albedo and normal pictures."""
-        ...
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
         """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
-        ...
 
 
 class HostSum:
-    """A `PassSum` in numpy's memory, of a tracer whose passes come there anyway."""
+    """A `PassSum` in numpy's memory, for a tracer that returns its passes there anyway."""
 
     def __init__(self, tracer: Tracer, camera: Camera) -> None:
         self._tracer, self._camera = tracer, camera

@@ -6,8 +6,8 @@ process of its own, without any kernel that another library compiled, and must m
 within its noise. The answer is remembered.
 
 A graphics card is used only where the user asks for it (TRILIGHT_VARIANT=cuda_ad_rgb), and only
-after the same probe: no figure of this project was measured on one. It denoises too, where Open
-Image Denoise gives the picture there that it gives on the processor.
+after the same probe: no figure of this project was measured on one. It denoises as well if Open
+Image Denoise gives the same picture on it as on the processor.
 
 Nothing here imports mitsuba, except `activate`.
 """
@@ -37,7 +37,7 @@ _PROBE_S = 180
 _REMEMBERED_TRIES = 32
 
 _RAYS_LEFT_OUT = "Disabling this ray tracing operation"
-"""What Dr.Jit says, and no more, where a kernel on a graphics card is too much for OptiX."""
+"""Dr.Jit only logs this where a kernel is too large for OptiX; it raises no error."""
 
 
 VariantName = Literal["llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"]
@@ -54,7 +54,7 @@ class Variant:
     libllvm: str
     """The LLVM library that it compiles with; empty for the others."""
     note: str
-    """What is slower than it could be, for the user, else empty."""
+    """What the user should know of this choice, such as that it is slow; empty if nothing."""
     denoiser: DenoiserDevice = "CPU"
     """What Open Image Denoise runs on."""
 
@@ -131,8 +131,7 @@ def activate(variant: Variant) -> None:
 def _works(library: Path) -> bool:
     """Return whether Mitsuba renders with a library, from memory or by a probe.
 
-    Only success is remembered: what failed may have failed for want of something else, which
-    somebody has installed since.
+    Only success is remembered: the cause of a failure may have been mended since.
     """
     memory = cache_folder("llvm_probes.json")
     identity = sha256_hex(canonical_json([_identity(library), probe_picture.TABLE]))

@@ -1,9 +1,9 @@
 """Run as a process of its own: renders a small picture with the variant that its argument names.
 
 LLVM's library is the one of the environment. Ends with status 0 only when the picture is the right
-one (pipeline.renders.probe_picture) within its noise. What the scene has, the picture needs: a lamp
-beside the view, a glossy wall that light is reflected by, and a screen that hides and shades what
-is behind it. Where a kernel misses one of its rays to surfaces or emitters, some part is wrong.
+one (pipeline.renders.probe_picture) within its noise. The scene needs every kind of ray: it has a
+lamp beside the view, a glossy wall that reflects light, and a screen that hides and shades what is
+behind it. Where a kernel misses one kind of hit, some block of the picture is wrong.
 
 On a graphics card it then says on standard output why pictures cannot be denoised there, if so.
 """
@@ -24,10 +24,10 @@ from storage.records.material import completed_rows
 from storage.records.scene import ObjectKind, Scene, SceneObject
 
 BLOCK = 4
-"""Pixels each way whose mean is compared: of single ones, a few bright samples decide."""
+"""Width in pixels of the blocks whose means are compared: a few bright samples decide a pixel."""
 
 _MOST_DEVIATIONS = 6
-"""A right picture is off by so much in one block and channel once in ten million probes."""
+"""Standard deviations by which a right picture is off, somewhere, once in ten million probes."""
 
 _DENOISER_TOLERANCE = 0.02
 """Of a block's mean: cards compute in half floats, which are exact to 0.0005, through many layers;

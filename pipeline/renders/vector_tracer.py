@@ -20,7 +20,6 @@ from pipeline.renders.emitter_table import EmitterTable
 from pipeline.renders.film import Film
 from pipeline.renders.kernel_scene import KernelScene
 from pipeline.renders.light_kernel import trace_light
-from pipeline.renders.light_starts import even_numbers
 from pipeline.renders.path_kernel import trace
 from pipeline.renders.splats import Splats, splat_unit
 from pipeline.renders.surface_table import SurfaceTable
@@ -31,6 +30,9 @@ from storage.seeds import seed_for
 LIGHT_PATHS = 0.25
 """Light paths for each camera path: a quarter has most of the gain, and the whole then takes 1.1 to
 1.4 times as long (docs/log)."""
+
+_GOLDEN = 1.1673039782614187
+"""The root of x^5 = x + 1, for points that fill four dimensions."""
 
 
 class VectorTracer:
@@ -51,7 +53,6 @@ class VectorTracer:
             max_depth=max_depth,
             rr_depth=rr_depth,
         )
-
         self._unit = splat_unit(scene)
 
     def only_light(self, row: int) -> "VectorTracer":
@@ -74,14 +75,14 @@ class VectorTracer:
         return traced + self._landed(camera, light_paths, seed=seed, count=int(light_paths * spp))
 
     def _traced(self, camera: Camera, light_paths: float, *, seed: int, spp: int) -> Any:
-        """Return what camera paths leave to themselves beside so many light paths per sample."""
+        """Return the camera paths' share of the light (Color3f), beside so many light paths."""
         sampler = _sampler(camera, seed, spp)
         film, beside = Film(camera), dr.opaque(mi.Float, light_paths)
         ray = film.rays(*_jittered(camera, sampler, spp))
         return _pixel_means(spp, trace(self._scene, film, beside, sampler, ray))
 
     def _landed(self, camera: Camera, light_paths: float, *, seed: int, count: int) -> Any:
-        """Return the rest, from `count` light paths."""
+        """Return the share of the light (Color3f) that `count` light paths find."""
         splats, beside = Splats(camera.resolution, self._unit), dr.opaque(mi.Float, light_paths)
         u = even_numbers(count, seed)
         emitter = self._scene.emitters.sample(mi.Point2f(u[0], u[1]), mi.Bool(True))
@@ -111,7 +112,7 @@ class VectorTracer:
 
 
 class _DeviceSum:
-    """A `PassSum` in the memory of the device, in double precision: passes do not wait for us."""
+    """A `PassSum` in float64 in the memory of the device, so that no pass waits for Python."""
 
     def __init__(self, tracer: VectorTracer, camera: Camera) -> None:
         self._tracer, self._camera = tracer, camera
@@ -126,12 +127,27 @@ class _DeviceSum:
         return _picture(self._camera, self._total)
 
 
+def even_numbers(count: int, seed: int) -> list[Any]:
+    """Return 4 arrays of `count` uniform numbers (Float, [0, 1)): points that fill 4 dimensions.
+
+    Multiples of the 4 inverse powers of a generalised golden ratio (Roberts 2018), shifted by the
+    seed. Any first part of them is spread evenly, so that any count will do.
+    """
+    lane = dr.arange(mi.UInt32, count)
+    numbers = []
+    for axis in range(4):
+        stride = round(2**32 / _GOLDEN ** (axis + 1))
+        shift = dr.opaque(mi.UInt32, 2 * seed_for(seed, "light paths", axis))
+        numbers.append(mi.Float((lane * stride + shift) >> 8) * 2.0**-24)
+    return numbers
+
+
 def _load(scene: Scene, triangles: NDArray[np.intp], beside: Any = None) -> Any:
     """Return a mi.Scene of one mesh, whose triangle numbers are places in `triangles`.
 
-    Rays of one kernel may meet it and the mi.Scene `beside`: on a graphics card Dr.Jit lets rays of
-    a kernel meet one OptiX shader binding table, and what has another one is empty space for them.
-    A scene that is given another one as a child shares its table.
+    One kernel may trace rays into this scene and into `beside`. On a graphics card all rays of a
+    kernel use one OptiX shader binding table, and miss whatever is in another table. A scene that
+    has another scene as a child shares its table.
     """
     mesh = mi.Mesh("triangles", len(scene.vertex_positions), len(triangles))
     parameters = mi.traverse(mesh)

@@ -28,8 +28,8 @@ def drawn_within(
 ) -> list[Entry]:
     """Draw entries with replacement, evenly among those that fit beside the ones before.
 
-    Where all fit, this is an even draw. Otherwise simple objects are drawn more often as
-    companions of demanding ones, as they would be if whole scenes were drawn until one fits.
+    If all fit, this is a uniform draw. Otherwise simple objects are drawn more often beside
+    demanding ones, as they would be if whole scenes were drawn until one fits.
     Entries of two different camps never fit beside each other.
 
     Args:
@@ -38,7 +38,7 @@ def drawn_within(
         least: triangles of the coarsest level of each entry.
         count: how many.
         num_triangles: for all together.
-        camps: which camp each entry belongs to, "" where to none; nothing where there is none.
+        camps: the camp of each entry, "" for an entry without one; empty if no entry has one.
 
     Raises:
         Rejected: "over_budget" where not even the simplest fit.

@@ -15,8 +15,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 LEAST_FACING = 0.1
-"""Cosine between the normals of a corner and of its face below which the face's own is used: seen
-from in front, such a corner would be shaded as if from behind."""
+"""Least cosine between the normals of a corner and of its face. Below it the corner gets the normal
+of its face, because seen from in front it would be shaded as if seen from behind."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

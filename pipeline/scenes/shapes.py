@@ -1,8 +1,8 @@
 """`MeshShape`: an object's mesh as the templates ask for it, with collisions by FCL.
 
 FCL (Pan, Chitta, Manocha 2012) tests triangle against triangle in float64 over bounding volume
-trees; two objects far apart are told by their spheres alone. A mesh inside another without touching
-it is met as well where one's box lies in the other's: a ball in a bowl is refused with it.
+trees; two objects far apart are told by their spheres alone. A mesh inside another one does not
+touch it, so a mesh also meets every mesh whose box holds its own. This refuses a ball in a bowl.
 """
 
 from typing import Any, Literal
@@ -34,7 +34,7 @@ class MeshShape:
         self._tree: tuple[float, Any] | None = None
 
     def meets(self, pose: Pose, other: "MeshShape", its_pose: Pose) -> bool:
-        """Return whether two meshes in their places share a point, or one's box holds the other."""
+        """Return whether two posed meshes share a point, or the box of one holds the other's."""
         apart = pose.centre - its_pose.centre
         if np.sum(np.square(apart)) > (pose.radius + its_pose.radius) ** 2:
             return False

@@ -33,7 +33,7 @@ class ViewFacts:
     shell_back: float
     """Share of the rays that meet a floor or wall first, from behind."""
     lit: float
-    """Share of what is met that at least one emitter's centre shines upon, on the side seen."""
+    """Share of the hit points that the centre of an emitter lights, on the side that is seen."""
     depth: float
     """Distance to the nearest thing: what a ray meets, or the bounding box of an object."""
 

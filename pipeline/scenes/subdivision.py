@@ -1,8 +1,8 @@
 """More triangles of the same surface: the longest edges are halved until there are enough.
 
-A test set can so ask what the number of triangles does by itself. Triangles are flat, so positions
-stay on the surface to the rounding of float32; each part keeps the material of the whole, and new
-vertices get the mean of their neighbours' normals.
+With it a test set measures what the number of triangles alone does. Triangles are flat, so new
+vertices stay on the surface to the rounding of float32; each part keeps the material of the whole,
+and new vertices get the mean of their neighbours' normals.
 """
 
 import dataclasses
@@ -18,10 +18,10 @@ Edge = tuple[int, int]
 
 
 def filled(pieces: Sequence[ScenePiece], fill_to: int) -> list[ScenePiece]:
-    """Return the pieces with the objects subdivided until all have `fill_to` triangles together.
+    """Return the pieces with the objects subdivided until the scene has `fill_to` triangles.
 
-    Each object gets its share by what it has. The sum falls short of `fill_to` by a few; pieces
-    that have more already stay as they are.
+    Objects grow in proportion to their triangles. The sum falls short of `fill_to` by a few; pieces
+    with more triangles than that stay as they are.
     """
     counts = [len(piece.mesh.faces) for piece in pieces]
     is_object = [piece.entry.kind == "object" for piece in pieces]
@@ -48,7 +48,7 @@ def subdivided(piece: ScenePiece, num_faces: int) -> ScenePiece:
 
 
 class _Work:
-    """A mesh in the making. Edges are told by position, since flat faces share no vertices."""
+    """A mesh in the making. Edges are identified by position: flat faces share no vertices."""
 
     def __init__(self, mesh: ShadedMesh) -> None:
         self._points = list(mesh.positions.astype(np.float64))

@@ -1,11 +1,13 @@
-"""Chooses cameras: the first of sixteen proposals per view that sees enough.
+"""Chooses cameras: of sixteen proposals per view, those that see enough, one after the other.
 
 Proposals are numbered, and each is a pure function of (seed, scene, attempt, view, number). A view
-whose picture turns out black can therefore ask for the next one, long after composition and in
+whose picture turns out black can therefore go on to the next one, long after composition and in
 another process.
 """
 
 import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,35 +22,57 @@ from storage.seeds import rng_for
 CAMERA_ATTEMPTS = 16
 """Proposals per view."""
 
-PoseAndAngle = tuple[NDArray[np.float32], np.float32]
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewCamera:
+    """A camera of a view."""
+
+    c2w: NDArray[np.float32]
+    """[4, 4] camera to world."""
+    fov_deg: np.float32
+    """Full field of view in degrees."""
+    attempt: int
+    """Number of the proposal."""
 
 
 def with_first_cameras(scene: Scene, settings: SceneSettings) -> Scene:
     """Return the scene with `settings.num_views` cameras; raises Rejected("no_camera")."""
     sight = Sight(scene)
-    chosen = [_first_camera(scene, sight, settings, view, 0) for view in range(settings.num_views)]
-    return _with_cameras(
-        scene, [camera for camera, _ in chosen], [attempt for _, attempt in chosen]
+    return with_cameras(
+        scene,
+        [next(_that_see(scene, sight, settings, view, 0)) for view in range(settings.num_views)],
     )
 
 
-def next_camera(scene: Scene, settings: SceneSettings, *, view: int) -> Scene:
-    """Return the same scene with the camera of `view` replaced by the next that passes.
+def cameras_of_view(
+    scene: Scene, sight: Sight, settings: SceneSettings, view: int
+) -> Iterator[ViewCamera]:
+    """Yield the camera that a view has, and then each following proposal that sees enough.
 
     Args:
-        scene: as compose_scene or this function returned it.
+        scene: as compose_scene returned it.
+        sight: of this scene.
         settings: those that the scene was composed with.
         view: row of `scene.c2w`.
 
     Raises:
         Rejected: "no_camera" when the sixteen proposals of the view are used up.
     """
-    settings = settings.of_scene(scene.provenance["scene_index"])
-    attempts = list(scene.provenance["camera_attempts"])
-    camera, attempt = _first_camera(scene, Sight(scene), settings, view, attempts[view] + 1)
-    cameras: list[PoseAndAngle] = list(zip(scene.c2w, scene.fov_deg, strict=True))
-    cameras[view], attempts[view] = camera, attempt
-    return _with_cameras(scene, cameras, attempts)
+    attempt = int(scene.provenance["camera_attempts"][view])
+    yield ViewCamera(c2w=scene.c2w[view], fov_deg=scene.fov_deg[view], attempt=attempt)
+    of_scene = settings.of_scene(scene.provenance["scene_index"])
+    yield from _that_see(scene, sight, of_scene, view, attempt + 1)
+
+
+def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
+    """Return the scene seen by these cameras, whose attempts it remembers."""
+    posed = scene.with_cameras(
+        np.stack([camera.c2w for camera in cameras]),
+        np.array([camera.fov_deg for camera in cameras]),
+    )
+    attempts = [camera.attempt for camera in cameras]
+    provenance = {**scene.provenance, "camera_attempts": attempts}
+    return dataclasses.replace(posed, provenance=provenance)
 
 
 def complaint(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str | None:
@@ -64,34 +88,31 @@ def complaint(facts: ViewFacts, settings: ViewLaws, *, has_objects: bool) -> str
     return None
 
 
-def _first_camera(
+def _that_see(
     scene: Scene, sight: Sight, settings: SceneSettings, view: int, first: int
-) -> tuple[PoseAndAngle, int]:
+) -> Iterator[ViewCamera]:
+    """Yield proposals from `first` on that see enough; raises Rejected when they are used up."""
     has_objects = any(entry.kind == "object" for entry in scene.objects)
     complaints: list[str] = []
     for attempt in range(first, CAMERA_ATTEMPTS):
-        c2w, fov_deg = _proposal(scene, settings, view, attempt)
-        facts = sight.facts(c2w, float(fov_deg), settings.views.coverage_grid)
+        camera = _proposal(scene, settings, view, attempt)
+        facts = sight.facts(camera.c2w, float(camera.fov_deg), settings.views.coverage_grid)
         found = complaint(facts, settings.views, has_objects=has_objects)
         if found is None:
-            return (c2w, fov_deg), attempt
-        complaints.append(found)
+            yield camera
+            first, complaints = attempt + 1, []
+        else:
+            complaints.append(found)
     counts = ", ".join(f"{text} x{complaints.count(text)}" for text in sorted(set(complaints)))
     raise Rejected(
         "no_camera", f"view {view}: none of attempts {first} to {CAMERA_ATTEMPTS - 1}: {counts}"
     )
 
 
-def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> PoseAndAngle:
+def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> ViewCamera:
     origin = scene.provenance
     rng = rng_for(origin["seed"], "camera", origin["scene_index"], origin["attempt"], view, attempt)
     pose = TEMPLATES[origin["template"]].camera_rand(rng, settings.cameras)
-    return pose.c2w.astype(np.float32), np.float32(pose.fov_deg)
-
-
-def _with_cameras(scene: Scene, cameras: list[PoseAndAngle], attempts: list[int]) -> Scene:
-    posed = scene.with_cameras(
-        np.stack([c2w for c2w, _ in cameras]), np.array([fov_deg for _, fov_deg in cameras])
+    return ViewCamera(
+        c2w=pose.c2w.astype(np.float32), fov_deg=np.float32(pose.fov_deg), attempt=attempt
     )
-    provenance = {**scene.provenance, "camera_attempts": attempts}
-    return dataclasses.replace(posed, provenance=provenance)

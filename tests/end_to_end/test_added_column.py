@@ -215,9 +215,9 @@ def test_the_path_tracer_says_what_it_does_not_read() -> None:
 
     engine = MitsubaEngine(cast(PathTracer, Tracer()))
     scene = tiny_scene()
-    assert engine.open(scene, "floor") == ()
+    assert engine.open(scene, "floor").notes == ()
     scene.materials[FLOOR, -1] = 0.9
-    assert engine.open(scene, "floor") == ("floor: the path tracer does not read coat",)
+    assert engine.open(scene, "floor").notes == ("floor: the path tracer does not read coat",)
 
 
 def test_inspect_names_the_columns_in_use(tmp_path: Path) -> None:

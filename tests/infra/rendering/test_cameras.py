@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, shots
+from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, paired
 from infra.rendering.sources import scene_sources
 from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
@@ -72,14 +72,14 @@ def test_a_camera_that_looks_away_turns_about_itself() -> None:
 
 
 def test_scenes_and_cameras_go_together() -> None:
-    assert [shot.camera for shot in shots(sources(2), None)] == [None, None]
+    first, second = sources(2)
+    assert paired(sources(2), [7]) == [(first, 7), (second, 7)]
     one, three = sources(1), cameras(3)
-    assert [shot.camera for shot in shots(one, three)] == three
-    assert [shot.source for shot in shots(sources(3), three)] == sources(3)
-    fixed = shots(sources(3), three[:1])
-    assert [shot.camera for shot in fixed] == [three[0]] * 3
+    assert paired(one, three) == [(first, camera) for camera in three]
+    assert paired(sources(3), three) == list(zip(sources(3), three, strict=True))
+    assert [camera for _, camera in paired(sources(3), three[:1])] == [three[0]] * 3
     with pytest.raises(TrilightError, match="2 scenes and 3 cameras; expected one of either"):
-        shots(sources(2), three)
+        paired(sources(2), three)
 
 
 def test_a_view_that_is_not_there_is_one_line() -> None:

@@ -1,21 +1,21 @@
 """Files of many pictures: numbered, kept where they would come out again, shown in a row."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 
-from infra.rendering.cameras import Shot, orbit, own_camera, shots
+from infra.rendering import look as look_module
+from infra.rendering.cameras import ShotCamera, orbit, own_camera, paired
 from infra.rendering.comparison import comparison_sheet
-from infra.rendering.engines import Engine, Rendered
-from infra.rendering.look import Look, enlarged, enlargement
+from infra.rendering.engines import Facts, OpenedScene, Rendered
+from infra.rendering.look import Look, enlarged, enlargement, tone_mapped
 from infra.rendering.places import PicturePlaces, place
-from infra.rendering.run import FinishedShot, ShotRun
-from infra.rendering.tone_maps import require_tone_map, tone_mapped
+from infra.rendering.plan import RenderPlan, shots
+from infra.rendering.run import FinishedShot, carry_out
 from infra.rendering.video import write_video
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
@@ -36,40 +36,69 @@ class FlatEngine:
         self.opened = 0
         self.rendered = 0
 
-    def open(self, scene: Scene, name: str) -> tuple[str, ...]:
-        self.opened += 1
-        return (f"{name} was opened",)
+    def start(self, sampled: object) -> "FlatEngine":
+        return self
 
-    def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> Rendered:
+    def caveats(self, pictures: Sequence[Facts]) -> list[str]:
+        return []
+
+    def open(self, scene: Scene, name: str) -> OpenedScene:
+        self.opened += 1
+        return OpenedScene(notes=(f"{name} was opened",), render=self._render)
+
+    def _render(self, camera: ShotCamera, name: str) -> Rendered:
         self.rendered += 1
-        picture = np.full((16, 16, 3), 3 + c2w[0, 3], np.float32)
+        picture = np.full((16, 16, 3), 3 + camera.c2w[0, 3], np.float32)
         return Rendered(radiance_rgb=picture, facts={"number": self.rendered, "half": 0.5})
 
     def close(self) -> None:
         pass
 
 
+class Nobody:
+    """Hears how far a render is, and says nothing."""
+
+    def pictures(self, done: int, total: int) -> None:
+        pass
+
+    def sampled(self, now: object) -> None:
+        pass
+
+
+Pairs = list[tuple[SceneSource, ShotCamera | int]]
+
+
 @pytest.fixture
-def turn(tmp_path: Path) -> list[Shot]:
+def turn(tmp_path: Path) -> Pairs:
     path = tmp_path / "tiny.safetensors"
     path.write_bytes(encode_scene(tiny_scene()))
     cameras = orbit(tiny_scene(), own_camera(tiny_scene(), 0), 4, 360)
-    return shots([SceneSource(path=path, key=None)], cameras)
+    return paired([SceneSource(path=path, key=None)], cameras)
 
 
 def run(
-    engines: list[Engine],
+    engines: list[FlatEngine],
     out: Path,
-    wanted: list[Shot],
+    pairs: Pairs,
     look: Look = Look(),  # noqa: B008
-) -> tuple[list[FinishedShot], list[str]]:
-    drawn = ShotRun(engines, place(out), view=0, look=look)
-    return drawn.run(wanted, HereReader(), lambda now: None), list(drawn.notes)
+) -> tuple[Sequence[FinishedShot], Sequence[str]]:
+    where = place(out)
+    plan = RenderPlan(
+        source="tiny",
+        view=0,
+        engine="neural",
+        engines=engines,
+        resolution=16,
+        look=look,
+        place=where,
+        shots=list(shots(pairs, where, [engine.name for engine in engines])),
+        fps=24,
+    )
+    outcome = carry_out(plan, HereReader(), Nobody())
+    return outcome.shots, outcome.notes
 
 
-def test_pictures_are_numbered_and_the_scene_is_opened_once(
-    turn: list[Shot], tmp_path: Path
-) -> None:
+def test_pictures_are_numbered_and_the_scene_is_opened_once(turn: Pairs, tmp_path: Path) -> None:
     engine = FlatEngine()
     finished, notes = run([engine], tmp_path / "turn", turn)
     assert (engine.opened, engine.rendered) == (1, 4)
@@ -81,7 +110,7 @@ def test_pictures_are_numbered_and_the_scene_is_opened_once(
         np.testing.assert_allclose(decode_exr(shot.pictures["neural"].path.read_bytes()), value)
 
 
-def test_what_is_there_is_kept_and_only_the_rest_is_made(turn: list[Shot], tmp_path: Path) -> None:
+def test_what_is_there_is_kept_and_only_the_rest_is_made(turn: Pairs, tmp_path: Path) -> None:
     out, again = tmp_path / "turn", FlatEngine()
     first, _ = run([FlatEngine()], out, turn)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
@@ -100,7 +129,7 @@ def test_what_is_there_is_kept_and_only_the_rest_is_made(turn: list[Shot], tmp_p
 
 
 def test_pictures_of_other_settings_scenes_or_cameras_are_made_anew(
-    turn: list[Shot], tmp_path: Path
+    turn: Pairs, tmp_path: Path
 ) -> None:
     out = tmp_path / "turn"
     run([FlatEngine()], out, turn)
@@ -113,19 +142,19 @@ def test_pictures_of_other_settings_scenes_or_cameras_are_made_anew(
     assert moved.rendered == 3
     changed = FlatEngine(name="mitsuba", setting=1)
     materials = tiny_scene().materials * np.float32(0.5)
-    turn[0].source.path.write_bytes(encode_scene(tiny_scene(materials=materials)))
+    turn[0][0].path.write_bytes(encode_scene(tiny_scene(materials=materials)))
     run([changed], out, turn)
     assert changed.rendered == 4
 
 
-def test_one_picture_is_always_made_anew(turn: list[Shot], tmp_path: Path) -> None:
+def test_one_picture_is_always_made_anew(turn: Pairs, tmp_path: Path) -> None:
     engine = FlatEngine()
     for _ in range(2):
-        run([engine], tmp_path / "one.exr", shots([turn[0].source], None))
+        run([engine], tmp_path / "one.exr", [(turn[0][0], 0)])
     assert engine.rendered == 2
 
 
-def test_another_tone_map_needs_no_other_picture(turn: list[Shot], tmp_path: Path) -> None:
+def test_another_tone_map_needs_no_other_picture(turn: Pairs, tmp_path: Path) -> None:
     pytest.importorskip("PyOpenColorIO", reason="the film-like curve is OpenColorIO's")
     out, again = tmp_path / "turn", FlatEngine()
     run([FlatEngine()], out, turn)
@@ -135,7 +164,7 @@ def test_another_tone_map_needs_no_other_picture(turn: list[Shot], tmp_path: Pat
     assert (out / "000000.png").read_bytes() != plain
 
 
-def test_another_exposure_needs_no_other_picture(turn: list[Shot], tmp_path: Path) -> None:
+def test_another_exposure_needs_no_other_picture(turn: Pairs, tmp_path: Path) -> None:
     """Stops multiply the light by powers of two; the EXR that is measured knows nothing of it."""
     out, again = tmp_path / "turn", FlatEngine()
     run([FlatEngine()], out, turn)
@@ -176,7 +205,7 @@ def test_the_captions_of_a_small_comparison_are_whole(exposure_ev: float) -> Non
 def test_the_film_like_curve_keeps_what_the_plain_one_clips() -> None:
     pytest.importorskip("PyOpenColorIO", reason="the film-like curve is OpenColorIO's")
     levels = np.repeat(np.array([0, 0.01, 0.18, 1, 5, 50, 65504], np.float32)[:, None], 3, axis=1)
-    shown = tone_mapped(levels[None], require_tone_map("filmic"))[0].astype(int)
+    shown = tone_mapped(levels[None], "filmic")[0].astype(int)
     assert (np.diff(shown[:, 0]) > 0).all()
     # ACES 2.0 shows 0.18 as 10 of 100 nits, which sRGB encodes as 89; grey stays grey to a step
     assert abs(shown[2] - 89).max() <= 1
@@ -241,8 +270,6 @@ def test_out_says_what_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(TrilightError, match="needs PyAV, which is not installed: pip install av"):
         place(tmp_path / "x.mp4")
     monkeypatch.setitem(__import__("sys").modules, "PyOpenColorIO", None)
-    from infra.rendering import tone_maps
-
-    tone_maps._filmic.cache_clear()
+    look_module._filmic.cache_clear()
     with pytest.raises(TrilightError, match="OpenColorIO is not installed"):
-        require_tone_map("filmic")
+        Look(tone_map="filmic")

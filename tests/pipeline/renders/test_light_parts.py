@@ -96,7 +96,7 @@ def test_directions_into_the_scene_have_the_density_that_is_claimed(position: li
     import mitsuba as mi
 
     from pipeline.renders.emission_cone import EmissionCone
-    from pipeline.renders.light_starts import even_numbers
+    from pipeline.renders.vector_tracer import even_numbers
 
     cone = EmissionCone(_scene())
     count, normal = 1 << 16, dr.normalize(mi.Vector3f(0.3, 0.5, 1.0))
@@ -125,7 +125,7 @@ def test_directions_into_the_scene_have_the_density_that_is_claimed(position: li
 
 
 def test_light_starts_are_even_and_their_shift_goes_with_the_seed() -> None:
-    from pipeline.renders.light_starts import even_numbers
+    from pipeline.renders.vector_tracer import even_numbers
 
     count = 4096
     first, second = (np.array(even_numbers(count, seed)) for seed in (1, 2))

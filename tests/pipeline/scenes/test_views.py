@@ -1,6 +1,7 @@
 """Laws of cameras: where they stand, what they see, and how the next one is found."""
 
 import dataclasses
+import itertools
 import json
 
 import numpy as np
@@ -10,7 +11,13 @@ from numpy.typing import NDArray
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.sight import Sight
-from pipeline.scenes.views import CAMERA_ATTEMPTS, complaint, next_camera
+from pipeline.scenes.views import (
+    CAMERA_ATTEMPTS,
+    ViewCamera,
+    cameras_of_view,
+    complaint,
+    with_cameras,
+)
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings, ViewLaws
 from storage.conventions import camera_rays, look_at_c2w
@@ -118,35 +125,45 @@ def test_emitters_are_hidden_from_the_camera() -> None:
     assert 2.01 < facts.depth < 2.01 * 1.00001
 
 
-def test_next_camera_changes_one_view_only_and_ends(scenes: list[Scene]) -> None:
-    scene = scenes[0]
-    seen = {scene.c2w[1].tobytes()}
-    attempts = [scene.provenance["camera_attempts"][1]]
-    with pytest.raises(Rejected) as caught:
-        for _ in range(CAMERA_ATTEMPTS + 1):
-            following = next_camera(scene, SETTINGS, view=1)
-            following.check()
-            for name in ARRAY_FIELDS:
-                if name not in ("c2w", "fov_deg"):
-                    assert np.array_equal(getattr(following, name), getattr(scene, name))
-            others = [0, 2, 3]
-            assert np.array_equal(following.c2w[others], scene.c2w[others])
-            assert np.array_equal(following.fov_deg[others], scene.fov_deg[others])
-            scene = following
-            seen.add(scene.c2w[1].tobytes())
-            attempts.append(scene.provenance["camera_attempts"][1])
+def test_a_view_has_its_camera_and_then_others_until_they_are_used_up(scenes: list[Scene]) -> None:
+    scene, found = scenes[0], list[ViewCamera]()
+    with pytest.raises(Rejected, match="view 1: none of attempts") as caught:
+        for camera in cameras_of_view(scene, Sight(scene), SETTINGS, 1):
+            found.append(camera)
     assert caught.value.reason == "no_camera"
-    assert len(seen) == len(attempts) > 5
-    assert attempts == sorted(set(attempts))
-    assert attempts[-1] < CAMERA_ATTEMPTS
+    np.testing.assert_array_equal(found[0].c2w, scene.c2w[1])
+    attempts = [camera.attempt for camera in found]
+    assert attempts[0] == scene.provenance["camera_attempts"][1]
+    assert attempts == sorted(set(attempts)) and attempts[-1] < CAMERA_ATTEMPTS
+    assert len({camera.c2w.tobytes() for camera in found}) == len(found) > 5
 
 
-def test_next_camera_needs_nothing_but_the_stored_scene(scenes: list[Scene]) -> None:
+def test_cameras_are_remembered_with_their_attempts(scenes: list[Scene]) -> None:
+    scene = scenes[0]
+    cameras = cameras_of_view(scene, Sight(scene), SETTINGS, 1)
+    own, other = next(cameras), next(cameras)
+    seen = with_cameras(scene, [other, own])
+    seen.check()
+    assert seen.provenance == {
+        **scene.provenance,
+        "camera_attempts": [other.attempt, own.attempt],
+    }
+    for name in ARRAY_FIELDS:
+        if name not in ("c2w", "fov_deg"):
+            assert np.array_equal(getattr(seen, name), getattr(scene, name))
+    np.testing.assert_array_equal(seen.c2w, [other.c2w, own.c2w])
+    np.testing.assert_array_equal(seen.fov_deg, [other.fov_deg, own.fov_deg])
+
+
+def test_the_cameras_of_a_view_need_nothing_but_the_stored_scene(scenes: list[Scene]) -> None:
     scene = scenes[1]
     stored = dataclasses.replace(scene, provenance=json.loads(json.dumps(dict(scene.provenance))))
-    one, other = (next_camera(each, SETTINGS, view=0) for each in (scene, stored))
-    assert np.array_equal(one.c2w, other.c2w)
-    assert one.provenance == other.provenance
+    one, other = (
+        list(itertools.islice(cameras_of_view(each, Sight(each), SETTINGS, 0), 2))
+        for each in (scene, stored)
+    )
+    np.testing.assert_array_equal([row.c2w for row in one], [row.c2w for row in other])
+    assert [row.attempt for row in one] == [row.attempt for row in other]
 
 
 def test_views_that_nobody_can_find_are_rejected(pool: list[PooledAsset]) -> None:

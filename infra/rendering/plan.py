@@ -1,0 +1,170 @@
+"""All that one call of `trilight render` will do: decided once, before any picture is made."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from infra.rendering.asked import Asked, EngineChoice
+from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, paired
+from infra.rendering.engines import EnginePlan, MitsubaPlan, NeuralPlan
+from infra.rendering.look import Look
+from infra.rendering.places import PicturePlaces, place
+from infra.rendering.sources import scene_sources
+from infra.torch_library import require_torch
+from pipeline.exchange.open_scene import SceneSource, scene_source
+from pipeline.exchange.reader import SceneReader
+from pipeline.renders.settings import RenderSettings, one_picture
+from pipeline.renders.variant import choose_variant
+from storage.errors import TrilightError
+
+_RESOLUTION = 512
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shot:
+    """One picture to make."""
+
+    source: SceneSource
+    """The scene."""
+    camera: ShotCamera | int
+    """From where; a number is the row of the scene's own camera."""
+    exrs: Mapping[str, Path]
+    """What is measured: a file for each engine, by its name."""
+    png: Path
+    """What people look at."""
+    keep: bool
+    """Whether files of this very picture that are there already are kept."""
+
+    @property
+    def name(self) -> str:
+        """The picture in messages."""
+        if isinstance(self.camera, int):
+            return f"{self.source.name}, view {self.camera}"
+        return f"{self.source.name}, picture {self.png.stem}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RenderPlan:
+    """What is rendered, by what, and to which files. Nothing in it is open or left to a default."""
+
+    source: str
+    """Scene or scenes as the user named them."""
+    view: int
+    """Row of the camera of a scene that the user named."""
+    engine: EngineChoice
+    """As the user named it."""
+    engines: Sequence[EnginePlan]
+    """One, or Mitsuba and the network."""
+    resolution: int
+    """Width of every picture in pixels."""
+    look: Look
+    """Of the PNG files."""
+    place: PicturePlaces
+    """Where the pictures are."""
+    shots: Sequence[Shot]
+    """Picture by picture; shots of one scene follow each other."""
+    fps: int
+    """Pictures a second of the video, if there is one."""
+
+
+def plan_render(asked: Asked, reader: SceneReader) -> RenderPlan:
+    """Return the plan of what a user asked for; makes the folder of the files.
+
+    Raises:
+        TrilightError: an option that means nothing, a source, camera or checkpoint that is
+            unusable, or a place that cannot be written.
+    """
+    checkpoint, resolution = _network_and_width(asked)
+    settings = one_picture(
+        resolution=resolution, noise_floor_db=asked.noise_floor_db, max_spp=asked.max_spp
+    )
+    look = Look(tone_map=asked.tone_map, exposure_ev=asked.exposure_ev)
+    if asked.out.suffix.lower() == ".exr":
+        scene_source(asked.source)  # a wrong name is said before any library is loaded
+    where = place(asked.out)
+    pairs = _pairs(asked, reader) if where.is_sequence else _one_pair(asked)
+    engines = _engines(asked, settings, checkpoint)
+    return RenderPlan(
+        source=asked.source,
+        view=asked.view,
+        engine=asked.engine,
+        engines=engines,
+        resolution=settings.resolution,
+        look=look,
+        place=where,
+        shots=list(shots(pairs, where, [engine.name for engine in engines])),
+        fps=asked.fps,
+    )
+
+
+def shots(
+    pairs: Sequence[tuple[SceneSource, ShotCamera | int]], where: PicturePlaces, names: list[str]
+) -> Iterator[Shot]:
+    """Yield the pictures of scenes by cameras with their files.
+
+    Args:
+        pairs: scene and camera of each picture.
+        where: the files go.
+        names: of the engines.
+    """
+    for index, (source, camera) in enumerate(pairs):
+        stem = where.stem_of(index)
+        suffixes = {name: f".{name}.exr" if len(names) > 1 else ".exr" for name in names}
+        exrs = {name: Path(f"{stem}{suffix}") for name, suffix in suffixes.items()}
+        png = Path(f"{stem}.png")
+        yield Shot(source=source, camera=camera, exrs=exrs, png=png, keep=where.is_sequence)
+
+
+def _network_and_width(asked: Asked) -> tuple[str | None, int]:
+    """Return the checkpoint, if a network renders, and the width of pictures in pixels."""
+    if asked.engine == "mitsuba":
+        return None, asked.resolution or _RESOLUTION
+    require_torch("--engine neural")
+    from model.open import BUILTIN, find_network
+    from train.networks import network_of_run
+
+    checkpoint = asked.checkpoint or BUILTIN
+    if asked.resolution is not None:
+        return checkpoint, asked.resolution
+    return checkpoint, find_network(checkpoint, network_of_run).trained.resolution or _RESOLUTION
+
+
+def _engines(asked: Asked, settings: RenderSettings, checkpoint: str | None) -> list[EnginePlan]:
+    engines = list[EnginePlan]()
+    if asked.engine != "neural":
+        mitsuba = MitsubaPlan(
+            settings=settings,
+            seed=asked.seed,
+            threads=asked.threads or os.cpu_count() or 1,
+            variant=choose_variant(),
+        )
+        engines.append(mitsuba)
+    if checkpoint is not None:
+        neural = NeuralPlan(
+            checkpoint=checkpoint,
+            precision=asked.precision,
+            resolution=settings.resolution,
+            lights_per_pass=asked.lights_per_pass,
+            skip_empty_bundles=asked.skip_empty_bundles,
+            threads=asked.threads,
+        )
+        engines.append(neural)
+    return engines
+
+
+def _one_pair(asked: Asked) -> list[tuple[SceneSource, ShotCamera | int]]:
+    if asked.orbit is not None or asked.cameras is not None:
+        raise TrilightError(f"--out is {asked.out}; expected a folder, X.mp4 or X.webp for many.")
+    return [(scene_source(asked.source), asked.view)]
+
+
+def _pairs(asked: Asked, reader: SceneReader) -> list[tuple[SceneSource, ShotCamera | int]]:
+    sources = scene_sources(asked.source, reader)
+    cameras: Sequence[ShotCamera | int] = [asked.view]
+    if asked.cameras is not None:
+        cameras = camera_path(asked.cameras, reader, asked.view)
+    elif asked.orbit is not None:
+        scene = reader.load(sources[0]).scene
+        cameras = orbit(scene, own_camera(scene, asked.view), asked.orbit, asked.arc_deg)
+    return paired(sources, cameras)

@@ -1,0 +1,120 @@
+"""Sheets: one picture that shows many of a dataset's, for people; tones as preview_srgb8."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from pipeline.documents.chosen import choose_scenes, read_chosen
+from pipeline.documents.png import encode_png
+from storage.atomic import write_atomically
+from storage.conventions import preview_srgb8
+from storage.dataset.dataset import Dataset
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.manifest import ShardEntry
+from storage.dataset.statistics import Statistics
+from storage.records.sample import Sample
+
+_TILE_PX = 192
+_MARGIN_PX, _TEMPLATE_MARGIN_PX = 8, 4
+_CAPTION_PX, _LABEL_PX, _TITLE_PX = 50, 22, 64
+_TILES_PER_ROW = 8
+_BACKGROUND, _INK, _FAINT = (24, 24, 26), (235, 235, 235), (160, 160, 165)
+
+
+def write_contact_sheet(
+    dataset: Dataset,
+    statistics: Statistics,
+    *,
+    max_scenes: int = 16,
+    out: DatasetFolder | None = None,
+) -> None:
+    """Write `contact_sheet.png`: every view of up to `max_scenes` scenes, over splits and shards.
+
+    Args:
+        dataset: the dataset.
+        statistics: its statistics.
+        max_scenes: most scenes that are shown.
+        out: the folder to write into; the folder of the dataset by default.
+
+    Raises:
+        TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
+    """
+    chosen = choose_scenes(dataset.manifest, max_scenes)
+    if not chosen:
+        return
+    views = dataset.manifest.num_views
+    per_row = min(max(1, _TILES_PER_ROW // views), len(chosen))
+    row_width = per_row * (views * _TILE_PX + 2 * _MARGIN_PX)
+    rows = -(-len(chosen) // per_row)
+    row_height = _TILE_PX + _CAPTION_PX + _MARGIN_PX
+    sheet = Image.new("RGB", (row_width, _TITLE_PX + rows * row_height), _BACKGROUND)
+    values = dict(statistics.lines())
+    title = f"{dataset.manifest.build}: {values['scenes']}, {values['views']} views"
+    _write(sheet, _MARGIN_PX, 8, title, 20)
+    floors = f"noise floor {values['noise floor']}; at the cap {values['views at the cap']}"
+    _write(sheet, _MARGIN_PX, 36, floors, 14, _FAINT)
+    for number, (entry, sample) in enumerate(read_chosen(dataset, chosen)):
+        row, column = divmod(number, per_row)
+        left = column * (row_width // per_row) + _MARGIN_PX
+        _draw_cell(sheet, sample, entry.split, left, _TITLE_PX + row * row_height)
+    write_atomically((out or dataset.folder).contact_sheet, encode_png(np.asarray(sheet)))
+
+
+def write_template_sheet(
+    dataset: Dataset, *, per_template: int, out: DatasetFolder | None = None
+) -> None:
+    """Write `templates.png`: the first view of the first `per_template` scenes of every layout.
+
+    Each layout has a row, so that builds can be compared. Arguments and errors are those of
+    `write_contact_sheet`.
+    """
+    rows = _first_scenes(dataset, per_template)
+    row_height = _TILE_PX + _LABEL_PX + _TEMPLATE_MARGIN_PX
+    width = per_template * (_TILE_PX + _TEMPLATE_MARGIN_PX) + _TEMPLATE_MARGIN_PX
+    sheet = Image.new("RGB", (width, row_height * len(rows)), _BACKGROUND)
+    for row, (template, places) in enumerate(sorted(rows.items())):
+        top = row * row_height
+        _write(sheet, _TEMPLATE_MARGIN_PX, top + 3, f"{dataset.manifest.build}: {template}", 14)
+        for column, (key, shard) in enumerate(places.items()):
+            left = _TEMPLATE_MARGIN_PX + column * (_TILE_PX + _TEMPLATE_MARGIN_PX)
+            for sample in dataset.read_samples(shard, [key]):
+                sheet.paste(_tile(sample.radiance_rgb[0]), (left, top + _LABEL_PX))
+    write_atomically((out or dataset.folder).template_sheet, encode_png(np.asarray(sheet)))
+
+
+def _draw_cell(sheet: Image.Image, sample: Sample, split: str, left: int, top: int) -> None:
+    origin = sample.scene.provenance
+    excursion = origin.get("excursion")
+    beyond = f"  {excursion['axis']} {excursion['value']:g}" if excursion else ""
+    _write(sheet, left, top, f"{sample.key}  {split}{beyond}", 13)
+    triangles = f"{origin['template']}  {sample.scene.num_triangles} triangles"
+    _write(sheet, left, top + 16, triangles, 13)
+    for view, (picture, record) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
+        x = left + view * _TILE_PX
+        sheet.paste(_tile(picture), (x, top + _CAPTION_PX))
+        mark = " (cap)" if record.at_cap else ""
+        floor = f"{record.noise_floor_db:.1f} dB, {record.spp} spp{mark}"
+        _write(sheet, x, top + 33, floor, 11, _FAINT)
+
+
+def _write(
+    sheet: Image.Image, x: int, y: int, line: str, size: int, ink: tuple[int, int, int] = _INK
+) -> None:
+    ImageDraw.Draw(sheet).text((x, y), line, fill=ink, font=ImageFont.load_default(size))
+
+
+def _tile(radiance_rgb: NDArray[np.float32]) -> Image.Image:
+    return Image.fromarray(preview_srgb8(radiance_rgb)).resize((_TILE_PX, _TILE_PX))
+
+
+def _first_scenes(dataset: Dataset, per_template: int) -> Mapping[str, dict[str, ShardEntry]]:
+    """Return the shard of each scene to show by key, by template."""
+    rows: dict[str, dict[str, ShardEntry]] = {}
+    for shard in dataset.manifest.shards:
+        for record in dataset.read_scenes(shard):
+            places = rows.setdefault(str(record.scene.provenance["template"]), {})
+            if len(places) < per_template:
+                places[record.key] = shard
+    return rows
