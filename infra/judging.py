@@ -22,9 +22,9 @@ from train.evaluation.evaluate import (
 from train.evaluation.judged_view import JudgedView
 from train.evaluation.report import markdown, record
 from train.evaluation.sheet import drawn_sheet, write_picture
+from train.loop.checkpoints import network_of_run
 from train.loop.crew import choose_device
-from train.loss.lpips_weights import load_lpips
-from train.networks import network_of_run
+from train.loss.lpips import load_lpips
 from train.result import pretty_json
 
 

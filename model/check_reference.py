@@ -16,8 +16,7 @@ from torch import Tensor
 from torch.nn.functional import elu
 
 from model.published.config import decode_published
-from model.published.convert import from_published
-from model.published.texture import NORMAL
+from model.published.convert import NORMAL, from_published
 from model.renderformer import ELU_ALPHA, RenderFormer
 from model.scene_tensors import SceneBatch
 from model.weights import read_tensors

@@ -24,8 +24,7 @@ from model.open import Finder, find_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import Cameras, batch_scenes, scene_tensors
-from model.trained_range import MAX_LIGHTS, TrainedRange
-from model.weights import network_digest
+from model.weights import MAX_LIGHTS, TrainedRange, network_digest
 from storage.errors import TrilightError
 from storage.records.material import unread_columns
 from storage.records.scene import Scene

@@ -6,7 +6,7 @@ published, local   a folder with config.json and model.safetensors
 published, hub     microsoft/renderformer-v1-base, microsoft/renderformer-v1.1-swin-large
 
 A caller may add forms: `open_network(place, network_of_run)` also opens the checkpoints of training
-(train.networks).
+(train.loop.checkpoints).
 """
 
 import json
@@ -20,8 +20,15 @@ from safetensors.torch import save
 from model.published.config import PublishedConfig, decode_published, encode_published
 from model.published.convert import from_published, to_published
 from model.renderformer import RenderFormer
-from model.trained_range import PUBLISHED_RANGE, TrainedRange, trained_range
-from model.weights import CONFIG_KEY, from_tensors, read_metadata, read_tensors
+from model.weights import (
+    CONFIG_KEY,
+    PUBLISHED_RANGE,
+    TrainedRange,
+    from_tensors,
+    read_metadata,
+    read_tensors,
+    trained_range,
+)
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 
@@ -61,8 +68,8 @@ class FoundNetwork:
 
 
 Finder = Callable[[Path], FoundNetwork | None]
-"""Finds the network of a place in a form that this package does not know (train.networks has one);
-None for any other place."""
+"""Finds the network of a place in a form that this package does not know, such as a training
+checkpoint (train.loop.checkpoints); returns None for any other place."""
 
 
 def open_network(place: str | Path, *finders: Finder) -> RenderFormer:
@@ -84,7 +91,7 @@ def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
 
     Args:
         place: BUILTIN, a file, a folder, or the name of a repository on the Hugging Face hub.
-        finders: are asked first, such as `train.networks.network_of_run`.
+        finders: are asked first, such as `train.loop.checkpoints.network_of_run`.
 
     Raises:
         TrilightError: there is none, or it holds pickled code.

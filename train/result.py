@@ -5,16 +5,14 @@ import json
 from dataclasses import dataclass
 
 from model.renderformer import count_parameters
-from model.trained_range import TrainedRange
-from model.weights import encode_weights
+from model.weights import TrainedRange, encode_weights
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData
 from train.evaluation.judge import Judge
 from train.evaluation.scores import Lead
-from train.evaluation.sheet import write_picture
-from train.evaluation.validation_sheet import drawn_validation_sheet
+from train.evaluation.sheet import drawn_validation_sheet, write_picture
 from train.folder import RunFolder
-from train.loop.metrics_log import read_rows
+from train.loop.recorder import read_rows
 from train.loop.state import TrainState
 from train.settings import TrainSettings
 

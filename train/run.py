@@ -19,19 +19,23 @@ from storage.errors import TrilightError
 from storage.extensions import recorded
 from storage.settings.described import settings_record
 from train.data.scenes import training_scene
-from train.data.splits import first_samples
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable
+from train.data.unusable import Unusable, first_samples
 from train.evaluation.judge import Judge, median_picture
 from train.folder import RunFolder
-from train.loop.checkpoints import Checkpoint, resumed_checkpoint, resumed_state, saved_steps
+from train.loop.checkpoints import (
+    Checkpoint,
+    network_of_run,
+    resumed_checkpoint,
+    resumed_state,
+    saved_steps,
+)
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState, new_state
 from train.loop.trainer import Trainer
-from train.loss.lpips_weights import load_lpips
+from train.loss.lpips import load_lpips
 from train.loss.objective import Objective
-from train.networks import network_of_run
 from train.progress import Silent, TrainProgress
 from train.result import TrainResult, finished, pretty_json
 from train.settings import TrainSettings

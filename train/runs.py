@@ -19,9 +19,7 @@ from storage.errors import TrilightError
 from storage.registry import Registry
 from storage.settings.changes import changed
 from storage.suggestion import expected_one_of
-from train.data.augmentation import AugmentationSettings
-from train.loss.settings import LossSettings
-from train.settings import TrainSettings
+from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 
 def smoke() -> TrainSettings:

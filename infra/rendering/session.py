@@ -95,7 +95,7 @@ def _completed(asked: Asked) -> Asked:
     if asked.engine != "mitsuba":
         require_torch("--engine neural")
         from model.open import BUILTIN, find_network
-        from train.networks import network_of_run
+        from train.loop.checkpoints import network_of_run
 
         checkpoint = checkpoint or BUILTIN
         if resolution is None:
@@ -158,7 +158,7 @@ def _neural(asked: Asked, settings: RenderSettings, watcher: RenderWatcher) -> E
     import torch
 
     from model.neural_renderer import NeuralRenderer
-    from train.networks import network_of_run
+    from train.loop.checkpoints import network_of_run
 
     if asked.threads is not None:
         torch.set_num_threads(asked.threads)

@@ -12,15 +12,14 @@ import torch
 from PIL import Image
 
 from model.layers import Norm
-from model.trained_range import TrainedRange, trained_range
-from model.weights import decode_weights
+from model.weights import TrainedRange, decode_weights, trained_range
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from storage.records.safe_read import safetensors_header
 from tests.command_line import trilight
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.loop.metrics_log import read_rows
+from train.loop.recorder import read_rows
 from train.progress import Silent
 from train.result import TrainResult
 from train.settings import TrainSettings

@@ -11,12 +11,10 @@ from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.loop.checkpoints import saved_steps
-from train.loss.settings import LossSettings
-from train.networks import network_of_run
+from train.loop.checkpoints import network_of_run, saved_steps
 from train.progress import Silent
 from train.run import train_run
-from train.settings import TrainSettings
+from train.settings import LossSettings, TrainSettings
 from train.start import Start
 
 

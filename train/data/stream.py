@@ -30,11 +30,10 @@ from train.data.order import (
     windows_from,
 )
 from train.data.scenes import TrainingScene, training_scene
-from train.data.splits import lost_with
-from train.data.unusable import Unusable
+from train.data.unusable import Unusable, lost_with
 
 if TYPE_CHECKING:
-    from train.data.augmentation import AugmentationSettings
+    from train.settings import AugmentationSettings
 
 PREFETCHED_SCENES = 16
 """Scenes decoded ahead of the network, at least one batch."""

@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 from torch import Tensor
 
+from model.open import FoundNetwork
 from model.renderformer import RenderFormer
-from model.weights import decode_config, encode_config, load_tensors
+from model.weights import TrainedRange, decode_config, encode_config, load_tensors, read_metadata
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
 from storage.records.safe_read import read_safetensors
 from storage.settings.described import from_record, settings_record
 from train.data.unusable import Unusable
+from train.folder import RunFolder
 from train.loop.crew import Crew
 from train.loop.state import TrainState, new_state
 from train.settings import TrainSettings
@@ -245,3 +247,30 @@ def keep_checkpoint(
     for step in passed[: -settings.checkpoints_kept]:
         if not settings.keep_every or step % settings.keep_every:
             path_of_step(folder, step).unlink(missing_ok=True)
+
+
+def network_of_run(path: Path) -> FoundNetwork | None:
+    """Return the network of a run's checkpoint, or of its folder while it is not finished.
+
+    A checkpoint is read at once, since its header is vouched for by the digest of the whole. The
+    finished network of a run is a file of weights, which `model.open` reads: None.
+
+    Args:
+        path: a file or a folder, of whatever kind.
+
+    Raises:
+        TrilightError: the checkpoint is damaged.
+    """
+    if path.is_dir():
+        folder = RunFolder(path)
+        steps = saved_steps(folder.checkpoints)
+        if folder.weights.is_file() or not steps:
+            return None
+        path = path_of_step(folder.checkpoints, steps[-1])
+    if path.suffix != ".safetensors" or not path.is_file():
+        return None
+    if not is_checkpoint(read_metadata(path)):
+        return None
+    checkpoint = read_checkpoint(path)
+    trained = TrainedRange(resolution=int(checkpoint.header["settings"]["resolution"]))
+    return FoundNetwork(path=path, trained=trained, open=checkpoint.network)

@@ -8,7 +8,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from storage.dataset.dataset import Dataset
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.loop.metrics_log import read_rows
+from train.loop.recorder import read_rows
 from train.progress import Silent
 
 
