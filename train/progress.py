@@ -1,11 +1,13 @@
 """What a run reports to its caller. `train` itself prints nothing."""
 
 from collections.abc import Mapping
-from typing import Protocol
 
 
-class TrainProgress(Protocol):
-    """Receives the events of a run: noted, then begin, then advance and validated in turns."""
+class TrainProgress:
+    """Receives the events of a run: noted, then begin, then advance and validated in turns.
+
+    Each does nothing here; a subclass shows those that it overrides.
+    """
 
     def noted(self, text: str) -> None:
         """A warning for the user, such as one about the data."""
@@ -31,7 +33,3 @@ class TrainProgress(Protocol):
 
     def interrupted(self, times: int) -> None:
         """A signal asks to stop, for the `times`-th time; called from another thread."""
-
-
-class Silent(TrainProgress):
-    """Ignores everything; the default."""

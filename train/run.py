@@ -36,7 +36,7 @@ from train.loop.state import TrainState, new_state
 from train.loop.trainer import Trainer
 from train.loss.lpips import load_lpips
 from train.loss.objective import Objective
-from train.progress import Silent, TrainProgress
+from train.progress import TrainProgress
 from train.result import TrainResult, finished, pretty_json
 from train.settings import TrainSettings
 from train.start import Start
@@ -87,7 +87,7 @@ def train_run(
     """
     began = time.monotonic()
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
-    progress = progress if progress is not None and crew.is_first else Silent()
+    progress = progress if progress is not None and crew.is_first else TrainProgress()
     opened, folder = open_training_data(data), RunFolder(out)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         progress.noted(note)

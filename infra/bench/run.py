@@ -11,8 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from infra.bench.asked import Asked
-from infra.bench.effort import Effort
+from infra.bench.effort import Asked, Effort
 from infra.bench.experiment import Experiment
 from infra.bench.machine import ROOT, machine
 from infra.bench.plot import plot

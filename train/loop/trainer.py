@@ -21,7 +21,7 @@ from train.loop.state import TrainState
 from train.loop.step import Stepper, StepReport
 from train.loop.window import Window, device_peak
 from train.loss.objective import Objective
-from train.progress import Silent
+from train.progress import TrainProgress
 from train.settings import TrainSettings
 
 WATCHED_STEPS = 50
@@ -104,7 +104,7 @@ class Trainer:
             TrilightError: a signal asked to stop or the start went dead (the state is saved), or
                 the steps keep failing.
         """
-        progress = Silent() if self.recorder is None else self.recorder.progress
+        progress = TrainProgress() if self.recorder is None else self.recorder.progress
         with deferred_interrupts(progress.interrupted) as asked_to_stop:
             while self.state.step < self.settings.num_steps:
                 self._after_step(self._step(batches))

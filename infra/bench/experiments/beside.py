@@ -17,7 +17,7 @@ from infra.bench.curve import PricedLevel, at_error
 from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Figures, Point, percent
 from infra.bench.experiments.sampling import CORE_S, DB, WORST
-from infra.bench.sides.plain_mitsuba import render_levels
+from infra.bench.sides.sampled_pictures import render_levels
 from infra.bench.sides.shots import SEED, shots
 from infra.bench.subjects.named_scenes import NUM_SAMPLED, sampled_names
 from infra.bench.workshop import Subject, Workshop

@@ -10,8 +10,7 @@ import numpy as np
 
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
 from infra.bench.subjects.named_scenes import first_sample
-from infra.bench.subjects.render_child import render_child
-from infra.bench.workshop import Workshop
+from infra.bench.workshop import Workshop, render_child
 from pipeline.builds.named import BUILDS
 from pipeline.builds.training import smoke
 from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of

@@ -5,17 +5,15 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent, repeats
 from infra.bench.experiments.beside import BROKEN_DB, TARGETS_DB, adaptive
 from infra.bench.experiments.sampling import CORE_S
+from infra.bench.sides.sampled_pictures import first_camera
 from infra.bench.sides.shots import SEED, shots
 from infra.bench.subjects.cost_scene import cost_scene
 from infra.bench.subjects.named_scenes import NUM_SAMPLED, sampled, sampled_names
 from infra.bench.workshop import Workshop
 from pipeline.making.price import USD_PER_CORE_HOUR
-from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import PASS_SPP, RenderSettings
@@ -53,11 +51,7 @@ AXES: Mapping[str, tuple[int, ...]] = {
 def traced(settings: PathCost) -> dict[str, float]:
     """Load the scene and trace one pass, without the denoiser, in a render child."""
     scene = cost_scene(settings.triangles, settings.lights)
-    camera = Camera(
-        c2w=np.asarray(scene.c2w[0], np.float64),
-        fov_deg=float(scene.fov_deg[0]),
-        resolution=settings.resolution,
-    )
+    camera = first_camera(scene, settings.resolution)
     started = time.process_time()
     tracer = load_tracer(scene, max_depth=settings.depth, rr_depth=RenderSettings.rr_depth)
     loaded = time.process_time()

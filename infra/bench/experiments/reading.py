@@ -18,8 +18,12 @@ from typing import TYPE_CHECKING
 
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
 from infra.bench.sides.stream_processes import seconds_of_processes
-from infra.bench.subjects.byte_server import serve_bytes
-from infra.bench.subjects.manifests import memory_of_opening, write_copies, write_manifest_of
+from infra.bench.subjects.manifests import (
+    memory_of_opening,
+    serve_bytes,
+    write_copies,
+    write_manifest_of,
+)
 from infra.bench.workshop import Workshop
 from storage.dataset.shard_set import ShardSet
 from storage.dataset.training_data import TrainingData, open_training_data

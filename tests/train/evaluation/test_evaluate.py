@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from infra.excursion_plots import plot_excursions
+from infra.judging import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
 from storage.dataset.dataset import Dataset
