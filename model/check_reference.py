@@ -1,4 +1,4 @@
-"""`python -m model.check_reference FILE`: are we the published network?
+"""`python -m model.check_reference FILE`: compares this network with the published one's outputs.
 
 Reads a file with a configuration, weights under published names, scenes, and what the published
 code made of them; runs this network on it, padded as the file is and each scene alone without its
@@ -53,11 +53,11 @@ class Differences:
     unpadded: float
     """Of each scene alone, on the triangles that exist."""
     output_std: float
-    """Standard deviation of the expected output: what a difference is to be seen against."""
+    """Standard deviation of the expected output, the scale of a difference."""
 
     @property
     def accepted(self) -> bool:
-        """Whether both are small; a NaN, which no comparison with is true, is not."""
+        """Whether both are within TOLERANCE; NaN is not."""
         return self.padded <= TOLERANCE and self.unpadded <= TOLERANCE
 
 

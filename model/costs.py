@@ -1,4 +1,4 @@
-"""What a network costs, from its configuration alone: parameters, FLOPs, bytes.
+"""Costs of a network from its configuration alone: parameters, FLOPs, bytes.
 
 A multiplication and an addition count as two. Counted are matrix products, attention and
 convolutions, as torch's FlopCounterMode counts them, against which this is tested; norms,

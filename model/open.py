@@ -1,4 +1,4 @@
-"""Opening a network, wherever it comes from: the one place for it, and no pickle anywhere.
+"""Opens a network from any source; the only place that does, and without pickle.
 
 ours, shipped      builtin:
 our own            model.safetensors of `trilight train`, or the folder that holds one
@@ -48,7 +48,7 @@ MAX_CONFIG_BYTES = 1 << 16
 """A published config.json has about 1 KiB."""
 
 _ANSWER_S = 5.0
-"""Within which the hub says that it is there; what was fetched before is used without it."""
+"""Time limit for the hub's first answer; without one, files fetched before are used."""
 
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 _PICKLES = (".pt", ".pth", ".bin", ".ckpt", ".pkl")

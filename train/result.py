@@ -1,4 +1,4 @@
-"""What a finished run has to show, and how it is written down."""
+"""The result of a finished run, and how it is written."""
 
 import dataclasses
 import json

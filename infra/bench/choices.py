@@ -1,4 +1,4 @@
-"""If you need this, choose that: needs and settings as data; every figure comes from results."""
+"""The table `If you need this, choose that`; every figure in it comes from results."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class Choice:
     point: str
     """Name of its point."""
     despite: str = ""
-    """Why it is advised where its point is not on the front; a test asks for it then."""
+    """Why it is advised although its point is not on the front; a test requires a reason."""
 
 
 CHOICES = (

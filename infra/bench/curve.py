@@ -14,7 +14,7 @@ from infra.bench.store import Run
 from storage.errors import TrilightError
 
 COST_NOISE = 0.03
-"""Costs that differ by less than this share are equal: core-seconds of one run vary by as much."""
+"""Costs that differ by less than this share count as equal: core-seconds vary by that much."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ def on_front(figures: Sequence[tuple[float, Sequence[float]]]) -> list[bool]:
 
     One with less error dominates where none of its costs is more than COST_NOISE higher; one with
     the same error where none is higher and one is more than COST_NOISE lower. Some point always
-    stays: whoever dominates has less error, or the same and less cost.
+    remains, since a dominating point has less error, or the same error and less cost.
 
     Args:
         figures: error (smaller is better) and costs above 0 of each point, equally many.

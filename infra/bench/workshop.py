@@ -1,4 +1,4 @@
-"""What experiments are measured with: children, scenes with references, objects, the network.
+"""Shared means of experiments: children, scenes with references, objects, the network.
 
 Everything is made when it is first asked for, so that an experiment costs no more than it needs.
 """
@@ -94,14 +94,14 @@ class Subject:
 
 
 class Workshop:
-    """Holds what is shared until `close`."""
+    """Makes and holds what experiments share, until `close`."""
 
     def __init__(self, effort: Effort, asked: Asked) -> None:
         # before any child: pymeshlab takes a second to import, and would be counted as work
         preload_mesh_libraries()
         self.effort, self.asked = effort, asked
         self.notes: list[str] = []
-        """What was found out on the way and belongs to the result."""
+        """Notes that belong to the result."""
         self._stack = contextlib.ExitStack()
         self._kept: dict[Any, Any] = {}
 

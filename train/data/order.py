@@ -21,7 +21,7 @@ class Place:
     """One sample, at one point of the order."""
 
     position: int
-    """In the endless order; what is drawn for a visit is drawn by it."""
+    """Position in the endless order; it seeds the augmentation of the visit."""
     shard: int
     """Number of the shard."""
     row: int

@@ -1,7 +1,7 @@
 """Shards -> an endless stream of batches of training scenes, fetched and decoded ahead in threads.
 
-Batch i holds the same scenes with the same augmentation whoever asks, wherever the stream was
-entered, and however many ranks and threads there are: a run resumes by the number of its step.
+Batch i holds the same scenes with the same augmentation wherever the stream was entered, for any
+number of ranks and threads: a run resumes by the number of its step.
 """
 
 import queue
@@ -129,7 +129,7 @@ def _planned(
 
 
 def _counter(shards: ShardSet, unusable: Unusable) -> Callable[[int], int]:
-    """Return what counts the samples of a shard; those of an unusable one are none."""
+    """Return a function that counts the samples of a shard; an unusable shard has none."""
 
     def count(number: int) -> int:
         try:

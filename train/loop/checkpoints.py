@@ -38,7 +38,7 @@ HEADER_KEY = "trilight_checkpoint"
 """Metadata entry with counters, damage met, settings, digest of the data, number of processes."""
 
 UNSEALED = "0" * 64
-"""Stands where the sha256 will, while it is taken. Checkpoints from before it existed have none."""
+"""Placeholder for the sha256 while it is computed. Old checkpoints have no sha256."""
 
 
 def save_checkpoint(
@@ -97,7 +97,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         data = path.read_bytes()
         arrays, metadata = read_safetensors(data)
         if not is_checkpoint(metadata):
-            raise TrilightError("it is none of a run; expected one that train wrote")
+            raise TrilightError("it belongs to no run; expected one that `trilight train` wrote")
         header = json.loads(metadata[HEADER_KEY])
         if "sha256" in header and header["sha256"] != _seal(*_around(data, header["sha256"])):
             raise TrilightError("its bytes are not those that were written")
@@ -190,7 +190,7 @@ def resumed_checkpoint(folder: Path, crew: Crew, noted: Callable[[str], None]) -
     Args:
         folder: of the checkpoints.
         crew: the processes that go on together; all must call it.
-        noted: is told of those that are not, and which one took their place.
+        noted: called with a note where a damaged one was passed over.
 
     Raises:
         TrilightError: there is none, none is whole, or a process reads another than this one.
@@ -202,11 +202,11 @@ def resumed_checkpoint(folder: Path, crew: Crew, noted: Callable[[str], None]) -
         )
     checkpoint = _newest_whole(folder, steps, noted)
     step = checkpoint.header["step"]
-    # bit by bit, since the mean of a large number is rounded, and the verdict must be everybody's
+    # bit by bit, since a float32 mean of a large number is rounded, and all must reach one verdict
     if any(0 < share < 1 for share in crew.mean([step >> bit & 1 for bit in range(32)])):
         raise TrilightError(
             f"{folder.parent}: the processes do not read the same checkpoint; this one reads that "
-            f"of step {step}. Look whether the folder is the same on every machine, and resume "
+            f"of step {step}. Check that the folder is the same on every machine, and resume "
             "again."
         )
     return checkpoint
@@ -235,7 +235,7 @@ def keep_checkpoint(
     """Save the state, whole or not at all, and only then delete what the run does not keep.
 
     Kept are the newest `checkpoints_kept` and every multiple of `keep_every`. One of a later step
-    could not be read when the run went on from an earlier one, and takes nobody's place.
+    was damaged when the run resumed from an earlier one, and does not count.
 
     Raises:
         TrilightError: the folder is full or cannot be written; the older ones are still there.

@@ -1,4 +1,4 @@
-"""The processes that train together: one, or as many as torchrun started.
+"""The processes that train together: one, or those that torchrun started.
 
 Each takes its part of every batch (train.data.order.RankShare); gradients are averaged by torch's
 DistributedDataParallel over nccl or gloo. The first process alone logs, judges and saves.
@@ -53,7 +53,7 @@ class Crew:
 
 @contextmanager
 def join_crew(device: str | None = None) -> Iterator[Crew]:
-    """Join the processes that torchrun started, or be alone where it did not.
+    """Join the processes that torchrun started; without torchrun, train alone.
 
     Args:
         device: `cpu` or `cuda`, or None for CUDA where there is any. With CUDA each process takes

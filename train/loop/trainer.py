@@ -153,11 +153,11 @@ class Trainer:
         return training_flops(settings.model, workload)
 
     def _skip(self, keys: Sequence[str]) -> None:
-        """Count a step that was left out, and name its scenes; other processes had others."""
+        """Count a skipped step, and name this process's scenes."""
         self.state.skipped_steps += 1
         if self.recorder is not None:
             self.recorder.progress.noted(
-                f"step {self.state.step} was left out, since its loss or gradient was not finite; "
+                f"step {self.state.step} was skipped, since its loss or gradient was not finite; "
                 f"its scenes were {', '.join(keys)}"
             )
         self.skipped_in_a_row += 1

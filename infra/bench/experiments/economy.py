@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from infra.bench.experiment import Column, Experiment, Figures, Point
+from infra.bench.experiment import Column, Experiment, Point, TurnFigures
 from infra.bench.workshop import Workshop
 from pipeline.exchange.renderformer_h5 import CELLS, CHANNELS, write_renderformer_h5
 from storage.cache import cache_folder
@@ -170,9 +170,7 @@ PARTS = (OBJECTS, FLOPS, LEAST_FLOPS, LEAST_KB, STORED, SAMPLES, ARRAYS, TEXTURE
          ALL_FLOPS, ALL_KB)  # fmt: skip
 
 
-def _measure(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     dataset = open_dataset(workshop.asked.data or "")
     found = list(scene_costs(dataset))
     if not found:

@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import os
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.bench.curve import PricedLevel, at_error
-from infra.bench.experiment import Column, Experiment, Figures, Point, percent
+from infra.bench.experiment import Column, Experiment, Figures, Point, TurnFigures, percent
 from infra.bench.experiments.sampling import DB
 from infra.bench.sides.sampled_pictures import SampledPictures, bare_pictures
 from infra.bench.sides.shots import SEED
@@ -98,9 +98,7 @@ _REPEATS = 3
 """Counted passes of the network over each scene."""
 
 
-def _measure(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Render one held-out scene by the network, and find the samples that come as near."""
     from train.data.resolution import block_mean
 

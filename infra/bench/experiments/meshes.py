@@ -1,12 +1,20 @@
 """What geometry costs: triangles of an object, against error, picture, network."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent
+from infra.bench.experiment import (
+    Column,
+    Experiment,
+    Figures,
+    Point,
+    TurnFigures,
+    one_by_one,
+    percent,
+)
 from infra.bench.sides import remeshing
 from infra.bench.sides.shots import fixed_samples
 from infra.bench.subjects.mesh_pictures import coarser, picture_db
@@ -47,9 +55,7 @@ def _recipes(budget: int, least: int) -> list[Point]:
     ]
 
 
-def _measure_budget(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_budget(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure one object at every budget, and the picture of the few that are path traced."""
     path, effort = workshop.source(turn, LARGE), workshop.effort
     budgets, pictures = [point.settings for point in points], []

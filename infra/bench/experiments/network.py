@@ -5,12 +5,12 @@ But for `trained-precision` weights are random, since costs do not depend on the
 
 import copy
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, repeats
+from infra.bench.experiment import Column, Experiment, Point, TurnFigures, repeats
 from infra.bench.experiments.sampling import DB, WORST, scenes
 from infra.bench.workshop import Workshop
 
@@ -29,9 +29,7 @@ def _bright(workshop: Workshop) -> Any:
     return workshop.kept("bright", lambda: bright_network(SIZES[workshop.effort.network]()))
 
 
-def _measure_precision(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_precision(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure a whole pass in each precision that a processor has."""
     from infra.bench.sides.networks import (
         CPU,
@@ -53,9 +51,7 @@ def _measure_precision(
         yield point.name, {**figures, "db": log10_psnr_db(picture, exact)}
 
 
-def _measure_trained(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_trained(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Render a built-in scene by the network that is asked for, in each precision."""
     from model.neural_renderer import NeuralRenderer
 
@@ -81,9 +77,7 @@ def _db(picture: Any, exact: Any) -> float:
     return psnr_log_db(picture, exact)
 
 
-def _measure_attention(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_attention(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure one attention layer of the encoder, several ways, on the same normal numbers."""
     from infra.bench.sides.networks import CPU, timed_forward
 
@@ -128,9 +122,7 @@ def _attention(effort: Effort) -> "tuple[dict[str, Callable[[], Tensor]], Tensor
     return ways, scores.softmax(dim=-1) @ v.double()
 
 
-def _measure_bundles(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_bundles(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure the view stage of one scene; the lower of two times counts, taken in turns."""
     import torch
 

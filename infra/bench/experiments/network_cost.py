@@ -3,12 +3,20 @@
 A graphics card is used where there is one; there the clock counts, on a processor core-seconds.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
+from infra.bench.experiment import (
+    Column,
+    Experiment,
+    Figures,
+    Point,
+    TurnFigures,
+    one_by_one,
+    repeats,
+)
 from infra.bench.workshop import Workshop
 
 if TYPE_CHECKING:
@@ -80,9 +88,7 @@ def _contenders(workshop: Workshop) -> Any:
     return workshop.kept("contenders", lambda: Contenders(decode_published({}), SIDES, device()))
 
 
-def _measure(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure time, memory and, within a case, the difference to the sides before it."""
     from infra.bench.sides.networks import log10_psnr_db, published_like, timed_forward
 

@@ -2,10 +2,18 @@
 
 import dataclasses
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent, repeats
+from infra.bench.experiment import (
+    Column,
+    Experiment,
+    Point,
+    TurnFigures,
+    one_by_one,
+    percent,
+    repeats,
+)
 from infra.bench.experiments.beside import BROKEN_DB, TARGETS_DB, adaptive
 from infra.bench.experiments.sampling import CORE_S
 from infra.bench.sides.sampled_pictures import first_camera
@@ -82,9 +90,7 @@ def promises(scene: Scene, targets: dict[str, RenderSettings], reference: Render
     return found
 
 
-def _measure_promises(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_promises(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     scene = sampled(int(turn.split()[-1])).make(workshop.child)
     targets = {point.name: point.settings for point in points}
     most = 4 * workshop.effort.max_spp
@@ -98,9 +104,7 @@ def _measure_promises(
     yield from workshop.call(promises, scene, targets, reference).items()
 
 
-def _measure_throughput(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_throughput(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     scene = sampled(int(turn.split()[-1])).make(workshop.child)
     taken = workshop.call(shots, scene, {point.name: point.settings for point in points})
     for name, shot in taken.items():

@@ -1,12 +1,12 @@
 """What one picture costs: samples, denoiser, noise floor, guide pictures, length of paths."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point
+from infra.bench.experiment import Column, Experiment, Point, TurnFigures
 from infra.bench.sides.shots import Shot, fixed_samples, shots
 from infra.bench.subjects.named_scenes import sampled_names
 from infra.bench.workshop import Subject, Workshop
@@ -48,9 +48,7 @@ def to_reference(subject: Subject, shot: Shot) -> dict[str, float]:
     }
 
 
-def measure(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Render one scene under the settings of every point, with equal random numbers."""
     subject = workshop.subject(turn)
     found = workshop.call(shots, subject.scene, {point.name: point.settings for point in points})
@@ -58,9 +56,7 @@ def measure(
         yield name, to_reference(subject, shot)
 
 
-def _measure_depth(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_depth(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Compare with the same samples of paths of DEEPEST edges, so that noise is common to both."""
     variants = {point.name: point.settings for point in points}
     variants["all"] = dataclasses.replace(points[0].settings, max_depth=DEEPEST)

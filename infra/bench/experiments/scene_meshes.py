@@ -7,13 +7,13 @@ that of the finest ones to themselves with other random numbers.
 
 import contextlib
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, percent
+from infra.bench.experiment import Column, Experiment, Point, TurnFigures, percent
 from infra.bench.experiments.meshes import NETWORK
 from infra.bench.experiments.sampling import DB, WORST
 from infra.bench.workshop import Workshop
@@ -153,9 +153,7 @@ SCENE_BUDGETS = (768, 1024, 1536, 2048, 4096)
 FINEST = "finest, other samples"
 
 
-def _measure_fits(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_fits(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure what the objects of composed scenes lose to each budget, the same in every one."""
     scenes: list[tuple[Fit, ...]] = []
     for index in range(workshop.effort.composed):
@@ -178,9 +176,7 @@ def _measure_fits(
         )
 
 
-def _measure_detail(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_detail(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     effort = workshop.effort
     index = int(turn.split()[-1])
     found = workshop.call(picture_errors, index, effort.picture_px, effort.fixed_spp)

@@ -6,14 +6,23 @@ A codec is judged by bytes, time to pack and unpack, and error against the noise
 import dataclasses
 import time
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent, repeats
+from infra.bench.experiment import (
+    Column,
+    Experiment,
+    Figures,
+    Point,
+    TurnFigures,
+    one_by_one,
+    percent,
+    repeats,
+)
 from infra.bench.experiments.sampling import DB, WORST, scenes
 from infra.bench.sides.packed_arrays import ARRAYS, COLOURS, SAMPLES, array_figures, sample_figures
 from infra.bench.sides.shots import fixed_samples, shots
@@ -155,9 +164,7 @@ def _kilobytes(scene: Scene, in_half: tuple[str, ...]) -> float:
     return len(packed) / 1000
 
 
-def _measure_rounding(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_rounding(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Render one scene with its arrays rounded, and compare with the picture of the first point."""
     settings = {"view": fixed_samples(workshop.effort.resolution, workshop.effort.fixed_spp)}
     exact: NDArray[np.float32] | None = None
