@@ -32,49 +32,13 @@ from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 
 if TYPE_CHECKING:
-    from pipeline.builds.settings import BuildSettings
     from storage.records.objects import ObjectRecord
     from storage.records.sample import Sample
 
 
-_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10_000)
-
-
-def render_child(
-    folder: Path, build: BuildSettings, *, objects: str, threads: int
-) -> IsolatedChild:
-    """Return a child that can compose the scenes of a build and render them.
-
-    Args:
-        folder: an empty one, for the record of its objects.
-        build: the settings.
-        objects: source of the objects.
-        threads: of Mitsuba and the denoiser.
-    """
-    variant = choose_variant()
-    here = environment(variant)
-    publication = begin(DatasetFolder(folder), build, here, 1, accept_environment=False)
-    accepted = accept_objects(objects, None, build, publication, workers=threads)
-    source = SceneRecipe(settings=build, variant=variant, threads=threads, objects=accepted.objects)
-    return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(source,))
-
-
-def asked_child(folder: Path, build: BuildSettings, asked: Asked) -> IsolatedChild:
-    """Return a child on all cores for a build of the objects that the user names.
-
-    Of several sources the first counts.
-    """
-    allowed = dataclasses.replace(build, allowed_licences=asked.allowed_licences)
-    threads = os.cpu_count() or 1
-    return render_child(folder, allowed, objects=asked.objects[0], threads=threads)
-
-
-def smoke_child(folder: Path, *, threads: int) -> IsolatedChild:
-    """Return a child for the sampled scenes: the build `smoke`, of built-in objects."""
-    return render_child(folder, smoke(), objects="builtin:", threads=threads)
-
-
 Result = TypeVar("Result")
+
+_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10_000)
 
 
 def _nothing() -> None:
@@ -136,15 +100,35 @@ class Workshop:
     @functools.cached_property
     def child(self) -> IsolatedChild:
         """A render child of the build `smoke`, on all cores."""
-        return self.closing(smoke_child(self.folder(), threads=os.cpu_count() or 1))
+        return self.render_child(smoke(), "builtin:")
 
     def call(self, function: Callable[..., Result], *arguments: Any) -> Result:
         """Run a function in the render child."""
         return self.child.call(function, *arguments)
 
-    def child_of(self, build: "BuildSettings") -> IsolatedChild:
-        """Return a render child of another build, of the objects that are asked for."""
-        return self.closing(asked_child(self.folder(), build, self.asked))
+    def child_of(self, build: BuildSettings) -> IsolatedChild:
+        """Return a render child of another build, with the first source of objects asked for."""
+        allowed = dataclasses.replace(build, allowed_licences=self.asked.allowed_licences)
+        return self.render_child(allowed, self.asked.objects[0])
+
+    def render_child(
+        self, build: BuildSettings, objects: str, threads: int | None = None
+    ) -> IsolatedChild:
+        """Return a child that composes the scenes of a build and renders them, on all cores.
+
+        Args:
+            build: the settings.
+            objects: source of the objects.
+            threads: of Mitsuba and the denoiser, if fewer than there are cores.
+        """
+        variant, workers = choose_variant(), threads or os.cpu_count() or 1
+        folder = DatasetFolder(self.folder())  # keeps the record of the objects
+        publication = begin(folder, build, environment(variant), 1, accept_environment=False)
+        accepted = accept_objects(objects, None, build, publication, workers=workers)
+        recipe = SceneRecipe(
+            settings=build, variant=variant, threads=workers, objects=accepted.objects
+        )
+        return self.closing(IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(recipe,)))
 
     @functools.cached_property
     def mesh_child(self) -> IsolatedChild:
@@ -212,7 +196,6 @@ class Workshop:
     @functools.cached_property
     def samples(self) -> "list[Sample]":
         """Scenes of `smoke` as a run would make them."""
-        from pipeline.builds.training import smoke
         from storage.settings.changes import changed
 
         px = max(self.effort.picture_px, 2 * self.effort.resolution)

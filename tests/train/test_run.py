@@ -256,7 +256,7 @@ def test_a_run_that_recovers_goes_on_and_counts(
     settings = tiny_run(num_steps=20, validate_every=20)
     result = run(settings, dataset, tmp_path, progress=poison)
     assert result.skipped_steps == 16
-    named = [re.search(r"step (\d+) was left out.* scenes were 0+\d+, ", n) for n in poison.notes]
+    named = [re.search(r"step (\d+) was skipped.* scenes were 0+\d+, ", n) for n in poison.notes]
     assert [int(match[1]) for match in named if match] == [*range(2, 10), *range(11, 19)]
     losses = {row["step"]: row["loss"] for row in read_rows(result.folder.metrics) if "loss" in row}
     assert losses[4] is None and losses[10] > 0, "a row without a finite step has no loss"

@@ -8,7 +8,6 @@ is shipped, the named builds and the published checkpoints alike.
 
 import contextlib
 import dataclasses
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from infra.bench.experiment import Column, Experiment, Figures, Point, TurnFigur
 from infra.bench.experiments.sampling import DB
 from infra.bench.sides.sampled_pictures import SampledPictures, bare_pictures
 from infra.bench.sides.shots import SEED
-from infra.bench.workshop import Workshop, render_child
+from infra.bench.workshop import Workshop
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of
@@ -153,12 +152,11 @@ def _set_up(workshop: Workshop) -> Any:
 
     renderer = NeuralRenderer.load(workshop.asked.checkpoint, device="cpu")
     build = build_within(renderer.trained.max_triangles)
-    threads = os.cpu_count() or 1
-    child = render_child(workshop.folder(), build, objects=BENCHMARK, threads=threads)
+    child = workshop.render_child(build, BENCHMARK)
     name = Path(workshop.asked.checkpoint).name
     workshop.note(f"scenes of at most {build.scenes.max_triangles} triangles")
     workshop.note(f"network {name}, {renderer.digest[:8]}")
-    return renderer, workshop.closing(child), build
+    return renderer, child, build
 
 
 def _resolution(renderer: "NeuralRenderer", px: int) -> int:

@@ -5,6 +5,7 @@ tests/references. Those of a user's scenes stay in the user's cache: they may no
 publish.
 """
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of, attempt_scene
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.compose import compose_scene
+from scene_templates.settings import SceneSettings
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.errors import Rejected, TrilightError
@@ -85,14 +87,20 @@ def described(folder: Path | None) -> list[NamedScene]:
 def sampled_scene(scene_index: int) -> Scene:
     """Return a scene of the build `smoke` with one camera, as a run would compose it."""
     settings = dataclasses.replace(smoke().scenes, num_views=1)
+    scene, _ = first_composed(settings, scene_index)
+    if scene is None:
+        raise _all_rejected(scene_index)
+    return scene
+
+
+def first_composed(settings: SceneSettings, scene_index: int) -> tuple[Scene | None, int]:
+    """Return a training scene's first attempt that passes, and the number of rejected attempts."""
+    pool = assets_of("train")
     for attempt in range(MAX_ATTEMPTS):
-        try:
-            return compose_scene(
-                settings, assets_of("train"), seed=0, scene_index=scene_index, attempt=attempt
-            )
-        except Rejected:
-            continue
-    raise _all_rejected(scene_index)
+        with contextlib.suppress(Rejected):
+            scene = compose_scene(settings, pool, seed=0, scene_index=scene_index, attempt=attempt)
+            return scene, attempt
+    return None, MAX_ATTEMPTS
 
 
 def first_sample(scene_index: int) -> Sample:
