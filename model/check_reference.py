@@ -49,9 +49,9 @@ class Differences:
     """Largest absolute differences from the reference."""
 
     padded: float
-    """Of the whole batch."""
+    """Difference of the whole batch, padding included."""
     unpadded: float
-    """Of each scene alone, on the triangles that exist."""
+    """Largest difference of a scene alone, on the triangles that exist."""
     output_std: float
     """Standard deviation of the expected output, the scale of a difference."""
 

@@ -42,7 +42,7 @@ BUILTIN = "builtin:"
 """Name of the small network that comes with Trilight; model/builtin/README.md is its card."""
 
 BUILTIN_WEIGHTS = Path(__file__).parent / "builtin" / WEIGHTS_NAME
-"""Its file."""
+"""File of the builtin network."""
 
 MAX_CONFIG_BYTES = 1 << 16
 """A published config.json has about 1 KiB."""

@@ -31,7 +31,7 @@ class PrecisionChoice:
     """One number format and where it is available."""
 
     dtype: torch.dtype
-    """Of the weights and activations of the layers and the head."""
+    """Type of the weights and activations of the layers and the head."""
     tf32: bool = False
     """Whether a GPU may multiply float32 matrices with 10 bits of mantissa."""
     needs_cuda: bool = False

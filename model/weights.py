@@ -35,7 +35,7 @@ class TrainedRange:
     """
 
     max_triangles: int | None = None
-    """Of a whole scene."""
+    """Most triangles of a whole scene."""
     resolution: int | None = None
     """Pixels across the pictures."""
 
@@ -45,7 +45,7 @@ class TrainedRange:
 
 
 PUBLISHED_RANGE = TrainedRange(max_triangles=4096, resolution=512)
-"""Of the published checkpoints: their second stage (Zeng et al. 2025)."""
+"""Range of the published checkpoints: their second stage (Zeng et al. 2025)."""
 
 
 def trained_range(metadata: Mapping[str, str]) -> TrainedRange | None:

@@ -27,7 +27,7 @@ class TrainResult:
     folder: RunFolder
     """Where everything is."""
     num_parameters: int
-    """Of the network."""
+    """Numbers in the network's weights."""
     num_steps: int
     """Steps done, including skipped ones."""
     skipped_steps: int
@@ -41,7 +41,7 @@ class TrainResult:
     median_scores: dict[str, float] | None
     """The median picture of the training views on the same split."""
     lead: Lead | None
-    """Of the network over the median picture."""
+    """Advantage of the network over the median picture."""
     unusable: tuple[str, ...]
     """What was wrong with data that was left out in this call."""
     seconds: float

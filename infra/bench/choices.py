@@ -17,7 +17,7 @@ class Choice:
     """One row of the table."""
 
     need: str
-    """In a user's words."""
+    """The need, in a user's words."""
     how: str
     """What to type, or where it is said."""
     experiment: str

@@ -34,11 +34,11 @@ class Row:
     """One point beside the others."""
 
     point: Point
-    """Its declaration."""
+    """The point's declaration."""
     values: Mapping[str, float]
-    """By name of the column; without those that were not measured."""
+    """Value of each measured column, by name."""
     cost_ratio: float
-    """Its cost divided by that of the default."""
+    """The point's cost divided by the default's."""
     cost_spread: Spread | None
     """The cost over the turns; None where it was not kept or there was one turn."""
     on_front: bool | None

@@ -172,7 +172,7 @@ def _dpt(ours: str, theirs: str) -> dict[str, str]:
 
 TEXTURE_CHANNELS = 13
 NORMAL = slice(7, 10)
-"""Of the channels: diffuse 3, specular 3, roughness 1, tangent-space normal 3, emission 3."""
+"""The tangent-space normal among diffuse 3, specular 3, roughness 1, normal 3, emission 3."""
 
 TANGENT_NORMAL = (0.5, 0.5, 1.0)
 

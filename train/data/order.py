@@ -25,7 +25,7 @@ class Place:
     shard: int
     """Number of the shard."""
     row: int
-    """Of the sample in the shard."""
+    """Row of the sample in the shard."""
     arrival: int
     """Number of the shard in the order of its epoch."""
 

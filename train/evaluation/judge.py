@@ -39,7 +39,7 @@ class ValidationJudgement:
     scores: dict[str, float]
     """evaluation.scores.summarise, and `better_than_median`: the share of views won."""
     lead: Lead
-    """Of the network over the median picture."""
+    """Advantage of the network over the median picture."""
 
 
 class Judge:

@@ -31,19 +31,19 @@ class JudgedView:
     template: str
     """Layout of the scene."""
     num_triangles: int
-    """Of the scene."""
+    """Triangles of the scene."""
     num_lights: int
-    """Of the scene."""
+    """Lights of the scene."""
     roughness: float
-    """Of its smoothest surface, emitters apart."""
+    """Roughness of the scene's smoothest surface, emitters excluded."""
     excursion: tuple[str, float] | None
     """Axis and value by which the scene leaves the usual range, if it does."""
     floors: dict[str, float]
     """What the target's noise alone would score (metrics.noise_floors)."""
     scores: dict[str, dict[str, float | None]]
-    """By contestant and metric; None is n/a. Not every view has every contestant."""
+    """Score by contestant and metric; None is n/a. Not every view has every contestant."""
     swapped_psnr_log_db: float | None = None
-    """Of the network shown the triangles of the scene before; None for the first scene."""
+    """Score of the network given the previous scene's triangles; None for the first scene."""
 
     def gap(self, metric: str, contestant: str = NETWORK) -> float | None:
         """Return how much worse the picture is than the noise of its target; below 0: not worse."""

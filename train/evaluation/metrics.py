@@ -54,7 +54,7 @@ class Metric:
     meaning: str
     """Unit, tone map, range and library, for whoever reads the figure."""
     decimals: int = 4
-    """With which it is printed."""
+    """Decimals with which it is printed."""
     floor: Callable[[ViewRecord], float] | None = None
     """What the measured noise of a target alone scores; where it is None, noise of the measured
     size is drawn onto the target and judged (`noise_floors`)."""

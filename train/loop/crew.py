@@ -23,7 +23,7 @@ class Crew:
     device: torch.device
     """Where its network is."""
     rank: int = 0
-    """Its number, from 0."""
+    """Number of this process, from 0."""
     world_size: int = 1
     """How many train together."""
 
@@ -34,7 +34,7 @@ class Crew:
 
     @property
     def share(self) -> RankShare:
-        """Its part of every batch."""
+        """This process's part of every batch."""
         return RankShare(rank=self.rank, world_size=self.world_size)
 
     def mean(self, values: Sequence[float]) -> list[float]:

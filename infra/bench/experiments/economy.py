@@ -34,25 +34,25 @@ class SceneCosts:
     """One scene with its views."""
 
     triangles: int
-    """In the scene."""
+    """Triangles in the scene."""
     source_faces: int
-    """Of its objects' sources."""
+    """Triangles of its objects' sources."""
     object_faces: int
-    """Of the same objects in the scene."""
+    """Triangles of the same objects in the scene."""
     object_errors: tuple[float, ...]
-    """By object: two-way distance to its source, 99th percentile, as a share of the diagonal."""
+    """Two-way distance of each object to its source, 99th percentile, share of the diagonal."""
     spp: tuple[int, ...]
-    """By view."""
+    """Samples per pixel of each view."""
     at_cap: tuple[bool, ...]
-    """By view: whether sampling ended at the cap before the target was reached."""
+    """Whether sampling of a view ended at the cap before its target was reached."""
     floors_db: tuple[float, ...]
-    """By view."""
+    """Noise floor of each view."""
     array_bytes: int
-    """Of the stored member."""
+    """Bytes of the stored arrays."""
     record_bytes: int
-    """Of its JSON."""
+    """Bytes of its JSON."""
     picture_bytes: int
-    """Of all stored pictures."""
+    """Bytes of all stored pictures."""
     stored_pictures: int
     """Picture files of all views together."""
     empty_share: float

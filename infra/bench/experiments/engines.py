@@ -50,9 +50,9 @@ class HeldOut:
     """One scene with its reference."""
 
     scene: Scene
-    """With one camera."""
+    """The scene, with one camera."""
     reference: RenderedView
-    """Of its view."""
+    """Converged picture of its view."""
 
 
 def build_within(max_triangles: int | None) -> BuildSettings:

@@ -137,7 +137,7 @@ WINDOW = 8
 RENDERING, WAITING = (1, 2, 4), (1, 2, 4, 8, 16)
 """Numbers of workers."""
 VIEWS = 4
-"""Of a scene of `smoke`."""
+"""Views of a scene of `smoke`."""
 TASKS_EACH = 4
 """Sleeping tasks of each worker."""
 _IDLE_S = 30.0

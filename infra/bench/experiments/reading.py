@@ -38,9 +38,9 @@ THREADS, PROCESSES = (1, 2, 4), 2
 MANIFESTS = (1_000, 100_000)
 """Samples of datasets that are opened, to see what the reader holds."""
 PASSES = 4
-"""Over all shards, where only bytes are read: one pass takes hundredths of a second."""
+"""Passes over all shards where only bytes are read: one takes hundredths of a second."""
 BATCH, RESOLUTION = 4, 64
-"""Of training, from pictures of 256."""
+"""Scenes of a batch, and pixels across its pictures, which are reduced from 256."""
 _PIPE_BYTES = 1 << 20
 
 Dataset = tuple[Path, int, list[dict[str, bytes]]]

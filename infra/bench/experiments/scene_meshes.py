@@ -121,7 +121,7 @@ class Fit:
     triangles: int
     """Triangles of the whole scene."""
     errors: tuple[float, ...]
-    """Of each object: two-way distance, 99th percentile, as a share of the diagonal."""
+    """Error of each object: two-way distance, 99th percentile, as a share of the diagonal."""
 
 
 def scene_fits(budgets: tuple[int, ...], scene_index: int) -> tuple[Fit, ...]:

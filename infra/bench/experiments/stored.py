@@ -48,9 +48,9 @@ class PictureCodec:
     """One way to pack a picture."""
 
     encode: Callable[[Picture, float], bytes]
-    """From the picture and its noise floor in dB."""
+    """Packs a picture, given its noise floor in dB."""
     decode: Callable[[bytes, tuple[int, ...]], Picture]
-    """From the bytes and the shape."""
+    """Unpacks a picture of a shape."""
 
 
 def codecs() -> Mapping[str, PictureCodec]:

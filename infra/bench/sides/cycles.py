@@ -30,11 +30,11 @@ class Request:
     denoise: bool
     """Whether Open Image Denoise cleans the picture, with Cycles' own albedo and normals."""
     bounces: int = 8
-    """Of every kind, and in sum: 8 is Mitsuba's max_depth 10, and 0 is direct light alone."""
+    """Most bounces, of each kind and in sum: 8 is Mitsuba's max_depth 10, 0 is direct light."""
     seed: int = 0
-    """Of the samples."""
+    """Seed of the samples."""
     threads: int = 1
-    """Of Cycles; the denoiser takes what the process may use."""
+    """Threads of Cycles; the denoiser takes all that the process may use."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

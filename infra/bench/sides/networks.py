@@ -75,14 +75,14 @@ PUBLISHED, EQUAL, DEFAULT = "published", "float32", "bfloat16"
 SIDES = (PUBLISHED, EQUAL, DEFAULT)
 
 RENDERED_MEAN, RENDERED_STD = 0.09, 0.075
-"""Of log10(1 + radiance) over the 20 reference pictures in `tests/references`; their peak is 1."""
+"""Mean and spread of log10(1 + radiance) of the 20 pictures in `tests/references`; peak 1."""
 
 _PROBE_PX = 64
 
 CPU = torch.device("cpu")
 
 _SHARES = (0.1, 1 / 3, 2 / 3, 1.0, 5 / 3, 8 / 3)
-"""Of the effort's triangles: sizes at which the time of the network is measured; 154 to 4096."""
+"""Shares of the effort's triangles at which the network is timed: 154 to 4096 triangles."""
 
 Forward = Callable[[], Tensor]
 """Returns log10(1 + radiance) [V, R, R, 3] before the ELU; of the published one behind it."""

@@ -47,7 +47,7 @@ class SampledPictures:
     load_core_s: float
     """Core-seconds of loading the scene."""
     levels: tuple[SampledPicture, ...]
-    """From few samples to many: each holds the samples of the one before."""
+    """Pictures from few samples to many; each includes the samples of the one before."""
 
 
 _PASSES = (*PASS_SPP, 1)

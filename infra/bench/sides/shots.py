@@ -72,7 +72,7 @@ class RememberingTracer:
 
 
 SEED = 20_261_122
-"""Of pictures and of scenes that are drawn here: no build and no run has it."""
+"""Seed of pictures and scenes that are drawn here; no build and no run uses it."""
 
 _SMALL = 32
 """Pixels each way of what only compiles."""
@@ -85,11 +85,11 @@ class Shot:
     view: RenderedView
     """The picture with its floor and its samples."""
     core_s: float
-    """What it takes alone: samples, guide pictures, measuring the floor, the last denoise."""
+    """Core-seconds alone: samples, guide pictures, measuring the floor, the last denoise."""
     load_core_s: float
     """Loading the scene: arrays, tree of triangles, tables of lights."""
     packed_bytes: int
-    """In the profile `compact`, with the pictures of single lights where there are any."""
+    """Size in the profile `compact`, with the pictures of single lights if there are any."""
 
 
 def fixed_samples(resolution: int, spp: int) -> RenderSettings:

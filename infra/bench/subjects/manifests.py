@@ -19,7 +19,7 @@ from storage.records.sample import sample_key
 SAMPLES_PER_SHARD = 256
 SUFFIXES = ("0.exr", "1.exr", "2.exr", "3.exr", "json", "scene.safetensors.gz")
 MEMBER_BYTES = 25_600
-"""Of each member with its header: a sample of four small pictures takes about 150 kB."""
+"""Bytes of a member with its header: a sample of four small pictures takes about 150 kB."""
 
 COPIES = 16
 """Keys of each sample that is copied."""

@@ -148,7 +148,7 @@ RESOLUTION = 128
 """Pixels each way: a fourth of the price of 256, with the same materials, lights and shapes."""
 
 _SEED = 1_000_003
-"""Of references alone: what is judged uses other seeds, hence other samples."""
+"""Seed of references alone: judged pictures use other seeds, hence other samples."""
 
 _MAX_SPP = 16_384
 """Each fourfold is worth 3 to 6 dB, and views that are judged end at 1024."""
@@ -169,7 +169,7 @@ class Reference:
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance."""
     noise_floor_db: float
-    """Its own measured floor, psnr_log_db: errors near it are the reference's as well."""
+    """Its own measured floor, psnr_log_db: errors near it are partly the reference's own."""
     spp: int
     """Samples per pixel."""
 
