@@ -69,9 +69,8 @@ def run(
     if not current.whole_turns():
         reasons = "; ".join(sorted(set(current.left_out.values())))
         raise TrilightError(f"bench {experiment.name}: no turn could be measured: {reasons}.")
-    plot(
-        experiment, current, store.path.with_suffix(".png")
-    )  # before the end: a run that cannot be drawn is unfinished
+    # before the end is stored: a run that cannot be drawn is unfinished
+    plot(experiment, current, store.path.with_suffix(".png"))
     store.end(current, time.perf_counter() - began, notes)
     return store
 
