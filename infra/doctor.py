@@ -1,4 +1,4 @@
-"""What this machine has, what it lacks, what is then slower, and the one command that mends it."""
+"""What this machine has and lacks, what that slows down, and the one command that fixes it."""
 
 import contextlib
 import importlib.util
@@ -38,7 +38,7 @@ class Finding:
     consequence: str = ""
     """What is slower or impossible; empty when all is well."""
     mend: str = ""
-    """The one command that mends it."""
+    """The one command that fixes it."""
 
 
 def examine(looking_at: Callable[[str], None] = lambda name: None) -> Iterator[Finding]:
@@ -106,7 +106,7 @@ def _denoiser() -> Finding:
         return Finding(
             name="denoiser",
             state="missing",
-            found=f"pyoidn {facts['pyoidn']} does not answer",
+            found=f"pyoidn {facts['pyoidn']} does not respond",
             consequence="pictures cannot be denoised",
             mend="make setup",
         )
@@ -207,7 +207,7 @@ def _cache() -> Finding:
         name="cache",
         state="missing",
         found=f"{folder} cannot be written",
-        consequence="the orchestrator has no place for its records",
+        consequence="the orchestrator cannot store its records",
         mend="export TRILIGHT_CACHE=/a/writable/folder",
     )
 

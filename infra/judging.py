@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from infra.excursion_plots import plot_excursions
+import numpy as np
+
 from model.open import find_network
 from model.weights import network_digest
 from storage.atomic import write_atomically
@@ -19,18 +20,18 @@ from train.evaluation.evaluate import (
     worst_and_median,
     worst_of_each_excursion,
 )
-from train.evaluation.judged_view import JudgedView
+from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.report import markdown, record
 from train.evaluation.sheet import drawn_sheet, write_picture
+from train.loop.checkpoints import network_of_run
 from train.loop.crew import choose_device
-from train.loss.lpips_weights import load_lpips
-from train.networks import network_of_run
+from train.loss.lpips import load_lpips
 from train.result import pretty_json
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judgement:
-    """What came of it."""
+    """The result of an evaluation."""
 
     record: dict[str, Any]
     """All that was measured, as JSON values (train.evaluation.report)."""
@@ -52,13 +53,13 @@ def judge_network(
     device: str | None = None,
     done: Callable[[int, int], None] = lambda now, total: None,
 ) -> Judgement:
-    """Judge a network view by view, beside each view's own noise floor and simple rivals.
+    """Judge a network view by view, beside each view's own noise floor and simple baselines.
 
     Args:
         checkpoint: folder of a run, its model.safetensors, a checkpoint, or `builtin:`.
         data: root of a dataset, or shards by name or pattern.
         split: which of its splits.
-        train_data: data of the rivals' training pictures; by default `data`, if it has any.
+        train_data: data of the baselines' training pictures; by default `data`, if it has any.
         resolution: pixels across; by default what the network was trained at, else the data's.
         most_scenes: the first so many scenes are judged.
         lpips: folder of LPIPS' weights, or `hub`; without them LPIPS is n/a.
@@ -111,7 +112,7 @@ def write_judgement(judgement: Judgement, out: str | Path) -> None:
 
 
 class _Counted:
-    """Tells how many scenes are judged, of how many."""
+    """Reports the number of judged scenes and of all."""
 
     def __init__(self, done: Callable[[int, int], None], total: int) -> None:
         self._done, self._total, self._now = done, total, 0
@@ -149,3 +150,49 @@ def _num_scenes(contest: Contest) -> int:
         if count < contest.most_scenes:
             count += contest.shards.num_samples(number)
     return min(count, contest.most_scenes)
+
+
+COLUMNS = 3
+"""Plots in a row."""
+
+
+def plot_excursions(path: Path, views: Sequence[JudgedView]) -> int:
+    """Draw how psnr_log_db falls off beyond the usual range; return how many axes there are.
+
+    One plot for each axis: a dot is a view, the line the median at each value, the dashed line
+    that of the noise floors. Nothing is written where no view leaves the usual range.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")  # before pyplot: no display is needed
+    import matplotlib.pyplot as plt
+
+    axes: dict[str, list[JudgedView]] = {}
+    for view in views:
+        if view.excursion is not None:
+            axes.setdefault(view.excursion[0], []).append(view)
+    if not axes:
+        return 0
+    rows = -(-len(axes) // COLUMNS)
+    figure, grid = plt.subplots(
+        rows, COLUMNS, figsize=(4.2 * COLUMNS, 3.2 * rows), squeeze=False, layout="constrained"
+    )
+    for place, (axis, members) in zip(grid.flat, sorted(axes.items()), strict=False):
+        at = np.array([view.excursion[1] for view in members if view.excursion is not None])
+        scores = np.array([view.scores[NETWORK]["psnr_log_db"] for view in members], float)
+        floors = np.array([view.floors["psnr_log_db"] for view in members])
+        values = np.unique(at)
+        place.plot(at, scores, ".", color="tab:blue", alpha=0.4)
+        medians = [np.median(scores[at == value]) for value in values]
+        place.plot(values, medians, "-o", color="tab:blue", label="network")
+        noise = [np.median(floors[at == value]) for value in values]
+        place.plot(values, noise, "--", color="grey", label="noise floor")
+        place.set(title=axis.replace("_", " "), xlabel="value", ylabel="psnr_log_db")
+        if values[0] > 0 and values[-1] / values[0] > 8:
+            place.set_xscale("log")
+    grid.flat[0].legend()
+    for place in grid.flat[len(axes) :]:
+        place.axis("off")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return len(axes)

@@ -1,4 +1,4 @@
-"""What a dataset will take: a few scenes measured on this machine, and the arithmetic.
+"""Predicts what a dataset will take from a few scenes measured on this machine.
 
 Scenes differ in cost by orders of magnitude (a hard view takes a hundred times the samples of an
 easy one), so a mean of few has a wide interval: it is the bootstrap's, from the measured scenes.
@@ -31,17 +31,17 @@ from storage.seeds import rng_for
 
 _DRAWS = 2000
 _BYTES_PER_TASK_RUN = 19_400
-"""Of Prefect's database: states, events and indices (`trilight bench orchestration`; figures in
-docs/tradeoffs.md, How far the records keep up)."""
+"""Bytes in Prefect's database: states, events and indices (`trilight bench orchestration`; figures
+in docs/tradeoffs.md, How far the records keep up)."""
 _BYTES_PER_MEMBER = 65
-"""Of the manifest: name, offset and size of one member (measured, in the same place)."""
+"""Bytes in the manifest: name, offset and size of one member (measured, in the same place)."""
 _LARGE_MANIFEST_MB = 512
 _LONG_TASK_MINUTES = 10
 
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """A figure with where it lies in nine cases of ten, as far as few scenes tell."""
+    """A figure with its 90 % interval, as far as few scenes can tell."""
 
     value: float
     """What to expect."""
@@ -96,7 +96,7 @@ class Prediction:
     manifest_mb: float
     """Size of manifest.json when all is done."""
     notes: tuple[str, ...]
-    """What a person should think of before."""
+    """Warnings before the dataset is begun."""
 
 
 def measure_scenes(
@@ -113,7 +113,7 @@ def measure_scenes(
     Raises:
         TrilightError: as `prepare_dataset`.
     """
-    # begun as large as it will be, so that a lack of objects is told now and not by `generate`
+    # begun as large as it will be, so that a lack of objects is reported now and not by `generate`
     scenes = max(count, _num_scenes(order))
     run = prepare_dataset(dataclasses.replace(order, out=str(place), scenes=scenes))
     job = ShardJob(

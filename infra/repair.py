@@ -1,4 +1,4 @@
-"""Making anew exactly the shards of a local dataset that are missing or bad."""
+"""Repair: makes exactly the missing or bad shards of a local dataset again."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -68,7 +68,7 @@ def repair(
         views=manifest.num_views if scenes_from else None,
         albedo_over_one=cast(AlbedoOverOne, value_of(asked, "--albedo-over-one") or "scale"),
         changes=changes,
-    )  # which checks it all, before anything is moved
+    )  # checks everything before a shard is moved
     for name in bad_shards:
         if (root / name).exists():
             (root / name).replace(root / f"{name}{ASIDE}")
@@ -87,13 +87,13 @@ def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:
     if (derivation := derivation_of(manifest.settings)) is not None:
         raise TrilightError(
             f"the dataset was made by `trilight shards {derivation.operation}`; expected one of "
-            "`trilight generate`. Make it again of its sources: the same bytes come out."
+            "`trilight generate`. Make it again from its sources: the bytes will be the same."
         )
     of_files = manifest.settings["splits"].get("listed_scenes") is not None
     if of_files and scenes_from is None:
         raise TrilightError(
-            f"build {manifest.build!r} was made of scene files; expected --scenes-from FOLDER, "
-            "the one that it was made of."
+            f"build {manifest.build!r} was made from scene files; expected --scenes-from FOLDER, "
+            "the folder that it was made from."
         )
     if scenes_from is not None and not of_files:
         raise TrilightError(

@@ -1,4 +1,4 @@
-"""`TrainOrder`: what a person says of a training run, on the command line or in Prefect's form."""
+"""`TrainOrder`: everything a user asks of a training run, by command line or Prefect's form."""
 
 import sys
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""`python -m model.check_reference FILE`: are we the published network?
+"""`python -m model.check_reference FILE`: compares this network with the published one's outputs.
 
 Reads a file with a configuration, weights under published names, scenes, and what the published
 code made of them; runs this network on it, padded as the file is and each scene alone without its
@@ -16,8 +16,7 @@ from torch import Tensor
 from torch.nn.functional import elu
 
 from model.published.config import decode_published
-from model.published.convert import from_published
-from model.published.texture import NORMAL
+from model.published.convert import NORMAL, from_published
 from model.renderformer import ELU_ALPHA, RenderFormer
 from model.scene_tensors import SceneBatch
 from model.weights import read_tensors
@@ -50,15 +49,15 @@ class Differences:
     """Largest absolute differences from the reference."""
 
     padded: float
-    """Of the whole batch."""
+    """Difference of the whole batch, padding included."""
     unpadded: float
-    """Of each scene alone, on the triangles that exist."""
+    """Largest difference of a scene alone, on the triangles that exist."""
     output_std: float
-    """Standard deviation of the expected output: what a difference is to be seen against."""
+    """Standard deviation of the expected output, the scale of a difference."""
 
     @property
     def accepted(self) -> bool:
-        """Whether both are small; a NaN, which no comparison with is true, is not."""
+        """Whether both are within TOLERANCE; NaN is not."""
         return self.padded <= TOLERANCE and self.unpadded <= TOLERANCE
 
 

@@ -1,4 +1,4 @@
-"""What a network costs, from its configuration alone: parameters, FLOPs, bytes.
+"""Costs of a network from its configuration alone: parameters, FLOPs, bytes.
 
 A multiplication and an addition count as two. Counted are matrix products, attention and
 convolutions, as torch's FlopCounterMode counts them, against which this is tested; norms,
@@ -33,9 +33,9 @@ class Workload:
     """What is to be rendered."""
 
     triangles: int
-    """In the scene."""
+    """Triangles in the scene."""
     views: int
-    """Of that scene."""
+    """Views of that scene."""
     resolution: int
     """Pixels across each view."""
 
@@ -45,11 +45,11 @@ class Costs:
     """What a network costs, and a workload with it."""
 
     parameters: dict[str, int]
-    """By part of the network."""
+    """Numbers in the weights, by part of the network."""
     flops: dict[str, int]
-    """By part of the computation, for the whole workload."""
+    """FLOPs of the whole workload, by part of the computation."""
     weight_bytes: dict[str, int]
-    """By precision."""
+    """Bytes of the weights, by precision."""
     scene_bytes: dict[str, int]
     """Keys and values that are kept of an encoded scene, by precision."""
     training_bytes: int

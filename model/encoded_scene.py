@@ -32,9 +32,9 @@ class EncodedScene:
     """
 
     places: TokenPlaces
-    """Of the tokens."""
+    """Positions of the tokens."""
     keys_values: tuple[KeysValues, ...]
-    """For each layer of the view stage."""
+    """Keys and values for each layer of the view stage."""
 
     def only(self, index: int) -> "EncodedScene":
         """Return one scene of the batch, without the padding that its company brought."""

@@ -1,7 +1,7 @@
-"""What a precision costs, layer by layer, against the same network in float64.
+"""Error of a precision, layer by layer, against the same network in float64.
 
-Says where the error of a precision arises, and how near a layer's activations come to the largest
-number of a type: float16 ends at 65504.
+Shows where the error arises, and how near a layer's activations come to the largest number of a
+type: float16 ends at 65504.
 """
 
 import copy
@@ -17,7 +17,7 @@ from model.scene_tensors import SceneBatch, SceneTensors, batch_scenes, converte
 from storage.records.material import material_columns, material_width
 
 PROBE_TRIANGLES, PROBE_RESOLUTION = 256, 64
-"""Of the random scene that stands for all where none is given."""
+"""Size of the random scene that errors are measured on."""
 
 
 @dataclass(frozen=True, kw_only=True)

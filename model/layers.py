@@ -15,10 +15,10 @@ from model.precision import as_given
 from model.windows import Windows, attend_in_windows
 
 LAYER_NORM_EPS = 1e-6
-"""Of every norm inside a layer, as published."""
+"""Epsilon of every norm inside a layer, as published."""
 
 TOKEN_NORM_EPS = 1.1920929e-07
-"""Of the norms that make tokens: float32's machine epsilon, as published."""
+"""Epsilon of the norms that make tokens: float32's machine epsilon, as published."""
 
 
 class Norm(nn.RMSNorm):

@@ -6,7 +6,6 @@ picture = renderer.render(read_scene_file("scene.safetensors"), resolution=512)
 All of the network that is used here is in `_encode` and `_decode`.
 """
 
-import dataclasses
 import functools
 import warnings
 from collections.abc import Sequence
@@ -23,9 +22,8 @@ from model.light_groups import light_groups
 from model.open import Finder, find_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
-from model.scene_tensors import Cameras, batch_scenes, scene_tensors
-from model.trained_range import MAX_LIGHTS, TrainedRange
-from model.weights import network_digest
+from model.scene_tensors import Cameras, batch_scenes, converted, scene_tensors
+from model.weights import MAX_LIGHTS, TrainedRange, network_digest
 from storage.errors import TrilightError
 from storage.records.material import unread_columns
 from storage.records.scene import Scene
@@ -220,7 +218,7 @@ class NeuralRenderer:
         return tuple(notes)
 
     def _require_memory(self, num_triangles: int) -> None:
-        """Refuse what cannot be: one layer's tokens alone are more than the memory that is free."""
+        """Refuse a scene of which one layer's tokens alone exceed the free memory."""
         config = self._model.config
         least = num_triangles * (2 * config.hidden_width + 2 * config.width) * _FLOAT_BYTES
         free = _free_bytes(self.device)
@@ -234,13 +232,7 @@ class NeuralRenderer:
 def _encode(model: RenderFormer, scene: Scene, device: torch.device) -> EncodedScene:
     """Return one scene after the view-independent stage."""
     batch = batch_scenes([scene_tensors(scene, model.config.material_columns)])
-    moved = dataclasses.replace(
-        batch,
-        triangles_BT33=batch.triangles_BT33.to(device),
-        normals_BT33=batch.normals_BT33.to(device),
-        material_BTM=batch.material_BTM.to(device),
-    )
-    return model.encode(moved)
+    return model.encode(converted(batch, lambda tensor: tensor.to(device)))
 
 
 def _decode(
@@ -257,7 +249,7 @@ def _decode(
 
 
 def _free_bytes(device: torch.device) -> int | None:
-    """Return how much memory can still be taken there, or None where nobody says."""
+    """Return how much memory can still be taken there, or None where it is unknown."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
     try:

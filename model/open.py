@@ -1,4 +1,4 @@
-"""Opening a network, wherever it comes from: the one place for it, and no pickle anywhere.
+"""Opens a network from any source; the only place that does, and without pickle.
 
 ours, shipped      builtin:
 our own            model.safetensors of `trilight train`, or the folder that holds one
@@ -6,7 +6,7 @@ published, local   a folder with config.json and model.safetensors
 published, hub     microsoft/renderformer-v1-base, microsoft/renderformer-v1.1-swin-large
 
 A caller may add forms: `open_network(place, network_of_run)` also opens the checkpoints of training
-(train.networks).
+(train.loop.checkpoints).
 """
 
 import json
@@ -20,8 +20,15 @@ from safetensors.torch import save
 from model.published.config import PublishedConfig, decode_published, encode_published
 from model.published.convert import from_published, to_published
 from model.renderformer import RenderFormer
-from model.trained_range import PUBLISHED_RANGE, TrainedRange, trained_range
-from model.weights import CONFIG_KEY, from_tensors, read_metadata, read_tensors
+from model.weights import (
+    CONFIG_KEY,
+    PUBLISHED_RANGE,
+    TrainedRange,
+    from_tensors,
+    read_metadata,
+    read_tensors,
+    trained_range,
+)
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
 
@@ -35,13 +42,13 @@ BUILTIN = "builtin:"
 """Name of the small network that comes with Trilight; model/builtin/README.md is its card."""
 
 BUILTIN_WEIGHTS = Path(__file__).parent / "builtin" / WEIGHTS_NAME
-"""Its file."""
+"""File of the builtin network."""
 
 MAX_CONFIG_BYTES = 1 << 16
 """A published config.json has about 1 KiB."""
 
 _ANSWER_S = 5.0
-"""Within which the hub says that it is there; what was fetched before is used without it."""
+"""Time limit for the hub's first answer; without one, files fetched before are used."""
 
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 _PICKLES = (".pt", ".pth", ".bin", ".ckpt", ".pkl")
@@ -61,8 +68,8 @@ class FoundNetwork:
 
 
 Finder = Callable[[Path], FoundNetwork | None]
-"""Finds the network of a place in a form that this package does not know (train.networks has one);
-None for any other place."""
+"""Finds the network of a place in a form that this package does not know, such as a training
+checkpoint (train.loop.checkpoints); returns None for any other place."""
 
 
 def open_network(place: str | Path, *finders: Finder) -> RenderFormer:
@@ -84,7 +91,7 @@ def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
 
     Args:
         place: BUILTIN, a file, a folder, or the name of a repository on the Hugging Face hub.
-        finders: are asked first, such as `train.networks.network_of_run`.
+        finders: are asked first, such as `train.loop.checkpoints.network_of_run`.
 
     Raises:
         TrilightError: there is none, or it holds pickled code.

@@ -1,4 +1,4 @@
-"""In how many bits the network computes: a choice made at run time, not part of a checkpoint.
+"""The number format of the network's products: chosen at run time, not part of a checkpoint.
 
 The layers of both stages and the head may be rounded. Always float32, whatever is chosen:
 positions and rotary angles with their sines, the rotation itself, ray directions and their layer,
@@ -8,8 +8,8 @@ trained network (docs/tradeoffs.md has every part alone). `trilight model NAME -
 what is left, layer by layer.
 
 Weights are rounded once, when the network is made ready, and not at every use (autocast): equally
-fast, half the memory. Training in few bits is another matter and needs float32 weights, so that it
-asks autocast; what is always float32 stands in `as_given` and does not hear of that.
+fast, half the memory. Training in few bits needs float32 weights and therefore uses autocast;
+`as_given` switches autocast off for what is always float32.
 """
 
 from collections.abc import Iterator
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class PrecisionChoice:
-    """One choice."""
+    """One number format and where it is available."""
 
     dtype: torch.dtype
-    """Of the weights and activations of the layers and the head."""
+    """Type of the weights and activations of the layers and the head."""
     tf32: bool = False
     """Whether a GPU may multiply float32 matrices with 10 bits of mantissa."""
     needs_cuda: bool = False
@@ -86,9 +86,9 @@ def as_given(device: torch.device) -> AbstractContextManager[None]:
 
 @contextmanager
 def tf32(allowed: bool) -> Iterator[None]:
-    """Say whether CUDA's float32 products and convolutions may be TF32; a CPU does not care.
+    """Allow or forbid TF32 in CUDA's float32 products and convolutions; no effect on a CPU.
 
-    Torch allows TF32 to convolutions unasked, so float32 has to be asked for too.
+    Torch allows TF32 in convolutions by default, so plain float32 has to be requested too.
     """
     convolution = torch.backends.cudnn.conv  # type: ignore[attr-defined]
     switches = (torch.backends.cuda.matmul, convolution)

@@ -1,10 +1,11 @@
-"""Weights as one safetensors file that carries its own configuration; no pickle anywhere."""
+"""A network as one safetensors file: weights, configuration, what it was trained on. No pickle."""
 
 import dataclasses
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,55 @@ from torch import Tensor
 
 from model.config import ModelConfig
 from model.renderformer import RenderFormer
-from model.trained_range import TrainedRange
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS
 from storage.records.safe_read import MAX_HEADER_BYTES, safetensors_header
+
+RANGE_KEY = "trilight_trained_range"
+"""Metadata entry of a weights file."""
+
+MAX_LIGHTS = 8
+"""Emitting triangles of a training scene, at most: in the published data as in ours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainedRange:
+    """The largest scenes and the picture width of the training data; None where it is unknown.
+
+    Renderers warn where a scene leaves this range; they do not refuse it.
+    """
+
+    max_triangles: int | None = None
+    """Most triangles of a whole scene."""
+    resolution: int | None = None
+    """Pixels across the pictures."""
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return the entries for the metadata of a safetensors file."""
+        return {RANGE_KEY: json.dumps(asdict(self), sort_keys=True)}
+
+
+PUBLISHED_RANGE = TrainedRange(max_triangles=4096, resolution=512)
+"""Range of the published checkpoints: their second stage (Zeng et al. 2025)."""
+
+
+def trained_range(metadata: Mapping[str, str]) -> TrainedRange | None:
+    """Return what the metadata of a file says, or None where it says nothing.
+
+    Raises:
+        TrilightError: the entry is not readable.
+    """
+    if RANGE_KEY not in metadata:
+        return None
+    try:
+        fields = json.loads(metadata[RANGE_KEY])
+        known = {name: fields.get(name) for name in ("max_triangles", "resolution")}
+        return TrainedRange(
+            **{name: None if value is None else int(value) for name, value in known.items()}
+        )
+    except (AttributeError, TypeError, ValueError) as error:
+        raise TrilightError(f"{RANGE_KEY}: not readable ({error}).") from error
+
 
 CONFIG_KEY = "trilight_model"
 """Metadata entry that holds the configuration as JSON."""

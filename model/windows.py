@@ -1,4 +1,4 @@
-"""Shifted windows of ray bundles (Swin, Liu et al. 2021): who sees whom, without a mask.
+"""Shifted windows of ray bundles (Swin, Liu et al. 2021), attended without a mask.
 
 A picture's bundles are cut into square windows, and attend within their own. Every second layer
 cuts half a window further on. The published code rolls the picture there and masks what the roll

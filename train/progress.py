@@ -1,14 +1,16 @@
-"""What a run tells whoever started it, while it runs. `train` itself prints nothing."""
+"""What a run reports to its caller. `train` itself prints nothing."""
 
 from collections.abc import Mapping
-from typing import Protocol
 
 
-class TrainProgress(Protocol):
-    """Receives the course of a run: noted, then begin, then advance and validated, in turns."""
+class TrainProgress:
+    """Receives the events of a run: noted, then begin, then advance and validated in turns.
+
+    Each does nothing here; a subclass shows those that it overrides.
+    """
 
     def noted(self, text: str) -> None:
-        """There is something about the data that the user should know."""
+        """A warning for the user, such as one about the data."""
 
     def begin(
         self,
@@ -18,9 +20,9 @@ class TrainProgress(Protocol):
         num_parameters: int,
         median_scores: Mapping[str, float] | None,
     ) -> None:
-        """The run starts at `step`, above 0 when it resumes; the median picture is its rival.
+        """The run starts at `step`, above 0 when it resumes.
 
-        None where there is no validation split.
+        The median picture is the baseline; None where there is no validation split.
         """
 
     def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
@@ -30,30 +32,4 @@ class TrainProgress(Protocol):
         """The validation split was judged after `step` steps (evaluation.scores)."""
 
     def interrupted(self, times: int) -> None:
-        """A signal asks to stop, for the `times`-th time; comes from a thread of its own."""
-
-
-class Silent:
-    """A Progress that says nothing."""
-
-    def noted(self, text: str) -> None:
-        """Ignore it."""
-
-    def begin(
-        self,
-        *,
-        step: int,
-        num_steps: int,
-        num_parameters: int,
-        median_scores: Mapping[str, float] | None,
-    ) -> None:
-        """Ignore it."""
-
-    def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
-        """Ignore it."""
-
-    def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
-        """Ignore it."""
-
-    def interrupted(self, times: int) -> None:
-        """Ignore it."""
+        """A signal asks to stop, for the `times`-th time; called from another thread."""

@@ -1,20 +1,18 @@
-"""What a finished run has to show, and how it is written down."""
+"""The result of a finished run, and how it is written."""
 
 import dataclasses
 import json
 from dataclasses import dataclass
 
 from model.renderformer import count_parameters
-from model.trained_range import TrainedRange
-from model.weights import encode_weights
+from model.weights import TrainedRange, encode_weights
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData
 from train.evaluation.judge import Judge
 from train.evaluation.scores import Lead
-from train.evaluation.sheet import write_picture
-from train.evaluation.validation_sheet import drawn_validation_sheet
+from train.evaluation.sheet import drawn_validation_sheet, write_picture
 from train.folder import RunFolder
-from train.loop.metrics_log import read_rows
+from train.loop.recorder import read_rows
 from train.loop.state import TrainState
 from train.settings import TrainSettings
 
@@ -29,7 +27,7 @@ class TrainResult:
     folder: RunFolder
     """Where everything is."""
     num_parameters: int
-    """Of the network."""
+    """Numbers in the network's weights."""
     num_steps: int
     """Steps done, including skipped ones."""
     skipped_steps: int
@@ -43,7 +41,7 @@ class TrainResult:
     median_scores: dict[str, float] | None
     """The median picture of the training views on the same split."""
     lead: Lead | None
-    """Of the network over the median picture."""
+    """Advantage of the network over the median picture."""
     unusable: tuple[str, ...]
     """What was wrong with data that was left out in this call."""
     seconds: float

@@ -1,4 +1,4 @@
-"""One training run, from a dataset to weights, figures and a sheet: joins the parts, no more."""
+"""One training run, from a dataset to weights, figures and a sheet: joins the parts."""
 
 import dataclasses
 import platform
@@ -19,20 +19,24 @@ from storage.errors import TrilightError
 from storage.extensions import recorded
 from storage.settings.described import settings_record
 from train.data.scenes import training_scene
-from train.data.splits import first_samples
 from train.data.stream import StreamSettings, stream_batches
-from train.data.unusable import Unusable
+from train.data.unusable import Unusable, first_samples
 from train.evaluation.judge import Judge, median_picture
 from train.folder import RunFolder
-from train.loop.checkpoints import Checkpoint, resumed_checkpoint, resumed_state, saved_steps
+from train.loop.checkpoints import (
+    Checkpoint,
+    network_of_run,
+    resumed_checkpoint,
+    resumed_state,
+    saved_steps,
+)
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState, new_state
 from train.loop.trainer import Trainer
-from train.loss.lpips_weights import load_lpips
+from train.loss.lpips import load_lpips
 from train.loss.objective import Objective
-from train.networks import network_of_run
-from train.progress import Silent, TrainProgress
+from train.progress import TrainProgress
 from train.result import TrainResult, finished, pretty_json
 from train.settings import TrainSettings
 from train.start import Start
@@ -64,13 +68,13 @@ def train_run(
     Args:
         settings: the run; `train.runs.named_run` returns those that have a name.
         data: root of a dataset, or a list of shards (storage.dataset.training_data), with a train
-        split;
-            without a validation split nothing is judged.
+        split; without a
+            validation split nothing is judged.
         out: folder of the run (train.folder), new unless it resumes.
         start: how it begins; anew unless said.
         crew: the processes that train together (loop.crew.join_crew); this one unless said.
         workers: threads that read and decode samples; the weights do not depend on them.
-        progress: is told how it goes, by the first process.
+        progress: receives the events of the run, in the first process.
 
     Returns:
         What the run has to show; None in all processes but the first.
@@ -83,7 +87,7 @@ def train_run(
     """
     began = time.monotonic()
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
-    progress = progress if progress is not None and crew.is_first else Silent()
+    progress = progress if progress is not None and crew.is_first else TrainProgress()
     opened, folder = open_training_data(data), RunFolder(out)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         progress.noted(note)
@@ -131,7 +135,7 @@ def stream_settings(settings: TrainSettings) -> StreamSettings:
 
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:
-    """Find out before any work what the data cannot give; damage is counted when it is used."""
+    """Refuse data that lacks views or lights before any work; damage is counted when it is read."""
     data.split("train")
     num_views = data.num_views
     lights_apart = settings.augmentation.light_mix > 1
@@ -201,7 +205,7 @@ def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable)
         training_scene(sample, settings.resolution)
         for sample in first_samples(data.split("train"), MEDIAN_SCENES, unusable)
     ]
-    # what is judged by must be whole: a score over fewer scenes would be another score
+    # no damage is allowed here: a score over fewer scenes would be another score
     samples = list(first_samples(data.split(VALIDATION), settings.validation_scenes, Unusable(0)))
     return Judge(samples, settings.resolution, median_picture(training))
 

@@ -18,9 +18,7 @@ from model.config import smoke as smoke_model
 from storage.errors import TrilightError, expected_one_of
 from storage.registry import Registry
 from storage.settings.changes import changed
-from train.data.augmentation import AugmentationSettings
-from train.loss.settings import LossSettings
-from train.settings import TrainSettings
+from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 
 def smoke() -> TrainSettings:
@@ -138,7 +136,7 @@ def paper_finetune_large() -> TrainSettings:
 
 
 def pretrain() -> TrainSettings:
-    """Return our first stage: half the paper's steps, every symmetry, less said by noisy views.
+    """Return our first stage: half the paper's steps, all symmetries, less weight for noisy views.
 
     Which of these choices helps was measured in small trainings (docs/log); at this size none
     has been.
@@ -161,7 +159,7 @@ def pretrain() -> TrainSettings:
 
 
 def finetune() -> TrainSettings:
-    """Return our second stage: as the paper's is to its first."""
+    """Return our second stage, which follows ours as the paper's second follows its first."""
     return dataclasses.replace(
         pretrain(),
         run="finetune",
@@ -277,7 +275,7 @@ def in_proportion(run: TrainSettings, steps: int, stated: Mapping[str, Any]) -> 
     if not 0 < steps < run.num_steps:
         return {}
     given = {name: stated[name] for name in _INTERVALS if name in stated}
-    # what is no number of steps is refused, by name, when the settings are made
+    # other values are refused, by name, when the settings are made
     kept = {name: value for name, value in given.items() if isinstance(value, int) and value > 0}
 
     def shorter(name: str, unit: int) -> int:

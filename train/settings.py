@@ -11,8 +11,47 @@ from model.config import ModelConfig
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Seed, Share, Within
-from train.data.augmentation import AugmentationSettings
-from train.loss.settings import LossSettings
+
+Rotation = Literal["none", "recipe", "uniform"]
+"""`recipe`: a rotation vector of three normal numbers, which favours small turns; `uniform`: every
+orientation alike."""
+
+
+@checked("train settings")
+class AugmentationSettings:
+    """What is drawn anew at every visit of a scene. The default changes nothing."""
+
+    rotation: Rotation = "none"
+    """How scene and cameras are turned together."""
+    translation: Annotated[float, Within(0, 100, unit="metres")] = 0.0
+    """Standard deviation per axis of their common shift, metres."""
+    mirror: bool = False
+    """Whether half of the visits see the mirrored scene."""
+    channels: bool = False
+    """Whether the colour channels are permuted."""
+    vertex_order: bool = False
+    """Whether each triangle begins with any of its vertices."""
+    light_scale: Annotated[float, Within(1, 1000)] = 1.0
+    """Largest factor by which all light is made stronger or weaker, log-uniform."""
+    light_mix: Annotated[float, Within(1, 1000)] = 1.0
+    """The same for each light alone; needs a dataset that keeps lights apart (`per_light`)."""
+
+
+Perceptual = Literal["lpips", "ms_ssim", "none"]
+"""`lpips` is the recipe's and needs published weights; `ms_ssim` needs none and is another term."""
+
+
+@checked("train settings")
+class LossSettings:
+    """Terms of the loss (Zeng et al. 2025, section 4) and how views are weighed."""
+
+    perceptual: Perceptual
+    """The second term, on tone-mapped pictures."""
+    perceptual_weight: Annotated[float, Within(0, 1000)] = 0.05
+    """Its factor beside the first term, the L1 error of log10(1 + radiance)."""
+    noise_half: Annotated[float, Within(0, 10)] = 0.0
+    """Root mean square noise of log10(1 + radiance) at which a view counts half; 0 weighs none."""
+
 
 Precision = Literal["float32", "bfloat16"]
 """Of the network's products. Positions, losses, weights and optimisers' memories stay float32."""

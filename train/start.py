@@ -18,7 +18,7 @@ class Start:
     begin_with: str | None = None
     """Network whose weights and configuration a run with `from_weights` takes over."""
     lpips: str | None = None
-    """Where LPIPS' weights are (loss.lpips_weights)."""
+    """Where LPIPS' weights are (train.loss.lpips.load_lpips)."""
 
     def check(self, settings: TrainSettings) -> None:
         """Refuse a start that is not the run's; one that goes on has begun and is not asked.

@@ -1,4 +1,4 @@
-"""If you need this, choose that: needs and settings as data; every figure comes from results."""
+"""The table `If you need this, choose that`; every figure in it comes from results."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Choice:
     """One row of the table."""
 
     need: str
-    """In a user's words."""
+    """The need, in a user's words."""
     how: str
     """What to type, or where it is said."""
     experiment: str
@@ -25,34 +25,19 @@ class Choice:
     point: str
     """Name of its point."""
     despite: str = ""
-    """Why it is advised where its point is not on the front; a test asks for it then."""
+    """Why it is advised although its point is not on the front; a test requires a reason."""
 
 
 CHOICES = (
-    Choice(
-        "a first look at a training, in minutes",
-        "`--noise-floor 34`",
-        "noise-floor",
-        "34 dB",
-    ),
-    Choice(
-        "targets to train on for weeks",
-        "`pretrain-256` as it is",
-        "noise-floor",
-        "46 dB",
-    ),
+    Choice("a first look at a training, in minutes", "`--noise-floor 34`", "noise-floor", "34 dB"),
+    Choice("targets to train on for weeks", "`pretrain-256` as it is", "noise-floor", "46 dB"),
     Choice(
         "pictures to judge networks by",
         "`--noise-floor 50` with a high cap",
         "noise-floor",
         "50 dB",
     ),
-    Choice(
-        "direct light and one bounce only",
-        "`--set renders.max_depth=3`",
-        "depth",
-        "3",
-    ),
+    Choice("direct light and one bounce only", "`--set renders.max_depth=3`", "depth", "3"),
     Choice(
         "the fewest triangles for a network",
         "`--set scenes.max_triangles=768`",
@@ -91,12 +76,7 @@ CHOICES = (
         "lights",
         "one picture of each light",
     ),
-    Choice(
-        "as many different scenes as possible",
-        "`--set scenes.num_views=1`",
-        "views",
-        "1",
-    ),
+    Choice("as many different scenes as possible", "`--set scenes.num_views=1`", "views", "1"),
     Choice(
         "a large network's picture soon",
         "`trilight render --engine neural --precision bfloat16`",

@@ -14,7 +14,7 @@ from infra.bench.store import Run
 from storage.errors import TrilightError
 
 COST_NOISE = 0.03
-"""Costs that differ by less than this share are equal: core-seconds of one run vary by as much."""
+"""Costs that differ by less than this share count as equal: core-seconds vary by that much."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +34,11 @@ class Row:
     """One point beside the others."""
 
     point: Point
-    """Its declaration."""
+    """The point's declaration."""
     values: Mapping[str, float]
-    """By name of the column; without those that were not measured."""
+    """Value of each measured column, by name."""
     cost_ratio: float
-    """Its cost divided by that of the default."""
+    """The point's cost divided by the default's."""
     cost_spread: Spread | None
     """The cost over the turns; None where it was not kept or there was one turn."""
     on_front: bool | None
@@ -81,7 +81,7 @@ def on_front(figures: Sequence[tuple[float, Sequence[float]]]) -> list[bool]:
 
     One with less error dominates where none of its costs is more than COST_NOISE higher; one with
     the same error where none is higher and one is more than COST_NOISE lower. Some point always
-    stays: whoever dominates has less error, or the same and less cost.
+    remains, since a dominating point has less error, or the same error and less cost.
 
     Args:
         figures: error (smaller is better) and costs above 0 of each point, equally many.

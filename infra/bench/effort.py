@@ -1,6 +1,11 @@
-"""How much is measured: minutes with `--quick`, otherwise what figures to quote need."""
+"""How much is measured, and on what: minutes with `--quick`, else what quoted figures need."""
 
+import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.objects.licences import DEFAULT_ALLOWED
+from storage.settings.described import checked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,20 +61,28 @@ CAREFUL = Effort(
     repeats=3,
     growth=4,
 )
-QUICK = Effort(
-    name="quick",
-    scenes=4,
-    resolution=128,
-    max_spp=512,
-    fixed_spp=128,
-    picture_px=128,
-    widths=(64, 128, 256, 512),
-    objects=6,
-    samples=2,
-    composed=40,
-    network="base",
-    network_triangles=1536,
-    network_px=256,
-    repeats=1,
-    growth=2,
-)
+QUICK = dataclasses.replace(
+    CAREFUL, name="quick", scenes=4, max_spp=512, fixed_spp=128, picture_px=128, objects=6,
+    samples=2, composed=40, repeats=1, growth=2,
+)  # fmt: skip
+
+
+@checked()
+class Asked:
+    """What the user asks for besides the experiments and the effort."""
+
+    objects: tuple[str, ...] = ("builtin:",)
+    """Sources of objects."""
+    allow_licences: tuple[str, ...] = ()
+    """Licences of objects that are measured too; by default the usual ones are."""
+    scenes: Path | None = None
+    """Folder of RenderFormer scenes that are rendered as well; by default none."""
+    checkpoint: str = "builtin:"
+    """Network that is measured; by default the one that comes with Trilight."""
+    data: str | None = None
+    """Root of a finished dataset, for the experiment economy; by default none."""
+
+    @property
+    def allowed_licences(self) -> tuple[str, ...]:
+        """Licences of objects that may be measured."""
+        return (*DEFAULT_ALLOWED, *self.allow_licences)

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 Figures = Mapping[str, float]
 """What one turn measures of one point, by name."""
 
+TurnFigures = Iterable[tuple[str, Figures]]
+"""The figures of every point in one turn, in order, by the name of the point."""
+
 Over = Literal["median", "mean", "least", "most", "p5", "p95"]
 
 
@@ -30,7 +33,7 @@ class Column:
     over: Over = "median"
     """How the figures of all turns become one number."""
     then: Callable[[float], float] | None = None
-    """What is done to that number, for example `3600 / seconds`."""
+    """Converts that number, for example `3600 / seconds`; None leaves it as it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,15 +45,14 @@ class Point:
     settings: Any = None
     """What measuring it needs to know."""
     default: bool = False
-    """Whether this is what the product does when nobody says otherwise."""
+    """Whether this is the product's default."""
     judged: bool = True
-    """Whether the point is a choice; a yardstick, which shows what cannot be told apart, is not."""
+    """Whether the point is a choice; False for a yardstick, such as a picture's own noise."""
 
 
-Measure = Callable[["Workshop", Sequence[Point], str], Iterable[tuple[str, Figures]]]
-"""Measures all points in one turn, in order, and yields the name of each with its figures. Raises
-`Rejected` or `ChildFailed` where the turn's scene or object cannot be used: it then counts for
-no point."""
+Measure = Callable[["Workshop", Sequence[Point], str], TurnFigures]
+"""Measures all points in one turn. Raises `Rejected` or `ChildFailed` where the turn's scene or
+object cannot be used: the turn then counts for no point."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,28 +68,28 @@ class Experiment:
     cost: Column
     """The first column; above 0."""
     points: Callable[[Effort], Sequence[Point]]
-    """The settings, in the order of the table."""
+    """The points, in the order of the table."""
     turns: Callable[[Effort], Sequence[str]]
     """Scenes, objects or repeats: in each turn every point is measured once."""
     measure: Measure = field(repr=False)
     """Measures a turn."""
     error: Column | None = None
-    """The second column; None where there is nothing to be wrong."""
+    """The second column; None where only costs are compared."""
     better: Literal["higher", "lower"] = "lower"
-    """Which errors are good: decibels are higher where pictures agree."""
+    """Which direction is better: decibels are higher where pictures agree."""
     against: str = ""
     """What the error is measured to."""
     columns: tuple[Column, ...] = ()
     """Further columns."""
     also_cost: tuple[str, ...] = ()
-    """Further columns that count as costs too: a setting that is cheaper in any of them stays."""
+    """Further columns that count as costs: a point cheaper in any of them is not dominated."""
     because: str = ""
     """The default and its reason, or what the figures mean."""
     covers: tuple[str, ...] = ()
     """Dotted names of the settings that this is about: `build.` as in `--set` of generate, `order.`
     what a dataset order says, `train.` as in `--set` of train, `render.` an option."""
     warm_up: bool = False
-    """Whether one turn that is not counted comes first: for turns that are repeats."""
+    """Whether one turn that is not counted comes first, where all turns are repeats."""
     takes_scenes: bool = False
     """Whether the scenes of the user's folder are turns as well."""
     needs: tuple[Literal["torch", "blender", "data"], ...] = ()
@@ -100,12 +102,10 @@ def percent(share: float) -> float:
 
 
 def one_by_one(measure: Callable[["Workshop", Point, str], Figures]) -> Measure:
-    """Return the measuring of a turn whose points have nothing in common; adds `seconds`."""
+    """Return a Measure that measures each point on its own, and adds `seconds` to its figures."""
     import time
 
-    def turn_of(
-        workshop: "Workshop", points: Sequence[Point], turn: str
-    ) -> Iterable[tuple[str, Figures]]:
+    def turn_of(workshop: "Workshop", points: Sequence[Point], turn: str) -> TurnFigures:
         for point in points:
             began = time.perf_counter()
             found = measure(workshop, point, turn)
@@ -115,5 +115,5 @@ def one_by_one(measure: Callable[["Workshop", Point, str], Figures]) -> Measure:
 
 
 def repeats(effort: Effort) -> tuple[str, ...]:
-    """Return the turns of an experiment that does the same several times."""
+    """Return the turns of an experiment that repeats the same measurement."""
     return tuple(f"round {number}" for number in range(1, effort.repeats + 1))

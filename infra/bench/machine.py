@@ -1,4 +1,4 @@
-"""On what a figure was measured: processor, cores, system, versions of libraries, revision."""
+"""The machine that a figure was measured on: processor, cores, system, libraries, revision."""
 
 import os
 import platform

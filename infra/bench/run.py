@@ -1,4 +1,4 @@
-"""Runs one experiment: turn after turn, every point once in each, written down as it is measured.
+"""Runs one experiment: every point once in each turn, stored as soon as it is measured.
 
 Machines drift. The points of an experiment therefore take turns (A B A B ...), and only ratios
 within one run are claims.
@@ -11,8 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from infra.bench.asked import Asked
-from infra.bench.effort import Effort
+from infra.bench.effort import Asked, Effort
 from infra.bench.experiment import Experiment
 from infra.bench.machine import ROOT, machine
 from infra.bench.plot import plot
@@ -25,7 +24,7 @@ from storage.errors import Rejected, TrilightError
 RESULTS = ROOT / "docs" / "bench"
 
 TurnDone = Callable[[int, int], None]
-"""Called with the number of turns that are done and of all."""
+"""Called with the number of finished turns and of all turns."""
 
 
 def store_of(folder: Path, name: str, effort: str) -> Store:
@@ -54,7 +53,7 @@ def run(
     """Measure what is missing of an experiment, draw its figure, and return its results.
 
     A run of the same plan that was interrupted goes on. Turns that were measured are not measured
-    again; one that was interrupted is.
+    again; an interrupted turn is.
 
     Raises:
         TrilightError: something that the experiment needs is missing, or no turn could be measured.
@@ -70,13 +69,14 @@ def run(
     if not current.whole_turns():
         reasons = "; ".join(sorted(set(current.left_out.values())))
         raise TrilightError(f"bench {experiment.name}: no turn could be measured: {reasons}.")
-    plot(experiment, current, store.path.with_suffix(".png"))  # what cannot be told has not ended
+    # before the end is stored: a run that cannot be drawn is unfinished
+    plot(experiment, current, store.path.with_suffix(".png"))
     store.end(current, time.perf_counter() - began, notes)
     return store
 
 
 def lacking(experiment: Experiment, asked: Asked) -> str:
-    """Return what an experiment needs and is not there, or nothing."""
+    """Return what an experiment needs that is missing; empty if nothing is."""
     if "torch" in experiment.needs and importlib.util.find_spec("torch") is None:
         return "torch is not installed; run `make setup-all`"
     if "data" in experiment.needs and not asked.data:

@@ -17,7 +17,7 @@ from infra.bench.experiment import Figures
 
 @dataclass(kw_only=True)
 class Run:
-    """One run, as far as it has come."""
+    """One run, finished or not."""
 
     plan: Mapping[str, Any]
     """All that its figures depend on: points, turns, effort, what was asked for, machine."""
@@ -28,11 +28,11 @@ class Run:
     left_out: dict[str, str] = field(default_factory=dict)
     """Turns that count for no point: why."""
     columns: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Columns by point, of results that were taken over from before there was this form."""
+    """Columns by point, of results that were converted from an older form."""
     notes: list[str] = field(default_factory=list)
-    """What was found out on the way."""
+    """Facts that belong to the result, such as the network's name."""
     seconds: float | None = None
-    """On the clock since it last went on; None where it has not ended."""
+    """Wall time since the run last resumed; None where it has not ended."""
 
     def whole_turns(self) -> list[str]:
         """Return the turns in which every point of the plan was measured."""

@@ -1,9 +1,10 @@
-"""What experiments are measured with: children, scenes with references, objects, the network.
+"""Shared means of experiments: children, scenes with references, objects, the network.
 
 Everything is made when it is first asked for, so that an experiment costs no more than it needs.
 """
 
 import contextlib
+import dataclasses
 import functools
 import os
 import tempfile
@@ -15,22 +16,29 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from infra.bench.asked import Asked
-from infra.bench.effort import Effort
-from infra.bench.subjects.named_scenes import described, first_sample, sampled
-from infra.bench.subjects.references import make_reference
-from infra.bench.subjects.render_child import asked_child, smoke_child
+from infra.bench.effort import Asked, Effort
+from infra.bench.subjects.named_scenes import described, first_sample, make_reference, sampled
+from pipeline.builds.settings import BuildSettings
+from pipeline.builds.training import smoke
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.making.accept_objects import accept_objects
+from pipeline.making.environment import environment
+from pipeline.making.make_scene import SceneRecipe, set_up_child
 from pipeline.making.prepare_isolated import preload_mesh_libraries
+from pipeline.making.publication import begin
+from pipeline.renders.variant import choose_variant
+from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 
 if TYPE_CHECKING:
-    from pipeline.builds.settings import BuildSettings
     from storage.records.objects import ObjectRecord
     from storage.records.sample import Sample
 
+
 Result = TypeVar("Result")
+
+_LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=4 * 3600, calls_per_child=10_000)
 
 
 def _nothing() -> None:
@@ -50,14 +58,14 @@ class Subject:
 
 
 class Workshop:
-    """Holds what is shared until `close`."""
+    """Makes and holds what experiments share, until `close`."""
 
     def __init__(self, effort: Effort, asked: Asked) -> None:
         # before any child: pymeshlab takes a second to import, and would be counted as work
         preload_mesh_libraries()
         self.effort, self.asked = effort, asked
         self.notes: list[str] = []
-        """What was found out on the way and belongs to the result."""
+        """Notes that belong to the result."""
         self._stack = contextlib.ExitStack()
         self._kept: dict[Any, Any] = {}
 
@@ -92,15 +100,35 @@ class Workshop:
     @functools.cached_property
     def child(self) -> IsolatedChild:
         """A render child of the build `smoke`, on all cores."""
-        return self.closing(smoke_child(self.folder(), threads=os.cpu_count() or 1))
+        return self.render_child(smoke(), "builtin:")
 
     def call(self, function: Callable[..., Result], *arguments: Any) -> Result:
         """Run a function in the render child."""
         return self.child.call(function, *arguments)
 
-    def child_of(self, build: "BuildSettings") -> IsolatedChild:
-        """Return a render child of another build, of the objects that are asked for."""
-        return self.closing(asked_child(self.folder(), build, self.asked))
+    def child_of(self, build: BuildSettings) -> IsolatedChild:
+        """Return a render child of another build, with the first source of objects asked for."""
+        allowed = dataclasses.replace(build, allowed_licences=self.asked.allowed_licences)
+        return self.render_child(allowed, self.asked.objects[0])
+
+    def render_child(
+        self, build: BuildSettings, objects: str, threads: int | None = None
+    ) -> IsolatedChild:
+        """Return a child that composes the scenes of a build and renders them, on all cores.
+
+        Args:
+            build: the settings.
+            objects: source of the objects.
+            threads: of Mitsuba and the denoiser, if fewer than there are cores.
+        """
+        variant, workers = choose_variant(), threads or os.cpu_count() or 1
+        folder = DatasetFolder(self.folder())  # keeps the record of the objects
+        publication = begin(folder, build, environment(variant), 1, accept_environment=False)
+        accepted = accept_objects(objects, None, build, publication, workers=workers)
+        recipe = SceneRecipe(
+            settings=build, variant=variant, threads=workers, objects=accepted.objects
+        )
+        return self.closing(IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(recipe,)))
 
     @functools.cached_property
     def mesh_child(self) -> IsolatedChild:
@@ -168,7 +196,6 @@ class Workshop:
     @functools.cached_property
     def samples(self) -> "list[Sample]":
         """Scenes of `smoke` as a run would make them."""
-        from pipeline.builds.training import smoke
         from storage.settings.changes import changed
 
         px = max(self.effort.picture_px, 2 * self.effort.resolution)

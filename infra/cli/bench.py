@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from infra.bench.asked import Asked
+from infra.bench.effort import Asked
 from infra.cli.console import console, first_words, progress_bars
 from infra.cli.options import command
 from storage.settings.described import checked

@@ -18,24 +18,24 @@ from infra.cli.help import Sections
 from storage.errors import expected_one_of
 
 COMMANDS = {
-    "doctor": "Say what this machine has, what it lacks, what is then slower, and what mends it.",
+    "doctor": "Report what this machine has and lacks, what that slows down, and what fixes it.",
     "assets": "Turn objects into clean meshes within a budget or an error; writes quality.html.",
-    "generate": "Turn objects into a verified, resumable dataset; run it again to go on after any "
+    "generate": "Turn objects into a verified, resumable dataset; run it again to resume after any "
     "stop.",
     "plan": "Measure a few scenes and predict time, cores, bytes and cost, each with an interval.",
     "render": "Render scenes: path traced to a measured noise floor, or by a trained network.",
-    "convert": "Convert by extension, and say what could not be carried over.",
+    "convert": "Convert by extension, and report what could not be carried over.",
     "verify": "Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."
-    "\n\nA dataset that is not finished is checked as far as it is, and the exit status is 1 too.",
-    "inspect": "Write report, gallery and contact sheet anew, and print what the dataset holds."
-    "\n\nA dataset that is read-only, or on a server, is only summed up, unless there is an --out. "
-    "Of one scene the summary is printed, with what of its file could not be carried over.",
+    "\n\nAn unfinished dataset is checked as far as it exists; the exit status is 1 then too.",
+    "inspect": "Rewrite report, gallery and contact sheet, and print what the dataset holds."
+    "\n\nOf a dataset that is read-only or on a server, only a summary is printed, unless --out "
+    "names a folder. Of a scene file, its summary and what a scene could not carry over.",
     "model": "Print parameters, FLOPs and memory by precision of a named size or of a checkpoint.",
-    "status": "Say how far a dataset is, when it will be done, and what failed; needs no server.",
+    "status": "Report a dataset's progress, estimated finish and failures; needs no server.",
     "train": "Train a model; writes checkpoints, metrics.jsonl, TensorBoard curves and a sheet."
     "\n\nFor processes on several machines: torchrun -m trilight train ...",
     "evaluate": "Judge a network; writes evaluation.json, evaluation.md and sheets of pictures.",
-    "bench": "Measure cost against error; an interrupted run goes on. Without a name, list all.",
+    "bench": "Measure cost against error; an interrupted run resumes. Without a name, list all.",
     "shards": "Make new datasets of finished ones.",
 }
 """What each does. It is the function of its name, or for a group of commands `app`, in the file of
@@ -75,9 +75,8 @@ def complaint(mistake: CycloptsError) -> str:
     see = f"See trilight {' '.join([*chain, '--help'])}."
     where = f"{' '.join(chain)}: " if chain else ""
     if isinstance(mistake, UnusedCliTokensError) and mistake.unused_tokens:
-        return (
-            f"{where}{mistake.unused_tokens[0]!r} is one word too many; expected an option. {see}"
-        )
+        extra = mistake.unused_tokens[0]
+        return f"{where}{extra!r} is one argument too many; expected an option. {see}"
     if isinstance(mistake, UnknownCommandError) and mistake.unused_tokens:
         known = [name for name in mistake.app or app if not name.startswith("-")]
         typed = mistake.unused_tokens[0]
@@ -88,7 +87,7 @@ def complaint(mistake: CycloptsError) -> str:
         near = "".join(f"; did you mean {name}?" for name in get_close_matches(typed, known, n=1))
         return f"{where}option {typed!r} is unknown{near or '.'} {see}"
     if isinstance(mistake, RepeatArgumentError):
-        return f"{where}{mistake.token.keyword} is there twice; expected it once. {see}"
+        return f"{where}{mistake.token.keyword} is given twice; expected it once. {see}"
     argument: Any = mistake.argument
     if isinstance(mistake, MissingArgumentError) and argument:
         thing = mistake.keyword or _called(argument)

@@ -1,4 +1,4 @@
-"""What a shell offers where a name is expected; asked at every press of the tab key."""
+"""Names that a shell completes; asked at every press of the tab key."""
 
 from collections.abc import Callable
 

@@ -24,11 +24,11 @@ from rich.text import Text
 console = Console(stderr=False, highlight=False)
 
 _LEAST_RATED_S = 1.0
-"""What was over sooner has no rate worth printing."""
+"""No rate is printed for tasks that are shorter."""
 
 
 def first_words(text: str, *, silent: bool = False) -> None:
-    """Say what begins now; call before anything slow is imported or read.
+    """Print what begins now; call before anything slow is imported or read.
 
     Args:
         text: a sentence without its full stop.
@@ -74,7 +74,7 @@ class RateColumn(ProgressColumn):
 
 
 class Bars(Progress):
-    """Progress bars, each drawn as soon as it is known how long it is; before, nothing is."""
+    """Progress bars; each is drawn only once its total is known."""
 
     def add_task(self, *args: Any, **fields: Any) -> TaskID:
         task = super().add_task(*args, **fields)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _STYLES = {"ok": "green", "slower": "yellow", "missing": "red"}
 _WIDTHS = (7, 16)
-"""Of the columns state and name: rows are printed one by one, as they are found."""
+"""Widths of the columns state and name: rows are printed one by one, as they are found."""
 
 
 @command()
@@ -38,7 +38,7 @@ def doctor(shown: Shown) -> None:
 def _row(finding: "Finding") -> Table:
     text = Text(finding.found)
     if finding.consequence:
-        text.append(f"\n{finding.consequence}; mend it with: {finding.mend}", "yellow")
+        text.append(f"\n{finding.consequence}; fix: {finding.mend}", "yellow")
     row = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     for width in _WIDTHS:
         row.add_column(width=width)

@@ -84,7 +84,7 @@ def model(counted: Counted, written: Written, shown: Shown) -> None:
 def _open(name: str) -> "RenderFormer":
     from model.config import SIZES
     from model.open import open_network
-    from train.networks import network_of_run
+    from train.loop.checkpoints import network_of_run
 
     try:
         return open_network(name, network_of_run)

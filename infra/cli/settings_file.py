@@ -38,7 +38,7 @@ def read_settings_file(file: str) -> Stated:
     stated: Stated = {}
     for name, value, line in [] if root is None else _entries(root, file, ""):
         if name in stated:
-            raise TrilightError(f"{file}, line {line}: {name} is there twice; expected it once.")
+            raise TrilightError(f"{file}, line {line}: {name} is given twice; expected it once.")
         stated[name] = value, line
     return stated
 
@@ -63,7 +63,9 @@ def _json(node: yaml.Node, file: str) -> Any:
     if isinstance(node, yaml.MappingNode):
         found = {str(key.value): _json(value, file) for key, value in node.value}
         if len(found) < len(node.value):
-            raise TrilightError(f"{file}, line {_line(node)}: a name is there twice.")
+            raise TrilightError(
+                f"{file}, line {_line(node)}: a name is given twice; expected it once."
+            )
         return found
     return json_or_word(node.value) if node.style is None else node.value
 

@@ -33,11 +33,11 @@ def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
         ("views", f"{found.scenes_done * found.num_views}"),
         *_speed(found),
         *(("rejected", f"{count} x {stage}: {reason}") for stage, reason, count in found.failures),
-        ("dataset digest", found.digest if found.finished else "when it is finished"),
+        ("dataset digest", found.digest if found.finished else "known once it is finished"),
     ]
     if cost is not None:
         rows.append(("cost so far", f"{found.core_hours:.2f} core-hours, {cost:.2f} USD"))
-    title = "finished" if found.finished else "in the making"
+    title = "finished" if found.finished else "unfinished"
     print_rows(f"{found.shown}: {found.build}, {title}", rows)
     if found.next_words:
         next_step(found.next_words)
@@ -49,7 +49,7 @@ def _next(found: DatasetStatus) -> str:
     if found.next_words:
         return shlex.join(["trilight", *found.next_words])
     return (
-        f"It goes on with trilight generate {found.build} --scenes {found.scenes_planned} and the "
+        f"To resume: trilight generate {found.build} --scenes {found.scenes_planned}, with the "
         "same other options as before."
     )
 

@@ -19,6 +19,7 @@ from infra.torch_library import require_torch
 from infra.train_order import TrainOrder
 from storage.errors import TrilightError
 from storage.settings.described import option_words
+from train.progress import TrainProgress
 from train.runs import in_proportion, named_run
 from train.settings import TrainSettings
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from train.result import TrainResult
 
 
-class _BarProgress:
+class _BarProgress(TrainProgress):
     """Shows a run as a progress bar, and each validation as a line."""
 
     def __init__(self, bars: Bars) -> None:
@@ -69,7 +70,9 @@ class _BarProgress:
 
     def interrupted(self, times: int) -> None:
         if times == 1:
-            console.print("Stopping after this step, which is then saved. Again: end at once.")
+            console.print(
+                "Stopping after this step and saving. Press Ctrl-C again to end without saving."
+            )
             return
         self._bars.stop()
         sys.stderr.write("\ntrilight: ended at once; --resume goes on from the last checkpoint.\n")

@@ -46,7 +46,7 @@ def verify(asked: Checked, shown: Shown) -> None:
 
         if not shown.json:
             _report(found, fast=asked.fast)
-            first_words("Making the named shards anew")
+            first_words("Repairing the named shards")
         make_anew(
             asked.dataset, found.bad_shards, objects=asked.objects, scenes_from=asked.scenes_from
         )
@@ -55,7 +55,7 @@ def verify(asked: Checked, shown: Shown) -> None:
         print_json(_as_json(found))
     else:
         _report(found, fast=asked.fast)
-        _say_what_mends(found, asked.dataset)
+        _print_repair(found, asked.dataset)
     if found.problems or not found.is_finished:
         sys.exit(1)
 
@@ -68,8 +68,8 @@ def _verified(dataset: str, *, fast: bool, silent: bool) -> Verification:
         return verify_dataset(opened, fast=fast, shard_done=lambda _: bars.advance(task))
 
 
-def _say_what_mends(found: Verification, dataset: str) -> None:
-    """Print what makes a dataset whole, which depends on where it is from."""
+def _print_repair(found: Verification, dataset: str) -> None:
+    """Print how to complete or repair a dataset, which depends on how it was made."""
     asked = read_asked(open_dataset(dataset))
     is_remote = isinstance(parse_url(dataset, what="dataset"), RemoteUrl)
     derivation = derivation_of(found.manifest.settings)
@@ -77,7 +77,7 @@ def _say_what_mends(found: Verification, dataset: str) -> None:
         if asked is not None:
             next_step((*asked, "--out", dataset))
         else:
-            look_at("It goes on with the same trilight generate that began it.")
+            look_at("To resume, run the trilight generate command that began it.")
     elif not found.bad_shards:
         return
     elif is_remote:
@@ -86,7 +86,7 @@ def _say_what_mends(found: Verification, dataset: str) -> None:
             "from the folder that the dataset was copied from."
         )
     elif derivation is not None:
-        look_at(f"Make it again of its sources: trilight shards {derivation.operation}.")
+        look_at(f"Make it again from its sources: trilight shards {derivation.operation}.")
     else:
         sources = ("--objects", "--scenes-from")
         given = [(option, value_of(asked or (), option)) for option in sources]
@@ -126,5 +126,5 @@ def _shards(found: Verification) -> str:
 
 def _verdict(found: Verification) -> str:
     if found.problems:
-        return "Not what the manifest says"
-    return "Verified" if found.is_finished else "Unfinished; what is there is as it should be"
+        return "Does not match its manifest"
+    return "Verified" if found.is_finished else "Unfinished; everything present is valid"

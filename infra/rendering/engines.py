@@ -162,7 +162,7 @@ class NeuralPlan:
         import torch
 
         from model.neural_renderer import NeuralRenderer
-        from train.networks import network_of_run
+        from train.loop.checkpoints import network_of_run
 
         if self.threads is not None:
             torch.set_num_threads(self.threads)

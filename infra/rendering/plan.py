@@ -122,7 +122,7 @@ def _network_and_width(asked: Asked) -> tuple[str | None, int]:
         return None, asked.resolution or _RESOLUTION
     require_torch("--engine neural")
     from model.open import BUILTIN, find_network
-    from train.networks import network_of_run
+    from train.loop.checkpoints import network_of_run
 
     checkpoint = asked.checkpoint or BUILTIN
     if asked.resolution is not None:

@@ -13,7 +13,7 @@ from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS
 
 REGISTER_EPS = 1e-5
-"""In the published registers' mean position."""
+"""Epsilon of the published registers' mean position."""
 
 WINDOW_BUNDLES = 8
 """Width of the published Swin windows."""

@@ -1,20 +1,19 @@
-"""Tensors under published names -> a network of ours, and back."""
+"""Tensors under published names -> a network of ours, and back.
+
+All layers are copied under another name but one. The published material encoder reads a 13 x P x P
+texture. Its input is always the same 13 numbers in every cell (x, y) with x + y <= P, and zero
+elsewhere, and three of them, the tangent-space normal, are always (0.5, 0.5, 1). So its weights may
+be summed over those cells, and the normal's share of the result belongs to the bias: the same
+function at a thousandth of the input and 10 million fewer weights (P = 32).
+"""
 
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
+from model.config import NUM_TAPS, ModelConfig
 from model.published.config import PublishedConfig
-from model.published.names import (
-    BUNDLE_TOKEN,
-    FREQUENCIES,
-    REGISTERS,
-    TEXTURE,
-    TRIANGLE_TOKEN,
-    module_names,
-)
-from model.published.texture import fold, unfold
 from model.renderformer import RenderFormer
 from model.weights import network_of, require_tensors
 from storage.errors import TrilightError
@@ -83,3 +82,122 @@ def _require_frequencies(name: str, got_F: Tensor, expected_F: Tensor) -> None:
             f"published weights: {name} is {got_F.tolist()}, but the configuration means "
             f"{expected_F.tolist()}; expected a config.json that belongs to these weights."
         )
+
+
+TEXTURE = "texture_encoder"
+"""The one layer that is folded and not copied (`fold`)."""
+
+FREQUENCIES = ("transformer.rope_emb.freqs", "view_transformer.transformer.rope_emb.freqs")
+"""Rotary frequencies of both stages, frozen and equal; ours follow from the configuration."""
+
+TRIANGLE_TOKEN = "tri_token"
+REGISTERS = "reg_tokens"
+BUNDLE_TOKEN = "view_transformer.ray_map_patch_token"
+"""The learned vectors; the published ones have leading dimensions of size 1."""
+
+_VIEW = "view_transformer"
+
+
+def module_names(config: ModelConfig) -> dict[str, str]:
+    """Return the published name of every layer with weights, by our name, but the material's."""
+    table = {
+        "encoder.tokens.material_norm": f"{TEXTURE}_norm",
+        "encoder.tokens.normal": "vn_encoding_proj",
+        "encoder.tokens.normal_norm": "vn_encoder_norm",
+        "decoder.rays": f"{_VIEW}.ray_map_encoder",
+        "decoder.rays_norm": f"{_VIEW}.ray_map_encoder_norm",
+    }
+    for layer in range(config.encoder_layers):
+        table |= _encoder_layer(f"encoder.layers.{layer}", f"transformer.layers.{layer}")
+    for layer in range(config.decoder_layers):
+        table |= _decoder_layer(f"decoder.layers.{layer}", f"{_VIEW}.transformer.layers.{layer}")
+    return table | _dpt("decoder.head", f"{_VIEW}.out_dpt")
+
+
+def _encoder_layer(ours: str, theirs: str) -> dict[str, str]:
+    return {
+        **_self_attention(f"{ours}.attention", f"{theirs}.multihead_attn"),
+        f"{ours}.attention_norm": f"{theirs}.query_norm",
+        **_ffn(ours, theirs),
+    }
+
+
+def _decoder_layer(ours: str, theirs: str) -> dict[str, str]:
+    cross = {
+        "q": "q_proj", "k": "k_proj", "v": "v_proj", "out": "out_proj",
+        "q_norm": "q_norm", "k_norm": "k_norm",
+    }  # fmt: skip
+    return {
+        **_self_attention(f"{ours}.self_attention", f"{theirs}.self_attn"),
+        **{f"{ours}.cross.{a}": f"{theirs}.multihead_attn.{b}" for a, b in cross.items()},
+        f"{ours}.cross.context_norm": f"{theirs}.kv_norm",
+        f"{ours}.cross_norm": f"{theirs}.query_norm",
+        f"{ours}.self_norm": f"{theirs}.self_attn_norm",
+        **_ffn(ours, theirs),
+    }
+
+
+def _self_attention(ours: str, theirs: str) -> dict[str, str]:
+    names = {"qkv": "in_proj", "q_norm": "q_norm", "k_norm": "k_norm", "out": "out_proj"}
+    return {f"{ours}.{a}": f"{theirs}.{b}" for a, b in names.items()}
+
+
+def _ffn(ours: str, theirs: str) -> dict[str, str]:
+    names = {"ffn.gate": "ffn.w1", "ffn.up": "ffn.w3", "ffn.down": "ffn.w2", "ffn_norm": "ffn_norm"}
+    return {f"{ours}.{a}": f"{theirs}.{b}" for a, b in names.items()}
+
+
+def _dpt(ours: str, theirs: str) -> dict[str, str]:
+    scratch = f"{theirs}.scratch"
+    table = {
+        f"{ours}.halve": f"{scratch}.output_conv1",
+        f"{ours}.widen": f"{scratch}.output_conv2.0",
+        f"{ours}.last": f"{scratch}.output_conv2.2",
+    }
+    for level in range(NUM_TAPS):
+        fuse, block = f"{ours}.fuse.{level}", f"{scratch}.refinenet{level + 1}"
+        table |= {
+            f"{ours}.project.{level}": f"{theirs}.projects.{level}",
+            f"{ours}.resize.{level}": f"{theirs}.resize_layers.{level}",
+            f"{ours}.reassemble.{level}": f"{scratch}.layer{level + 1}_rn",
+            f"{fuse}.project": f"{block}.out_conv",
+        }
+        for a, b in (("skip", "resConvUnit1"), ("refine", "resConvUnit2")):
+            table |= {
+                f"{fuse}.{a}.first": f"{block}.{b}.conv1",
+                f"{fuse}.{a}.second": f"{block}.{b}.conv2",
+            }
+    return table
+
+
+TEXTURE_CHANNELS = 13
+NORMAL = slice(7, 10)
+"""The tangent-space normal among diffuse 3, specular 3, roughness 1, normal 3, emission 3."""
+
+TANGENT_NORMAL = (0.5, 0.5, 1.0)
+
+
+def fold(weight_WC: Tensor, bias_W: Tensor, patch: int) -> tuple[Tensor, Tensor]:
+    """Return weight [W, 10] and bias [W] for the published weight [W, 13 P P] and bias.
+
+    Sums in float64, returns the type it was given.
+    """
+    cells = weight_WC.double().unflatten(1, (TEXTURE_CHANNELS, patch, patch))
+    place = torch.arange(patch, device=weight_WC.device)
+    thirteen = (cells * (place[:, None] + place <= patch)).sum(dim=(-2, -1))
+    normal = torch.tensor(TANGENT_NORMAL, dtype=torch.float64, device=weight_WC.device)
+    bias = bias_W.double() + (thirteen[:, NORMAL] * normal).sum(dim=1)
+    ten = torch.cat([thirteen[:, : NORMAL.start], thirteen[:, NORMAL.stop :]], dim=1)
+    return ten.to(weight_WC.dtype), bias.to(bias_W.dtype)
+
+
+def unfold(weight_WC: Tensor, bias_W: Tensor, patch: int) -> tuple[Tensor, Tensor]:
+    """Return a published weight [W, 13 P P] and bias that `fold` turns into these, bit by bit.
+
+    What was summed cannot be told apart again: the whole weight stands in the first cell, and the
+    normal's columns are zero.
+    """
+    cells = weight_WC.new_zeros((len(weight_WC), TEXTURE_CHANNELS, patch, patch))
+    cells[:, : NORMAL.start, 0, 0] = weight_WC[:, : NORMAL.start]
+    cells[:, NORMAL.stop :, 0, 0] = weight_WC[:, NORMAL.start :]
+    return cells.flatten(1), bias_W.clone()

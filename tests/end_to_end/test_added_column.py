@@ -35,14 +35,13 @@ from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import toy_sample, write_toy_dataset
-from train.data.augment import with_channels
+from train.data.augment import with_channels, with_light_scaled
 from train.data.order import RankShare
-from train.data.relight import with_light_scaled
 from train.data.scenes import training_scene
 from train.data.stream import stream_batches
 from train.data.unusable import Unusable
+from train.loop.checkpoints import network_of_run
 from train.loop.state import new_state
-from train.networks import network_of_run
 from train.run import stream_settings
 from train.settings import TrainSettings
 
@@ -213,7 +212,7 @@ def test_the_path_tracer_says_what_it_does_not_read() -> None:
         def open(self, scene: Scene, name: str) -> None:
             assert scene.num_triangles
 
-    engine = MitsubaEngine(cast(PathTracer, Tracer()))
+    engine = MitsubaEngine(cast("PathTracer", Tracer()))
     scene = tiny_scene()
     assert engine.open(scene, "floor").notes == ()
     scene.materials[FLOOR, -1] = 0.9

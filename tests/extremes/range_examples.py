@@ -29,12 +29,10 @@ from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, Vi
 from storage.records.scene import Scene
 from storage.settings.dataset import SplitSettings
 from storage.settings.ranges import Declared, declared_ranges
-from train.data.augmentation import AugmentationSettings
 from train.evaluation.evaluate import Contest
 from train.evaluation.order import EvaluationOrder
-from train.loss.settings import LossSettings
 from train.runs import named_run
-from train.settings import TrainSettings
+from train.settings import AugmentationSettings, LossSettings, TrainSettings
 
 End = Literal["low", "high"]
 

@@ -27,8 +27,7 @@ from tests.train.toy import toy_sample, toy_scene
 from train.data.buckets import make_batch
 from train.data.scenes import training_scene
 from train.loss.objective import Objective
-from train.loss.settings import LossSettings
-from train.settings import Precision
+from train.settings import LossSettings, Precision
 
 HALF_MAX = 65504.0
 """The largest float16."""

@@ -34,7 +34,6 @@ from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.train.kit import tiny_run
 from tests.train.toy import toy_sample
 from train.data.augment import augmented
-from train.data.augmentation import AugmentationSettings
 from train.data.buckets import make_batch
 from train.data.scenes import training_scene
 from train.loop.crew import Crew
@@ -42,7 +41,7 @@ from train.loop.optim import learning_rate
 from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective
-from train.loss.settings import LossSettings
+from train.settings import AugmentationSettings, LossSettings
 
 GROUPS: dict[type, str] = {
     SceneSettings: "",

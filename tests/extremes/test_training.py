@@ -15,12 +15,11 @@ from tests.train.kit import tiny_run
 from tests.train.loop.test_step import stepper
 from tests.train.toy import toy_sample, toy_scene
 from train.data.augment import augmented
-from train.data.augmentation import AugmentationSettings
 from train.data.buckets import TrainingBatch, make_batch
 from train.data.scenes import training_scene
 from train.loop.state import new_state
 from train.loss.objective import Objective
-from train.loss.settings import LossSettings
+from train.settings import AugmentationSettings, LossSettings
 
 RESOLUTION = 16
 BRIGHTEST = math.log10(1 + HALF_FLOAT_MAX)

@@ -6,8 +6,7 @@ from infra.setup.builtin_network import MOST_BYTES
 from model.neural_renderer import NeuralRenderer
 from model.open import BUILTIN, BUILTIN_WEIGHTS, open_network
 from model.renderformer import count_parameters
-from model.trained_range import trained_range
-from model.weights import encode_weights, from_tensors, read_tensors
+from model.weights import encode_weights, from_tensors, read_tensors, trained_range
 from storage.digests import sha256_hex
 from tests.scenes_by_hand import tiny_scene
 

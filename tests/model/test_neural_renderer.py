@@ -16,8 +16,7 @@ from model.config import smoke
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import batch_scenes, scene_tensors
-from model.trained_range import RANGE_KEY, TrainedRange, trained_range
-from model.weights import encode_weights
+from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
 from storage.records.material import EMISSION

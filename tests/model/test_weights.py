@@ -7,8 +7,7 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
-from model.trained_range import TrainedRange
-from model.weights import CONFIG_KEY, decode_weights, encode_config, encode_weights
+from model.weights import CONFIG_KEY, TrainedRange, decode_weights, encode_config, encode_weights
 from storage.errors import TrilightError
 from storage.records.safe_read import safetensors_header
 from tests.model.kit import awake, tiny_config

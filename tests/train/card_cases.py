@@ -25,7 +25,7 @@ from train.loop.checkpoints import save_checkpoint
 from train.loop.crew import Crew
 from train.loop.state import new_state
 from train.loop.step import predicted
-from train.loss.lpips_weights import load_lpips
+from train.loss.lpips import load_lpips
 from train.run import train_run
 from train.runs import changed_run
 from train.settings import TrainSettings

@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from model.config import ModelConfig
-from train.data.augmentation import AugmentationSettings
-from train.loss.settings import LossSettings
 from train.result import TrainResult
 from train.run import train_run
-from train.settings import TrainSettings
+from train.settings import AugmentationSettings, LossSettings, TrainSettings
 from train.start import Start
 
 TINY_MODEL = ModelConfig(

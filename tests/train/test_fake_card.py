@@ -19,7 +19,7 @@ from tests.train import card_cases
 from tests.train.fake_card import card_process
 from tests.train.loss.test_lpips import small_weights
 from tests.train.toy import write_toy_dataset
-from train.loss.lpips_weights import LINEAR_FILE, VGG16_FILE
+from train.loss.lpips import LINEAR_FILE, VGG16_FILE
 from train.runs import RUNS
 
 QUICK = {

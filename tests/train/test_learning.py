@@ -18,21 +18,19 @@ from storage.metrics import psnr_log_db
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import toy_picture, toy_sample, toy_scene, write_toy_dataset
 from train.data.augment import with_views
-from train.data.augmentation import AugmentationSettings
 from train.data.buckets import make_batch
 from train.data.scenes import TrainingScene, training_scene
 from train.evaluation.evaluate import Contest, judged_views, make_rivals
-from train.evaluation.groups import summary
 from train.evaluation.judge import predict
-from train.evaluation.judged_view import NETWORK
+from train.evaluation.judged_view import NETWORK, summary
 from train.evaluation.rivals import MEDIAN, NEAREST
+from train.loop.checkpoints import network_of_run
 from train.loop.crew import Crew
 from train.loop.optim import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective
-from train.networks import network_of_run
-from train.settings import TrainSettings
+from train.settings import AugmentationSettings, TrainSettings
 
 SMALL = dataclasses.replace(
     smoke_model(), width=64, num_heads=1, hidden_width=192, encoder_layers=2, decoder_layers=2

@@ -12,16 +12,15 @@ import torch
 from PIL import Image
 
 from model.layers import Norm
-from model.trained_range import TrainedRange, trained_range
-from model.weights import decode_weights
+from model.weights import TrainedRange, decode_weights, trained_range
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from storage.records.safe_read import safetensors_header
 from tests.command_line import trilight
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.loop.metrics_log import read_rows
-from train.progress import Silent
+from train.loop.recorder import read_rows
+from train.progress import TrainProgress
 from train.result import TrainResult
 from train.settings import TrainSettings
 
@@ -44,12 +43,12 @@ def run(
     out: Path,
     *,
     resume: bool = False,
-    progress: Silent | None = None,
+    progress: TrainProgress | None = None,
 ) -> TrainResult:
     return trained(settings, [str(dataset.folder.root)], out, resume=resume, progress=progress)
 
 
-class SignalAt(Silent):
+class SignalAt(TrainProgress):
     """A person who presses Ctrl-C, or a scheduler that sends SIGTERM."""
 
     def __init__(self, step: int, number: int) -> None:
@@ -65,7 +64,7 @@ class Killed(BaseException):
     """Stands for a power cut: nothing is saved on the way out."""
 
 
-class KillAt(Silent):
+class KillAt(TrainProgress):
     def __init__(self, step: int) -> None:
         self.step = step
 
@@ -141,7 +140,7 @@ def test_the_folder_holds_everything_and_agrees_with_the_result(whole: TrainResu
 
 
 def test_progress_hears_of_every_step(dataset: Dataset, tmp_path: Path) -> None:
-    class Listener(Silent):
+    class Listener(TrainProgress):
         heard: list[str] = []  # noqa: RUF012
 
         def begin(
@@ -194,7 +193,7 @@ def test_data_without_a_validation_split_trains_and_says_so(
 ) -> None:
     """As the eight scenes that somebody tries first; the steps are those of any other run."""
 
-    class Listener(Silent):
+    class Listener(TrainProgress):
         notes: list[str] = []  # noqa: RUF012
 
         def noted(self, text: str) -> None:
@@ -222,7 +221,7 @@ def test_data_without_a_validation_split_trains_and_says_so(
     assert done.exit_code == 0, done.output
 
 
-class Poison(Silent):
+class Poison(TrainProgress):
     """Makes every norm return NaN in all steps after the first but those in `spared`."""
 
     def __init__(self, spared: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,7 +256,7 @@ def test_a_run_that_recovers_goes_on_and_counts(
     settings = tiny_run(num_steps=20, validate_every=20)
     result = run(settings, dataset, tmp_path, progress=poison)
     assert result.skipped_steps == 16
-    named = [re.search(r"step (\d+) was left out.* scenes were 0+\d+, ", n) for n in poison.notes]
+    named = [re.search(r"step (\d+) was skipped.* scenes were 0+\d+, ", n) for n in poison.notes]
     assert [int(match[1]) for match in named if match] == [*range(2, 10), *range(11, 19)]
     losses = {row["step"]: row["loss"] for row in read_rows(result.folder.metrics) if "loss" in row}
     assert losses[4] is None and losses[10] > 0, "a row without a finite step has no loss"

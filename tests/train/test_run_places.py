@@ -14,7 +14,7 @@ from storage.remote import tries
 from tests.http_server import Fault, Site, serve
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.progress import Silent
+from train.progress import TrainProgress
 
 pytest.importorskip("aiohttp", reason="http needs the package aiohttp")
 
@@ -43,7 +43,7 @@ def server(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         yield running
 
 
-class StopAt(Silent):
+class StopAt(TrainProgress):
     def __init__(self, step: int) -> None:
         self.step = step
         self.notes: list[str] = []

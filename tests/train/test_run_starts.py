@@ -11,12 +11,10 @@ from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from tests.train.kit import TINY_MODEL, tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.loop.checkpoints import saved_steps
-from train.loss.settings import LossSettings
-from train.networks import network_of_run
-from train.progress import Silent
+from train.loop.checkpoints import network_of_run, saved_steps
+from train.progress import TrainProgress
 from train.run import train_run
-from train.settings import TrainSettings
+from train.settings import LossSettings, TrainSettings
 from train.start import Start
 
 
@@ -104,7 +102,7 @@ def test_lights_that_are_not_apart_cannot_be_mixed(dataset: Dataset, tmp_path: P
         run(tiny_run(augmentation=mixing), dataset, tmp_path, Start())
 
 
-class Notes(Silent):
+class Notes(TrainProgress):
     def __init__(self) -> None:
         self.texts: list[str] = []
 

@@ -1,13 +1,17 @@
 """Exact symmetries of light transport: other scenes with known pictures, for nothing.
 
 Each function returns a scene whose path-traced picture would be exactly the one it returns. They
-hold for every scene that Trilight makes: materials are isotropic, and colour channels never mix.
+hold for every scene that Trilight makes: materials are isotropic, colour channels never mix, and
+light adds up, so that a scene with stronger or weaker lights has a known picture. Emission and
+pictures are stored as log10(1 + x); relighting converts both to radiance and back, which is exact
+to the rounding of float32.
 
 Tensors are moved about by numpy, which shares their memory: torch would wake threads of its own in
 every decoding thread, and they wait for cores in loops that took four times the work's own time.
 """
 
 import dataclasses
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,12 +20,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from model.scene_tensors import SceneTensors
 from storage.records.material import laid_out
-from train.data.relight import with_light_scaled, with_lights_mixed
 from train.data.scenes import TrainingScene
 
 if TYPE_CHECKING:
-    from train.data.augmentation import AugmentationSettings, Rotation
+    from train.settings import AugmentationSettings, Rotation
 
 
 def augmented(
@@ -80,7 +84,7 @@ def mirrored(scene: TrainingScene) -> TrainingScene:
 
     Four things change together: positions and normals, the order of vertices (which keeps the
     winding), the poses (whose own x axis turns too, so that they stay rotations), and the pictures.
-    Lights apart are let go.
+    Drops the pictures of single lights.
     """
     old = scene.tensors
     sides_3 = np.array([-1, 1, 1], np.float32)
@@ -97,7 +101,7 @@ def mirrored(scene: TrainingScene) -> TrainingScene:
 
 
 def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
-    """Return the scene with its colour channels in another order; lights apart are let go."""
+    """Return the scene with its colour channels in another order. Drops single lights."""
     numbers = np.arange(scene.tensors.material_TM.shape[1])
     for column, part in laid_out(scene.tensors.columns):
         if column.is_colour:
@@ -151,3 +155,52 @@ def _take_vertices(values_T33: Tensor, order_T3: NDArray[np.int64]) -> Tensor:
 
 def _tensor(values: NDArray[np.float32]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values))
+
+
+LN_10 = math.log(10.0)
+
+
+def with_light_scaled(scene: TrainingScene, factor: float) -> TrainingScene:
+    """Return the scene with all of its light `factor` times as strong. Drops single lights."""
+    factor_T = torch.full((scene.tensors.num_triangles,), factor)
+    return dataclasses.replace(
+        scene,
+        tensors=_relit(scene.tensors, factor_T),
+        target_VRR3=_log10(factor * _linear(scene.target_VRR3)),
+        lights_VLRR3=None,
+    )
+
+
+def with_lights_mixed(scene: TrainingScene, factor_L: Tensor) -> TrainingScene:
+    """Return the scene with light i `factor_L[i]` times as strong.
+
+    Drops the pictures of single lights, which the scene must hold (`TrainingScene.lights_VLRR3`).
+    """
+    assert scene.lights_VLRR3 is not None
+    factor_T = torch.cat([factor_L, torch.ones(1)])[scene.light_T]  # -1: belongs to no light
+    mixed_VRR3 = torch.einsum("l,vlijc->vijc", factor_L, scene.lights_VLRR3)
+    return dataclasses.replace(
+        scene,
+        tensors=_relit(scene.tensors, factor_T),
+        target_VRR3=_log10(mixed_VRR3),
+        lights_VLRR3=None,
+    )
+
+
+def _relit(tensors: SceneTensors, factor_T: Tensor) -> SceneTensors:
+    """Return the tensors with the radiance of each triangle multiplied by its factor."""
+    material_TM = tensors.material_TM.clone()
+    for column, part in laid_out(tensors.columns):
+        if column.is_radiance and column.is_log_encoded:
+            material_TM[:, part] = _log10(factor_T[:, None] * _linear(material_TM[:, part]))
+        elif column.is_radiance:
+            material_TM[:, part] *= factor_T[:, None]
+    return dataclasses.replace(tensors, material_TM=material_TM)
+
+
+def _linear(log10: Tensor) -> Tensor:
+    return torch.expm1(log10 * LN_10)
+
+
+def _log10(linear: Tensor) -> Tensor:
+    return torch.log1p(linear) / LN_10

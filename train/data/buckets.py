@@ -1,4 +1,4 @@
-"""Scenes of one step -> batches of about one length, so that next to nothing is spent on padding.
+"""Scenes of one step -> batches of similar length, so that little work is spent on padding.
 
 A step's scenes are drawn at random, whatever their size; only then are they cut by length. Every
 gradient is therefore of a fair mixture, and the loss is a mean over all views of the step, not over
@@ -15,12 +15,12 @@ from model.scene_tensors import SceneBatch, batch_scenes, converted
 from train.data.scenes import TrainingScene
 
 MOST_WASTE = 0.05
-"""Largest share of what a batch's scenes cost alone that its padding may add."""
+"""Most extra cost by padding, as a share of what the batch's scenes cost without it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrainingBatch:
-    """Scenes that are worth computing together."""
+    """Scenes of similar length that are computed together."""
 
     scenes: SceneBatch
     """What the network reads."""

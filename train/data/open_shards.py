@@ -31,7 +31,7 @@ class OpenShards:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close all; one that is on its way is waited for, since its file must not be left open."""
+        """Close all shards; wait for those being opened, whose files must not be left open."""
         self._opening.shutdown(wait=True, cancel_futures=True)
         with self._lock:
             for future in self._open.values():
@@ -39,7 +39,7 @@ class OpenShards:
             self._open.clear()
 
     def plan(self, numbers: Iterable[int]) -> None:
-        """Begin to open the shards of samples that will be read; a number for each sample."""
+        """Begin to open the shards of planned samples: one shard number for each sample."""
         with self._lock:
             for number in numbers:
                 self._planned[number] += 1
@@ -53,7 +53,7 @@ class OpenShards:
         return future.result()
 
     def done(self, numbers: Iterable[int]) -> None:
-        """Say that samples have been read; a number for each, as it was planned."""
+        """Mark samples as read: one shard number for each, as planned."""
         with self._lock:
             self._planned.subtract(numbers)
             for number in [number for number, left in self._planned.items() if not left]:

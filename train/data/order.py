@@ -21,11 +21,11 @@ class Place:
     """One sample, at one point of the order."""
 
     position: int
-    """In the endless order; what is drawn for a visit is drawn by it."""
+    """Position in the endless order; it seeds the augmentation of the visit."""
     shard: int
     """Number of the shard."""
     row: int
-    """Of the sample in the shard."""
+    """Row of the sample in the shard."""
     arrival: int
     """Number of the shard in the order of its epoch."""
 

@@ -1,7 +1,7 @@
 """Shards -> an endless stream of batches of training scenes, fetched and decoded ahead in threads.
 
-Batch i holds the same scenes with the same augmentation whoever asks, wherever the stream was
-entered, and however many ranks and threads there are: a run resumes by the number of its step.
+Batch i holds the same scenes with the same augmentation wherever the stream was entered, for any
+number of ranks and threads: a run resumes by the number of its step.
 """
 
 import queue
@@ -30,11 +30,10 @@ from train.data.order import (
     windows_from,
 )
 from train.data.scenes import TrainingScene, training_scene
-from train.data.splits import lost_with
-from train.data.unusable import Unusable
+from train.data.unusable import Unusable, lost_with
 
 if TYPE_CHECKING:
-    from train.data.augmentation import AugmentationSettings
+    from train.settings import AugmentationSettings
 
 PREFETCHED_SCENES = 16
 """Scenes decoded ahead of the network, at least one batch."""
@@ -130,7 +129,7 @@ def _planned(
 
 
 def _counter(shards: ShardSet, unusable: Unusable) -> Callable[[int], int]:
-    """Return what counts the samples of a shard; those of an unusable one are none."""
+    """Return a function that counts the samples of a shard; an unusable shard has none."""
 
     def count(number: int) -> int:
         try:

@@ -1,15 +1,18 @@
-"""What to do about data that is damaged: stop and name it, or count it and go on to a limit.
+"""Damaged data: stop at the first damaged sample, or count and replace up to a limit.
 
-The count belongs to the run: a checkpoint keeps it, so that whoever resumes often is allowed no
-more than whoever never stops. What was met is kept by a digest of its name, since names of listed
-shards may be paths of a user's machine.
+The count belongs to the run: a checkpoint stores it, so that resuming often allows no more damage
+than one uninterrupted run. Damaged samples are stored by a digest of their name, since names of
+listed shards may be paths of a user's machine.
 """
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 
+from storage.dataset.shard_set import ShardSet
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.records.sample import Sample
 
 
 class Unusable:
@@ -20,7 +23,7 @@ class Unusable:
 
         Args:
             most: samples that may be unusable; at 0 the first one ends the run.
-            met: what `met` gave, of the part of the run that is resumed.
+            met: the property `met` of the run that is resumed.
         """
         self.most = most
         self._met: dict[str, int] = dict(met or {})
@@ -29,17 +32,17 @@ class Unusable:
 
     @property
     def messages(self) -> Sequence[str]:
-        """What was wrong, once for each sample or shard that this process has met."""
+        """What was wrong, one message for each damaged sample or shard that this process met."""
         return tuple(self._messages.values())
 
     @property
     def met(self) -> Mapping[str, int]:
-        """Samples that are lost, by a digest of what they are lost with."""
+        """Number of lost samples, by a digest of the name of the damaged sample or shard."""
         with self._lock:
             return dict(sorted(self._met.items()))
 
     def add(self, name: str, num_samples: int, error: TrilightError) -> None:
-        """Count something unusable, once however often it is met.
+        """Count a damaged sample or shard; one that is met again counts once.
 
         Args:
             name: of the sample or shard.
@@ -47,7 +50,7 @@ class Unusable:
             error: what is wrong with it; names it.
 
         Raises:
-            TrilightError: `error`, or that there are more than `most`.
+            TrilightError: `error` itself where none is allowed, or that the limit is passed.
         """
         if not self.most:
             raise error
@@ -60,3 +63,37 @@ class Unusable:
                 f"data: {count} samples are unusable; expected at most {self.most}. The last: "
                 f"{error}"
             ) from error
+
+
+def first_samples(shards: ShardSet, limit: int, unusable: Unusable) -> Iterator[Sample]:
+    """Yield the first usable samples of a split, at most `limit`, in the order of the shards.
+
+    Raises:
+        TrilightError: more samples are damaged than `unusable` allows.
+    """
+    left = limit
+    for number, name in enumerate(shards.names):
+        if not left:
+            return
+        try:
+            shard = shards.open(number)
+        except TrilightError as error:
+            unusable.add(name, lost_with(shards, number), error)
+            continue
+        with closing(shard):
+            for row, key in enumerate(shard.keys[:left]):
+                try:
+                    sample = shard.sample(row)
+                except TrilightError as error:
+                    unusable.add(f"{shard.name}: sample {key}", 1, error)
+                    continue
+                yield sample
+                left -= 1
+
+
+def lost_with(shards: ShardSet, number: int) -> int:
+    """Return how many samples a damaged shard holds; 1 where its index is damaged too."""
+    try:
+        return shards.num_samples(number)
+    except TrilightError:
+        return 1

@@ -1,4 +1,4 @@
-"""A network against every view of a split, beside what knows nothing about scenes."""
+"""A network judged on every view of a split, beside baselines that ignore the scene."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -7,27 +7,27 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import SkipValidation
 
+from model.light_groups import light_groups
+from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors
+from model.weights import MAX_LIGHTS
 from storage.conventions import radiance_from_log10
 from storage.dataset.shard_set import ShardSet
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
+from storage.records.scene import Scene
 from storage.seeds import rng_for
 from storage.settings.described import checked
 from train.data.scenes import TrainingScene, training_scene
-from train.data.splits import first_samples
-from train.data.unusable import Unusable
-from train.evaluation.grouped_lights import GROUPED, grouped_pictures
+from train.data.unusable import Unusable, first_samples
 from train.evaluation.judge import JudgedScene, judged_scene, predict
-from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
-from train.evaluation.metrics import picture_scores
-from train.evaluation.noise_floors import noise_floors
+from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, facts_of
+from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.order import SceneCount, Width
 from train.evaluation.rivals import Rivals
 from train.evaluation.sheet import SheetView
-from train.evaluation.swapped_scene import swapped_pictures
 from train.loss.lpips import Lpips
 
 RIVAL_SCENES = 256
@@ -179,3 +179,36 @@ def _sheet_view(row: JudgedView, scene: TrainingScene, picture: NDArray[np.float
         predicted_rgb=picture,
         noise=float(scene.noise_V[row.view]),
     )
+
+
+def grouped_pictures(
+    network: RenderFormer, scene: Scene, resolution: int
+) -> NDArray[np.float64] | None:
+    """Return what `trilight render` shows of a scene, its groups of lights added up.
+
+    Returns:
+        Linear radiance [V, R, R, 3] of at least 0, or None where one group holds every light, so
+        that one pass is the same.
+    """
+    if len(light_groups(scene, MAX_LIGHTS)) == 1:
+        return None
+    renderer = NeuralRenderer(network)
+    prepared = renderer.prepare(scene)
+    pictures = [
+        renderer.view(prepared, c2w, float(fov_deg), resolution)
+        for c2w, fov_deg in zip(scene.c2w, scene.fov_deg, strict=True)
+    ]
+    return np.stack(pictures).astype(np.float64)
+
+
+def swapped_pictures(
+    network: RenderFormer, scene: TrainingScene, other: SceneTensors
+) -> NDArray[np.float64]:
+    """Return another scene through the cameras of this one, linear radiance [V, R, R, 3].
+
+    Does the network look at the scene at all? One that has only learned what pictures look like on
+    average is no worse with the triangles of another scene.
+    """
+    cameras = scene.tensors
+    seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)
+    return predict(network, dataclasses.replace(scene, tensors=seen))

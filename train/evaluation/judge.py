@@ -8,11 +8,11 @@ import torch
 from numpy.typing import NDArray
 
 from model.renderformer import RenderFormer, radiance
-from storage.conventions import radiance_from_log10
+from storage.conventions import camera_rays, radiance_from_log10
 from storage.records.sample import Sample
+from storage.records.scene import Scene
 from train.data.buckets import make_batch
 from train.data.scenes import TrainingScene, training_scene
-from train.evaluation.hits import hit_masks
 from train.evaluation.scores import Lead, ViewScore, lead, score_view, share_better, summarise
 
 
@@ -25,7 +25,7 @@ class JudgedScene:
     target_VRR3: NDArray[np.float64]
     """Linear radiance."""
     hits_VRR: NDArray[np.bool_]
-    """evaluation.hits."""
+    """Which pixels see geometry (`hit_masks`)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,7 +39,7 @@ class ValidationJudgement:
     scores: dict[str, float]
     """evaluation.scores.summarise, and `better_than_median`: the share of views won."""
     lead: Lead
-    """Of the network over the median picture."""
+    """Advantage of the network over the median picture."""
 
 
 class Judge:
@@ -103,3 +103,39 @@ def median_picture(scenes: Sequence[TrainingScene]) -> NDArray[np.float64]:
     """
     log10_MRR3 = np.concatenate([scene.target_VRR3.numpy() for scene in scenes])
     return radiance_from_log10(np.median(log10_MRR3, axis=0))
+
+
+CHUNK = 256
+"""Triangles at a time, which bounds memory at R * R * CHUNK numbers a product."""
+
+
+def hit_masks(scene: Scene, resolution: int) -> NDArray[np.bool_]:
+    """Return [V, R, R]: whether the ray through the pixel's centre hits a triangle.
+
+    Emitters do not count, as they are hidden from the camera. Every ray is tested against every
+    triangle, in three matrix products: 64 x 64 rays of 32 views and 1536 triangles take a few
+    seconds; for many large pictures it would be too slow.
+    """
+    corners = scene.vertex_positions[scene.faces[~scene.triangle_emits]].astype(np.float64)
+    masks = [
+        _hits(corners, *camera_rays(c2w, float(fov_deg), resolution))
+        for c2w, fov_deg in zip(scene.c2w, scene.fov_deg, strict=True)
+    ]
+    return np.stack(masks)
+
+
+def _hits(corners_T33: NDArray, origin_3: NDArray, directions_RR3: NDArray) -> NDArray[np.bool_]:
+    # A ray meets the triangle (a, b, c), given relative to the ray's origin, exactly where its
+    # direction is a combination of a, b and c with positive weights.
+    rays = directions_RR3.reshape(-1, 3)
+    hit = np.zeros(len(rays), bool)
+    for start in range(0, len(corners_T33), CHUNK):
+        a, b, c = np.moveaxis(corners_T33[start : start + CHUNK] - origin_3, 1, 0)
+        faces_origin = np.sign(np.einsum("ti,ti->t", a, np.cross(b, c)))
+        inside = faces_origin != 0
+        all_positive = np.broadcast_to(inside, (len(rays), len(a)))
+        for first, second in ((b, c), (c, a), (a, b)):
+            weight = rays @ np.cross(first, second).T * faces_origin
+            all_positive = all_positive & (weight >= 0)
+        hit |= all_positive.any(axis=1)
+    return hit.reshape(directions_RR3.shape[:2])

@@ -1,10 +1,12 @@
-"""One view of a dataset, what is known of it, and how each contestant did."""
+"""The rows of an evaluation: one for each view, and their summaries by what the views show."""
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from model.weights import MAX_LIGHTS
 from storage.records.lights import num_lights
 from storage.records.material import ROUGHNESS
 from storage.records.sample import Sample
@@ -12,6 +14,10 @@ from train.evaluation.metrics import METRICS
 
 NETWORK = "network"
 """Name of the contestant that is judged; the others are train.evaluation.rivals."""
+
+GROUPED = f"network, {MAX_LIGHTS} lights at a time"
+"""The same network with few lights at a time: do groups or one pass make the better picture? Only
+scenes with more lights, or lights inside objects, have this contestant."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,19 +31,19 @@ class JudgedView:
     template: str
     """Layout of the scene."""
     num_triangles: int
-    """Of the scene."""
+    """Triangles of the scene."""
     num_lights: int
-    """Of the scene."""
+    """Lights of the scene."""
     roughness: float
-    """Of its smoothest surface, emitters apart."""
+    """Roughness of the scene's smoothest surface, emitters excluded."""
     excursion: tuple[str, float] | None
     """Axis and value by which the scene leaves the usual range, if it does."""
     floors: dict[str, float]
-    """What the target's noise alone would score (evaluation.noise_floors)."""
+    """What the target's noise alone would score (metrics.noise_floors)."""
     scores: dict[str, dict[str, float | None]]
-    """By contestant and metric; None is n/a. Not every view has every contestant."""
+    """Score by contestant and metric; None is n/a. Not every view has every contestant."""
     swapped_psnr_log_db: float | None = None
-    """Of the network shown the triangles of the scene before; None for the first scene."""
+    """Score of the network given the previous scene's triangles; None for the first scene."""
 
     def gap(self, metric: str, contestant: str = NETWORK) -> float | None:
         """Return how much worse the picture is than the noise of its target; below 0: not worse."""
@@ -62,3 +68,69 @@ def facts_of(sample: Sample) -> dict[str, Any]:
             (str(excursion["axis"]), float(excursion["value"])) if excursion is not None else None
         ),
     }
+
+
+NEAR_DB = 3.0
+"""Views whose psnr_log_db is within so much of their floor count as `near_floor`."""
+
+TRIANGLES = (256, 512, 1024, 1536, 4096)
+LIGHTS = (1, 2, 4, 8)
+ROUGHNESSES = (0.1, 0.25, 0.5)
+"""Upper ends of the parts; one more holds what is above."""
+
+SPLITS: Mapping[str, Callable[[JudgedView], str]] = {
+    "template": lambda view: view.template,
+    "triangles": lambda view: _part(view.num_triangles, TRIANGLES),
+    "lights": lambda view: _part(view.num_lights, LIGHTS),
+    "smoothest roughness": lambda view: _part(view.roughness, ROUGHNESSES),
+}
+"""What is split by, and which part a view belongs to."""
+
+
+def by_group(views: Sequence[JudgedView]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return the network's summary of every part of every split, in the order of the parts."""
+    groups: dict[str, dict[str, dict[str, Any]]] = {}
+    for name, part_of in SPLITS.items():
+        parts: dict[str, list[JudgedView]] = {}
+        for view in views:
+            parts.setdefault(part_of(view), []).append(view)
+        ordered = sorted(parts.items(), key=lambda part: _order(part[0]))
+        groups[name] = {part: summary(members) for part, members in ordered}
+    return groups
+
+
+def summary(views: Sequence[JudgedView], contestant: str = NETWORK) -> dict[str, Any]:
+    """Return median, mean and worse 5th percentile of every metric, and how far the noise is off.
+
+    A metric that is n/a for any view is None as a whole: a mean over the others would be of another
+    set. `near_floor` is the share of views within NEAR_DB of their floor.
+    """
+    result: dict[str, Any] = {"views": len(views)}
+    for name, metric in METRICS.items():
+        values = [view.scores[contestant][name] for view in views]
+        known = [value for value in values if value is not None]
+        gaps = [gap for view in views if (gap := view.gap(name, contestant)) is not None]
+        whole = len(known) == len(values)
+        worse = 5 if metric.higher_is_better else 95
+        result[name] = {
+            "median": float(np.median(known)) if whole else None,
+            "mean": float(np.mean(known)) if whole else None,
+            "worse_5_percent": float(np.percentile(known, worse)) if whole else None,
+            "median_worse_than_noise": float(np.median(gaps)) if gaps else None,
+        }
+    log_gaps = [view.gap("psnr_log_db", contestant) for view in views]
+    result["near_floor"] = float(np.mean([gap is not None and gap <= NEAR_DB for gap in log_gaps]))
+    return result
+
+
+def _part(value: float, ends: Sequence[float]) -> str:
+    for start, end in zip((None, *ends), ends, strict=False):
+        if value <= end:
+            return f"up to {end:g}" if start is None else f"over {start:g}, up to {end:g}"
+    return f"over {ends[-1]:g}"
+
+
+def _order(part: str) -> tuple[float, str]:
+    """Sort parts by where they begin, and names by themselves."""
+    word, _, rest = part.partition(" ")
+    return (float(rest.split(",")[0]), part) if word == "over" else (-1.0, part)

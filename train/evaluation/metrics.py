@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.precision import tf32
-from storage.conventions import log10_radiance
+from storage.conventions import log10_radiance, radiance_from_log10
 from storage.records.sample import ViewRecord
 from storage.registry import Registry
 from train.evaluation.scores import ViewScore, score_view
 from train.loss.lpips import Lpips
 from train.loss.ms_ssim import ssim
-from train.loss.tone_map import tone_mapped
+from train.loss.objective import tone_mapped
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,10 +54,10 @@ class Metric:
     meaning: str
     """Unit, tone map, range and library, for whoever reads the figure."""
     decimals: int = 4
-    """With which it is printed."""
+    """Decimals with which it is printed."""
     floor: Callable[[ViewRecord], float] | None = None
     """What the measured noise of a target alone scores; where it is None, noise of the measured
-    size is drawn onto the target and judged (evaluation.noise_floors)."""
+    size is drawn onto the target and judged (`noise_floors`)."""
 
 
 def hdr_flip(radiance_rgb: NDArray, target_rgb: NDArray) -> float | None:
@@ -156,3 +156,41 @@ def picture_scores(
         radiance_rgb=radiance_rgb, target_rgb=target_rgb, hits=hits, lpips=lpips
     )
     return {name: metric.score(picture) for name, metric in METRICS.items()}
+
+
+def noise_floors(
+    view: ViewRecord,
+    target_rgb: NDArray,
+    hits: NDArray[np.bool_],
+    lpips: Lpips | None,
+    rng: np.random.Generator,
+) -> dict[str, float]:
+    """Return what the noise of a target alone would score: no picture can be asked for more.
+
+    LPIPS has no floor without its weights. The stored floors were measured at the stored
+    resolution; fewer pixels have less noise, so that at a lower resolution these floors ask for a
+    little less than could be asked. For metrics in which no noise was measured, the target is
+    judged with noise of the stored size drawn onto it. What a denoiser leaves is smoother than
+    such independent noise: these floors are a model.
+
+    For log_l1 it is an upper bound, since a mean absolute error is at most the root mean square.
+
+    Args:
+        view: what is stored of the view.
+        target_rgb: [R, R, 3] linear radiance, as it is judged.
+        hits: [R, R] which pixels see geometry.
+        lpips: as in `picture_scores`.
+        rng: draws the noise.
+    """
+    noisy = log10_radiance(target_rgb) + rng.normal(0, noise_rms(view), target_rgb.shape)
+    twin = JudgedPicture(
+        radiance_rgb=radiance_from_log10(np.maximum(noisy, 0)),
+        target_rgb=target_rgb,
+        hits=hits,
+        lpips=lpips,
+    )
+    found = {
+        name: metric.floor(view) if metric.floor else metric.score(twin)
+        for name, metric in METRICS.items()
+    }
+    return {name: floor for name, floor in found.items() if floor is not None}

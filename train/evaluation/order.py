@@ -1,4 +1,4 @@
-"""`EvaluationOrder`: what a person says of an evaluation. Importing it loads no torch."""
+"""`EvaluationOrder`: everything a user asks of an evaluation. Importing it loads no torch."""
 
 from pathlib import Path
 from typing import Annotated, Literal

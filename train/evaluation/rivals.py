@@ -1,7 +1,7 @@
-"""What knows nothing about scenes and still makes a picture: who does not beat it has not learned.
+"""Baselines that ignore the scene: a network that does not beat them has learned nothing.
 
-The nearest training view knows the answer: it is the training picture closest to the target. No way
-of looking up a training picture by the scene can do better.
+The nearest training view is the training picture closest to the target itself. No method that looks
+up a training picture by the scene can do better.
 """
 
 from collections.abc import Iterable

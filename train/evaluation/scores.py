@@ -24,11 +24,8 @@ class ViewScore:
     """storage.metrics."""
 
 
-METRICS = ("log_l1", "psnr_log_db", "psnr_linear_db", "object_psnr_log_db")
-
-
 def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool_]) -> ViewScore:
-    """Judge one picture [R, R, 3] of linear radiance; `hits` is [R, R] (evaluation.hits)."""
+    """Judge one picture [R, R, 3] of linear radiance; `hits` is [R, R] (judge.hit_masks)."""
     difference = log10_radiance(radiance_rgb) - log10_radiance(target_rgb)
     return ViewScore(
         log_l1=float(np.abs(difference).mean(dtype=np.float64)),
@@ -41,7 +38,7 @@ def score_view(radiance_rgb: NDArray, target_rgb: NDArray, hits: NDArray[np.bool
 def summarise(views: Sequence[ViewScore]) -> dict[str, float]:
     """Return mean log_l1, and median and the worse 5th percentile of each dB value."""
     summary = {"log_l1": float(np.mean([view.log_l1 for view in views]))}
-    for metric in METRICS[1:]:
+    for metric in ("psnr_log_db", "psnr_linear_db", "object_psnr_log_db"):
         values = [getattr(view, metric) for view in views]
         summary[f"{metric}_median"] = float(np.median(values))
         summary[f"{metric}_p5"] = float(np.percentile(values, 5))
@@ -56,16 +53,16 @@ def share_better(views: Sequence[ViewScore], others: Sequence[ViewScore]) -> flo
 
 @dataclass(frozen=True, kw_only=True)
 class Lead:
-    """By how much some pictures are better than others, and how much of that chance may be."""
+    """The mean advantage of some pictures over others, with its standard error."""
 
     log_l1: float
-    """By how much log_l1 is less; a mean over scenes."""
+    """Mean decrease of log_l1, over scenes."""
     error: float | None
-    """Standard error of that mean, as scenes are drawn by chance; None of a single scene."""
+    """Standard error of that mean over randomly drawn scenes; None for a single scene."""
 
     @property
     def is_sure(self) -> bool:
-        """Whether it is more than two standard errors."""
+        """Whether the mean is larger than two standard errors."""
         return self.error is not None and self.log_l1 > 2 * self.error
 
 

@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 from torch import Tensor
 
+from model.open import FoundNetwork
 from model.renderformer import RenderFormer
-from model.weights import decode_config, encode_config, load_tensors
+from model.weights import TrainedRange, decode_config, encode_config, load_tensors, read_metadata
 from storage.atomic import atomic_writer, remove_leftovers
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
 from storage.records.safe_read import read_safetensors
 from storage.settings.described import from_record, settings_record
 from train.data.unusable import Unusable
+from train.folder import RunFolder
 from train.loop.crew import Crew
 from train.loop.state import TrainState, new_state
 from train.settings import TrainSettings
@@ -36,7 +38,7 @@ HEADER_KEY = "trilight_checkpoint"
 """Metadata entry with counters, damage met, settings, digest of the data, number of processes."""
 
 UNSEALED = "0" * 64
-"""Stands where the sha256 will, while it is taken. Checkpoints from before it existed have none."""
+"""Placeholder for the sha256 while it is computed. Old checkpoints have no sha256."""
 
 
 def save_checkpoint(
@@ -95,7 +97,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         data = path.read_bytes()
         arrays, metadata = read_safetensors(data)
         if not is_checkpoint(metadata):
-            raise TrilightError("it is none of a run; expected one that train wrote")
+            raise TrilightError("it belongs to no run; expected one that `trilight train` wrote")
         header = json.loads(metadata[HEADER_KEY])
         if "sha256" in header and header["sha256"] != _seal(*_around(data, header["sha256"])):
             raise TrilightError("its bytes are not those that were written")
@@ -188,7 +190,7 @@ def resumed_checkpoint(folder: Path, crew: Crew, noted: Callable[[str], None]) -
     Args:
         folder: of the checkpoints.
         crew: the processes that go on together; all must call it.
-        noted: is told of those that are not, and which one took their place.
+        noted: called with a note where a damaged one was passed over.
 
     Raises:
         TrilightError: there is none, none is whole, or a process reads another than this one.
@@ -200,11 +202,11 @@ def resumed_checkpoint(folder: Path, crew: Crew, noted: Callable[[str], None]) -
         )
     checkpoint = _newest_whole(folder, steps, noted)
     step = checkpoint.header["step"]
-    # bit by bit, since the mean of a large number is rounded, and the verdict must be everybody's
+    # bit by bit, since a float32 mean of a large number is rounded, and all must reach one verdict
     if any(0 < share < 1 for share in crew.mean([step >> bit & 1 for bit in range(32)])):
         raise TrilightError(
             f"{folder.parent}: the processes do not read the same checkpoint; this one reads that "
-            f"of step {step}. Look whether the folder is the same on every machine, and resume "
+            f"of step {step}. Check that the folder is the same on every machine, and resume "
             "again."
         )
     return checkpoint
@@ -233,7 +235,7 @@ def keep_checkpoint(
     """Save the state, whole or not at all, and only then delete what the run does not keep.
 
     Kept are the newest `checkpoints_kept` and every multiple of `keep_every`. One of a later step
-    could not be read when the run went on from an earlier one, and takes nobody's place.
+    was damaged when the run resumed from an earlier one, and does not count.
 
     Raises:
         TrilightError: the folder is full or cannot be written; the older ones are still there.
@@ -245,3 +247,30 @@ def keep_checkpoint(
     for step in passed[: -settings.checkpoints_kept]:
         if not settings.keep_every or step % settings.keep_every:
             path_of_step(folder, step).unlink(missing_ok=True)
+
+
+def network_of_run(path: Path) -> FoundNetwork | None:
+    """Return the network of a run's checkpoint, or of its folder while it is not finished.
+
+    A checkpoint is read at once, since its header is vouched for by the digest of the whole. The
+    finished network of a run is a file of weights, which `model.open` reads: None.
+
+    Args:
+        path: a file or a folder, of whatever kind.
+
+    Raises:
+        TrilightError: the checkpoint is damaged.
+    """
+    if path.is_dir():
+        folder = RunFolder(path)
+        steps = saved_steps(folder.checkpoints)
+        if folder.weights.is_file() or not steps:
+            return None
+        path = path_of_step(folder.checkpoints, steps[-1])
+    if path.suffix != ".safetensors" or not path.is_file():
+        return None
+    if not is_checkpoint(read_metadata(path)):
+        return None
+    checkpoint = read_checkpoint(path)
+    trained = TrainedRange(resolution=int(checkpoint.header["settings"]["resolution"]))
+    return FoundNetwork(path=path, trained=trained, open=checkpoint.network)

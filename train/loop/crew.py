@@ -1,4 +1,4 @@
-"""The processes that train together: one, or as many as torchrun started.
+"""The processes that train together: one, or those that torchrun started.
 
 Each takes its part of every batch (train.data.order.RankShare); gradients are averaged by torch's
 DistributedDataParallel over nccl or gloo. The first process alone logs, judges and saves.
@@ -23,7 +23,7 @@ class Crew:
     device: torch.device
     """Where its network is."""
     rank: int = 0
-    """Its number, from 0."""
+    """Number of this process, from 0."""
     world_size: int = 1
     """How many train together."""
 
@@ -34,7 +34,7 @@ class Crew:
 
     @property
     def share(self) -> RankShare:
-        """Its part of every batch."""
+        """This process's part of every batch."""
         return RankShare(rank=self.rank, world_size=self.world_size)
 
     def mean(self, values: Sequence[float]) -> list[float]:
@@ -53,7 +53,7 @@ class Crew:
 
 @contextmanager
 def join_crew(device: str | None = None) -> Iterator[Crew]:
-    """Join the processes that torchrun started, or be alone where it did not.
+    """Join the processes that torchrun started; without torchrun, train alone.
 
     Args:
         device: `cpu` or `cuda`, or None for CUDA where there is any. With CUDA each process takes

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, obeyed between two steps, when the state is whole and can be saved."""
+"""Ctrl-C and SIGTERM take effect between two steps, when the state is whole and can be saved."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ from storage.errors import TrilightError
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 ONE_ASKING_S = 1.0
-"""Signals so close together are one: torchrun passes on what the terminal sent to all."""
+"""Signals within this time are one: torchrun forwards a signal that the terminal sent to all."""
 
 
 class Stopped(TrilightError):
@@ -28,14 +28,14 @@ class Stopped(TrilightError):
 
 
 class Asking:
-    """How often it was asked to stop."""
+    """Counts the requests to stop."""
 
     def __init__(self) -> None:
         self.times = 0
         self._last_s = -ONE_ASKING_S
 
     def again(self) -> bool:
-        """Count a signal that is more than the echo of the one before; return whether it is."""
+        """Count a signal unless it is an echo of the one before; return whether it counts."""
         now_s = time.monotonic()
         new = now_s - self._last_s >= ONE_ASKING_S
         if new:

@@ -1,4 +1,4 @@
-"""What moves the weights, and how fast: a linear warm-up, then one cosine, and no restart."""
+"""Optimizers and learning rate: a linear warm-up, then one cosine, and no restart."""
 
 import itertools
 import math
@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from train.settings import TrainSettings
 
 ADAMW_KEEPS = ("exp_avg", "exp_avg_sq")
-"""Names of what AdamW remembers of each weight, beside its count of updates."""
+"""AdamW's state for each weight, beside its count of updates."""
 
 MUON_KEEPS = ("momentum_buffer",)
-"""Likewise of Muon, which counts nothing."""
+"""Muon's state for each weight; it counts no updates."""
 
 
 class Updater:
@@ -21,9 +21,9 @@ class Updater:
 
     Muon (Jordan et al. 2024) makes the step of a matrix near orthogonal, so that its rare
     directions move as far as the frequent ones. Its steps are scaled to the size of AdamW's (Liu et
-    al. 2025), so one learning rate serves both. What it cannot do: work without rounding; the
-    orthogonal matrix is found in bfloat16, so where sums in another order cross a rounding, a
-    weight moves otherwise, by up to a tenth of a typical step.
+    al. 2025), so one learning rate serves both. Muon is not exactly reproducible: the
+    orthogonal matrix is computed in bfloat16, so where sums in another order cross a rounding, a
+    weight moves differently, by up to a tenth of a typical step.
     """
 
     def __init__(self, model: nn.Module, settings: TrainSettings) -> None:
@@ -52,7 +52,7 @@ class Updater:
             optimizer.step()
 
     def memories(self) -> dict[str, Tensor]:
-        """Return what is remembered, by `kind/weight`; empty before the first update."""
+        """Return the optimizers' state, by `kind/weight`; empty before the first update."""
         return {
             f"{kind}/{self._names[weight]}": memory[kind]
             for optimizer, _ in self._optimizers
@@ -61,7 +61,7 @@ class Updater:
         }
 
     def remember(self, memories: Mapping[str, Tensor], updates: int) -> None:
-        """Take over, by `kind/weight`, what was remembered after so many updates (1 or more)."""
+        """Restore the state by `kind/weight`, saved after `updates` updates (1 or more)."""
         for optimizer, _ in self._optimizers:
             for weight in itertools.chain(*(group["params"] for group in optimizer.param_groups)):
                 name = self._names[weight]

@@ -1,7 +1,7 @@
 """What changes while a run goes on: weights, mean, the updater's memories, counters, damage met.
 
 Everything else (order, augmentation, learning rate) is a function of the settings and the step;
-nothing asks a generator that would have to be remembered.
+no random generator's state has to be saved.
 """
 
 import copy

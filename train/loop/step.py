@@ -24,7 +24,7 @@ class StepReport:
     loss: float
     """Mean over the views of the step of all that is minimised."""
     l1: float
-    """Its first term alone, unweighed."""
+    """The first term of the loss alone, unweighted."""
     brightness: float
     """Mean log10(1 + radiance) of the predicted pictures, as a share of the targets'."""
     grad_norm: float

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -13,22 +14,61 @@ from train.data.scenes import TrainingScene
 from train.folder import RunFolder
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.crew import Crew
-from train.loop.dead_start import StartWatch
 from train.loop.interrupts import Stopped, deferred_interrupts
 from train.loop.optim import learning_rate
-from train.loop.peak import device_peak
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
 from train.loop.step import Stepper, StepReport
-from train.loop.window import Window
+from train.loop.window import Window, device_peak
 from train.loss.objective import Objective
-from train.progress import Silent
+from train.progress import TrainProgress
 from train.settings import TrainSettings
+
+WATCHED_STEPS = 50
+"""Number of steps after the warm-up that are looked at, once."""
+
+DEAD_BRIGHTNESS = 0.01
+"""Pictures with less than this share of the targets' brightness are black in all but name. The L1
+error does not tell: a fast start overshoots, and is then worse than black while it learns."""
+
+
+class StartWatch:
+    """Notices a run whose pictures stay black in the first steps after the warm-up.
+
+    An output that is pushed below 0 can lose its gradient for good: with the loss behind the ELU
+    six of nine small runs ended so. Ours is taken before it and none has, but a wrong setting can
+    still do it, and a night later is too late to hear of it.
+    """
+
+    def __init__(self, settings: TrainSettings) -> None:
+        self.due = settings.warmup_steps + WATCHED_STEPS
+        self._reports: deque[StepReport] = deque(maxlen=WATCHED_STEPS)
+
+    def add(self, report: StepReport) -> None:
+        """Look at one step."""
+        self._reports.append(report)
+
+    def verdict(self, step: int) -> TrilightError | None:
+        """Return the error if the start is dead, looked at once, after `due` steps; else None.
+
+        A run that is resumed after that step is not looked at again.
+        """
+        if step != self.due or len(self._reports) < WATCHED_STEPS:
+            return None
+        brightest = max(report.brightness for report in self._reports)
+        if not brightest < DEAD_BRIGHTNESS:
+            return None
+        return TrilightError(
+            f"training: the start went dead: after {step} steps the pictures are still black, with "
+            f"at most {brightest:.2%} of the brightness of their targets. Start again with another "
+            "seed or learning_rate; --resume goes on all the same."
+        )
+
 
 PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 """Types of the network's products, by `precision`."""
 MOST_SKIPPED_IN_A_ROW = 10
-"""A few steps may overflow; this many say that the weights themselves are lost."""
+"""A few steps may overflow; this many in a row mean that the weights themselves are lost."""
 
 
 class Trainer:
@@ -64,7 +104,7 @@ class Trainer:
             TrilightError: a signal asked to stop or the start went dead (the state is saved), or
                 the steps keep failing.
         """
-        progress = Silent() if self.recorder is None else self.recorder.progress
+        progress = TrainProgress() if self.recorder is None else self.recorder.progress
         with deferred_interrupts(progress.interrupted) as asked_to_stop:
             while self.state.step < self.settings.num_steps:
                 self._after_step(self._step(batches))
@@ -78,7 +118,8 @@ class Trainer:
 
     def _leave(self, reason: TrilightError) -> None:
         self._save()
-        self.crew.any(False)  # nobody ends, and with it everybody, before the file is whole
+        # a barrier: torchrun ends all processes with the first that ends, so wait for the file
+        self.crew.any(False)
         raise reason
 
     def _step(self, batches: Iterator[list[TrainingScene]]) -> StepReport:
@@ -112,11 +153,11 @@ class Trainer:
         return training_flops(settings.model, workload)
 
     def _skip(self, keys: Sequence[str]) -> None:
-        """Count a step that was left out, and name its scenes; other processes had others."""
+        """Count a skipped step, and name this process's scenes."""
         self.state.skipped_steps += 1
         if self.recorder is not None:
             self.recorder.progress.noted(
-                f"step {self.state.step} was left out, since its loss or gradient was not finite; "
+                f"step {self.state.step} was skipped, since its loss or gradient was not finite; "
                 f"its scenes were {', '.join(keys)}"
             )
         self.skipped_in_a_row += 1

@@ -1,9 +1,12 @@
-"""What happened since the last row of the log: losses, speed, and what the time went to."""
+"""Steps since the last row of the log: losses, speed, time spent; and the device's peak."""
 
 import math
 import time
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import Any
+
+import torch
 
 from train.loop.step import StepReport
 
@@ -57,7 +60,7 @@ class Window:
         return max(time.monotonic() - self._began, 1e-9)
 
     def leave_out(self, seconds: float) -> None:
-        """Forget so much time."""
+        """Do not count some seconds that have passed."""
         self._began += seconds
 
 
@@ -77,3 +80,25 @@ class Pause:
 def _finite_mean(values: Iterable[float]) -> float | None:
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
+
+
+PEAK_WIDTH = {"cpu": 1024, "cuda": 8192}
+"""Width of the square matrix product whose speed counts as the device's peak."""
+
+
+@lru_cache
+def device_peak(device: torch.device, dtype: torch.dtype) -> float:
+    """Return the operations per second of a large square product here: the best of five.
+
+    It takes some milliseconds and then the measured value is remembered. No program reaches the
+    data sheet's figure.
+    """
+    width = PEAK_WIDTH[device.type]
+    matrix = torch.ones(width, width, dtype=dtype, device=device)
+    best = float("inf")
+    for _ in range(5):
+        began = time.perf_counter()
+        product = matrix @ matrix
+        product[0, 0].item()  # waits until it is done
+        best = min(best, time.perf_counter() - began)
+    return 2 * width**3 / best

@@ -1,16 +1,79 @@
 """LPIPS (Zhang et al. 2018), version 0.1 on VGG16: how different two pictures look.
 
-Written in plain torch from the paper and the published weights' names. Only with the published
-weights are its values LPIPS; who has none must name another term, and reports then say n/a.
+Written in plain torch from the paper and the published weights' names; torchvision is not needed.
+Only with the published weights are the values LPIPS: without them a run must name another term, and
+reports say n/a.
+
+Trilight does not ship the weights, since VGG16 is 528 MB. They come from a folder or from their
+publishers' servers. Both files are read with `weights_only`, so that nothing in them can run.
 """
 
+import os
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from storage.errors import TrilightError
-from train.loss.vgg16 import BLOCKS, MIN_PX, Vgg16
+
+BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
+"""Numbers of the convolutions in torchvision's `features`; a pooling stands between two blocks."""
+
+MIN_PX = 16
+"""Four poolings halve the picture; the last block needs a pixel."""
+
+
+class Vgg16(nn.Module):
+    """VGG16 (Simonyan and Zisserman 2015, configuration D) up to relu5_3; never trained.
+
+    Pictures -> the output of the last convolution of each block. The shapes in the state dict,
+    under torchvision's names, say how wide the layers are.
+    """
+
+    def __init__(self, state: Mapping[str, Tensor]) -> None:
+        """Take the weights `features.<n>.weight` and `.bias`; others are left alone.
+
+        Raises:
+            TrilightError: one is missing, or does not fit to the one before it.
+        """
+        super().__init__()
+        self.convolutions = nn.ModuleList()
+        channels = 3
+        for number in (number for block in BLOCKS for number in block):
+            names = [f"features.{number}.{part}" for part in ("weight", "bias")]
+            weight, bias = (_found(state, name) for name in names)
+            if weight.shape[1:] != (channels, 3, 3) or bias.shape != weight.shape[:1]:
+                raise TrilightError(
+                    f"VGG16: {names[0]} has the shape {tuple(weight.shape)}; expected "
+                    f"(any, {channels}, 3, 3) and a bias for each. Use torchvision's vgg16 file."
+                )
+            convolution = nn.Conv2d(channels, len(weight), 3, padding=1)
+            convolution.load_state_dict({"weight": weight, "bias": bias})
+            self.convolutions.append(convolution)
+            channels = len(weight)
+        self.requires_grad_(False)
+
+    def forward(self, picture_M3RR: Tensor) -> list[Tensor]:
+        """Return the five tapped grids [M, C, R / 2^k, R / 2^k] of pictures, k = 0 ... 4."""
+        x, taps, layers = picture_M3RR, [], iter(self.convolutions)
+        for index, block in enumerate(BLOCKS):
+            if index:
+                x = nn.functional.max_pool2d(x, 2)
+            for _ in block:
+                x = torch.relu(next(layers)(x))
+            taps.append(x)
+        return taps
+
+
+def _found(state: Mapping[str, Tensor], name: str) -> Tensor:
+    if name not in state:
+        raise TrilightError(
+            f"VGG16: the file has no {name}; expected the state dict of torchvision's vgg16."
+        )
+    return state[name].float()
+
 
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
@@ -82,3 +145,71 @@ def _unit(x_MCHW: Tensor) -> Tensor:
     """Return features of unit length per pixel; where all are 0 they stay so, gradient and all."""
     length = (x_MCHW.square().sum(dim=1, keepdim=True) + EPS**2).sqrt()
     return x_MCHW / (length + EPS)
+
+
+VGG16_FILE = "vgg16-397923af.pth"
+"""torchvision's file of VGG16; the name holds the beginning of its sha256."""
+
+LINEAR_FILE = "vgg.pth"
+"""The linear weights of LPIPS 0.1 on VGG16 (6 KB)."""
+
+VGG16_URL = f"https://download.pytorch.org/models/{VGG16_FILE}"
+LINEAR_URL = (
+    "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/"
+    f"{LINEAR_FILE}"
+)
+
+HUB = "hub"
+"""What to say in place of a folder to download them into torch's cache."""
+
+VARIABLE = "TRILIGHT_LPIPS"
+"""Environment variable with the folder, for those who name it once."""
+
+
+def load_lpips(place: str | None) -> Lpips | None:
+    """Return LPIPS with its published weights, or None where no place is named at all.
+
+    Args:
+        place: a folder with VGG16_FILE and LINEAR_FILE, or `hub`; None asks TRILIGHT_LPIPS.
+
+    Raises:
+        TrilightError: a file is missing, is no state dict, or cannot be downloaded.
+    """
+    place = place or os.environ.get(VARIABLE) or None
+    if place is None:
+        return None
+    if place == HUB:
+        return Lpips(_downloaded(VGG16_URL, check_hash=True), _downloaded(LINEAR_URL))
+    return Lpips(_read(Path(place) / VGG16_FILE), _read(Path(place) / LINEAR_FILE))
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise TrilightError(
+            f"LPIPS: {path} does not exist; expected {VGG16_FILE} (torchvision) and {LINEAR_FILE} "
+            f"(LPIPS 0.1) in that folder, or `{HUB}` in its place to download them."
+        )
+    try:
+        state: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises whatever the damage leads to
+        raise TrilightError(f"LPIPS: {path} is not readable ({type(error).__name__}).") from error
+    return _checked(state, str(path))
+
+
+def _downloaded(url: str, *, check_hash: bool = False) -> dict[str, Tensor]:
+    try:
+        state = torch.hub.load_state_dict_from_url(
+            url, map_location="cpu", weights_only=True, check_hash=check_hash, progress=False
+        )
+    except Exception as error:  # no network, a proxy's page, a wrong hash: torch has no one class
+        raise TrilightError(
+            f"LPIPS: {url} could not be downloaded ({error}); name a folder that holds "
+            f"{VGG16_FILE} and {LINEAR_FILE} instead."
+        ) from error
+    return _checked(state, url)
+
+
+def _checked(state: Any, where: str) -> dict[str, Tensor]:
+    if not isinstance(state, dict) or not all(isinstance(t, Tensor) for t in state.values()):
+        raise TrilightError(f"LPIPS: {where} holds no state dict; expected tensors by name.")
+    return state

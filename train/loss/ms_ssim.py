@@ -8,7 +8,7 @@ from storage.errors import TrilightError
 
 WINDOW_PX, SIGMA_PX = 11, 1.5
 K1, K2 = 0.01, 0.03
-"""Of both papers, for pictures in [0, 1]."""
+"""Constants of both papers, for pictures in [0, 1]."""
 
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponent of each scale, finest first; with fewer scales they are brought to a sum of 1."""

@@ -1,16 +1,15 @@
 """The loss of a run: L1 on log10(1 + radiance), a perceptual term, and the weight of each view."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor, nn
 
 from storage.errors import TrilightError
-from train.loss.lpips import Lpips
-from train.loss.lpips_weights import LINEAR_FILE, VGG16_FILE
+from train.loss.lpips import LINEAR_FILE, VGG16_FILE, Lpips
 from train.loss.ms_ssim import ms_ssim
-from train.loss.settings import LossSettings
-from train.loss.tone_map import tone_mapped
+from train.settings import LossSettings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,3 +86,16 @@ def _dissimilarity(
             "--set loss.perceptual=ms_ssim or none."
         )
     return lpips
+
+
+LOG10_OF_2 = math.log10(2.0)
+
+
+def tone_mapped(log10_rgb: Tensor) -> Tensor:
+    """Return log10(1 + radiance), any shape, as clamp(log2(1 + radiance), 0, 1).
+
+    The tone map of everything perceptual (Zeng et al. 2025, section 4). Radiance above
+    1 is white and has no gradient here; the L1 term sees it. `preview_srgb8` of
+    storage.conventions is the same curve, sRGB-encoded for people.
+    """
+    return (log10_rgb / LOG10_OF_2).clamp(0.0, 1.0)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from infra.bench.curve import PricedLevel, at_error
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, percent
+from infra.bench.experiment import Column, Experiment, Point, TurnFigures, percent
 from infra.bench.experiments.sampling import CORE_S, DB, WORST
-from infra.bench.sides.plain_mitsuba import render_levels
+from infra.bench.sides.sampled_pictures import render_levels
 from infra.bench.sides.shots import SEED, shots
 from infra.bench.subjects.named_scenes import NUM_SAMPLED, sampled_names
 from infra.bench.workshop import Subject, Workshop
@@ -98,9 +98,7 @@ def _by_cycles(
 def beside(theirs: Theirs) -> Any:
     """Return the measuring of our targets beside another renderer's fixed numbers of samples."""
 
-    def measure(
-        workshop: Workshop, points: Sequence[Point], turn: str
-    ) -> Iterable[tuple[str, Figures]]:
+    def measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
         subject = workshop.subject(turn)
         ours = {p.name: p.settings for p in points if isinstance(p.settings, RenderSettings)}
         taken = workshop.call(shots, subject.scene, ours)

@@ -9,14 +9,10 @@ import time
 import numpy as np
 
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
-from infra.bench.subjects.named_scenes import first_sample
-from infra.bench.subjects.render_child import render_child
+from infra.bench.subjects.named_scenes import first_composed, first_sample
 from infra.bench.workshop import Workshop
 from pipeline.builds.named import BUILDS
 from pipeline.builds.training import smoke
-from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of
-from pipeline.scenes.compose import compose_scene
-from storage.errors import Rejected
 
 COMPOSED = (
     "pretrain-256",
@@ -31,19 +27,14 @@ _RENDERED_SCENES = 4
 
 def composed(build: str, count: int) -> dict[str, float]:
     """Compose scenes in a render child, each until an attempt passes."""
-    settings, pool = BUILDS[build].settings().scenes, assets_of("train")
+    settings = BUILDS[build].settings().scenes
     triangles, rejected = [], 0
     began = time.process_time()
     for scene_index in range(count):
-        for attempt in range(MAX_ATTEMPTS):
-            try:
-                scene = compose_scene(
-                    settings, pool, seed=0, scene_index=scene_index, attempt=attempt
-                )
-                triangles.append(scene.num_triangles)
-                break
-            except Rejected:
-                rejected += 1
+        scene, attempts = first_composed(settings, scene_index)
+        rejected += attempts
+        if scene is not None:
+            triangles.append(scene.num_triangles)
     core_s = time.process_time() - began
     return {
         "core_s": core_s / len(triangles),
@@ -65,10 +56,7 @@ def rendered(count: int) -> dict[str, float]:
 
 def _measure(workshop: Workshop, point: Point, turn: str) -> Figures:
     child = workshop.kept(
-        "one thread",
-        lambda: workshop.closing(
-            render_child(workshop.folder(), smoke(), objects=workshop.asked.objects[0], threads=1)
-        ),
+        "one thread", lambda: workshop.render_child(smoke(), workshop.asked.objects[0], threads=1)
     )
     if point.name == RENDERED:
         return child.call(rendered, _RENDERED_SCENES)

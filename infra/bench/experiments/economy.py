@@ -1,21 +1,160 @@
 """What the scenes of a dataset cost part by part, and what was left out, from its own records.
 
-The sources' triangles are looked up in this machine's asset store: make the set here.
+Figures are counted from the samples and this machine's asset store, in which the sources' triangles
+are looked up: make the set here.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from infra.bench.experiment import Column, Experiment, Figures, Point
-from infra.bench.subjects.scene_costs import SceneCosts, hdf5_bytes, scene_costs
+from infra.bench.experiment import Column, Experiment, Point, TurnFigures
 from infra.bench.workshop import Workshop
-from pipeline.exchange.renderformer_h5 import CELLS, CHANNELS
+from pipeline.exchange.renderformer_h5 import CELLS, CHANNELS, write_renderformer_h5
+from storage.cache import cache_folder
 from storage.dataset.dataset import Dataset, open_dataset
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.records.asset import Asset, decode_asset
 from storage.records.profiles import LAW_DB
+from storage.records.sample import SceneRecord
+from storage.records.scene import Scene
+
+_HDF5_SCENES = 24
+"""Written in the published form: half a second each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneCosts:
+    """One scene with its views."""
+
+    triangles: int
+    """Triangles in the scene."""
+    source_faces: int
+    """Triangles of its objects' sources."""
+    object_faces: int
+    """Triangles of the same objects in the scene."""
+    object_errors: tuple[float, ...]
+    """Two-way distance of each object to its source, 99th percentile, share of the diagonal."""
+    spp: tuple[int, ...]
+    """Samples per pixel of each view."""
+    at_cap: tuple[bool, ...]
+    """Whether sampling of a view ended at the cap before its target was reached."""
+    floors_db: tuple[float, ...]
+    """Noise floor of each view."""
+    array_bytes: int
+    """Bytes of the stored arrays."""
+    record_bytes: int
+    """Bytes of its JSON."""
+    picture_bytes: int
+    """Bytes of all stored pictures."""
+    stored_pictures: int
+    """Picture files of all views together."""
+    empty_share: float
+    """Ray bundles that can see nothing."""
+
+
+def scene_costs(dataset: Dataset) -> Iterator[SceneCosts]:
+    """Yield what each scene of a dataset takes.
+
+    Raises:
+        TrilightError: objects of the set are not in this machine's asset store.
+    """
+    known = _prepared_assets()
+    objects = dataset.objects_lock()
+    unknown = [locked.uid for locked in objects if locked.asset_sha256 not in known]
+    if unknown:
+        raise TrilightError(
+            f"{dataset.shown}: the asset store of this machine does not know {len(unknown)} of its "
+            f"{len(objects)} objects, such as {unknown[0]}; expected a set that was made here. "
+            "Generate it with the same TRILIGHT_CACHE."
+        )
+    assets = {locked.uid: known[locked.asset_sha256] for locked in objects}
+    resolution = int(dataset.manifest.settings["renders"]["resolution"])
+    for shard in dataset.manifest.shards:
+        index = shard.index
+        for record in dataset.read_scenes(shard):
+            sizes = {suffix: size for suffix, (_, size) in index[record.key].items()}
+            yield _costs(record, sizes, assets, resolution)
+
+
+def _costs(
+    record: SceneRecord, sizes: Mapping[str, int], assets: Mapping[str, Asset], resolution: int
+) -> SceneCosts:
+    scene = record.scene
+    counts = np.bincount(scene.object_index, minlength=len(scene.objects))
+    known = [row for row, entry in enumerate(scene.objects) if entry.uid]
+    of_rows = [assets[scene.objects[row].uid] for row in known]
+    pictures = [size for suffix, size in sizes.items() if suffix.endswith(".exr")]
+    return SceneCosts(
+        triangles=scene.num_triangles,
+        source_faces=sum(asset.source.num_faces for asset in of_rows),
+        object_faces=int(counts[known].sum()),
+        object_errors=tuple(
+            _error_within(asset, int(counts[row]))
+            for asset, row in zip(of_rows, known, strict=True)
+        ),
+        spp=tuple(view.spp for view in record.views),
+        at_cap=tuple(view.at_cap for view in record.views),
+        floors_db=tuple(view.noise_floor_db for view in record.views),
+        array_bytes=sum(size for suffix, size in sizes.items() if suffix.startswith("scene.")),
+        record_bytes=sizes["json"],
+        picture_bytes=sum(pictures),
+        stored_pictures=len(pictures),
+        empty_share=_empty_share(scene, resolution),
+    )
+
+
+def _empty_share(scene: Scene, resolution: int) -> float:
+    import torch
+
+    from model.config import base
+    from model.empty_bundles import bundles_that_see
+    from model.positions import token_places
+    from model.scene_tensors import batch_scenes, scene_tensors
+
+    batch = batch_scenes([scene_tensors(scene)])
+    places = token_places(batch.triangles_BT33, batch.is_triangle_BT, num_registers=0, eps=0)
+    with torch.no_grad():
+        sees = bundles_that_see(places, batch.cameras, resolution, base().patch_px)
+    return 1 - float(sees.double().mean())
+
+
+def _error_within(asset: Asset, num_triangles: int) -> float:
+    """Return the error of the level that a scene holds, known by its number of triangles."""
+    level = asset.finest_within(num_triangles)
+    if level is None:
+        raise TrilightError(
+            f"an object of {num_triangles} triangles is coarser than every level of its asset; "
+            "expected one of them. Make the set anew with the same TRILIGHT_CACHE."
+        )
+    return level.record.quality.error_p99
+
+
+def _prepared_assets() -> dict[str, Asset]:
+    """Return what this machine has prepared, by the digests of the assets."""
+    paths = cache_folder("assets").glob("*/*.safetensors")
+    return {sha256_hex(data): decode_asset(data) for data in (path.read_bytes() for path in paths)}
+
+
+def hdf5_bytes(dataset: Dataset) -> float:
+    """Return the bytes a scene in the published HDF5 with half-float textures, without pictures."""
+    sizes: list[int] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for shard in dataset.manifest.shards:
+            for record in dataset.read_scenes(shard):
+                if len(sizes) == _HDF5_SCENES:
+                    break
+                path = Path(folder, f"{record.key}.h5")
+                write_renderformer_h5(path, record.scene, texture_type="float16")
+                sizes.append(path.stat().st_size)
+    return float(np.mean(sizes))
+
 
 PASSES = {"colour": 3, "diffuse": 3, "glossy": 3, "normal": 3, "albedo": 3, "depth": 1}
 """Channels by pass: what the published pipeline writes for every view, of which its exporter for
@@ -31,9 +170,7 @@ PARTS = (OBJECTS, FLOPS, LEAST_FLOPS, LEAST_KB, STORED, SAMPLES, ARRAYS, TEXTURE
          ALL_FLOPS, ALL_KB)  # fmt: skip
 
 
-def _measure(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     dataset = open_dataset(workshop.asked.data or "")
     found = list(scene_costs(dataset))
     if not found:
@@ -50,7 +187,7 @@ def _measure(
 
 def _geometry(found: Sequence[SceneCosts], settings: Any) -> dict[str, tuple[float, float]]:
     """Return what each part would take and takes: triangles, FLOPs, samples."""
-    from infra.bench.subjects.network_scenes import PUBLISHED_LENGTH, base_flops
+    from infra.bench.sides.networks import PUBLISHED_LENGTH, base_flops
 
     px, views = int(settings["renders"]["resolution"]), len(found[0].spp)
 

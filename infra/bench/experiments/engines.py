@@ -1,8 +1,16 @@
-"""A trained network against the path tracer with its denoiser, at equal error of the picture."""
+"""A trained network against the path tracer with its denoiser, at equal error of the picture.
 
-import os
+Scenes are of the objects of the set that networks are judged on, with another seed. No network
+learned from them: `builtin:benchmark-v1` has no object in common with any other source, and no
+build to train on draws from it. That holds for every network trained on other objects: the one that
+is shipped, the named builds and the published checkpoints alike.
+"""
+
+import contextlib
+import dataclasses
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,30 +18,86 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.bench.curve import PricedLevel, at_error
-from infra.bench.experiment import Column, Experiment, Figures, Point, percent
+from infra.bench.experiment import Column, Experiment, Figures, Point, TurnFigures, percent
 from infra.bench.experiments.sampling import DB
-from infra.bench.sides.bare_pictures import bare_pictures
-from infra.bench.sides.levels import SampledPictures
-from infra.bench.subjects.held_out import build_within, held_out
-from infra.bench.subjects.render_child import render_child
+from infra.bench.sides.sampled_pictures import SampledPictures, bare_pictures
+from infra.bench.sides.shots import SEED
 from infra.bench.workshop import Workshop
+from pipeline.builds.settings import BuildSettings
+from pipeline.builds.training import smoke
+from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of
 from pipeline.objects.generated import BENCHMARK
+from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.settings import RenderSettings
+from pipeline.scenes.compose import compose_scene
 from storage.conventions import log10_radiance
+from storage.dataset.splits import JUDGED_SPLIT
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
+from storage.settings.changes import changed
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
+
+
+_REFERENCE_SEED = 1_000_003
+_LEAST_LEVEL = 24
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeldOut:
+    """One scene with its reference."""
+
+    scene: Scene
+    """The scene, with one camera."""
+    reference: RenderedView
+    """Converged picture of its view."""
+
+
+def build_within(max_triangles: int | None) -> BuildSettings:
+    """Return `smoke` for scenes of at most so many triangles, its objects as much coarser.
+
+    All of its objects are to judge by, as those of `builtin:benchmark-v1` are.
+    """
+    build = changed(smoke(), {"splits.one_split": True})
+    most = build.scenes.max_triangles
+    if max_triangles is None or max_triangles >= most:
+        return build
+    budgets = [max(_LEAST_LEVEL, b * max_triangles // most) for b in build.assets.budgets]
+    levels = sorted(set(budgets), reverse=True)
+    return changed(build, {"scenes.max_triangles": max_triangles, "assets.budgets": levels})
+
+
+def held_out(build: BuildSettings, index: int, resolution: int, max_spp: int) -> HeldOut | None:
+    """Return a scene with its reference, or None where every attempt is rejected.
+
+    Runs in a render child of the build.
+    """
+    settings = dataclasses.replace(build.scenes, num_views=1)
+    pool = assets_of(JUDGED_SPLIT)
+    renders = RenderSettings(
+        resolution=resolution,
+        noise_floor_db=50.0,
+        min_spp=min(256, max_spp),
+        max_spp=max_spp,
+        min_mean_radiance=0.0,
+    )
+    for attempt in range(MAX_ATTEMPTS):
+        with contextlib.suppress(Rejected):
+            scene = compose_scene(settings, pool, seed=SEED, scene_index=index, attempt=attempt)
+            renderer = SceneRenderer(scene, renders)
+            view = renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), _REFERENCE_SEED)
+            return HeldOut(scene=scene, reference=view)
+    return None
+
 
 NETWORK, DENOISED, RAW = "network", "path tracer, denoised", "path tracer, raw"
 _REPEATS = 3
 """Counted passes of the network over each scene."""
 
 
-def _measure(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Render one held-out scene by the network, and find the samples that come as near."""
     from train.data.resolution import block_mean
 
@@ -88,12 +152,11 @@ def _set_up(workshop: Workshop) -> Any:
 
     renderer = NeuralRenderer.load(workshop.asked.checkpoint, device="cpu")
     build = build_within(renderer.trained.max_triangles)
-    threads = os.cpu_count() or 1
-    child = render_child(workshop.folder(), build, objects=BENCHMARK, threads=threads)
+    child = workshop.render_child(build, BENCHMARK)
     name = Path(workshop.asked.checkpoint).name
     workshop.note(f"scenes of at most {build.scenes.max_triangles} triangles")
     workshop.note(f"network {name}, {renderer.digest[:8]}")
-    return renderer, workshop.closing(child), build
+    return renderer, child, build
 
 
 def _resolution(renderer: "NeuralRenderer", px: int) -> int:

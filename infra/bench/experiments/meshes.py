@@ -1,11 +1,20 @@
 """What geometry costs: triangles of an object, against error, picture, network."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent
+from infra.bench.experiment import (
+    Column,
+    Experiment,
+    Figures,
+    Point,
+    TurnFigures,
+    one_by_one,
+    percent,
+)
 from infra.bench.sides import remeshing
 from infra.bench.sides.shots import fixed_samples
 from infra.bench.subjects.mesh_pictures import coarser, picture_db
@@ -46,9 +55,7 @@ def _recipes(budget: int, least: int) -> list[Point]:
     ]
 
 
-def _measure_budget(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_budget(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure one object at every budget, and the picture of the few that are path traced."""
     path, effort = workshop.source(turn, LARGE), workshop.effort
     budgets, pictures = [point.settings for point in points], []
@@ -105,7 +112,6 @@ _P99 = Column(
     then=percent,
 )
 _CPU = Column(name="core-seconds an object", figure="cpu_s")
-_SOURCE = "the cleaned source; median over the objects"
 _REMESHED = (
     Column(name="mean error %", figure="error_mean", then=percent),
     Column(name="area variation", figure="area_variation"),
@@ -114,16 +120,19 @@ _REMESHED = (
 )
 NETWORK = Column(name="core-seconds of the network for a scene and one view", figure="network_s")
 
+_of_objects = partial(
+    Experiment, error=_P99, against="the cleaned source; median over the objects", turns=_objects
+)
+"""Declares an experiment on objects, judged by their distance to the source."""
+
 EXPERIMENTS = (
-    Experiment(
+    _of_objects(
         name="budget",
         title="Triangles of an object",
         about="Objects at budgets, priced by the network's time for two of them in a scene; the "
         "largest few are path traced beside their source, alone on a floor under a lamp.",
         covers=("build.assets.budgets",),
         cost=NETWORK,
-        error=_P99,
-        against=_SOURCE,
         columns=(
             _REMESHED[0],
             Column(name="picture, psnr_log_db", figure="picture_db"),
@@ -135,47 +144,38 @@ EXPERIMENTS = (
         f"which a scene of 1536 triangles holds {OBJECTS}. Making them costs milliseconds; what "
         "triangles cost is the network's time, at every visit.",
         points=_budgets,
-        turns=_objects,
         measure=_measure_budget,
         needs=("torch",),
     ),
-    Experiment(
+    _of_objects(
         name="profile",
         title="How objects are made coarser, at 512 triangles",
         about="Objects decimated in each of our ways, and by the reference recipe: isotropic "
         "remeshing at 0.5 %, then quadric collapse.",
         covers=("build.assets.profile",),
         cost=_CPU,
-        error=_P99,
-        against=_SOURCE,
         columns=_REMESHED,
         because="Default: `faithful`, the least error for the triangles, which every visit pays. "
         "`uniform` is for who needs even triangles, at more error and more time.",
         points=lambda effort: _recipes(512, LARGE),
-        turns=_objects,
         measure=one_by_one(_remeshed),
     ),
-    Experiment(
+    _of_objects(
         name="profile-4096",
         title="How large objects are made coarser, at 4096 triangles",
         about="As above, of the objects that have more triangles than that.",
         cost=_CPU,
-        error=_P99,
-        against=_SOURCE,
         columns=_REMESHED,
         points=lambda effort: _recipes(4096, VERY_LARGE),
-        turns=_objects,
         measure=one_by_one(_remeshed),
     ),
-    Experiment(
+    _of_objects(
         name="epsilon",
         title="An error bound in place of a budget",
         about=f"Objects of {LARGE} triangles or more, prepared within a distance to their source, "
         f"with at most {AssetSettings.budgets[0]} triangles.",
         covers=("build.assets.epsilon",),
         cost=Column(name="triangles an object", figure="faces", over="mean"),
-        error=_P99,
-        against=_SOURCE,
         columns=(
             Column(name="largest error %", figure="error_p99", over="most", then=percent),
             Column(name="making it, core-s", figure="cpu_s", over="mean"),
@@ -190,7 +190,6 @@ EXPERIMENTS = (
             )
             for epsilon in EPSILONS
         ],
-        turns=_objects,
         measure=one_by_one(_measure_epsilon),
     ),
 )

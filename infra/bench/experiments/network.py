@@ -5,11 +5,12 @@ But for `trained-precision` weights are random, since costs do not depend on the
 
 import copy
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, repeats
+from infra.bench.experiment import Column, Experiment, Point, TurnFigures, repeats
 from infra.bench.experiments.sampling import DB, WORST, scenes
 from infra.bench.workshop import Workshop
 
@@ -28,9 +29,7 @@ def _bright(workshop: Workshop) -> Any:
     return workshop.kept("bright", lambda: bright_network(SIZES[workshop.effort.network]()))
 
 
-def _measure_precision(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_precision(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure a whole pass in each precision that a processor has."""
     from infra.bench.sides.networks import (
         CPU,
@@ -52,9 +51,7 @@ def _measure_precision(
         yield point.name, {**figures, "db": log10_psnr_db(picture, exact)}
 
 
-def _measure_trained(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_trained(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Render a built-in scene by the network that is asked for, in each precision."""
     from model.neural_renderer import NeuralRenderer
 
@@ -80,9 +77,7 @@ def _db(picture: Any, exact: Any) -> float:
     return psnr_log_db(picture, exact)
 
 
-def _measure_attention(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_attention(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure one attention layer of the encoder, several ways, on the same normal numbers."""
     from infra.bench.sides.networks import CPU, timed_forward
 
@@ -127,9 +122,7 @@ def _attention(effort: Effort) -> "tuple[dict[str, Callable[[], Tensor]], Tensor
     return ways, scores.softmax(dim=-1) @ v.double()
 
 
-def _measure_bundles(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_bundles(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure the view stage of one scene; the lower of two times counts, taken in turns."""
     import torch
 
@@ -162,16 +155,16 @@ def _measure_bundles(
 
 CORE_S = Column(name="core-seconds of the network", figure="core_s")
 _PRECISION_POINTS = [Point(name=name, default=name == PRECISIONS[0]) for name in PRECISIONS]
+_of_pictures = partial(Experiment, error=DB, better="higher", needs=("torch",))
+"""Declares an experiment on pictures of the network."""
 
 EXPERIMENTS = (
-    Experiment(
+    _of_pictures(
         name="precision",
         title="Precision of the network",
         about="One view of a full scene by Base with random weights, on a processor.",
         covers=("train.precision", "render.precision"),
         cost=CORE_S,
-        error=DB,
-        better="higher",
         against="the same network in float32 (100 dB is the same picture)",
         because="Default: float32, for references and small networks; bfloat16 from Base up, whose "
         "rounding is far below what any network gets wrong, trained ones too. tf32 and float16 "
@@ -180,23 +173,19 @@ EXPERIMENTS = (
         turns=repeats,
         measure=_measure_precision,
         warm_up=True,
-        needs=("torch",),
     ),
-    Experiment(
+    _of_pictures(
         name="trained-precision",
         title="Precision of a trained network",
         about="Built-in scenes by the shipped network, or by `--checkpoint`, at the width that it "
         "was trained on.",
         cost=CORE_S,
-        error=DB,
-        better="higher",
         against="the same network in float32; median over the scenes",
         columns=(WORST,),
         points=lambda effort: _PRECISION_POINTS,
         turns=scenes,
         measure=_measure_trained,
         warm_up=True,
-        needs=("torch",),
     ),
     Experiment(
         name="attention",
@@ -213,14 +202,12 @@ EXPERIMENTS = (
         warm_up=True,
         needs=("torch",),
     ),
-    Experiment(
+    _of_pictures(
         name="bundles",
         title="Empty ray bundles",
         about="The view stage of built-in scenes by Base with random weights.",
         covers=("render.skip_empty_bundles",),
         cost=Column(name="core-seconds of the view stage", figure="core_s", over="mean"),
-        error=DB,
-        better="higher",
         against="the same network with all bundles (100 dB is the same picture)",
         columns=(Column(name="empty bundles %", figure="empty"),),
         because="Default: none skipped. Bundles attend to each other, so that leaving out the "
@@ -231,6 +218,5 @@ EXPERIMENTS = (
         ],
         turns=scenes,
         measure=_measure_bundles,
-        needs=("torch",),
     ),
 )

@@ -3,11 +3,20 @@
 A graphics card is used where there is one; there the clock counts, on a processor core-seconds.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent, repeats
+from infra.bench.experiment import (
+    Column,
+    Experiment,
+    Figures,
+    Point,
+    TurnFigures,
+    one_by_one,
+    repeats,
+)
 from infra.bench.workshop import Workshop
 
 if TYPE_CHECKING:
@@ -15,8 +24,7 @@ if TYPE_CHECKING:
 
     from model.costs import Workload
 
-PUBLISHED, EQUAL, DEFAULT = "published", "float32", "bfloat16"
-SIDES = (PUBLISHED, EQUAL, DEFAULT)
+PUBLISHED, EQUAL, DEFAULT = SIDES = ("published", "float32", "bfloat16")
 CASES: Mapping[int, Mapping[str, int]] = {
     256: {"full": 1536, "median": 1434, "plane-only": 140},
     512: {"full": 4096, "median": 2462, "plane-only": 140},
@@ -24,8 +32,6 @@ CASES: Mapping[int, Mapping[str, int]] = {
 """Triangles by resolution; the median is that of 200 composed scenes of `pretrain-256` and of
 `finetune-512`."""
 _PRODUCTS = 20
-DENSE_BFLOAT16_TFLOPS = {"H200": 989.0, "H100": 989.0, "A100": 312.0}
-"""Peaks by a word of the device's name, as its maker states them, without sparsity."""
 
 
 def device() -> "torch.device":
@@ -82,9 +88,7 @@ def _contenders(workshop: Workshop) -> Any:
     return workshop.kept("contenders", lambda: Contenders(decode_published({}), SIDES, device()))
 
 
-def _measure(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure time, memory and, within a case, the difference to the sides before it."""
     from infra.bench.sides.networks import log10_psnr_db, published_like, timed_forward
 
@@ -139,29 +143,17 @@ def _product(workshop: Workshop, point: Point, turn: str) -> Figures:
     return {**figures, "gflop": gflop}
 
 
-def _training(workshop: Workshop, point: Point, turn: str) -> Figures:
-    """Take one step of Base at the paper's sizes, float32 weights under bfloat16 autocast."""
-    import torch
-
-    from infra.bench.sides.networks import timed_training_step
-    from model.config import SIZES
-
-    found = timed_training_step(SIZES[workshop.effort.network](), device(), scenes=point.settings)
-    name = torch.cuda.get_device_name() if device().type == "cuda" else ""
-    peak = next((peak for word, peak in DENSE_BFLOAT16_TFLOPS.items() if word in name), None)
-    return {**found, **({"of_peak": found["tflop_per_s"] / peak} if peak else {})}
-
-
 _SECONDS = Column(name="core-seconds", figure="core_s")
 _MEMORY = Column(name="MB beyond the weights", figure="memory_mb")
+_of_passes = partial(Experiment, cost=_SECONDS, needs=("torch",))
+"""Declares an experiment on the time of forward passes."""
 
 EXPERIMENTS = (
-    Experiment(
+    _of_passes(
         name="network-cases",
         title="Our network beside the published forward pass",
         about="Base with the same random weights: the published operations (float32, whole "
         "textures, padded, views together) beside ours in float32 and bfloat16.",
-        cost=_SECONDS,
         columns=(
             _MEMORY,
             Column(name="float32 differs from published by", figure="difference", over="most"),
@@ -171,51 +163,24 @@ EXPERIMENTS = (
         turns=repeats,
         measure=_measure,
         warm_up=True,
-        needs=("torch",),
     ),
-    Experiment(
+    _of_passes(
         name="network-growth",
         title="How the network's cost grows",
         about="Base with random weights by triangles, views and pixels, one at a time.",
-        cost=_SECONDS,
         columns=(_MEMORY,),
         points=_growth,
         turns=lambda effort: ["round 1"],  # neighbours on a curve bear each other out
         measure=_measure,
-        needs=("torch",),
     ),
-    Experiment(
+    _of_passes(
         name="matmul",
         title="What bfloat16 gives this machine's products of matrices",
         about="1536 tokens by the hidden layer of Base, as the network's layers are.",
-        cost=_SECONDS,
         columns=(Column(name="GFLOP", figure="gflop"),),
         points=lambda effort: [Point(name=EQUAL, default=True), Point(name=DEFAULT)],
         turns=repeats,
         measure=one_by_one(_product),
         warm_up=True,
-        needs=("torch",),
-    ),
-    Experiment(
-        name="training-step",
-        title="A training step at the paper's sizes",
-        about="Forward, backward and AdamW; a step is counted as three forward passes of work.",
-        cost=Column(name="seconds, on the clock", figure="step_s"),
-        columns=(
-            Column(name="TFLOP/s", figure="tflop_per_s"),
-            Column(
-                name="of the device's dense bfloat16 peak, %",
-                figure="of_peak",
-                then=percent,
-            ),
-        ),
-        points=lambda effort: [
-            Point(name=f"{scenes} scenes", settings=scenes)
-            for scenes in ((16,) if effort.name == "careful" else (1,))
-        ],
-        turns=repeats,
-        measure=one_by_one(_training),
-        warm_up=True,
-        needs=("torch",),
     ),
 )

@@ -9,26 +9,135 @@ with one core of its own (TRILIGHT_CORES). The first N scenes are left out, in w
 starts and compiles; that workers run out of work at the end, one after the other, counts.
 """
 
+import contextlib
 import os
+import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
-from infra.bench.sides import prefect_process
 from infra.bench.workshop import Workshop
+from pipeline.flows.prefect_server import SERVER, prefect_server, quiet_prefect
 from pipeline.making.pieces import MOST_TASKS
+from pipeline.making.runners import in_window
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import SceneLog, read_scene_logs
+
+_RECORDS_S = 600.0
+
+
+def sleeping_flow(workshop: Workshop) -> Callable[[float, int, int], None]:
+    """Start a server, and return a flow called with seconds of a task, their number, the window.
+
+    Tasks are handed out as `PrefectRunner` does. Prefect is imported when its server is up.
+    """
+    quiet_prefect()
+    workshop.entered(prefect_server())
+    from prefect import flow, task
+
+    @task(name="pause", persist_result=False)
+    def pause(seconds: float) -> None:
+        time.sleep(seconds)
+
+    @flow(name="bench-orchestration", persist_result=False)
+    def tasks_of(seconds: float, number: int, window: int) -> None:
+        for _ in in_window(
+            range(number),
+            submit=lambda _: pause.submit(seconds),
+            first_done=_first_done,
+            result=lambda future: future.result(),
+            window=window,
+        ):
+            pass
+
+    return tasks_of
+
+
+def _first_done(running: Iterable[Any]) -> Any:
+    from prefect.futures import as_completed
+
+    return next(iter(as_completed(list(running))))
+
+
+def recorded() -> int:
+    """Return how many task runs the server shows as completed."""
+    from prefect.client.orchestration import get_client
+
+    with get_client(sync_client=True) as client:
+        answer = client.request(
+            "POST",
+            "/task_runs/count",
+            json={"task_runs": {"state": {"type": {"any_": ["COMPLETED"]}}}},
+        )
+    return int(answer.json())
+
+
+def until_recorded(number: int) -> float:
+    """Return the seconds until the server shows so many task runs.
+
+    Raises:
+        RuntimeError: it does not within ten minutes.
+    """
+    started = time.perf_counter()
+    while (found := recorded()) < number:
+        if time.perf_counter() - started > _RECORDS_S:
+            raise RuntimeError(f"the server shows {found} task runs of {number} after ten minutes")
+        time.sleep(0.5)
+    return time.perf_counter() - started
+
+
+def database_bytes() -> int:
+    """Return what rows and indices take in the database of our private server."""
+    place = Path(os.environ["PREFECT_HOME"]) / "prefect.db"
+    with contextlib.closing(sqlite3.connect(f"file:{place}?mode=ro", uri=True)) as database:
+        pages, free, size = (
+            database.execute(f"PRAGMA {name}").fetchone()[0]
+            for name in ("page_count", "freelist_count", "page_size")
+        )
+    return int((pages - free) * size)
+
+
+def server() -> int:
+    """Return the process number of our private server: the child that serves."""
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((place / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == os.getpid() and SERVER[-1].encode() in (place / "cmdline").read_bytes():
+                return int(place.name)
+        except OSError:
+            continue
+    raise RuntimeError("PREFECT_API_URL is set: unset it, so that a server of our own is measured")
+
+
+def cores_of_server(seconds: float) -> float:
+    """Return the cores that the waiting server keeps busy."""
+    before = cpu_s(server())
+    time.sleep(seconds)
+    return (cpu_s(server()) - before) / seconds
+
+
+def cpu_s(pid: int) -> float:
+    """Return the processor seconds that a process has taken so far."""
+    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def megabytes(pid: int) -> float:
+    """Return the resident memory of a process."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
 
 WINDOW = 8
 RENDERING, WAITING = (1, 2, 4), (1, 2, 4, 8, 16)
 """Numbers of workers."""
 VIEWS = 4
-"""Of a scene of `smoke`."""
+"""Views of a scene of `smoke`."""
 TASKS_EACH = 4
 """Sleeping tasks of each worker."""
 _IDLE_S = 30.0
@@ -36,7 +145,7 @@ _IDLE_S = 30.0
 
 def _flow(workshop: Workshop) -> Callable[[float, int, int], None]:
     """Return a flow of sleeping tasks: seconds of each, their number and the window."""
-    return workshop.kept("flow", lambda: prefect_process.sleeping_flow(workshop))
+    return workshop.kept("flow", lambda: sleeping_flow(workshop))
 
 
 def _timed(call: Callable[[], object]) -> float:
@@ -55,32 +164,32 @@ def _prefect(workshop: Workshop, point: Point, turn: str) -> Figures:
 def _idle(flow: Any, seconds: float) -> Figures:
     return {
         "seconds_a_task": seconds,
-        "cores": prefect_process.cores_of_server(seconds),
-        "mb": prefect_process.megabytes(prefect_process.server()),
+        "cores": cores_of_server(seconds),
+        "mb": megabytes(server()),
     }
 
 
 def _sleeping(flow: Any, asked: tuple[float, int]) -> Figures:
     sleep_s, count = asked
-    cpu_s = prefect_process.cpu_s(os.getpid())
+    before_s = cpu_s(os.getpid())
     took_s = _timed(lambda: flow(sleep_s, count, WINDOW))
     return {
         "seconds_a_task": took_s / count,
         "overhead": 100 * (took_s / (sleep_s * count / WINDOW) - 1),
-        "cores": (prefect_process.cpu_s(os.getpid()) - cpu_s) / took_s,
-        "mb": prefect_process.megabytes(os.getpid()),
+        "cores": (cpu_s(os.getpid()) - before_s) / took_s,
+        "mb": megabytes(os.getpid()),
     }
 
 
 def _empty(flow: Any, count: int) -> Figures:
-    before, bytes_before = prefect_process.recorded(), prefect_process.database_bytes()
+    before, bytes_before = recorded(), database_bytes()
     took_s = _timed(lambda: flow(0.0, count, WINDOW))
-    recorded_s = prefect_process.until_recorded(before + count)
+    recorded_s = until_recorded(before + count)
     return {
         "seconds_a_task": took_s / count,
         "recorded_s": recorded_s,
-        "kb": (prefect_process.database_bytes() - bytes_before) / count / 1000,
-        "mb": prefect_process.megabytes(prefect_process.server()),
+        "kb": (database_bytes() - bytes_before) / count / 1000,
+        "mb": megabytes(server()),
     }
 
 

@@ -2,12 +2,12 @@
 
 import dataclasses
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point
+from infra.bench.experiment import Column, Experiment, Point, TurnFigures
 from infra.bench.experiments.sampling import CORE_S, DB, measure, scenes
 from infra.bench.sides.shots import fixed_samples, shots
 from infra.bench.subjects.named_scenes import sampled_names, sampled_scene
@@ -19,9 +19,7 @@ from storage.metrics import psnr_log_db
 VIEWS = (1, 2, 4, 8, 16)
 
 
-def _measure_resolution(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_resolution(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Compare with the largest picture, of which a smaller one keeps means of blocks of pixels."""
     from train.data.resolution import block_mean
 
@@ -83,9 +81,7 @@ def scene_parts(scene_index: int, resolution: int) -> dict[str, float]:
     return dict(zip(("compose_s", "load_s", "view_s"), map(float, spent), strict=True))
 
 
-def _measure_views(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_views(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure what is shared among the views of a scene, and share it out."""
     px = workshop.effort.picture_px
     workshop.kept("compiled", lambda: workshop.call(scene_parts, 0, px))

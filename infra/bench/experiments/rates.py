@@ -2,20 +2,26 @@
 
 import dataclasses
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, percent, repeats
+from infra.bench.experiment import (
+    Column,
+    Experiment,
+    Point,
+    TurnFigures,
+    one_by_one,
+    percent,
+    repeats,
+)
 from infra.bench.experiments.beside import BROKEN_DB, TARGETS_DB, adaptive
 from infra.bench.experiments.sampling import CORE_S
+from infra.bench.sides.sampled_pictures import first_camera
 from infra.bench.sides.shots import SEED, shots
 from infra.bench.subjects.cost_scene import cost_scene
 from infra.bench.subjects.named_scenes import NUM_SAMPLED, sampled, sampled_names
 from infra.bench.workshop import Workshop
 from pipeline.making.price import USD_PER_CORE_HOUR
-from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import PASS_SPP, RenderSettings
@@ -53,11 +59,7 @@ AXES: Mapping[str, tuple[int, ...]] = {
 def traced(settings: PathCost) -> dict[str, float]:
     """Load the scene and trace one pass, without the denoiser, in a render child."""
     scene = cost_scene(settings.triangles, settings.lights)
-    camera = Camera(
-        c2w=np.asarray(scene.c2w[0], np.float64),
-        fov_deg=float(scene.fov_deg[0]),
-        resolution=settings.resolution,
-    )
+    camera = first_camera(scene, settings.resolution)
     started = time.process_time()
     tracer = load_tracer(scene, max_depth=settings.depth, rr_depth=RenderSettings.rr_depth)
     loaded = time.process_time()
@@ -88,9 +90,7 @@ def promises(scene: Scene, targets: dict[str, RenderSettings], reference: Render
     return found
 
 
-def _measure_promises(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_promises(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     scene = sampled(int(turn.split()[-1])).make(workshop.child)
     targets = {point.name: point.settings for point in points}
     most = 4 * workshop.effort.max_spp
@@ -104,9 +104,7 @@ def _measure_promises(
     yield from workshop.call(promises, scene, targets, reference).items()
 
 
-def _measure_throughput(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_throughput(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     scene = sampled(int(turn.split()[-1])).make(workshop.child)
     taken = workshop.call(shots, scene, {point.name: point.settings for point in points})
     for name, shot in taken.items():

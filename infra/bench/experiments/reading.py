@@ -18,8 +18,12 @@ from typing import TYPE_CHECKING
 
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
 from infra.bench.sides.stream_processes import seconds_of_processes
-from infra.bench.subjects.byte_server import serve_bytes
-from infra.bench.subjects.manifests import memory_of_opening, write_copies, write_manifest_of
+from infra.bench.subjects.manifests import (
+    memory_of_opening,
+    serve_bytes,
+    write_copies,
+    write_manifest_of,
+)
 from infra.bench.workshop import Workshop
 from storage.dataset.shard_set import ShardSet
 from storage.dataset.training_data import TrainingData, open_training_data
@@ -34,9 +38,9 @@ THREADS, PROCESSES = (1, 2, 4), 2
 MANIFESTS = (1_000, 100_000)
 """Samples of datasets that are opened, to see what the reader holds."""
 PASSES = 4
-"""Over all shards, where only bytes are read: one pass takes hundredths of a second."""
+"""Passes over all shards where only bytes are read: one takes hundredths of a second."""
 BATCH, RESOLUTION = 4, 64
-"""Of training, from pictures of 256."""
+"""Scenes of a batch, and pixels across its pictures, which are reduced from 256."""
 _PIPE_BYTES = 1 << 20
 
 Dataset = tuple[Path, int, list[dict[str, bytes]]]

@@ -1,11 +1,12 @@
 """What one picture costs: samples, denoiser, noise floor, guide pictures, length of paths."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from infra.bench.effort import Effort
-from infra.bench.experiment import Column, Experiment, Figures, Point
+from infra.bench.experiment import Column, Experiment, Point, TurnFigures
 from infra.bench.sides.shots import Shot, fixed_samples, shots
 from infra.bench.subjects.named_scenes import sampled_names
 from infra.bench.workshop import Subject, Workshop
@@ -47,9 +48,7 @@ def to_reference(subject: Subject, shot: Shot) -> dict[str, float]:
     }
 
 
-def measure(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Render one scene under the settings of every point, with equal random numbers."""
     subject = workshop.subject(turn)
     found = workshop.call(shots, subject.scene, {point.name: point.settings for point in points})
@@ -57,9 +56,7 @@ def measure(
         yield name, to_reference(subject, shot)
 
 
-def _measure_depth(
-    workshop: Workshop, points: Sequence[Point], turn: str
-) -> Iterable[tuple[str, Figures]]:
+def _measure_depth(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Compare with the same samples of paths of DEEPEST edges, so that noise is common to both."""
     variants = {point.name: point.settings for point in points}
     variants["all"] = dataclasses.replace(points[0].settings, max_depth=DEEPEST)
@@ -143,27 +140,26 @@ def _varied(name: str, values: Sequence[int]) -> Any:
     return points
 
 
+_of_views = partial(
+    Experiment, cost=CORE_S, error=DB, better="higher", against=_REFERENCE, columns=_FURTHER,
+    turns=scenes, measure=measure,
+)  # fmt: skip
+"""Declares an experiment on views of the scenes whose references are published."""
+
 EXPERIMENTS = (
-    Experiment(
+    _of_views(
         name="samples",
         title="Samples and denoiser",
         about="Views of built-in scenes at fixed numbers of samples, by denoiser.",
         covers=("build.renders.max_spp", "build.renders.denoiser", "render.max_spp"),
-        cost=CORE_S,
-        error=DB,
-        better="higher",
-        against=_REFERENCE,
-        columns=_FURTHER,
         because="Default: `high`. Without a denoiser an equal error takes many times the samples, "
         "and `fast` saves the same fraction of a second at every number of samples, so only few of "
         "them make it worth its loss. In place of a fixed number builds have a cap: what a view "
         "needs is measured, and the cap bounds the hardest (256 in `smoke`, which the table marks "
         "as the default, 4096 in `pretrain-256`).",
         points=_samples,
-        turns=scenes,
-        measure=measure,
     ),
-    Experiment(
+    _of_views(
         name="noise-floor",
         title="Noise floor of a view",
         about="Views of built-in scenes that are sampled until a stated floor or a cap.",
@@ -173,58 +169,34 @@ EXPERIMENTS = (
             "order.noise_floor_db",
             "render.noise_floor_db",
         ),
-        cost=CORE_S,
-        error=DB,
-        better="higher",
-        against=_REFERENCE,
-        columns=_FURTHER,
         because="Default: 46 dB in the training builds, since an error in a target stays for every "
         "epoch; 40 dB in `smoke`, whose 24 scenes are to take minutes. Hard views end at the cap "
         "and say so: rejecting them (`reject_at_cap`) would change what the set shows.",
         points=_floors,
-        turns=scenes,
-        measure=measure,
     ),
-    Experiment(
+    _of_views(
         name="first-samples",
         title="Samples before the floor is measured first",
         about="Views to the floor of `smoke`, by the samples after which it is looked at first.",
         covers=("build.renders.min_spp",),
-        cost=CORE_S,
-        error=DB,
-        better="higher",
-        against=_REFERENCE,
-        columns=_FURTHER,
         because="Default: 32. With fewer the two halves may agree by luck, and small passes are "
         "stratified coarser, so that they save nothing; more only costs where a view is easy.",
         points=_first,
-        turns=scenes,
-        measure=measure,
     ),
-    Experiment(
+    _of_views(
         name="guides",
         title="Samples of the denoiser's guide pictures",
         about="Views at a fixed number of samples, by those of albedo and normals.",
         covers=("build.renders.aux_spp",),
-        cost=CORE_S,
-        error=DB,
-        better="higher",
-        against=_REFERENCE,
-        columns=_FURTHER,
         because="Default: 64. The filter takes the guides to be without noise, and they are traced "
         "without light, at a fraction of the price of a sample.",
         points=_varied("aux_spp", (4, 16, 64)),
-        turns=scenes,
-        measure=measure,
     ),
-    Experiment(
+    _of_views(
         name="depth",
         title="Length of paths",
         about="Views at a fixed number of samples, with paths that are cut at so many edges.",
         covers=("build.renders.max_depth",),
-        cost=CORE_S,
-        error=DB,
-        better="higher",
         against=f"the same samples with paths of {DEEPEST} edges, so that noise is common to both; "
         "median over the scenes",
         columns=(
@@ -236,22 +208,14 @@ EXPERIMENTS = (
         "and what is cut off is below the noise of the pictures. Fewer edges darken a picture, "
         "which no number of samples brings back.",
         points=_varied("max_depth", DEPTHS),
-        turns=scenes,
         measure=_measure_depth,
     ),
-    Experiment(
+    _of_views(
         name="roulette",
         title="Where roulette begins",
         about="Views at a fixed number of samples, by the edge from which paths may end by chance.",
         covers=("build.renders.rr_depth",),
-        cost=CORE_S,
-        error=DB,
-        better="higher",
-        against=_REFERENCE,
-        columns=_FURTHER,
         because="Default: 2. It changes no mean, only noise and time, and ends dark paths soonest.",
         points=_varied("rr_depth", (2, 3, 5, 8)),
-        turns=scenes,
-        measure=measure,
     ),
 )

@@ -1,4 +1,4 @@
-"""A view of a `Scene` as Blender's Cycles renders it, with what it took."""
+"""A view of a `Scene` as Blender's Cycles renders it, with its cost."""
 
 import dataclasses
 import json
@@ -30,16 +30,16 @@ class Request:
     denoise: bool
     """Whether Open Image Denoise cleans the picture, with Cycles' own albedo and normals."""
     bounces: int = 8
-    """Of every kind, and in sum: 8 is Mitsuba's max_depth 10, and 0 is direct light alone."""
+    """Most bounces, of each kind and in sum: 8 is Mitsuba's max_depth 10, 0 is direct light."""
     seed: int = 0
-    """Of the samples."""
+    """Seed of the samples."""
     threads: int = 1
-    """Of Cycles; the denoiser takes what the process may use."""
+    """Threads of Cycles; the denoiser takes all that the process may use."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CyclesPicture:
-    """One finished picture and what it took."""
+    """One finished picture and its cost."""
 
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance."""
@@ -50,7 +50,7 @@ class CyclesPicture:
     """Core-seconds of that call, with what little Blender does around it; other work on the
     machine moves them less than the clock."""
     prepare_s: float
-    """What came before: filling Blender's scene, and a picture of one sample; on the clock."""
+    """Wall time before that: filling Blender's scene, and a picture of one sample."""
 
 
 def cycles_picture(scene: Scene, view: int, request: Request) -> CyclesPicture:

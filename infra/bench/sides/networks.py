@@ -3,43 +3,86 @@
 Weights are random: none of Base's size are shipped, and neither seconds nor bytes depend on them.
 Errors do; those of a trained network are measured by the experiment `trained-precision`. The last
 layer is scaled so that pictures have the spread of rendered ones: an error in dB with peak 1 would
-otherwise say what the weights happen to be.
+otherwise say what the weights happen to be. Scenes have any number of triangles, and are seen from
+all around.
 """
 
 import copy
+import math
 import time
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import elu
 
 from infra.bench.effort import Effort
 from infra.bench.sides.published_network import published_forward, published_inputs
-from infra.bench.subjects.network_scenes import PUBLISHED_LENGTH, scene_of
-from model.config import SIZES, ModelConfig
+from infra.bench.subjects.cost_scene import cost_scene
+from model.config import SIZES, ModelConfig, base
 from model.costs import Workload, flops
 from model.layer_errors import probe_batch, random_network
 from model.precision import set_precision
 from model.published.config import PublishedConfig
 from model.published.convert import from_published, to_published
 from model.renderformer import ELU_ALPHA, RenderFormer
-from model.scene_tensors import Cameras, SceneTensors, batch_scenes, converted
-from storage.conventions import radiance_from_log10
+from model.scene_tensors import Cameras, SceneTensors, batch_scenes, converted, scene_tensors
+from storage.conventions import look_at_c2w, radiance_from_log10
 from storage.metrics import psnr_log_db
+
+PUBLISHED_LENGTH = {256: 1572, 512: 4192}
+"""Triangles that the published pipeline pads every scene to, by pixels across the picture."""
+
+_LIGHTS = 4
+
+
+def scene_of(workload: Workload) -> SceneTensors:
+    """Return two objects in a room, of exactly so many triangles, and cameras around them."""
+    scene = cost_scene(math.ceil(1.3 * workload.triangles) + 32, _LIGHTS)
+    angles = np.linspace(0, 1, workload.views, endpoint=False)
+    poses = [
+        look_at_c2w(
+            eye=(1.4 + math.cos(6 * a), math.sin(6 * a) - 2.2, 1.3),
+            target=(0, 0, 0.35),
+            up=(0, 0, 1),
+        )
+        for a in angles
+    ]
+    whole = scene_tensors(
+        scene.with_cameras(
+            np.stack(poses).astype(np.float32), np.full(workload.views, 40.0, np.float32)
+        )
+    )
+    # rows spread over the scene, the room first and the lights last
+    rows = torch.linspace(0, whole.num_triangles - 1, workload.triangles).round().long()
+    return SceneTensors(
+        triangles_T33=whole.triangles_T33[rows],
+        normals_T33=whole.normals_T33[rows],
+        material_TM=whole.material_TM[rows],
+        c2w_V44=whole.c2w_V44,
+        fov_deg_V=whole.fov_deg_V,
+    )
+
+
+def base_flops(triangles: int, views: int, px: int) -> int:
+    """Return the FLOPs of Base for a scene of so many triangles and square views of `px` pixels."""
+    workload = Workload(triangles=triangles, views=views, resolution=px)
+    return sum(flops(base(), workload).values())
+
 
 PUBLISHED, EQUAL, DEFAULT = "published", "float32", "bfloat16"
 SIDES = (PUBLISHED, EQUAL, DEFAULT)
 
 RENDERED_MEAN, RENDERED_STD = 0.09, 0.075
-"""Of log10(1 + radiance) over the 20 reference pictures in `tests/references`; their peak is 1."""
+"""Mean and spread of log10(1 + radiance) of the 20 pictures in `tests/references`; peak 1."""
 
 _PROBE_PX = 64
 
 CPU = torch.device("cpu")
 
 _SHARES = (0.1, 1 / 3, 2 / 3, 1.0, 5 / 3, 8 / 3)
-"""Of the effort's triangles: sizes at which the time of the network is measured; 154 to 4096."""
+"""Shares of the effort's triangles at which the network is timed: 154 to 4096 triangles."""
 
 Forward = Callable[[], Tensor]
 """Returns log10(1 + radiance) [V, R, R, 3] before the ELU; of the published one behind it."""
@@ -162,25 +205,3 @@ def core_s_by_triangles(effort: Effort) -> dict[int, float]:
         _, figures = timed_forward(forward_of(model, workload_of(effort, size)), CPU)
         found[size] = figures["core_s"]
     return found
-
-
-def timed_training_step(config: ModelConfig, on: torch.device, *, scenes: int) -> dict[str, float]:
-    """Take one step of a fresh network on the same scene many times over, and time it.
-
-    Float32 weights under bfloat16 autocast, AdamW, nothing recomputed, two views of 256 pixels of
-    1536 triangles (Zeng et al. 2025); a step is three forward passes of work.
-    """
-    workload = Workload(triangles=1536, views=2, resolution=256)
-    model = random_network(config).to(on).train()
-    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4)
-    batch = batch_scenes([_moved(scene_of(workload), on)] * scenes)
-    began = time.perf_counter()
-    with torch.autocast(on.type, torch.bfloat16):
-        loss = model(batch, workload.resolution).float().abs().mean()
-    loss.backward()
-    optimizer.step()
-    if on.type == "cuda":
-        torch.cuda.synchronize(on)
-    seconds = time.perf_counter() - began
-    tflop = 3e-12 * scenes * sum(flops(config, workload).values())
-    return {"step_s": seconds, "tflop_per_s": tflop / seconds}

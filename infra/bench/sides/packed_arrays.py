@@ -5,6 +5,7 @@ import io
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import h5py
 import numpy as np
@@ -24,6 +25,7 @@ ARRAYS = ("flat", "flat, deflate", "indexed", "indexed, deflate", *(f"HDF5 {t}" 
 SAMPLES = (*PROFILES, *(f"HDF5 {t}" for t in TEXTURES))
 
 Decode = Callable[[bytes], Mapping[str, NDArray]]
+Packed = TypeVar("Packed")
 
 
 def coloured(scene: Scene, colours: str) -> Scene:
@@ -103,29 +105,27 @@ def _read_h5(data: bytes) -> Mapping[str, NDArray]:
 
 
 def _unpacking(packed: Sequence[bytes], decode: Decode) -> Mapping[str, float]:
-    memory = 0
-    started = time.process_time()
-    for data in packed:
-        memory += sum(values.nbytes for values in decode(data).values())
-    spent = time.process_time() - started
-    return _figures([len(data) for data in packed], memory, spent)
+    return _timed(packed, lambda data: sum(x.nbytes for x in decode(data).values()), len)
 
 
 def _decoding(samples: Sequence[Mapping[str, bytes]]) -> Mapping[str, float]:
-    memory = 0
-    started = time.process_time()
-    for members in samples:
+    def memory(members: Mapping[str, bytes]) -> int:
         sample = decode_sample("0", members)
-        memory += sum(getattr(sample.scene, name).nbytes for name in ARRAY_FIELDS)
-        memory += sample.radiance_rgb.nbytes
+        arrays = sum(getattr(sample.scene, name).nbytes for name in ARRAY_FIELDS)
+        return int(arrays + sample.radiance_rgb.nbytes)
+
+    return _timed(samples, memory, lambda members: sum(map(len, members.values())))
+
+
+def _timed(
+    packed: Sequence[Packed], unpacked_bytes: Callable[[Packed], int], size: Callable[[Packed], int]
+) -> Mapping[str, float]:
+    """Unpack everything; return means of the bytes before and after, and of the time."""
+    started = time.process_time()
+    memory = sum(map(unpacked_bytes, packed))
     spent = time.process_time() - started
-    sizes = [sum(len(data) for data in members.values()) for members in samples]
-    return _figures(sizes, memory, spent)
-
-
-def _figures(sizes: Sequence[int], memory: int, spent: float) -> Mapping[str, float]:
     return {
-        "bytes": float(np.mean(sizes)),
-        "memory_bytes": memory / len(sizes),
-        "decode_ms": 1000 * spent / len(sizes),
+        "bytes": float(np.mean([size(one) for one in packed])),
+        "memory_bytes": memory / len(packed),
+        "decode_ms": 1000 * spent / len(packed),
     }

@@ -29,7 +29,7 @@ from torch.nn.functional import (
 
 from model.config import ModelConfig
 from model.published.config import PublishedConfig
-from model.published.texture import NORMAL
+from model.published.convert import NORMAL
 from model.rays import bundle_rays, ray_directions
 from model.scene_tensors import SceneTensors
 

@@ -3,8 +3,12 @@
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.assets.settings import AssetSettings
+
+if TYPE_CHECKING:
+    from pipeline.assets.mesh import TriangleMesh
 
 REFERENCE = "reference recipe"
 """Isotropic remeshing at 0.5 % of the diagonal, then quadric collapse, of the file as it is: the
@@ -18,13 +22,28 @@ METHODS: Mapping[str, str] = {
 """Our sides by the name of their decimation; cleaning and orientation count as theirs."""
 
 
-def count_faces(path: Path) -> int:
-    """Return how many triangles a source has after cleaning; raises Rejected."""
-    from pipeline.assets.cleaning.clean import clean, normalise
+def raw_mesh(path: Path) -> "TriangleMesh":
+    """Return the mesh of a file in nominal size, neither cleaned nor oriented; raises Rejected."""
+    from pipeline.assets.cleaning.clean import normalise
     from pipeline.assets.reading.load import load_mesh
     from pipeline.assets.reading.source_file import read_source
 
-    return len(clean(normalise(load_mesh(read_source(path, AssetSettings())))).faces)
+    return normalise(load_mesh(read_source(path, AssetSettings())))
+
+
+def cleaned(raw: "TriangleMesh") -> "TriangleMesh":
+    """Return a raw mesh as the mesh stage decimates it; raises Rejected."""
+    from pipeline.assets.cleaning.clean import clean
+    from pipeline.assets.cleaning.orient import orient_outward
+
+    return orient_outward(clean(raw))[0]
+
+
+def count_faces(path: Path) -> int:
+    """Return how many triangles a source has after cleaning; raises Rejected."""
+    from pipeline.assets.cleaning.clean import clean
+
+    return len(clean(raw_mesh(path)).faces)
 
 
 def remesh(path: Path, side: str, budget: int) -> dict[str, float]:
@@ -32,20 +51,17 @@ def remesh(path: Path, side: str, budget: int) -> dict[str, float]:
 
     Loading the file and measuring the result are not counted, since every side needs the same.
     """
-    from pipeline.assets.cleaning.clean import clean, normalise
-    from pipeline.assets.cleaning.orient import orient_outward
+    from pipeline.assets.cleaning.clean import clean
     from pipeline.assets.decimation.by_name import decimate
     from pipeline.assets.quality.measure import MeasuredSource
-    from pipeline.assets.reading.load import load_mesh
-    from pipeline.assets.reading.source_file import read_source
 
-    raw = normalise(load_mesh(read_source(path, AssetSettings())))
-    source, _ = orient_outward(clean(raw))
+    raw = raw_mesh(path)
+    source = cleaned(raw)
     started = time.process_time()
     if side == REFERENCE:
         result = _reference(raw.positions, raw.faces, budget)
     else:
-        result = decimate(orient_outward(clean(raw))[0], budget, METHODS[side])
+        result = decimate(cleaned(raw), budget, METHODS[side])
     cpu_s = time.process_time() - started
     mesh = clean(result)
     quality = MeasuredSource(source).quality(mesh)

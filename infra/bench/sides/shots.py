@@ -2,28 +2,77 @@
 
 Core-seconds are those of the process: sampling, guide pictures, measuring the floor, and the one
 denoise that makes the picture. Loading the scene is counted apart; kernels are warm.
+
+The same view rendered to several noise floors is the same passes, more or fewer of them. With a
+tracer that remembers, each target takes exactly the path that it would take alone, and is charged
+for all that it uses, while the machine traces only what the hardest one needs.
 """
 
 import copy
 import dataclasses
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from infra.bench.sides.remembering_tracer import RememberingTracer
+from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import Features
+from pipeline.renders.tracer import Features, HostSum, Tracer
 from storage.metrics import MAX_DB
 from storage.records.lights import encode_lights_exr
 from storage.records.profiles import pack_picture
 from storage.records.scene import Scene
 
+Answer = TypeVar("Answer")
+
+
+class RememberingTracer:
+    """A `Tracer` around another one that traces nothing twice; use a new one for every view."""
+
+    def __init__(self, tracer: Tracer) -> None:
+        self._tracer = tracer
+        self._answers: dict[tuple[Any, ...], tuple[Any, float]] = {}
+        self.owed_core_s = 0.0
+        """Core-seconds of remembered answers since this was last set to 0: what the caller would
+        have spent besides its own."""
+
+    def only_light(self, row: int) -> "RememberingTracer":
+        return RememberingTracer(self._tracer.only_light(row))
+
+    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+        return self._remembered(
+            ("radiance", seed, spp), lambda: self._tracer.radiance(camera, seed=seed, spp=spp)
+        )
+
+    def pass_sum(self, camera: Camera) -> HostSum:
+        return HostSum(self, camera)
+
+    def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
+        return self._remembered(
+            ("features", seed, spp), lambda: self._tracer.features(camera, seed=seed, spp=spp)
+        )
+
+    def hits(self, camera: Camera) -> NDArray[np.bool_]:
+        return self._remembered(("hits",), lambda: self._tracer.hits(camera))
+
+    def _remembered(self, key: tuple[Any, ...], trace: Callable[[], Answer]) -> Answer:
+        if key in self._answers:
+            answer, core_s = self._answers[key]
+            self.owed_core_s += core_s
+        else:
+            started = time.process_time()
+            answer = trace()
+            self._answers[key] = (answer, time.process_time() - started)
+        return answer
+
+
 SEED = 20_261_122
-"""Of pictures and of scenes that are drawn here: no build and no run has it."""
+"""Seed of pictures and scenes that are drawn here; no build and no run uses it."""
 
 _SMALL = 32
 """Pixels each way of what only compiles."""
@@ -36,11 +85,11 @@ class Shot:
     view: RenderedView
     """The picture with its floor and its samples."""
     core_s: float
-    """What it takes alone: samples, guide pictures, measuring the floor, the last denoise."""
+    """Core-seconds alone: samples, guide pictures, measuring the floor, the last denoise."""
     load_core_s: float
     """Loading the scene: arrays, tree of triangles, tables of lights."""
     packed_bytes: int
-    """In the profile `compact`, with the pictures of single lights where there are any."""
+    """Size in the profile `compact`, with the pictures of single lights if there are any."""
 
 
 def fixed_samples(resolution: int, spp: int) -> RenderSettings:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from infra.bench.sides.remeshing import cleaned, raw_mesh
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.renders.settings import RenderSettings
 from storage.conventions import look_at_c2w
@@ -26,14 +27,10 @@ _RADIANCE = 200.0
 
 def coarser(path: Path, budgets: Sequence[int], method: str) -> list[TriangleMesh]:
     """Return the cleaned source of a file, then one mesh for each budget; raises Rejected."""
-    from pipeline.assets.cleaning.clean import clean, normalise
-    from pipeline.assets.cleaning.orient import orient_outward
+    from pipeline.assets.cleaning.clean import clean
     from pipeline.assets.decimation.by_name import decimate
-    from pipeline.assets.reading.load import load_mesh
-    from pipeline.assets.reading.source_file import read_source
-    from pipeline.assets.settings import AssetSettings
 
-    source, _ = orient_outward(clean(normalise(load_mesh(read_source(path, AssetSettings())))))
+    source = cleaned(raw_mesh(path))
     return [source, *(clean(decimate(source, budget, method)) for budget in budgets)]
 
 

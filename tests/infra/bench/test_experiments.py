@@ -1,15 +1,16 @@
 """Every experiment's declaration is whole, its points can be listed, and its results told."""
 
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from infra.bench.asked import Asked
 from infra.bench.catalogue import chosen, every_experiment, families
 from infra.bench.choices import CHOICES, choices
 from infra.bench.curve import columns_of, rows
-from infra.bench.effort import CAREFUL, QUICK, Effort
+from infra.bench.effort import CAREFUL, QUICK, Asked, Effort
 from infra.bench.experiment import Experiment
 from infra.bench.machine import ROOT
 from infra.bench.pages import read_block, write_pages
@@ -50,6 +51,18 @@ def test_names_are_of_one_thing() -> None:
     assert chosen(["sampling", "samples"]) == list(families()["sampling"])
     with pytest.raises(TrilightError, match=r"experiment 'sample' is unknown; did you mean"):
         chosen(["sample"])
+
+
+def test_experiments_are_listed_where_torch_is_not_installed() -> None:
+    """What needs torch is then refused by name, and everything else can be measured."""
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from infra.bench.catalogue import every_experiment\n"
+        "from infra.bench.effort import QUICK\n"
+        "assert all(one.points(QUICK) for one in every_experiment())"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
 
 
 def test_what_is_missing_is_told() -> None:

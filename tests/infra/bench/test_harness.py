@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from infra.bench import run as running
-from infra.bench.asked import Asked
 from infra.bench.curve import COST_NOISE, PricedLevel, at_error, on_front, rows, spread
+from infra.bench.effort import Asked
 from infra.bench.experiment import Experiment
 from infra.bench.machine import machine, revision
 from infra.bench.run import newest_run, run

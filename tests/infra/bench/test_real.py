@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from infra.bench.asked import Asked
 from infra.bench.catalogue import chosen
 from infra.bench.curve import Row, rows
+from infra.bench.effort import Asked
 from infra.bench.run import run
 from tests.infra.bench.bench_kit import TINY
 

@@ -10,7 +10,7 @@ from prefect.client.schemas.objects import FlowRun
 from prefect.utilities.schema_tools import ValidationError, validate
 
 from tests.conftest import ROOT
-from tests.infra.bench.manifests_kit import IMAGES, MANIFESTS, containers, job_template
+from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, containers, job_template
 
 TEMPLATES = {
     "process": ROOT / "infra" / "serving" / "pool.json",

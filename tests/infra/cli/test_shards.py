@@ -51,7 +51,7 @@ def test_a_bad_derived_shard_is_made_of_its_sources_again(tmp_path: Path) -> Non
     (tmp_path / "ab" / "train-000001.tar").unlink()
     found = trilight(["verify", str(tmp_path / "ab")])
     assert found.exit_code == 1
-    assert "Make it again of its sources: trilight shards merge" in found.output
+    assert "Make it again from its sources: trilight shards merge" in found.output
     with pytest.raises(TrilightError, match=r"made by `trilight shards merge`; expected one of"):
         repair(str(tmp_path / "ab"), ["train-000001.tar"], objects=None, scenes_from=None)
     found = trilight(["verify", str(damaged := _without_a_shard(a))])

@@ -84,12 +84,12 @@ def test_a_file_says_what_set_would() -> None:
 
 
 WRONG: dict[str, tuple[str, str]] = {
-    "seed: 1\nseed: 2\n": ("line 2", "seed is there twice"),
-    "renders:\n  max_spp: 64\nrenders.max_spp: 64\n": ("line 3", "renders.max_spp is there twice"),
+    "seed: 1\nseed: 2\n": ("line 2", "seed is given twice"),
+    "renders:\n  max_spp: 64\nrenders.max_spp: 64\n": ("line 3", "renders.max_spp is given twice"),
     "- seed\n": ("line 1", "expected names with values"),
     "seed: {\n": ("line 2", "expected"),
     "? [a]\n: 1\n": ("line 1", "expected the name of a setting"),
-    "a: [{b: 1, b: 2}]\n": ("line 1", "a name is there twice"),
+    "a: [{b: 1, b: 2}]\n": ("line 1", "a name is given twice"),
     "seed: 1\nrenders:\n  resolution: wide\n": ("line 3", "'renders.resolution' is 'wide'"),
     "seeed: 1\n": ("line 1", "did you mean seed?"),
 }

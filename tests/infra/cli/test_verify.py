@@ -34,4 +34,4 @@ def test_words_that_do_not_print_are_not_repeated(tmp_path: Path) -> None:
         write_asked(publication.folder, words)
         shown = trilight(["verify", str(tmp_path)], env=WIDE).output
         assert "Next:" not in shown
-        assert "the same trilight generate that began it" in shown
+        assert "run the trilight generate command that began it" in shown

@@ -7,8 +7,7 @@ from typing import Any
 import torch
 
 from model.config import smoke
-from model.trained_range import TrainedRange
-from model.weights import encode_weights
+from model.weights import TrainedRange, encode_weights
 from tests.command_line import trilight
 from tests.model.kit import awake
 

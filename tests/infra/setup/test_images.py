@@ -11,7 +11,7 @@ import yaml
 
 from pipeline.flows.orders import DatasetInRuns
 from tests.conftest import ROOT
-from tests.infra.bench.manifests_kit import IMAGES, MANIFESTS, containers
+from tests.infra.setup.manifests_kit import IMAGES, MANIFESTS, containers
 
 BIN = Path(sys.executable).parent
 

@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from infra.bench.sides.bare_pictures import bare_pictures
-from infra.bench.sides.plain_mitsuba import render_levels
+from infra.bench.sides.sampled_pictures import bare_pictures, render_levels
 from infra.bench.sides.shots import SEED, fixed_samples, shots
 from pipeline.renders.renderer import SceneRenderer
 from storage.metrics import psnr_log_db

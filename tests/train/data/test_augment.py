@@ -21,12 +21,12 @@ from train.data.augment import (
     moved,
     rotation_rand,
     with_channels,
+    with_light_scaled,
     with_vertices_turned,
     with_views,
 )
-from train.data.augmentation import AugmentationSettings
-from train.data.relight import with_light_scaled
 from train.data.scenes import TrainingScene, training_scene
+from train.settings import AugmentationSettings
 
 RESOLUTION = 32
 

@@ -25,8 +25,8 @@ from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.train.data.test_augment import scene_behind
 from tests.train.toy import toy_sample
 from train.data.augment import augmented
-from train.data.augmentation import AugmentationSettings
 from train.data.scenes import TrainingScene, training_scene
+from train.settings import AugmentationSettings
 
 RESOLUTION, BLOCK, PASSES, SPP = 32, 4, 16, 64
 

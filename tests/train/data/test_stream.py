@@ -14,12 +14,11 @@ from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from tests.train.toy import write_toy_dataset
-from train.data.augmentation import AugmentationSettings
 from train.data.order import RankShare
 from train.data.scenes import TrainingScene
-from train.data.splits import first_samples
 from train.data.stream import StreamSettings, prefetched, stream_batches
-from train.data.unusable import Unusable
+from train.data.unusable import Unusable, first_samples
+from train.settings import AugmentationSettings
 
 SETTINGS = StreamSettings(
     seed=1,

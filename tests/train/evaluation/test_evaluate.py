@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from infra.excursion_plots import plot_excursions
+from infra.judging import plot_excursions
 from model.light_groups import light_groups
 from model.weights import encode_weights
 from storage.dataset.dataset import Dataset
@@ -25,16 +25,16 @@ from tests.train.loss.test_lpips import small_weights
 from tests.train.toy import toy_sample, toy_scene, write_toy_dataset
 from train.data.scenes import training_scene
 from train.evaluation.evaluate import (
+    GROUPED,
     Contest,
+    grouped_pictures,
     judged_views,
     make_rivals,
     worst_and_median,
     worst_of_each_excursion,
 )
-from train.evaluation.grouped_lights import GROUPED, grouped_pictures
-from train.evaluation.groups import by_group, summary
 from train.evaluation.judge import judged_scene, median_picture, predict
-from train.evaluation.judged_view import NETWORK, JudgedView, facts_of
+from train.evaluation.judged_view import NETWORK, JudgedView, by_group, facts_of, summary
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals

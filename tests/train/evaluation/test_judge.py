@@ -12,8 +12,7 @@ from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.train.toy import toy_sample, toy_scene
 from train.data.scenes import training_scene
-from train.evaluation.hits import CHUNK, hit_masks
-from train.evaluation.judge import median_picture
+from train.evaluation.judge import CHUNK, hit_masks, median_picture
 from train.evaluation.scores import ViewScore, lead, score_view, share_better, summarise
 from train.evaluation.sheet import (
     ERROR_WHITE,

@@ -19,6 +19,7 @@ from tests.train.kit import tiny_run
 from train.folder import RunFolder
 from train.loop.checkpoints import (
     keep_checkpoint,
+    network_of_run,
     path_of_step,
     resumed_checkpoint,
     resumed_state,
@@ -26,7 +27,6 @@ from train.loop.checkpoints import (
 )
 from train.loop.crew import Crew
 from train.loop.state import new_state
-from train.networks import network_of_run
 
 ALONE = Crew(device=torch.device("cpu"))
 

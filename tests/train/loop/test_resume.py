@@ -23,7 +23,7 @@ from train.loop.checkpoints import (
     save_checkpoint,
 )
 from train.loop.crew import Crew
-from train.loop.metrics_log import MetricsLog, read_rows
+from train.loop.recorder import MetricsLog, read_rows
 from train.loop.state import TrainState, new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective

@@ -11,9 +11,7 @@ from torch import Tensor
 
 from storage.errors import TrilightError
 from storage.seeds import rng_for
-from train.loss.lpips import SCALE, SHIFT, Lpips
-from train.loss.lpips_weights import LINEAR_FILE, VGG16_FILE, load_lpips
-from train.loss.vgg16 import BLOCKS
+from train.loss.lpips import BLOCKS, LINEAR_FILE, SCALE, SHIFT, VGG16_FILE, Lpips, load_lpips
 
 WIDTHS = (4, 5, 6, 7, 8)
 RESOLUTION = 16

@@ -13,9 +13,8 @@ from storage.seeds import rng_for
 from tests.train.loss.test_lpips import small_weights
 from train.loss.lpips import Lpips
 from train.loss.ms_ssim import SCALE_WEIGHTS, ms_ssim, ssim
-from train.loss.objective import Objective
-from train.loss.settings import LossSettings
-from train.loss.tone_map import tone_mapped
+from train.loss.objective import Objective, tone_mapped
+from train.settings import LossSettings
 
 
 def log10_pictures(name: str, resolution: int = 16) -> Tensor:

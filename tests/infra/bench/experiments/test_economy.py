@@ -13,11 +13,13 @@ from infra.bench.experiments.economy import (
     LEAST_KB,
     OBJECTS,
     SAMPLES,
+    SceneCosts,
+    _costs,
+    _error_within,
     _errors,
     _geometry,
 )
-from infra.bench.subjects.network_scenes import base_flops
-from infra.bench.subjects.scene_costs import SceneCosts, _costs, _error_within
+from infra.bench.sides.networks import base_flops
 from storage.errors import TrilightError
 from storage.records.asset import Asset
 from storage.records.sample import SceneRecord, encode_sample

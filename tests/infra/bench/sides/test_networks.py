@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-import torch
 
 from infra.bench.experiments.network_size import trained_scores
 from infra.bench.sides.network_memory import peaks_of
@@ -17,11 +16,9 @@ from infra.bench.sides.networks import (
     Contenders,
     log10_psnr_db,
     published_like,
+    scene_of,
     timed_forward,
-    timed_training_step,
 )
-from infra.bench.subjects.network_scenes import scene_of
-from model.config import SIZES
 from model.costs import Workload
 from model.published.config import PublishedConfig
 from tests.model.published.test_convert import publishable
@@ -58,12 +55,6 @@ def test_scenes_have_the_size_that_is_asked_for(triangles: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_training_step_is_timed() -> None:
-    torch.manual_seed(0)
-    found = timed_training_step(SIZES["smoke"](), CPU, scenes=1)
-    assert found["step_s"] > 0 and found["tflop_per_s"] > 0
-
-
 def test_what_a_size_is_worth_is_the_mean_of_its_trainings(tmp_path: Path) -> None:
     def row(scenes: int, log_l1: float, change: str = "ours") -> str:
         scores = {"log_l1": log_l1, "psnr_log_db_median": 20.0}

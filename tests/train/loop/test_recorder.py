@@ -8,15 +8,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from storage.dataset.dataset import Dataset
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.loop.metrics_log import read_rows
-from train.progress import Silent
+from train.loop.recorder import read_rows
+from train.progress import TrainProgress
 
 
 class Stop(BaseException):
     """A power cut."""
 
 
-class StopAt(Silent):
+class StopAt(TrainProgress):
     def advance(self, *, step: int, loss: float, learning_rate: float, views_per_s: float) -> None:
         if step == 7:
             raise Stop

@@ -10,8 +10,7 @@ from storage.metrics import psnr_log_db
 from storage.seeds import rng_for
 from tests.train.loss.test_lpips import small_weights
 from tests.train.toy import toy_sample
-from train.evaluation.metrics import METRICS, picture_scores
-from train.evaluation.noise_floors import noise_floors
+from train.evaluation.metrics import METRICS, noise_floors, picture_scores
 from train.loss.lpips import Lpips
 
 

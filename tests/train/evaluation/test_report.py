@@ -2,8 +2,7 @@
 
 from pipeline.builds.judging import JUDGING_BUILDS
 from tests.train.evaluation.test_evaluate import row
-from train.evaluation.published import BENCHMARK
-from train.evaluation.report import markdown, record
+from train.evaluation.report import BENCHMARK, markdown, record
 
 
 def test_the_benchmark_stands_beside_the_paper() -> None:

@@ -16,7 +16,7 @@ from tests.train.kit import TINY_MODEL
 from tests.train.toy import toy_sample
 from train.data.buckets import MOST_WASTE, bucket_scenes, make_batch
 from train.data.scenes import TrainingScene, training_scene
-from train.loop.peak import device_peak
+from train.loop.window import device_peak
 
 RESOLUTION = 16
 DEEPER = dataclasses.replace(TINY_MODEL, encoder_layers=2, decoder_layers=2)

@@ -1,0 +1,207 @@
+"""Pictures of a view at rising numbers of samples, of which nothing is measured, with their price.
+
+`bare_pictures` is our tracer: the path tracer that a network competes with. There is no second half
+and no noise floor: a user who only wants a picture pays for its samples, the denoiser's guide
+pictures and one denoise. Few samples go with guide pictures of few samples.
+
+`render_levels` is what a user of plain Mitsuba would run: stock `path` with its defaults and the
+`independent` sampler, and Open Image Denoise once. Material and emitters are those of
+pipeline.renders.plugin_scene: without its one texture rough metals would lose light, and no number
+of samples would give the right picture. Its emitters are chosen by their power, which is more than
+a user gets without asking, and the denoiser reads our own guide pictures: both favour this side.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.bench.sides.shots import SEED, warm_up_denoiser
+from pipeline.renders.camera import Camera
+from pipeline.renders.denoiser import denoise
+from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.settings import PASS_SPP, RenderSettings
+from pipeline.renders.tracer import Features, Tracer
+from storage.records.scene import Scene
+from storage.seeds import seed_for
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampledPicture:
+    """One view with a fixed number of samples."""
+
+    spp: int
+    """Samples per pixel."""
+    radiance_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance."""
+    core_s: float
+    """Core-seconds of this picture alone, kernels warm and scene loaded."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampledPictures:
+    """One view at every level."""
+
+    load_core_s: float
+    """Core-seconds of loading the scene."""
+    levels: tuple[SampledPicture, ...]
+    """Pictures from few samples to many; each includes the samples of the one before."""
+
+
+_PASSES = (*PASS_SPP, 1)
+
+
+def first_camera(scene: Scene, resolution: int) -> Camera:
+    """Return the first camera of a scene for square pictures of `resolution` pixels."""
+    pose = np.asarray(scene.c2w[0], np.float64)
+    return Camera(c2w=pose, fov_deg=float(scene.fov_deg[0]), resolution=resolution)
+
+
+def bare_pictures(
+    scene: Scene, resolution: int, levels_spp: Sequence[int]
+) -> tuple[SampledPictures, SampledPictures]:
+    """Return a scene's first view as sampled, and denoised; runs in a render child.
+
+    Args:
+        scene: that passes `Scene.check`.
+        resolution: pixels each way.
+        levels_spp: rising from 1 up.
+    """
+    camera = first_camera(scene, resolution)
+    _warm_up(_load(scene), camera)
+    started = time.process_time()
+    tracer = _load(scene)
+    load_core_s = time.process_time() - started
+    total, done, spent = np.zeros((resolution, resolution, 3)), 0, 0.0
+    raw, denoised = [], []
+    for spp in levels_spp:
+        started = time.process_time()
+        total += _sum_of_samples(tracer, camera, done, spp)
+        picture = (total / spp).astype(np.float32)
+        spent, done = spent + time.process_time() - started, spp
+        raw.append(SampledPicture(spp=spp, radiance_rgb=picture, core_s=spent))
+        started = time.process_time()
+        clean = _denoised(tracer, camera, picture, spp)
+        core_s = spent + time.process_time() - started
+        denoised.append(SampledPicture(spp=spp, radiance_rgb=clean, core_s=core_s))
+    return (
+        SampledPictures(load_core_s=load_core_s, levels=tuple(raw)),
+        SampledPictures(load_core_s=load_core_s, levels=tuple(denoised)),
+    )
+
+
+def _load(scene: Scene) -> Tracer:
+    depths = {"max_depth": RenderSettings.max_depth, "rr_depth": RenderSettings.rr_depth}
+    return load_tracer(scene, **depths)
+
+
+def _warm_up(tracer: Tracer, camera: Camera) -> None:
+    for spp in _PASSES:
+        tracer.radiance(camera, seed=0, spp=spp)
+        tracer.features(camera, seed=0, spp=spp)
+    warm_up_denoiser(camera.resolution)
+
+
+def _largest_pass(spp: int) -> int:
+    return next(size for size in _PASSES if size <= spp)
+
+
+def _sum_of_samples(tracer: Tracer, camera: Camera, done: int, spp: int) -> NDArray[np.float64]:
+    """Return the sum of the samples from number `done` up to `spp`, [R, R, 3]."""
+    total = np.zeros((camera.resolution, camera.resolution, 3))
+    while done < spp:
+        size = _largest_pass(spp - done)
+        seed = seed_for(SEED, "bare", done)
+        total += size * tracer.radiance(camera, seed=seed, spp=size).astype(np.float64)
+        done += size
+    return total
+
+
+def _denoised(
+    tracer: Tracer, camera: Camera, picture: NDArray[np.float32], spp: int
+) -> NDArray[np.float32]:
+    seed = seed_for(SEED, "features")
+    features = tracer.features(camera, seed=seed, spp=_largest_pass(spp))
+    return denoise(picture, features, "high")
+
+
+_RR_DEPTH = 5
+"""Mitsuba's default."""
+
+
+def render_levels(
+    scene: Scene, resolution: int, levels_spp: tuple[int, ...], seed: int
+) -> SampledPictures:
+    """Render a scene's first view with each number of samples; no sample is traced twice.
+
+    Core-seconds are those of the samples, the guide pictures, and one denoise.
+
+    Args:
+        scene: that passes `Scene.check`.
+        resolution: pixels each way.
+        levels_spp: rising. Mitsuba is called once for what each adds to the one before, in steps
+            as large as a user's, since few samples a call cost it up to a tenth.
+        seed: of the view.
+    """
+    camera = first_camera(scene, resolution)
+    _Plain(scene).radiance(camera, seed_for(seed, "plain warm-up"), levels_spp[0])
+    warm_up_denoiser(resolution)
+    started = time.process_time()
+    plain = _Plain(scene)
+    load_core_s = time.process_time() - started
+    features, core_s = _features(scene, camera, seed)
+    total, before, levels = np.zeros((resolution, resolution, 3)), 0, []
+    for spp in levels_spp:
+        started = time.process_time()
+        total += (spp - before) * plain.radiance(camera, seed_for(seed, "plain", spp), spp - before)
+        core_s += time.process_time() - started
+        started = time.process_time()
+        picture = denoise((total / spp).astype(np.float32), features, "high")
+        finished_core_s = core_s + time.process_time() - started
+        levels.append(SampledPicture(spp=spp, radiance_rgb=picture, core_s=finished_core_s))
+        before = spp
+    return SampledPictures(load_core_s=load_core_s, levels=tuple(levels))
+
+
+def _features(scene: Scene, camera: Camera, seed: int) -> tuple[Features, float]:
+    tracer = load_tracer(scene, max_depth=RenderSettings.max_depth, rr_depth=_RR_DEPTH)
+    aux_spp = RenderSettings.aux_spp
+    tracer.features(camera, seed=seed, spp=aux_spp)  # compiles
+    started = time.process_time()
+    features = tracer.features(camera, seed=seed, spp=aux_spp)
+    return features, time.process_time() - started
+
+
+class _Plain:
+    """A scene with its integrator."""
+
+    def __init__(self, scene: Scene) -> None:
+        import mitsuba  # not before `activate`, which says where compiled kernels are kept
+
+        from pipeline.renders.plugin_scene import plugin_scene
+
+        self._mi = mitsuba
+        self._scene = plugin_scene(scene)
+        self._path = mitsuba.load_dict(
+            {
+                "type": "path",
+                "max_depth": RenderSettings.max_depth,
+                "rr_depth": _RR_DEPTH,
+                "hide_emitters": True,
+            }
+        )
+
+    def radiance(self, camera: Camera, seed: int, spp: int) -> NDArray[np.float64]:
+        """Return the mean of `spp` samples, [R, R, 3]."""
+        from pipeline.renders.plugin_tracer import stock_sensor
+
+        picture = self._mi.render(
+            self._scene,
+            sensor=stock_sensor(camera, {"type": "independent", "sample_count": spp}),
+            integrator=self._path,
+            seed=self._mi.UInt32(seed),
+            spp=spp,
+        )
+        return np.array(picture, np.float64)
