@@ -15,7 +15,7 @@ from storage.records.failures import count_by_reason, read_failures
 from storage.records.objects_lock import read_objects_lock
 
 if TYPE_CHECKING:
-    from pipeline.making.dataset_run import Outcome
+    from pipeline.making.run import Outcome
 
 _MAX_NOTES = 20
 """Most notes that are printed."""

@@ -1,7 +1,6 @@
 """The flow `build-dataset`: objects, then scenes, then the documents, by one worker or by many."""
 
 import dataclasses
-import itertools
 from typing import Any
 
 from prefect import flow
@@ -12,6 +11,7 @@ from pipeline.flows.generate_scenes import generate_scenes
 from pipeline.flows.orders import DATASET_FORMS, DatasetInRuns, dataset_in_runs, run_name
 from pipeline.flows.prepare_assets import prepare_assets
 from pipeline.making.order import DatasetOrder
+from pipeline.making.tasks import shard_ranges
 from storage.dataset.status import read_status
 
 
@@ -28,19 +28,12 @@ def build_dataset(**parameters: Any) -> None:
     given = {field.name: parameters[field.name] for field in dataclasses.fields(DatasetOrder)}
     prepare_assets(**given)
     if order.flow_runs > 1:
-        own, *others = ranges_of(read_status(order.place).shards_planned, order.flow_runs)
+        own, *others = shard_ranges(read_status(order.place).shards_planned, order.flow_runs)
         for shards in others:
             ranged = {name: _json(value) for name, value in given.items()} | {"shards": shards}
             run_deployment(order.deployment, parameters=ranged, timeout=0, as_subflow=False)
         generate_scenes(**{**given, "shards": own})
     generate_scenes(**given)
-
-
-def ranges_of(num_shards: int, flow_runs: int) -> list[str]:
-    """Return ranges A:B of shards, nearly equal, as many as there are runs or shards."""
-    count = min(flow_runs, num_shards)
-    bounds = [num_shards * part // count for part in range(count + 1)]
-    return [f"{first}:{last}" for first, last in itertools.pairwise(bounds)]
 
 
 def _json(value: Any) -> Any:

@@ -7,8 +7,8 @@ from prefect.logging import get_run_logger
 
 from pipeline.flows.forms import parameters_of
 from pipeline.flows.orders import DATASET_FORMS, dataset_order, run_name
-from pipeline.making.dataset_run import prepare_dataset
 from pipeline.making.order import DatasetOrder
+from pipeline.making.pipeline import prepare_dataset
 
 
 @flow(name="prepare-assets", flow_run_name=run_name, persist_result=False)

@@ -20,7 +20,7 @@ from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
 from infra.bench.sides import prefect_process
 from infra.bench.workshop import Workshop
-from pipeline.making.pieces import MOST_TASKS
+from pipeline.making.tasks import MOST_TASKS
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.scene_log import SceneLog, read_scene_logs
 

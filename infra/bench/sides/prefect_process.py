@@ -10,7 +10,7 @@ from typing import Any
 
 from infra.bench.workshop import Workshop
 from pipeline.flows.prefect_server import SERVER, prefect_server, quiet_prefect
-from pipeline.making.runners import in_window
+from pipeline.making.runner import in_window
 
 _RECORDS_S = 600.0
 

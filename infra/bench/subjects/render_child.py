@@ -8,9 +8,9 @@ from infra.bench.asked import Asked
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.isolation import ChildLimits, IsolatedChild
-from pipeline.making.accept_objects import accept_objects
 from pipeline.making.environment import environment
 from pipeline.making.make_scene import SceneRecipe, set_up_child
+from pipeline.making.pipeline import accept_objects
 from pipeline.making.publication import begin
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import DatasetFolder

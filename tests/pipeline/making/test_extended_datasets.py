@@ -10,8 +10,9 @@ from prefect.exceptions import ParameterTypeError
 from infra.repair import repair
 from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.file_child import file_child
-from pipeline.making.make_task import ShardJob, make_task
+from pipeline.making.pipeline import make_task
 from pipeline.making.publication import begin
+from pipeline.making.run import ShardJob
 from pipeline.shards.derive import _extensions
 from scene_templates.default_families import FAMILIES
 from storage.dataset.asked import read_asked, write_asked

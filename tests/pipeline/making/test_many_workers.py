@@ -10,13 +10,13 @@ import pytest
 
 from pipeline.flows import build_dataset as building
 from pipeline.flows import on_dask, runner
-from pipeline.flows.executors import find_executor
 from pipeline.flows.limits import GPU_LIMIT
 from pipeline.flows.orders import DatasetInRuns, dataset_in_runs
 from pipeline.isolation import IsolatedChild
-from pipeline.making import make_task
+from pipeline.making import render_children
 from pipeline.making.children import ChildPool
 from pipeline.making.order import DatasetOrder
+from pipeline.making.tasks import shard_ranges
 from storage.dataset.layout import DatasetFolder
 from storage.errors import TrilightError
 
@@ -53,8 +53,8 @@ def test_so_many_flow_runs_are_so_many_in_all(made: list[str | None]) -> None:
 
 
 def test_there_are_no_more_ranges_than_shards() -> None:
-    assert building.ranges_of(2, 5) == ["0:1", "1:2"]
-    assert building.ranges_of(7, 1) == ["0:7"]
+    assert shard_ranges(2, 5) == ["0:1", "1:2"]
+    assert shard_ranges(7, 1) == ["0:7"]
 
 
 @pytest.mark.parametrize(
@@ -106,13 +106,13 @@ def test_only_children_that_nobody_uses_are_closed(monkeypatch: pytest.MonkeyPat
     job = cast(Any, SimpleNamespace(
         folder=DatasetFolder(Path("a")), settings=SimpleNamespace(digest="d"), lock_sha256="l"
     ))  # fmt: skip
-    monkeypatch.setattr(make_task, "_pools", {("b", "d", "l"): pool("other")})
-    monkeypatch.setattr(make_task, "_new_pool", lambda job: pool("ours"))
-    with make_task._child_of(job):
+    monkeypatch.setattr(render_children, "_pools", {("b", "d", "l"): pool("other")})
+    monkeypatch.setattr(render_children, "_new_pool", lambda job: pool("ours"))
+    with render_children.render_child(job):
         assert closed == ["other"]
-        make_task.close_idle_children()
+        render_children.close_idle_children()
         assert closed == ["other"]
-    make_task.close_idle_children()
+    render_children.close_idle_children()
     assert closed == ["other", "ours"]
 
 
@@ -129,9 +129,7 @@ def test_a_dask_worker_that_sees_another_folder_is_named_before_any_work(tmp_pat
     assert list((tmp_path / "set" / ".staging").iterdir()) == []
 
 
-def test_what_cannot_be_told_to_dask_is_named() -> None:
-    with pytest.raises(TrilightError, match="--workers is 2; expected it without --runner dask"):
-        find_executor("dask", "tcp://127.0.0.1:1", 2)
+def test_a_dask_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed", reason="needs the package distributed (setup-all)")
     with (
         pytest.raises(TrilightError, match="--address http://127.0.0.1:1: no Dask scheduler"),
