@@ -20,9 +20,9 @@ class ExecutorChoice:
     """Who does the work."""
 
     runner: str = "threads"
-    """Who runs the tasks: threads of this process; slurm, where this command is a task of an array and
-    makes its share; prefect, as a flow run at PREFECT_API_URL; the workers of a dask cluster; or an
-    executor of your own (--extend)."""
+    """Who runs the tasks: threads of this process; slurm, where this command is a task of an array
+    and makes its share; prefect, as a flow run at PREFECT_API_URL; the workers of a dask cluster;
+    or an executor of your own (--extend)."""
     address: str | None = None
     """With --runner dask: the scheduler, such as tcp://host:8786; by default there is none."""
 

@@ -70,13 +70,9 @@ def test_an_array_makes_the_dataset_that_one_process_makes(
     finished = Undocumented()
     monkeypatch.setattr("pipeline.executors.slurm.ThreadRunner", lambda: finished)
     monkeypatch.setattr("pipeline.executors.threads.ThreadRunner", Undocumented)
-    find_executor("threads", None, None).make(
-        tiny_order(out=str(tmp_path / "one"), scenes=20), None
-    )
-    slurm, order = (
-        find_executor("slurm", None, None),
-        tiny_order(out=str(tmp_path / "set"), scenes=20),
-    )
+    alone, shared = (tiny_order(out=str(tmp_path / name), scenes=20) for name in ("one", "set"))
+    find_executor("threads", None, None).make(alone, None)
+    slurm = find_executor("slurm", None, None)
     for task in (2, 0, 1):
         assert finished.finished == 0
         for name, value in _array(task, 0, 2, 3).items():
