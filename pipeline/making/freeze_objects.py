@@ -22,7 +22,7 @@ log = logging.getLogger("trilight.objects")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Meshes:
+class MadeMeshes:
     """The objects of a source as the mesh stage leaves them."""
 
     found: FoundObjects
@@ -46,7 +46,7 @@ class AcceptedObjects:
 
 
 def freeze_objects(
-    source: str, meshes: Meshes, settings: BuildSettings, publication: Publication
+    source: str, meshes: MadeMeshes, settings: BuildSettings, publication: Publication
 ) -> AcceptedObjects:
     """Freeze the objects at the first time, and later require that they are the same.
 

@@ -35,7 +35,12 @@ from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.making.accept_scene_files import accept_scene_files
 from pipeline.making.bucket_publication import begin_dataset, joined
 from pipeline.making.environment import environment
-from pipeline.making.freeze_objects import AcceptedObjects, Meshes, freeze_objects, frozen_objects
+from pipeline.making.freeze_objects import (
+    AcceptedObjects,
+    MadeMeshes,
+    freeze_objects,
+    frozen_objects,
+)
 from pipeline.making.machine import cores_owned
 from pipeline.making.make_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.making.order import DatasetOrder, generate_words
@@ -172,7 +177,7 @@ def make_meshes(
     downloaded: Callable[[int, int], None],
     planned: Callable[[int], None],
     done: Callable[[], None],
-) -> Meshes:
+) -> MadeMeshes:
     """Objects to meshes; what is in the asset store is not made again.
 
     Args:
@@ -196,7 +201,7 @@ def make_meshes(
     wanted = [record for record in found.records if only is None or record.uid in only]
     planned(len(wanted))
     prepared, rejected = prepare_isolated(wanted, settings, workers=workers, done=done)
-    return Meshes(found=found, prepared=prepared, rejected=rejected)
+    return MadeMeshes(found=found, prepared=prepared, rejected=rejected)
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
