@@ -21,20 +21,18 @@ bucket share what is finished (pipeline.shards.mirror).
 """
 
 import contextlib
-import logging
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
-from pipeline.builds.named import BUILDS, object_source
+from pipeline.builds.named import object_source
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.making.accept_scene_files import accept_scene_files
-from pipeline.making.bucket_publication import begin_dataset, joined
-from pipeline.making.environment import environment
+from pipeline.making.bucket_publication import joined
 from pipeline.making.freeze_objects import (
     AcceptedObjects,
     MadeMeshes,
@@ -53,24 +51,20 @@ from pipeline.making.run import (
     ShardJob,
     TaskOutcome,
     Watcher,
-    require_shards,
+    begun_publication,
     settings_of,
 )
 from pipeline.making.runner import Runner
 from pipeline.making.tasks import Piece, rounds
 from pipeline.making.unfinished_shard import UnfinishedShard
 from pipeline.objects.sources import find_objects
-from pipeline.renders.variant import choose_variant
 from storage.dataset.asked import write_asked
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.output import dataset_folder
 from storage.dataset.progress import announce_downloads, announce_objects, count_object
-from storage.dataset.scene_log import log_scene
 from storage.dataset.statistics import Statistics
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
-
-log = logging.getLogger("trilight.scenes")
 
 
 def make_dataset(
@@ -104,20 +98,12 @@ def prepare_dataset(order: DatasetOrder) -> Run:
 
 @contextlib.contextmanager
 def _begun(order: DatasetOrder) -> Iterator[Run]:
-    """Join those who make a dataset, with its objects frozen."""
+    """Join the makers of a dataset, and have its objects frozen by whoever comes first."""
     folder = dataset_folder(order.place)
     folder = replace(folder, root=folder.root.resolve())
     settings, listed = settings_of(order, folder)  # refuses an order before anything is written
-    num_scenes = BUILDS[order.build].num_scenes if order.scenes is None else order.scenes
     with joined(folder):
-        publication = begin_dataset(
-            folder,
-            settings,
-            environment(choose_variant()),
-            num_scenes,
-            accept_environment=order.accept_environment,
-        )
-        require_shards(order, publication)
+        publication = begun_publication(order, settings, folder)
         with folder.turn("objects"):  # one maker prepares, and the others find it done
             publication.refresh()
             if listed:
@@ -144,7 +130,7 @@ def accept_objects(
     publication: Publication,
     workers: int,
 ) -> AcceptedObjects:
-    """Objects to frozen meshes: all that the source has, or those that were frozen before.
+    """Turn a source into frozen meshes: of all its objects, or of those that were frozen before.
 
     Raises:
         TrilightError, EnvironmentFailure: as `make_meshes` and `freeze_objects`.
@@ -178,7 +164,7 @@ def make_meshes(
     planned: Callable[[int], None],
     done: Callable[[], None],
 ) -> MadeMeshes:
-    """Objects to meshes; what is in the asset store is not made again.
+    """Turn the objects of a source into meshes; what is in the asset store is not made again.
 
     Args:
         source, allowed_licences, licence, work_dir, downloaded: as `find_objects` takes them.
@@ -205,12 +191,12 @@ def make_meshes(
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
-    """Frozen meshes to shards: cut what is missing into tasks, and have the runner run them."""
+    """Turn frozen meshes into shards: the runner runs many tasks at once, each by `make_task`."""
     publication = run.publication
     job = run.job(runner.num_at_once or run.num_workers())
     try:
         for this_round in rounds(run, at_once=runner.window or job.num_at_once):
-            for outcome in runner.run(this_round.tasks, job):  # many at a time: see make_task
+            for outcome in runner.run(this_round.tasks, job):  # here work goes parallel
                 this_round.record(outcome)
                 for shard in outcome.shards:
                     publication.add_shard(shard)
@@ -257,18 +243,10 @@ def make_piece(job: ShardJob, piece: Piece, child: IsolatedChild) -> tuple[int, 
         with shard.claim(scene_index) as ours:
             if not ours:
                 continue
-            started = time.monotonic()
+            began = time.monotonic()
             sample, failures = make_scene(shard.split, scene_index, attempts, child)
-            shard.stage(scene_index, sample, failures, profile)
-            seconds, outcome = time.monotonic() - started, "made" if sample else "given up"
-            log.info("%s: scene %09d %s in %.1f s", shard.name, scene_index, outcome, seconds)
-            log_scene(
-                job.folder,
-                shard.name,
-                scene_index,
-                seconds=seconds,
-                cores=cores_of_child(job),
-                num_rejected=len(failures),
+            shard.stage(
+                scene_index, sample, failures, profile, began=began, cores=cores_of_child(job)
             )
             scenes += 1
     return scenes, shard.pack()
@@ -277,7 +255,7 @@ def make_piece(job: ShardJob, piece: Piece, child: IsolatedChild) -> tuple[int, 
 def make_scene(
     split: str, scene_index: int, attempts: int, child: IsolatedChild
 ) -> tuple[Sample | None, list[Failure]]:
-    """Meshes to a scene with its pictures: the first attempt that is not rejected, or nothing.
+    """Turn meshes into a scene with pictures: the first attempt that is not rejected, if any is.
 
     In the child, `attempt_scene` composes the scene (or reads its file) and renders its views. If a
     child is killed, crashes or takes too long, the same attempt is tried again in a new one.
@@ -304,7 +282,7 @@ def make_scene(
 
 
 def make_documents(publication: Publication) -> Statistics:
-    """Shards to documents, once all of them are there; one maker at a time."""
+    """Turn all shards into documents; one maker at a time."""
     with publication.folder.turn("documents"):
         statistics = write_documents(publication.dataset(), publication.folder)
         publication.send_documents()

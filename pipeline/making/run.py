@@ -4,10 +4,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.builds.named import frozen_note, named_build, object_source
+from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_folder import SceneFolder, find_scene_files
 from pipeline.making.accept_scene_files import settings_for_files
+from pipeline.making.bucket_publication import begin_dataset
+from pipeline.making.environment import environment
 from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.machine import visible_gpus
 from pipeline.making.order import DatasetOrder
@@ -179,11 +181,25 @@ def settings_of(
     return settings_for_files(settings, listed, order.views), listed
 
 
-def require_shards(order: DatasetOrder, publication: Publication) -> None:
-    """Raise TrilightError where the order asks for shards beyond the end of the dataset."""
+def begun_publication(
+    order: DatasetOrder, settings: BuildSettings, folder: DatasetFolder
+) -> Publication:
+    """Begin the dataset of an order, or go on with the one that is there.
+
+    Raises:
+        TrilightError: the dataset was begun otherwise, or has not got the shards of the order.
+    """
+    publication = begin_dataset(
+        folder,
+        settings,
+        environment(choose_variant()),
+        BUILDS[order.build].num_scenes if order.scenes is None else order.scenes,
+        accept_environment=order.accept_environment,
+    )
     wanted = order.shard_range()
     if wanted is not None and wanted.start >= publication.num_shards:
         raise TrilightError(
             f"shards is {order.shards!r}; expected one that begins below {publication.num_shards}, "
             f"the shards of {publication.manifest.num_scenes} scenes."
         )
+    return publication

@@ -7,6 +7,7 @@ the process that holds it, so that nothing has to be cleaned up after a kill.
 
 import contextlib
 import logging
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pipeline.shards.pack import pack_shard
 from storage.dataset.claims import claimed
 from storage.dataset.layout import DatasetFolder, numbered
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.scene_log import log_scene
 from storage.dataset.splits import scenes_of_shard, shard_name, split_of_shard
 from storage.dataset.staging import is_staged, stage_scene
 from storage.records.objects import Failure
@@ -54,9 +56,32 @@ class UnfinishedShard:
         sample: Sample | None,
         failures: list[Failure],
         profile: Profile,
+        *,
+        began: float,
+        cores: int,
     ) -> None:
-        """Keep a finished scene, or that it was given up; raises TrilightError as `stage_scene`."""
+        """Keep a finished scene, or that it was given up, and log what it took.
+
+        Args:
+            scene_index, sample, failures, profile: as `stage_scene` takes them.
+            began: when work on the scene began, by `time.monotonic`.
+            cores: how many were busy with it.
+
+        Raises:
+            TrilightError: the folder cannot be written.
+        """
         stage_scene(self._staged, scene_index, sample, failures, profile)
+        seconds, outcome = time.monotonic() - began, "made" if sample else "given up"
+        log.info("%s: scene %09d %s in %.1f s", self.name, scene_index, outcome, seconds)
+        rejected = len(failures)
+        log_scene(
+            self._folder,
+            self.name,
+            scene_index,
+            seconds=seconds,
+            cores=cores,
+            num_rejected=rejected,
+        )
 
     def pack(self) -> ShardEntry | None:
         """Pack the shard if all its scenes are staged, unless somebody else does.
