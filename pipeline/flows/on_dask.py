@@ -48,7 +48,7 @@ def _make(order: DatasetOrder, address: str) -> Outcome:
             "--runner dask needs prefect-dask; expected it to be installed. Run pip install "
             "--requirement requirements/served.txt."
         ) from error
-    from pipeline.flows.runner import PrefectRunner
+    from pipeline.flows.prefect_runner import PrefectRunner
 
     with _client(address) as client:
         threads = _threads(client, address)

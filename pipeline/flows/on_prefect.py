@@ -9,7 +9,7 @@ from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.making.order import DatasetOrder
 
 if TYPE_CHECKING:
-    from pipeline.flows.runner import PrefectRunner
+    from pipeline.flows.prefect_runner import PrefectRunner
     from pipeline.making.run import Outcome
 
 
@@ -17,7 +17,7 @@ def make(order: DatasetOrder, address: str | None) -> "Outcome":
     """Make a dataset; raises as `make_dataset`, or the private server does not start."""
     quiet_prefect()
     with prefect_server():
-        from pipeline.flows.runner import PrefectRunner  # Prefect reads its settings now
+        from pipeline.flows.prefect_runner import PrefectRunner  # Prefect reads its settings now
 
         return as_flow(order, PrefectRunner())
 

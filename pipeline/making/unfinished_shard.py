@@ -73,14 +73,13 @@ class UnfinishedShard:
         stage_scene(self._staged, scene_index, sample, failures, profile)
         seconds, outcome = time.monotonic() - began, "made" if sample else "given up"
         log.info("%s: scene %09d %s in %.1f s", self.name, scene_index, outcome, seconds)
-        rejected = len(failures)
         log_scene(
             self._folder,
             self.name,
             scene_index,
             seconds=seconds,
             cores=cores,
-            num_rejected=rejected,
+            num_rejected=len(failures),
         )
 
     def pack(self) -> ShardEntry | None:

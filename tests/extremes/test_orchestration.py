@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.generate_scenes import generate_scenes
+from pipeline.flows.dataset_flows import generate_scenes
 from pipeline.flows.orders import dataset_order
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.run import ShardJob, TaskOutcome
