@@ -1,4 +1,4 @@
-"""The flows of datasets: `prepare-assets`, `generate-scenes`, and `build-dataset`, which is both."""
+"""The flows `prepare-assets`, `generate-scenes` and `build-dataset`, which is both of them."""
 
 import dataclasses
 from typing import Any

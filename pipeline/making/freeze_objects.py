@@ -22,18 +22,6 @@ log = logging.getLogger("trilight.objects")
 
 
 @dataclass(frozen=True, kw_only=True)
-class MadeMeshes:
-    """The objects of a source as the mesh stage leaves them."""
-
-    found: FoundObjects
-    """What the source has, and what was refused before the mesh stage."""
-    prepared: list[PreparedAsset]
-    """The usable objects, in the order of their uids."""
-    rejected: list[Failure]
-    """The other ones."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class AcceptedObjects:
     """What scenes may use."""
 
@@ -46,13 +34,19 @@ class AcceptedObjects:
 
 
 def freeze_objects(
-    source: str, meshes: MadeMeshes, settings: BuildSettings, publication: Publication
+    source: str,
+    found: FoundObjects,
+    prepared: list[PreparedAsset],
+    rejected: list[Failure],
+    settings: BuildSettings,
+    publication: Publication,
 ) -> AcceptedObjects:
     """Freeze the objects at the first time, and later require that they are the same.
 
     Args:
         source: where the objects come from, for messages.
-        meshes: all objects of the source at the first time, and later those that are frozen.
+        found: what the source has.
+        prepared, rejected: what the mesh stage made of it, or later of what is frozen.
         settings: the build, which says how objects are dealt to splits.
         publication: the dataset.
 
@@ -62,20 +56,20 @@ def freeze_objects(
         EnvironmentFailure: one of those could not be prepared this time.
     """
     shown, frozen = safe_url(source), frozen_objects(publication)
-    passing = [failure for failure in meshes.rejected if is_passing(failure.reason)]
+    passing = [failure for failure in rejected if is_passing(failure.reason)]
     if frozen is not None:
         _require_tried(shown, passing)
-    publication.add_failures([*meshes.found.failures, *meshes.rejected])
-    locked = [_locked(asset, settings) for asset in meshes.prepared]
+    publication.add_failures([*found.failures, *rejected])
+    locked = [_locked(asset, settings) for asset in prepared]
     if frozen is None:
         _require_enough(locked, settings, publication, shown)
         _warn_of(shown, passing)
         publication.lock_objects(locked)
     else:
         _require_same_objects(shown, frozen, locked)
-    paths = [asset.path for asset in meshes.prepared]
+    paths = [asset.path for asset in prepared]
     return AcceptedObjects(
-        objects=tuple(zip(locked, paths, strict=True)), num_found=meshes.found.num_found
+        objects=tuple(zip(locked, paths, strict=True)), num_found=found.num_found
     )
 
 

@@ -20,9 +20,9 @@ from pipeline.assets.stage import PreparedAsset
 from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.isolation import ChildFailed, call_with_retries
-from pipeline.making.pipeline import make_meshes
-from pipeline.making.prepare_isolated import asset_child
+from pipeline.making.prepare_isolated import asset_child, prepare_isolated
 from pipeline.objects.ply import encode_ply
+from pipeline.objects.sources import find_objects
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json
@@ -128,30 +128,21 @@ def make_assets(
     if workers < 1:
         raise TrilightError(f"workers is {workers}; expected at least 1.")
     _require_ours(folder)
-
-    def known(num_objects: int) -> None:
-        write_atomically(folder.summary, b"{}")  # from here on the folder is ours
-        planned(num_objects)
-
-    meshes = make_meshes(
+    found = find_objects(
         source,
-        settings,
+        work_dir=cache_folder("objects"),
         allowed_licences=allowed_licences,
         licence=licence,
-        work_dir=cache_folder("objects"),
-        workers=workers,
         downloaded=downloaded,
-        planned=known,
-        done=done,
     )
-    prepared = meshes.prepared
+    write_atomically(folder.summary, b"{}")  # from here on the folder is ours
+    planned(len(found.records))
+    prepared, rejected = prepare_isolated(list(found.records), settings, workers=workers, done=done)
     levels = [_only_level(asset) for asset in prepared]
     rows = [_row(asset, level) for asset, level in zip(prepared, levels, strict=True)]
     report = AssetReport(
         rows=tuple(rows),
-        failures=tuple(
-            sorted([*meshes.found.failures, *meshes.rejected], key=lambda row: row.item)
-        ),
+        failures=tuple(sorted([*found.failures, *rejected], key=lambda row: row.item)),
         geometry_sha256=tuple(map(_geometry_sha256, levels)),
     )
     _write(folder, settings, report, levels)

@@ -22,23 +22,16 @@ bucket share what is finished (pipeline.shards.mirror).
 
 import contextlib
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
-from pipeline.assets.settings import AssetSettings
 from pipeline.builds.named import object_source
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.making.accept_scene_files import accept_scene_files
 from pipeline.making.bucket_publication import joined
-from pipeline.making.freeze_objects import (
-    AcceptedObjects,
-    MadeMeshes,
-    freeze_objects,
-    frozen_objects,
-)
+from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects, frozen_objects
 from pipeline.making.machine import cores_owned
 from pipeline.making.make_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.making.order import DatasetOrder, generate_words
@@ -133,61 +126,22 @@ def accept_objects(
     """Turn a source into frozen meshes: of all its objects, or of those that were frozen before.
 
     Raises:
-        TrilightError, EnvironmentFailure: as `make_meshes` and `freeze_objects`.
+        TrilightError, EnvironmentFailure: as `find_objects` and `freeze_objects`.
     """
-    folder = publication.folder
-    meshes = make_meshes(
-        source,
-        settings.assets,
-        only=frozen_objects(publication),
-        allowed_licences=settings.allowed_licences,
-        licence=licence,
-        work_dir=folder.staged_objects,
-        workers=workers,
-        downloaded=lambda done, total: announce_downloads(folder, done, total),
-        planned=lambda total: announce_objects(folder, total),
-        done=lambda: count_object(folder),
-    )
-    return freeze_objects(source, meshes, settings, publication)
-
-
-def make_meshes(
-    source: str,
-    settings: AssetSettings,
-    *,
-    only: Collection[str] | None = None,
-    allowed_licences: Sequence[str],
-    licence: str | None,
-    work_dir: Path,
-    workers: int,
-    downloaded: Callable[[int, int], None],
-    planned: Callable[[int], None],
-    done: Callable[[], None],
-) -> MadeMeshes:
-    """Turn the objects of a source into meshes; what is in the asset store is not made again.
-
-    Args:
-        source, allowed_licences, licence, work_dir, downloaded: as `find_objects` takes them.
-        settings: how objects become meshes.
-        only: uids of the objects that are wanted; all by default.
-        workers: objects at a time.
-        planned: called with the number of objects, once they are known.
-        done: called after each object, from any thread.
-
-    Raises:
-        TrilightError: the source is unusable, or a needed library is not installed.
-    """
+    folder, frozen = publication.folder, frozen_objects(publication)
     found = find_objects(
         source,
-        work_dir=work_dir,
-        allowed_licences=allowed_licences,
+        work_dir=folder.staged_objects,
+        allowed_licences=settings.allowed_licences,
         licence=licence,
-        downloaded=downloaded,
+        downloaded=lambda done, total: announce_downloads(folder, done, total),
     )
-    wanted = [record for record in found.records if only is None or record.uid in only]
-    planned(len(wanted))
-    prepared, rejected = prepare_isolated(wanted, settings, workers=workers, done=done)
-    return MadeMeshes(found=found, prepared=prepared, rejected=rejected)
+    wanted = [record for record in found.records if frozen is None or record.uid in frozen]
+    announce_objects(folder, len(wanted))
+    prepared, rejected = prepare_isolated(
+        wanted, settings.assets, workers=workers, done=lambda: count_object(folder)
+    )
+    return freeze_objects(source, found, prepared, rejected, settings, publication)
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:

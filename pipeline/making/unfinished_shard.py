@@ -60,27 +60,15 @@ class UnfinishedShard:
         began: float,
         cores: int,
     ) -> None:
-        """Keep a finished scene, or that it was given up, and log what it took.
+        """Keep a finished scene, or that it was given up, and log what it took; as `stage_scene`.
 
-        Args:
-            scene_index, sample, failures, profile: as `stage_scene` takes them.
-            began: when work on the scene began, by `time.monotonic`.
-            cores: how many were busy with it.
-
-        Raises:
-            TrilightError: the folder cannot be written.
+        Work on it `began` at that time, by `time.monotonic`, and kept so many `cores` busy.
         """
         stage_scene(self._staged, scene_index, sample, failures, profile)
         seconds, outcome = time.monotonic() - began, "made" if sample else "given up"
         log.info("%s: scene %09d %s in %.1f s", self.name, scene_index, outcome, seconds)
-        log_scene(
-            self._folder,
-            self.name,
-            scene_index,
-            seconds=seconds,
-            cores=cores,
-            num_rejected=len(failures),
-        )
+        folder, count = self._folder, len(failures)
+        log_scene(folder, self.name, scene_index, seconds=seconds, cores=cores, num_rejected=count)
 
     def pack(self) -> ShardEntry | None:
         """Pack the shard if all its scenes are staged, unless somebody else does.

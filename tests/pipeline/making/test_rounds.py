@@ -1,6 +1,7 @@
 """Rounds of a run: what others are at is waited for, seldom, without tasks; the budget holds."""
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,21 @@ def test_waiting_for_others_takes_few_looks_and_no_tasks(
     pipeline.make_shards(run, runner, lambda run, outcome: None)
     assert pauses == [1, 2, 4, 8, 16, 32, 60, 60, 60, 60]
     assert runner.rounds == [1, 1, 1]  # at first, after the eighth pause, after the ninth
+
+
+def test_a_range_leaves_to_others_what_they_are_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def sleep(seconds: float) -> None:
+        raise AssertionError("nobody waits")
+
+    monkeypatch.setattr(tasks.time, "sleep", sleep)
+    run, runner = _run(tmp_path, 8), Idle()
+    ranged = dataclasses.replace(run, order=dataclasses.replace(run.order, shards="0:1"))
+    pipeline.make_shards(ranged, runner, lambda run, outcome: None)
+    assert runner.rounds == [1]
+    assert ranged.missing_shards() == [0]
+    assert run.missing_shards() == [0, 1]
 
 
 def test_what_is_free_is_what_nobody_is_at(tmp_path: Path) -> None:
