@@ -9,10 +9,11 @@
     shards     tars of finished scenes, the same bytes everywhere    pipeline.shards.pack
     documents  card, report, contact sheet: what people look at      pipeline.documents
 
-The objects are frozen after the mesh stage. From then on scene k is a function of the settings, the
-frozen objects and k, and so it does not matter who makes it. A `Runner` makes many scenes at the
-same time (`make_shards`): on threads, with Prefect, on a Dask cluster, in a Slurm array
-(pipeline.executors). Native code runs in child processes, so that a crash costs one attempt.
+The objects are frozen after the mesh stage (where scenes come from files, the files are). From then
+on scene k is a function of the settings, the frozen objects and k, and so it does not matter who
+makes it. A `Runner` makes many scenes at the same time (`make_shards`): on threads, in a Slurm
+array, with Prefect, on a Dask cluster (pipeline.executors.registry lists them). Native code runs in
+child processes, so that a crash costs one attempt.
 
 Files are the truth, and every step may be killed at any moment. A mesh is kept in the asset store,
 a scene in the staging folder, a shard in the dataset; the next run looks at what is there and makes
