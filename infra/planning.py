@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.dataset_run import prepare_dataset
 from pipeline.making.machine import cores_owned
-from pipeline.making.make_task import ShardJob, close_children, make_task
 from pipeline.making.order import DatasetOrder
-from pipeline.making.pieces import MOST_TASKS, TASK_S, Piece
+from pipeline.making.pipeline import make_task, prepare_dataset
+from pipeline.making.render_children import close_children
+from pipeline.making.run import ShardJob
+from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import index_shard
 from storage.dataset.splits import planned_scenes, shard_name, shards_for

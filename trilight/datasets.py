@@ -8,7 +8,7 @@ from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.records.sample import Sample
 
 if TYPE_CHECKING:
-    from pipeline.making.dataset_run import Outcome
+    from pipeline.making.run import Outcome
 
 __all__ = [
     "Dataset",
@@ -33,8 +33,8 @@ def generate(order: DatasetOrder) -> "Outcome":
     Raises:
         TrilightError: what the user can mend; what is finished is safe.
     """
-    from pipeline.making.dataset_run import make_dataset
-    from pipeline.making.runners import ThreadRunner
+    from pipeline.executors.threads import ThreadRunner
+    from pipeline.making.pipeline import make_dataset
 
     return make_dataset(order, ThreadRunner())
 
@@ -42,6 +42,6 @@ def generate(order: DatasetOrder) -> "Outcome":
 def __getattr__(name: str) -> object:
     if name != "Outcome":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from pipeline.making.dataset_run import Outcome
+    from pipeline.making.run import Outcome
 
     return Outcome

@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from pipeline.exchange.formats import Pictures as Pictures
     from pipeline.exchange.formats import SceneFormat as SceneFormat
     from pipeline.exchange.formats import SceneSource as SceneSource
-    from pipeline.flows.executors import EXECUTORS as EXECUTORS
-    from pipeline.flows.executors import Executor as Executor
-    from pipeline.making.dataset_run import Outcome as Outcome
-    from pipeline.making.dataset_run import make_dataset as make_dataset
-    from pipeline.making.dataset_run import prepare_dataset as prepare_dataset
+    from pipeline.executors.registry import EXECUTORS as EXECUTORS
+    from pipeline.executors.registry import Executor as Executor
+    from pipeline.executors.threads import ThreadRunner as ThreadRunner
     from pipeline.making.order import DatasetOrder as DatasetOrder
-    from pipeline.making.order_words import generate_words as generate_words
-    from pipeline.making.runners import ThreadRunner as ThreadRunner
+    from pipeline.making.order import generate_words as generate_words
+    from pipeline.making.pipeline import make_dataset as make_dataset
+    from pipeline.making.pipeline import prepare_dataset as prepare_dataset
+    from pipeline.making.run import Outcome as Outcome
     from pipeline.objects.listing import Listing as Listing
     from pipeline.objects.ply import encode_ply as encode_ply
     from pipeline.objects.sources import SOURCES as SOURCES
@@ -76,11 +76,11 @@ _NAMES = {
     "model.config": "ModelConfig SIZES",
     "pipeline.assets.settings": "AssetSettings",
     "pipeline.builds.named": "BUILDS named_build",
-    "pipeline.making.dataset_run": "Outcome make_dataset prepare_dataset",
-    "pipeline.flows.executors": "EXECUTORS Executor",
-    "pipeline.making.order": "DatasetOrder",
-    "pipeline.making.order_words": "generate_words",
-    "pipeline.making.runners": "ThreadRunner",
+    "pipeline.executors.registry": "EXECUTORS Executor",
+    "pipeline.executors.threads": "ThreadRunner",
+    "pipeline.making.order": "DatasetOrder generate_words",
+    "pipeline.making.pipeline": "make_dataset prepare_dataset",
+    "pipeline.making.run": "Outcome",
     "pipeline.exchange.formats": "FORMATS LoadedScene Pictures SceneFormat SceneSource",
     "pipeline.builds.settings": "BuildSettings NamedBuild",
     "pipeline.objects.listing": "Listing",

@@ -22,7 +22,7 @@ def _sizes() -> list[str]:
 
 
 def _runners() -> list[str]:
-    from pipeline.flows.executors import EXECUTORS
+    from pipeline.executors.registry import EXECUTORS
 
     return list(EXECUTORS)
 

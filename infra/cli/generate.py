@@ -8,7 +8,7 @@ from infra.cli.dataset_changes import with_shared
 from infra.cli.generate_progress import watched
 from infra.cli.generate_report import report
 from infra.cli.options import Shown, command
-from pipeline.flows.executors import find_executor
+from pipeline.executors.registry import find_executor
 from pipeline.making.order import DatasetOrder
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import dataset_folder
@@ -20,8 +20,9 @@ class ExecutorChoice:
     """Who does the work."""
 
     runner: str = "threads"
-    """Threads of this process, the workers of a dask cluster, or an executor of your own
-    (--extend)."""
+    """Who runs the tasks: threads of this process; slurm, where this command is a task of an array
+    and makes its share; prefect, as a flow run at PREFECT_API_URL; the workers of a dask cluster;
+    or an executor of your own (--extend)."""
     address: str | None = None
     """With --runner dask: the scheduler, such as tcp://host:8786; by default there is none."""
 

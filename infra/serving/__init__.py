@@ -1,4 +1,4 @@
-"""What a served deployment needs beside the flows; see pipeline.flows.served of extensions."""
+"""What a served deployment needs beside the flows: server, limits, access, the flow that trains."""
 
 from storage.extensions import load_named_extensions
 

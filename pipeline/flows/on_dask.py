@@ -11,9 +11,11 @@ import uuid
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from pipeline.making.dataset_run import Outcome
-from pipeline.making.make_task import close_idle_children
+from pipeline.flows.on_prefect import as_flow
+from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.making.order import DatasetOrder
+from pipeline.making.render_children import close_idle_children
+from pipeline.making.run import Outcome
 from storage.atomic import write_atomically
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
@@ -25,13 +27,20 @@ _AHEAD = 2
 """Tasks handed out for each thread of the cluster, so that none waits for the next one."""
 
 
-def make_on_dask(order: DatasetOrder, address: str) -> Outcome:
-    """Make a dataset with the workers of a Dask cluster; needs a Prefect API (PREFECT_API_URL).
+def make(order: DatasetOrder, address: str | None) -> Outcome:
+    """Make a dataset with the workers of a Dask cluster, as a flow run of this process.
 
     Raises:
         TrilightError: prefect-dask is not installed, the cluster does not answer, has no worker or
             one that sees another folder; or as `make_dataset`.
     """
+    assert address is not None, "the executor needs one"
+    quiet_prefect()
+    with prefect_server():
+        return _make(order, address)
+
+
+def _make(order: DatasetOrder, address: str) -> Outcome:
     try:
         from prefect_dask import DaskTaskRunner
     except ImportError as error:
@@ -39,23 +48,14 @@ def make_on_dask(order: DatasetOrder, address: str) -> Outcome:
             "--runner dask needs prefect-dask; expected it to be installed. Run pip install "
             "--requirement requirements/served.txt."
         ) from error
-    from prefect import flow
-
-    from pipeline.flows.generate_scenes import make_watched
-    from pipeline.flows.runner import PrefectRunner
+    from pipeline.flows.prefect_runner import PrefectRunner
 
     with _client(address) as client:
         threads = _threads(client, address)
         _require_shared(client, order)
     runner = PrefectRunner(window=_AHEAD * sum(threads), num_at_once=max(threads))
-
-    def on_dask() -> Outcome:
-        return make_watched(order, runner)
-
-    # its declared type lacks the results' own, which Prefect's signature names
-    cluster: Any = DaskTaskRunner(address=address)
     try:
-        return flow(name="generate-scenes", persist_result=False, task_runner=cluster)(on_dask)()
+        return as_flow(order, runner, task_runner=DaskTaskRunner(address=address))
     finally:
         # the workers outlive the run; where the cluster is gone, so are its children
         with contextlib.suppress(TrilightError, OSError), _client(address) as client:

@@ -6,6 +6,7 @@ goes on where it cannot be shown.
 
 import base64
 import io
+import logging
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -23,10 +24,11 @@ from prefect.artifacts import (
 )
 from prefect.logging import get_run_logger
 
-from pipeline.making.dataset_run import Outcome, Run
-from pipeline.making.make_task import TaskOutcome
 from pipeline.making.order import DatasetOrder
+from pipeline.making.pipeline import make_dataset
 from pipeline.making.price import PRICES, USD_PER_CORE_HOUR
+from pipeline.making.run import Outcome, Run, TaskOutcome
+from pipeline.making.runner import Runner
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason, read_failures
@@ -36,6 +38,20 @@ _EVERY_S = 15.0
 """Between two tables; each is a row of Prefect's database."""
 _SHEET_PX = 1024
 """Longest side of the contact sheet there: about 100 kB."""
+
+
+def make_watched(order: DatasetOrder, runner: Runner) -> Outcome:
+    """Make a dataset within a flow run, with its artifacts; the summary also says what failed."""
+    # one line per scene; PREFECT_LOGGING_EXTRA_LOGGERS=trilight brings it to the server
+    logging.getLogger("trilight").setLevel(logging.INFO)
+    watched = Watched(order)
+    try:
+        outcome = make_dataset(order, runner, watched.task_done)
+    except Exception as error:
+        watched.failed(error)
+        raise
+    watched.finished(outcome)
+    return outcome
 
 
 class Watched:

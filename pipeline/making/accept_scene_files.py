@@ -11,7 +11,7 @@ from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_note
 from pipeline.exchange.scene_files import SceneFiles, build_scene
 from pipeline.exchange.scene_folder import SceneFolder, require_usable
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
-from pipeline.making.accept_objects import AcceptedObjects, frozen_objects
+from pipeline.making.freeze_objects import AcceptedObjects, frozen_objects
 from pipeline.making.prepare_isolated import asset_child
 from pipeline.making.publication import Publication
 from pipeline.objects.licences import StatedLicence, stated_licence

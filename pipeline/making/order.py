@@ -11,11 +11,14 @@ from pipeline.renders.settings import NoiseFloor, Resolution
 from storage.dataset.layout import dataset_folder
 from storage.errors import TrilightError
 from storage.extensions import function_name
+from storage.remote.safe_url import safe_url
 from storage.settings.dataset import MOST_SCENES
-from storage.settings.described import checked
+from storage.settings.described import checked, option_words
 from storage.settings.ranges import Seed, Share, Within
 
 _RANGE = re.compile(r"(\d+):(\d+)")
+_ELSEWHERE = ("build", "out", "shards", "workers")
+"""What another machine says otherwise: where, which part, with how many processes."""
 
 
 @checked()
@@ -98,3 +101,17 @@ class DatasetOrder:
                 "to but not including the last."
             )
         return range(int(match[1]), int(match[2]))
+
+
+def generate_words(order: DatasetOrder) -> list[str]:
+    """Return the words of `generate` for what an order asks beside its defaults, without `--out`.
+
+    Which part of the dataset this machine makes, and with how many processes, is left out; so are
+    passwords.
+    """
+    words = option_words(order, leave_out=_ELSEWHERE)
+    return ["generate", order.build, *map(_shown, words)]
+
+
+def _shown(word: str) -> str:
+    return safe_url(word) if "://" in word else word

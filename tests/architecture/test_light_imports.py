@@ -59,4 +59,4 @@ def test_help_needs_no_heavy_library() -> None:
 
 
 def test_making_data_needs_no_torch() -> None:
-    assert "torch" not in _loaded_by("import pipeline.flows.generate_scenes")
+    assert "torch" not in _loaded_by("import pipeline.flows.dataset_flows")

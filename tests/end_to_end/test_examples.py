@@ -16,7 +16,7 @@ from model.config import SIZES, ModelConfig
 from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
-from pipeline.flows.executors import EXECUTORS
+from pipeline.executors.registry import EXECUTORS
 from pipeline.objects.sources import find_objects, look_at_source
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError

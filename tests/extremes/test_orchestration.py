@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.flows.generate_scenes import generate_scenes
+from pipeline.flows.dataset_flows import generate_scenes
 from pipeline.flows.orders import dataset_order
-from pipeline.making.dataset_run import make_dataset
-from pipeline.making.make_task import ShardJob, TaskOutcome
-from pipeline.making.pieces import MOST_TASKS, Piece, TaskSizes, cut_tasks
-from pipeline.making.runners import in_window
+from pipeline.making.pipeline import make_dataset
+from pipeline.making.run import ShardJob, TaskOutcome
+from pipeline.making.runner import in_window
+from pipeline.making.tasks import MOST_TASKS, Piece, TaskSizes, cut_tasks
 from storage.dataset.dataset import open_dataset
 from storage.dataset.splits import shards_for
 from storage.dataset.verify import verify_dataset

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from infra.planning import MeasuredScenes, measure_scenes, predict
-from pipeline.making.dataset_run import make_dataset
 from pipeline.making.machine import cores_owned
 from pipeline.making.order import DatasetOrder
-from pipeline.making.pieces import MOST_TASKS
+from pipeline.making.pipeline import make_dataset
+from pipeline.making.tasks import MOST_TASKS
 from storage.dataset.dataset import open_dataset
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
@@ -75,7 +75,7 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
     """Ten scenes reach the third shard, which is for validation. The clock moves on by 1000 s for
     the first scene, which a prediction leaves out, and by its number for each other one."""
     clock = _Clock()
-    monkeypatch.setattr("pipeline.making.make_task.time", clock)
+    monkeypatch.setattr("pipeline.making.pipeline.time", clock)
 
     def work(scene: int) -> None:
         clock.now += scene or 1000

@@ -23,8 +23,8 @@ from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Figures, Point, one_by_one, repeats
 from infra.bench.workshop import Workshop
 from pipeline.flows.prefect_server import SERVER, prefect_server, quiet_prefect
-from pipeline.making.pieces import MOST_TASKS
-from pipeline.making.runners import in_window
+from pipeline.making.runner import in_window
+from pipeline.making.tasks import MOST_TASKS
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import SceneLog, read_scene_logs
 

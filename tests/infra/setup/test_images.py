@@ -205,5 +205,5 @@ def test_the_array_job_is_a_shell_script(tmp_path: Path) -> None:
     done = subprocess.run(
         ["bash", script], env=environment, capture_output=True, text=True, check=True
     )
-    expected = f"generate smoke --out {tmp_path}/set --scenes 64 --shards 8:12 --objects a b\n"
+    expected = f"generate smoke --out {tmp_path}/set --scenes 64 --runner slurm --objects a b\n"
     assert done.stdout == expected

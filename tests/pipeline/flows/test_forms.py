@@ -8,12 +8,10 @@ from prefect.exceptions import ParameterTypeError
 
 from infra.serving.train_model import train_model
 from pipeline.builds.settings import BuildSettings
-from pipeline.flows.build_dataset import build_dataset
+from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare_assets
 from pipeline.flows.forms import BuildChanges, changed_values
-from pipeline.flows.generate_scenes import generate_scenes
 from pipeline.flows.orders import dataset_order
-from pipeline.flows.prepare_assets import prepare_assets
-from pipeline.flows.runner import may_pass
+from pipeline.flows.prefect_runner import may_pass
 from pipeline.making.order import DatasetOrder
 from storage.errors import EnvironmentFailure, TrilightError
 

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from pipeline.flows import generate_scenes, watching
-from pipeline.flows.runner import PrefectRunner
+from pipeline.flows import watching
+from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.watching import Watched, report_url, small_picture, usd_per_core_hour
-from pipeline.making.make_task import TaskOutcome
 from pipeline.making.order import DatasetOrder
+from pipeline.making.run import TaskOutcome
 from storage.errors import TrilightError
 
 
@@ -111,9 +111,9 @@ def test_a_run_that_fails_says_so_in_its_summary(
     def full(*arguments: object) -> None:
         raise TrilightError("the disk is full of https://me:secret@host/x")
 
-    monkeypatch.setattr(generate_scenes, "make_dataset", full)
+    monkeypatch.setattr(watching, "make_dataset", full)
     with pytest.raises(TrilightError):
-        generate_scenes.make_watched(DatasetOrder(out=str(tmp_path)), PrefectRunner())
+        watching.make_watched(DatasetOrder(out=str(tmp_path)), PrefectRunner())
     ((key, rows),) = tables
     assert key == "summary"
     assert rows["failed"].startswith("TrilightError: the disk is full")

@@ -10,8 +10,9 @@ from prefect.exceptions import ParameterTypeError
 from infra.repair import repair
 from pipeline.builds.named import BUILDS, named_build, typed_build
 from pipeline.exchange.reader import file_child
-from pipeline.making.make_task import ShardJob, make_task
+from pipeline.making.pipeline import make_task
 from pipeline.making.publication import begin
+from pipeline.making.run import ShardJob
 from pipeline.shards.derive import _extensions
 from scene_templates.families import FAMILIES
 from storage.dataset.asked import read_asked, write_asked
@@ -114,7 +115,7 @@ def test_a_dataset_never_causes_an_import(
 
 
 def test_a_form_cannot_name_a_file(tmp_path: Path) -> None:
-    from pipeline.flows.generate_scenes import generate_scenes
+    from pipeline.flows.dataset_flows import generate_scenes
 
     trap = written(tmp_path, TRAP)
     with pytest.raises(ParameterTypeError, match="build"):

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.making import make_shard
-from pipeline.making.dataset_run import Outcome, make_dataset, prepare_dataset
+from pipeline.executors.threads import ThreadRunner
+from pipeline.making import pipeline
 from pipeline.making.order import DatasetOrder
-from pipeline.making.runners import ThreadRunner
+from pipeline.making.pipeline import make_dataset, prepare_dataset
+from pipeline.making.run import Outcome
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.errors import EnvironmentFailure, TrilightError
@@ -122,8 +123,8 @@ def test_scenes_that_abort_their_child_are_counted(
     workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One is saved by its next attempt; one is given up, within the budget and beyond it."""
-    monkeypatch.setattr(make_shard, "attempt_scene", poison.render_or_abort)
-    monkeypatch.setattr(make_shard, "MAX_ATTEMPTS", 2)  # 16 would start a child 48 times
+    monkeypatch.setattr(pipeline, "attempt_scene", poison.render_or_abort)
+    monkeypatch.setattr(pipeline, "MAX_ATTEMPTS", 2)  # 16 would start a child 48 times
     with pytest.raises(TrilightError, match="1 of 8 scenes could not be made.*budget of 0%"):
         make(workshop, tmp_path / "set", failure_budget=0.0)
     outcome = make(workshop, tmp_path / "set", failure_budget=0.2)

@@ -1,19 +1,20 @@
 """Rounds of a run: what others are at is waited for, seldom, without tasks; the budget holds."""
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pipeline.making import dataset_run
-from pipeline.making.accept_objects import AcceptedObjects
-from pipeline.making.dataset_run import Run, make_dataset
-from pipeline.making.make_shard import is_free
-from pipeline.making.make_task import ShardJob, TaskOutcome
+from pipeline.making import pipeline, tasks
+from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.order import DatasetOrder
-from pipeline.making.pieces import Piece
+from pipeline.making.pipeline import make_dataset
+from pipeline.making.run import Run, ShardJob, TaskOutcome
+from pipeline.making.tasks import Piece
+from pipeline.making.unfinished_shard import UnfinishedShard
 from pipeline.shards.pack import pack_shard
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
@@ -73,28 +74,44 @@ def test_waiting_for_others_takes_few_looks_and_no_tasks(
         if len(pauses) == 10:  # and somebody else was quicker
             make_tiny_shard(begin_tiny(tmp_path, 4), 0)
 
-    monkeypatch.setattr(dataset_run.time, "sleep", sleep)
+    monkeypatch.setattr(tasks.time, "sleep", sleep)
     for scene in range(4):
         held.enter_context(_claim(run.publication.folder, scene))
-    dataset_run._make_missing(run, runner, lambda run, outcome: None)
+    pipeline.make_shards(run, runner, lambda run, outcome: None)
     assert pauses == [1, 2, 4, 8, 16, 32, 60, 60, 60, 60]
     assert runner.rounds == [1, 1, 1]  # at first, after the eighth pause, after the ninth
 
 
+def test_a_range_leaves_to_others_what_they_are_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def sleep(seconds: float) -> None:
+        raise AssertionError("nobody waits")
+
+    monkeypatch.setattr(tasks.time, "sleep", sleep)
+    run, runner = _run(tmp_path, 8), Idle()
+    ranged = dataclasses.replace(run, order=dataclasses.replace(run.order, shards="0:1"))
+    pipeline.make_shards(ranged, runner, lambda run, outcome: None)
+    assert runner.rounds == [1]
+    assert ranged.missing_shards() == [0]
+    assert run.missing_shards() == [0, 1]
+
+
 def test_what_is_free_is_what_nobody_is_at(tmp_path: Path) -> None:
-    folder, build = DatasetFolder(tmp_path), _build()
-    assert is_free(folder, build, 0)
+    folder = DatasetFolder(tmp_path)
+    shard = UnfinishedShard(folder, _build().splits, 0)
+    assert shard.is_free()
     for scene in range(3):
         stage_scene(folder.staged_shard(FIRST), scene, _sample(scene), [], "lossless")
     with _claim(folder, 3):
-        assert not is_free(folder, build, 0)
-    assert is_free(folder, build, 0)
+        assert not shard.is_free()
+    assert shard.is_free()
     stage_scene(folder.staged_shard(FIRST), 3, _sample(3), [], "lossless")
-    assert is_free(folder, build, 0)  # to be packed
+    assert shard.is_free()  # to be packed
     with claimed(folder.staged_shard(FIRST) / "pack.claim"):
-        assert not is_free(folder, build, 0)
+        assert not shard.is_free()
     pack_shard(folder, FIRST, range(4))
-    assert not is_free(folder, build, 0)
+    assert not shard.is_free()
 
 
 def test_a_rerun_does_not_escape_the_failure_budget(
@@ -107,6 +124,6 @@ def test_a_rerun_does_not_escape_the_failure_budget(
         failure = Failure(stage="scenes", item=sample_key(scene), reason="no", message="x")
         stage_scene(folder.staged_shard(FIRST), scene, None, [failure], "lossless")
     run.publication.add_shard(pack_shard(folder, FIRST, range(4)))
-    monkeypatch.setattr(dataset_run, "_begin", lambda *arguments: run)
+    monkeypatch.setattr(pipeline, "_begun", lambda order: contextlib.nullcontext(run))
     with pytest.raises(TrilightError, match="4 of 4 scenes could not be made"):
         make_dataset(run.order, Idle())

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.making.accept_objects import AcceptedObjects
+from pipeline.executors.threads import ThreadRunner
+from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.order import DatasetOrder
 from pipeline.making.publication import Publication
-from pipeline.making.runners import ThreadRunner
 from storage.dataset.statistics import Statistics
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
@@ -45,8 +45,8 @@ def without_rendering(
         made(scene)
         return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
 
-    monkeypatch.setattr("pipeline.making.dataset_run.accept_objects", accept)
-    monkeypatch.setattr("pipeline.making.make_shard._make_scene", make)
+    monkeypatch.setattr("pipeline.making.pipeline.accept_objects", accept)
+    monkeypatch.setattr("pipeline.making.pipeline.make_scene", make)
     monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")  # needs no probe
     return scenes
 

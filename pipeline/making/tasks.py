@@ -1,13 +1,21 @@
-"""How work is cut: a task takes one to ten minutes, and a run has at most a thousand of them.
+"""What is missing of a dataset, cut into tasks, round by round until nothing is.
 
 A piece is a range of scenes of one shard; a task is several pieces. Small shards are put together,
-large ones are cut. How long a scene takes is known only as the run goes, so tasks are cut one by
-one, each when it is handed out.
+large ones are cut. A task takes one to ten minutes, and a run has at most a thousand of them. How
+long a scene takes is known only as the run goes, so tasks are cut one by one, each when it is
+handed out.
+
+Several makers may share a dataset. A round leaves out what others are making; after it, a run waits
+until they are done, and makes what is left over where one of them died.
 """
 
+import itertools
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from pipeline.making.run import Run, TaskOutcome
+from pipeline.making.unfinished_shard import UnfinishedShard
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure
 from storage.settings.dataset import SplitSettings
@@ -18,6 +26,9 @@ TASK_S = 240.0
 """Seconds that a task should take."""
 _FIRST_SCENES = 4
 """Scenes of a task before anything is measured."""
+_FIRST_PAUSE_S = 1.0
+_LONGEST_PAUSE_S = 60.0
+"""Between two looks at what others are making; the pause doubles while nothing is left for us."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,3 +127,64 @@ def cut_tasks(
                 room = sizes.next_size(scenes_left, most - yielded, at_once)
     if pieces:
         yield tuple(pieces)
+
+
+class Round:
+    """The tasks of all that is missing now; each is cut when the executor asks for it."""
+
+    def __init__(self, tasks: Iterator[tuple[Piece, ...]], sizes: TaskSizes) -> None:
+        self.tasks = tasks
+        self.made_anything = False
+        self._sizes = sizes
+
+    def record(self, outcome: TaskOutcome) -> None:
+        """Take a finished task into account: later tasks get the size that its speed suggests."""
+        self.made_anything |= bool(outcome.scenes or outcome.shards)
+        if outcome.scenes:
+            self._sizes.measured(outcome.scenes, outcome.seconds)
+
+
+def rounds(run: Run, at_once: int) -> Iterator[Round]:
+    """Yield rounds of tasks until no shard that was asked for is missing.
+
+    A run of a range of shards ends earlier: when others are making all that is left of the range.
+
+    Args:
+        run: the dataset; its publication must learn of each shard that a task has packed.
+        at_once: tasks that are handed out at the same time.
+
+    Raises:
+        EnvironmentFailure: the run has handed out as many tasks as it may.
+    """
+    sizes, tasks, pause_s = TaskSizes(), TasksLeft(), _FIRST_PAUSE_S
+    while missing := run.missing_shards():
+        this = Round(tasks.cut(missing, run.settings.splits, sizes, at_once=at_once), sizes)
+        yield this
+        if this.made_anything:
+            pause_s = _FIRST_PAUSE_S
+        elif run.order.shards is None:
+            pause_s = _wait_for_others(run, pause_s)
+        else:
+            return
+
+
+def _wait_for_others(run: Run, pause_s: float) -> float:
+    """Return the next pause, as soon as nothing is missing or somebody left something undone.
+
+    No tasks are handed out meanwhile: each would be a row of a scheduler's database.
+    """
+    publication, splits = run.publication, run.settings.splits
+    while True:
+        time.sleep(pause_s)
+        pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+        missing = publication.missing_shards()
+        shards = (UnfinishedShard(publication.folder, splits, index) for index in missing)
+        if not missing or any(shard.is_free() for shard in shards):
+            return pause_s
+
+
+def shard_ranges(num_shards: int, parts: int) -> list[str]:
+    """Return nearly equal ranges A:B of shards, as many as there are parts, or shards if fewer."""
+    count = min(parts, num_shards)
+    bounds = [num_shards * part // count for part in range(count + 1)]
+    return [f"{first}:{last}" for first, last in itertools.pairwise(bounds)]

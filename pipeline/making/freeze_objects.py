@@ -1,4 +1,4 @@
-"""From a source of objects to the frozen list that scenes draw from."""
+"""The objects of a dataset, frozen: what its scenes draw from, the same for all its makers."""
 
 import logging
 from dataclasses import dataclass
@@ -8,11 +8,9 @@ from pipeline.assets.stage import PreparedAsset
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.isolation import is_passing
-from pipeline.making.prepare_isolated import prepare_isolated
 from pipeline.making.publication import Publication
-from pipeline.objects.sources import find_objects
+from pipeline.objects.sources import FoundObjects
 from storage.conventions import SPLITS
-from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.objects import Failure, LockedObject, count_by_reason, read_objects_lock
@@ -33,37 +31,29 @@ class AcceptedObjects:
     """Where scenes come from files: those, and `objects` are the files themselves."""
 
 
-def accept_objects(
+def freeze_objects(
     source: str,
-    licence: str | None,
+    found: FoundObjects,
+    prepared: list[PreparedAsset],
+    rejected: list[Failure],
     settings: BuildSettings,
     publication: Publication,
-    workers: int,
 ) -> AcceptedObjects:
-    """List, filter and prepare the objects, and freeze them at the first time.
+    """Freeze the objects at the first time, and later require that they are the same.
+
+    Args:
+        source: where the objects come from, for messages.
+        found: what the source has.
+        prepared, rejected: what the mesh stage made of it, or later of what is frozen.
+        settings: the build, which says how objects are dealt to splits.
+        publication: the dataset.
 
     Raises:
-        TrilightError: the source is unusable, no object is accepted, a split has none, or the
-            objects are not those that the dataset was begun with.
+        TrilightError: no object is accepted, a split has none, or the objects are not those that
+            the dataset was begun with.
         EnvironmentFailure: one of those could not be prepared this time.
     """
-    folder = publication.folder
-    found = find_objects(
-        source,
-        work_dir=folder.staged_objects,
-        allowed_licences=settings.allowed_licences,
-        licence=licence,
-        downloaded=lambda done, total: announce_downloads(folder, done, total),
-    )
-    allowed = list(found.records)
-    shown = safe_url(source)
-    frozen = frozen_objects(publication)
-    if frozen is not None:
-        allowed = [record for record in allowed if record.uid in frozen]
-    announce_objects(folder, len(allowed))
-    prepared, rejected = prepare_isolated(
-        allowed, settings.assets, workers=workers, done=lambda: count_object(folder)
-    )
+    shown, frozen = safe_url(source), frozen_objects(publication)
     passing = [failure for failure in rejected if is_passing(failure.reason)]
     if frozen is not None:
         _require_tried(shown, passing)

@@ -1,6 +1,6 @@
 """The tasks of a dataset as Prefect's: scheduled, displayed, and tried again where that can help.
 
-A task run is some minutes of scenes (pipeline.making.pieces). Native code runs in children of our
+A task run is some minutes of scenes (pipeline.making.tasks). Native code runs in children of our
 own, never in a process pool of Prefect's, which one segfault breaks as a whole.
 """
 
@@ -16,9 +16,10 @@ from prefect.futures import PrefectFuture, as_completed
 from prefect.tasks import Task, exponential_backoff
 
 from pipeline.flows.limits import DISK_LIMIT, GPU_LIMIT
-from pipeline.making.make_task import ShardJob, TaskOutcome, make_task
-from pipeline.making.pieces import Piece
-from pipeline.making.runners import in_window
+from pipeline.making.pipeline import make_task
+from pipeline.making.run import ShardJob, TaskOutcome
+from pipeline.making.runner import in_window
+from pipeline.making.tasks import Piece
 from pipeline.renders.variant import choose_variant
 from storage.dataset.statistics import Statistics
 from storage.errors import EnvironmentFailure

@@ -1,15 +1,16 @@
-"""Who runs the tasks of a dataset: threads here, or a scheduler (pipeline.flows.served).
+"""`Runner`: the one interface between the engine and who runs its tasks.
 
-A runner takes tasks one by one as it has room, and gives their outcomes as they come: memory does
-not grow with the number of tasks, and no finished task waits for a slow one.
+The engine knows none of them: threads and Slurm are in pipeline.executors, Prefect and Dask in
+pipeline.flows, and a user may bring another. A runner takes tasks one by one as it has room, and
+gives their outcomes as they come: memory does not grow with the number of tasks, and no finished
+task waits for a slow one.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Protocol, TypeVar
 
-from pipeline.making.make_task import ShardJob, TaskOutcome, make_task
-from pipeline.making.pieces import Piece
+from pipeline.making.run import ShardJob, TaskOutcome
+from pipeline.making.tasks import Piece
 from storage.dataset.statistics import Statistics
 
 Task = TypeVar("Task")
@@ -18,7 +19,7 @@ Result = TypeVar("Result")
 
 
 class Runner(Protocol):
-    """Runs `make_task` for each task."""
+    """Runs `pipeline.making.pipeline.make_task` for each task, somewhere."""
 
     @property
     def num_at_once(self) -> int | None:
@@ -36,30 +37,7 @@ class Runner(Protocol):
         """
 
     def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
-        """Call what finishes a dataset; few may at the same time, since it reads all of it."""
-
-
-class ThreadRunner:
-    """Threads of this process, each with its render child; no server, no scheduler."""
-
-    num_at_once = None
-    window = None
-
-    def run(self, tasks: Iterable[tuple[Piece, ...]], job: ShardJob) -> Iterator[TaskOutcome]:
-        pool = ThreadPoolExecutor(job.num_at_once)
-        try:
-            yield from in_window(
-                tasks,
-                submit=lambda task: pool.submit(make_task, job, task),
-                first_done=_first_done,
-                result=lambda future: future.result(),
-                window=job.num_at_once,
-            )
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-    def finish(self, write_documents: Callable[[], Statistics]) -> Statistics:
-        return write_documents()
+        """Call what writes the documents; few may at the same time: it reads the whole dataset."""
 
 
 def in_window(
@@ -88,7 +66,3 @@ def in_window(
         outcome = result(done)
         fill()
         yield outcome
-
-
-def _first_done(running: list["Future[TaskOutcome]"]) -> "Future[TaskOutcome]":
-    return next(iter(wait(running, return_when=FIRST_COMPLETED).done))

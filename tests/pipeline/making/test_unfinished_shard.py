@@ -13,10 +13,13 @@ import pytest
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.isolation import ChildFailed, IsolatedChild
-from pipeline.making import make_shard
+from pipeline.making import unfinished_shard
+from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.make_scene import SceneAttempt
-from pipeline.making.make_shard import is_free, make_piece
-from pipeline.making.pieces import Piece
+from pipeline.making.pipeline import make_piece
+from pipeline.making.run import ShardJob
+from pipeline.making.tasks import Piece
+from pipeline.making.unfinished_shard import UnfinishedShard
 from pipeline.shards.pack import note_shard, noted_shard
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
@@ -52,7 +55,17 @@ def _build() -> BuildSettings:
 def _make(root: Path, first: int, last: int, made: "Counter[int]", broken: int = -1) -> Any:
     child = cast(IsolatedChild, FakeChild(made, broken))
     piece = Piece(shard_index=0, first=first, last=last)
-    return make_piece(DatasetFolder(root), _build(), piece, child, lambda *scene: None)
+    job = ShardJob(
+        folder=DatasetFolder(root),
+        settings=_build(),
+        environment={},
+        accepted=AcceptedObjects(objects=(), num_found=0),
+        lock_sha256="",
+        num_at_once=1,
+        extensions={},
+    )
+    _, shard = make_piece(job, piece, child)
+    return shard
 
 
 def test_many_makers_of_one_shard_make_every_scene_once(tmp_path: Path) -> None:
@@ -95,17 +108,17 @@ def test_a_shard_that_is_packed_while_one_looks_is_not_free(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its scenes leave the staging then: they are neither staged nor claimed, and yet not free."""
-    folder, build = DatasetFolder(tmp_path), _build()
-    assert is_free(folder, build, 0)
+    looked_at = UnfinishedShard(DatasetFolder(tmp_path), _build().splits, 0)
+    assert looked_at.is_free()
 
     def packed_meanwhile(staged: Path, scene_index: int) -> bool:
         seen = is_staged(staged, scene_index)
-        monkeypatch.setattr(make_shard, "is_staged", is_staged)
+        monkeypatch.setattr(unfinished_shard, "is_staged", is_staged)
         assert _make(tmp_path, 0, 4, Counter()) is not None
         return seen
 
-    monkeypatch.setattr(make_shard, "is_staged", packed_meanwhile)
-    assert not is_free(folder, build, 0)
+    monkeypatch.setattr(unfinished_shard, "is_staged", packed_meanwhile)
+    assert not looked_at.is_free()
 
 
 def _somebody_quicker(
@@ -116,12 +129,12 @@ def _somebody_quicker(
     @contextlib.contextmanager
     def claimed_late(claim: Path) -> Iterator[bool]:
         if claim.name == claim_name:
-            monkeypatch.setattr(make_shard, "claimed", claimed)
+            monkeypatch.setattr(unfinished_shard, "claimed", claimed)
             work()
         with claimed(claim) as ours:
             yield ours
 
-    monkeypatch.setattr(make_shard, "claimed", claimed_late)
+    monkeypatch.setattr(unfinished_shard, "claimed", claimed_late)
 
 
 def test_a_scene_that_somebody_made_before_the_claim_is_not_made_again(

@@ -1,6 +1,6 @@
 """Tasks in a window: always full, and one by one."""
 
-from pipeline.making.runners import in_window
+from pipeline.making.runner import in_window
 
 
 def test_a_place_that_is_free_is_taken_before_the_result_is_looked_at() -> None:

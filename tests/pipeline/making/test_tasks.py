@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.making.order import DatasetOrder
-from pipeline.making.pieces import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
+from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.settings.dataset import SplitSettings

@@ -1,18 +1,44 @@
-"""The flow `build-dataset`: objects, then scenes, then the documents, by one worker or by many."""
+"""The flows `prepare-assets`, `generate-scenes` and `build-dataset`, which is both of them."""
 
 import dataclasses
-import itertools
 from typing import Any
 
 from prefect import flow
 from prefect.deployments import run_deployment
+from prefect.logging import get_run_logger
 
 from pipeline.flows.forms import parameters_of
-from pipeline.flows.generate_scenes import generate_scenes
-from pipeline.flows.orders import DATASET_FORMS, DatasetInRuns, dataset_in_runs, run_name
-from pipeline.flows.prepare_assets import prepare_assets
+from pipeline.flows.orders import (
+    DATASET_FORMS,
+    DatasetInRuns,
+    dataset_in_runs,
+    dataset_order,
+    run_name,
+)
+from pipeline.flows.prefect_runner import PrefectRunner
+from pipeline.flows.watching import make_watched
 from pipeline.making.order import DatasetOrder
+from pipeline.making.pipeline import prepare_dataset
+from pipeline.making.run import Outcome
+from pipeline.making.tasks import shard_ranges
 from storage.dataset.progress import read_status
+
+
+@flow(name="prepare-assets", flow_run_name=run_name, persist_result=False)
+@parameters_of(DatasetOrder, **DATASET_FORMS)
+def prepare_assets(**parameters: Any) -> None:
+    """Begin a dataset: list, clean, decimate and freeze its objects, without a picture."""
+    run = prepare_dataset(dataset_order(parameters))
+    get_run_logger().info(
+        "%d of %d objects accepted", len(run.accepted.objects), run.accepted.num_found
+    )
+
+
+@flow(name="generate-scenes", flow_run_name=run_name, persist_result=False)
+@parameters_of(DatasetOrder, **DATASET_FORMS)
+def generate_scenes(**parameters: Any) -> Outcome:
+    """Make a dataset, or what is missing of it, or of a range of its shards."""
+    return make_watched(dataset_order(parameters), PrefectRunner())
 
 
 @flow(name="build-dataset", flow_run_name=run_name, persist_result=False)
@@ -28,19 +54,12 @@ def build_dataset(**parameters: Any) -> None:
     given = {field.name: parameters[field.name] for field in dataclasses.fields(DatasetOrder)}
     prepare_assets(**given)
     if order.flow_runs > 1:
-        own, *others = ranges_of(read_status(order.place).shards_planned, order.flow_runs)
+        own, *others = shard_ranges(read_status(order.place).shards_planned, order.flow_runs)
         for shards in others:
             ranged = {name: _json(value) for name, value in given.items()} | {"shards": shards}
             run_deployment(order.deployment, parameters=ranged, timeout=0, as_subflow=False)
         generate_scenes(**{**given, "shards": own})
     generate_scenes(**given)
-
-
-def ranges_of(num_shards: int, flow_runs: int) -> list[str]:
-    """Return ranges A:B of shards, nearly equal, as many as there are runs or shards."""
-    count = min(flow_runs, num_shards)
-    bounds = [num_shards * part // count for part in range(count + 1)]
-    return [f"{first}:{last}" for first, last in itertools.pairwise(bounds)]
 
 
 def _json(value: Any) -> Any:

@@ -1,23 +1,31 @@
-"""Who runs the tasks of a dataset, by the name that `--runner` takes."""
+"""Who runs the tasks of a dataset, by the name that `--runner` takes.
+
+Executors are peers: each is a module with a function `make`, and none is known to the engine
+(pipeline.making). `make` narrows an order or begins a flow, and then calls `make_dataset` with a
+`Runner` (pipeline.making.runner).
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING
 
-from pipeline.flows.prefect_server import prefect_server, quiet_prefect
 from pipeline.making.order import DatasetOrder
 from storage.errors import TrilightError, expected_one_of
+from storage.installation import module_name
 from storage.registry import Registry
 
 if TYPE_CHECKING:
-    from pipeline.making.dataset_run import Outcome
+    from pipeline.making.run import Outcome
+
+Make = Callable[[DatasetOrder, str | None], "Outcome"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Executor:
     """A way to make a dataset; the same order gives the same bytes in each."""
 
-    make: "Callable[[DatasetOrder, str | None], Outcome]"
+    make: Make
     """Makes an order, or what is missing of it; the second argument is `--address`."""
     needs_address: bool = False
     """Whether `--address` says where; without, it is refused."""
@@ -25,28 +33,29 @@ class Executor:
     """Whether `--workers` says how many tasks run at a time."""
 
 
-def _on_threads(order: DatasetOrder, address: str | None) -> "Outcome":
-    from pipeline.making.dataset_run import make_dataset  # slow, since it brings every stage
-    from pipeline.making.runners import ThreadRunner
+def _made_by(module: str) -> Make:
+    """Return the function `make` of a module, which is loaded when a dataset is made.
 
-    return make_dataset(order, ThreadRunner())
+    Loading brings every stage, and for some executors packages that may not be installed.
+    """
 
+    def make(order: DatasetOrder, address: str | None) -> "Outcome":
+        outcome: Outcome = import_module(module_name(module)).make(order, address)
+        return outcome
 
-def _on_dask(order: DatasetOrder, address: str | None) -> "Outcome":
-    assert address is not None
-    quiet_prefect()
-    with prefect_server():
-        from pipeline.flows.on_dask import make_on_dask
-
-        return make_on_dask(order, address)
+    return make
 
 
 EXECUTORS: Registry[Executor] = Registry(
     "runner",
     Executor,
     {
-        "threads": Executor(make=_on_threads),
-        "dask": Executor(make=_on_dask, needs_address=True, takes_workers=False),
+        "threads": Executor(make=_made_by("pipeline.executors.threads")),
+        "slurm": Executor(make=_made_by("pipeline.executors.slurm")),
+        "prefect": Executor(make=_made_by("pipeline.flows.on_prefect")),
+        "dask": Executor(
+            make=_made_by("pipeline.flows.on_dask"), needs_address=True, takes_workers=False
+        ),
     },
 )
 """By name. How a dataset is made does not stand in it."""

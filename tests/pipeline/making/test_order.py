@@ -3,8 +3,7 @@
 import json
 
 from infra.cli.changes import parse_changes
-from pipeline.making.order import DatasetOrder
-from pipeline.making.order_words import generate_words
+from pipeline.making.order import DatasetOrder, generate_words
 from tests.command_line import trilight
 
 ASKED = DatasetOrder(

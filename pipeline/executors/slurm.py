@@ -1,0 +1,80 @@
+"""The part of a dataset that falls to one task of a Slurm array; each task runs on threads.
+
+    sbatch --array=0-63 ... trilight generate pretrain-256 --out /scratch/mine --runner slurm
+
+No task submits another, and none waits for another: they meet in the folder, or the bucket, that
+`--out` names, and whoever makes the last shard finishes the dataset. Nobody has run this on a real
+Slurm cluster yet; tests give it the variables that Slurm's manual promises.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping
+
+from pipeline.executors.threads import ThreadRunner
+from pipeline.making.order import DatasetOrder
+from pipeline.making.pipeline import make_dataset, prepare_dataset
+from pipeline.making.run import Outcome
+from pipeline.making.tasks import shard_ranges
+from storage.errors import TrilightError
+
+
+def make(order: DatasetOrder, address: str | None) -> Outcome:
+    """Make the shards of this array task.
+
+    Raises:
+        TrilightError: this is no task of an array, or the order has a range of its own; or as
+            `make_dataset`.
+    """
+    if order.shards is not None:
+        raise TrilightError(
+            f"--shards is {order.shards}; expected none with --runner slurm: the number of the "
+            "array task says which shards are made. Leave one of the two away."
+        )
+    shards = shards_of_task(os.environ, lambda: prepare_dataset(order).publication.num_shards)
+    return make_dataset(dataclasses.replace(order, shards=shards), ThreadRunner())
+
+
+def shards_of_task(environment: Mapping[str, str], num_shards: Callable[[], int]) -> str:
+    """Return the range A:B of shards that falls to this task.
+
+    With SHARDS_PER_TASK it follows from SLURM_ARRAY_TASK_ID alone, so that single tasks can be
+    submitted again. Without, every task of the array gets an equal share; where there are more
+    tasks than shards, several share one range.
+
+    Args:
+        environment: what Slurm and the user set.
+        num_shards: returns how many shards the dataset will have; only called if that matters.
+
+    Raises:
+        TrilightError: a variable is missing or is no number, or the array has gaps.
+    """
+    task = _number(environment, "SLURM_ARRAY_TASK_ID", least=0)
+    if environment.get("SHARDS_PER_TASK"):
+        each = _number(environment, "SHARDS_PER_TASK", least=1)
+        return f"{task * each}:{(task + 1) * each}"
+    first, last = (
+        _number(environment, f"SLURM_ARRAY_TASK_{end}", least=0) for end in ("MIN", "MAX")
+    )
+    count = _number(environment, "SLURM_ARRAY_TASK_COUNT", least=1)
+    step = (last - first) // (count - 1) if count > 1 else 1
+    if first + step * (count - 1) != last or (task - first) % max(1, step):
+        raise TrilightError(
+            f"--runner slurm: the array has {count} tasks between {first} and {last}, with gaps; "
+            "expected one without, such as --array=0-63. Or set SHARDS_PER_TASK: task K then makes "
+            "that many shards from K times that number."
+        )
+    ranges = shard_ranges(num_shards(), count)
+    return ranges[(task - first) // step % len(ranges)]
+
+
+def _number(environment: Mapping[str, str], name: str, *, least: int) -> int:
+    text = environment.get(name)
+    if text is None:
+        raise TrilightError(
+            f"--runner slurm: {name} is not set; expected a task of a Slurm array. Submit "
+            "infra/slurm/generate.sbatch with sbatch --array=0-63, or choose another --runner."
+        )
+    if not (text.isascii() and text.isdecimal()) or int(text) < least:
+        raise TrilightError(f"--runner slurm: {name} is {text!r}; expected a number from {least}.")
+    return int(text)
