@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from scene_templates.templates import TEMPLATES as TEMPLATES
     from scene_templates.templates import Template as Template
     from storage.atomic import write_atomically as write_atomically
+    from storage.dataset.settings import SplitSettings as SplitSettings
+    from storage.dataset.settings import StorageSettings as StorageSettings
     from storage.errors import TrilightError as TrilightError
     from storage.extensions import load_extension as load_extension
     from storage.records.material import COLUMNS as COLUMNS
@@ -60,8 +62,6 @@ if TYPE_CHECKING:
     from storage.records.scene import SceneObject as SceneObject
     from storage.seeds import rng_for as rng_for
     from storage.settings.changes import changed as changed
-    from storage.settings.dataset import SplitSettings as SplitSettings
-    from storage.settings.dataset import StorageSettings as StorageSettings
     from storage.settings.described import checked as checked
     from storage.settings.ranges import Within as Within
     from train.evaluation.metrics import METRICS as METRICS
@@ -95,7 +95,7 @@ _NAMES = {
     "scene_templates.cameras": "Sector",
     "storage.atomic": "write_atomically",
     "storage.settings.changes": "changed",
-    "storage.settings.dataset": "SplitSettings StorageSettings",
+    "storage.dataset.settings": "SplitSettings StorageSettings",
     "storage.errors": "TrilightError",
     "storage.extensions": "load_extension",
     "storage.records.material": "COLUMNS EMISSION MaterialColumn",

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from storage.errors import TrilightError
-from storage.settings.changes import changed
+from storage.settings.changes import changed, json_or_word
 from storage.settings.described import checked, settings_record
 
 if TYPE_CHECKING:
@@ -45,14 +45,6 @@ def parse_changes(texts: Iterable[str]) -> dict[str, Any]:
             )
         changes[name] = json_or_word(value)
     return changes
-
-
-def json_or_word(text: str) -> Any:
-    """Return the JSON value that a text is, or the text."""
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        return text
 
 
 def all_changes(

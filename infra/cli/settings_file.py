@@ -6,8 +6,8 @@ from typing import Any
 
 import yaml
 
-from infra.cli.changes import json_or_word
 from storage.errors import TrilightError
+from storage.settings.changes import json_or_word
 
 _MOST_BYTES = 1 << 24
 _EXAMPLE = "such as scenes.lights.coloured_share: 0.5"

@@ -8,7 +8,7 @@ from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.builds.settings import BuildSettings
 from pipeline.renders.settings import RenderSettings
 from scene_templates.frozen_v1 import SCENES_V1
-from storage.settings.dataset import SplitSettings, StorageSettings
+from storage.dataset.settings import SplitSettings, StorageSettings
 
 _LICENCES = (
     "CC0-1.0",

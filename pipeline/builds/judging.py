@@ -9,7 +9,7 @@ from pipeline.builds.frozen_v1 import BUILD_V1, JUDGING_SPLITS
 from pipeline.builds.settings import BuildSettings, NamedBuild
 from pipeline.objects.generated import BENCHMARK
 from scene_templates.out_of_range import out_of_range_settings
-from storage.settings.dataset import StorageSettings
+from storage.dataset.settings import StorageSettings
 
 _EXACT = StorageSettings(profile="lossless")
 

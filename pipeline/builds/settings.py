@@ -8,9 +8,9 @@ from typing import Any
 from pipeline.assets.settings import AssetSettings
 from pipeline.renders.settings import RenderSettings
 from scene_templates.settings import SceneSettings
+from storage.dataset.settings import SplitSettings, StorageSettings
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.settings.dataset import SplitSettings, StorageSettings
 from storage.settings.described import checked, settings_record
 from storage.settings.ranges import Seed
 

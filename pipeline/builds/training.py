@@ -28,7 +28,7 @@ from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.renders.settings import RenderSettings
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
-from storage.settings.dataset import SplitSettings
+from storage.dataset.settings import SplitSettings
 
 
 def smoke() -> BuildSettings:

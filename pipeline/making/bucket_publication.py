@@ -11,12 +11,12 @@ from pipeline.shards.mirror import Mirror
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, read_manifest
+from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import shard_name
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, encode_objects_lock
 from storage.remote.bucket import Bucket
 from storage.remote.url import RemoteUrl, parse_url
-from storage.settings.dataset import SplitSettings
 
 
 class BucketPublication(Publication):

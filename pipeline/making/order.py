@@ -9,10 +9,10 @@ from pipeline.builds.named import BUILDS
 from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.settings import NoiseFloor, Resolution
 from storage.dataset.layout import dataset_folder
+from storage.dataset.settings import MOST_SCENES
 from storage.errors import TrilightError
 from storage.extensions import function_name
 from storage.remote.safe_url import safe_url
-from storage.settings.dataset import MOST_SCENES
 from storage.settings.described import checked, option_words
 from storage.settings.ranges import Seed, Share, Within
 

@@ -12,6 +12,7 @@ from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, read_manifest, write_manifest
+from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import planned_scenes, scenes_of_shard, shard_name, shards_for
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -24,7 +25,6 @@ from storage.records.objects import (
     write_failures,
     write_objects_lock,
 )
-from storage.settings.dataset import SplitSettings
 from storage.settings.described import from_record, settings_record
 
 _LOOKS = 7

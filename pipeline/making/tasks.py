@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 from pipeline.making.run import Run, TaskOutcome
 from pipeline.making.unfinished_shard import UnfinishedShard
+from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure
-from storage.settings.dataset import SplitSettings
 
 MOST_TASKS = 1000
 """Task runs of one flow run: Prefect's server takes in about 20 a second, of 19 kB each."""

@@ -16,12 +16,12 @@ from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder, numbered
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.progress import log_scene
+from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard, shard_name, split_of_shard
 from storage.dataset.staging import is_staged, stage_scene
 from storage.records.objects import Failure
 from storage.records.profiles import Profile
 from storage.records.sample import Sample, sample_key
-from storage.settings.dataset import SplitSettings
 
 log = logging.getLogger("trilight.scenes")
 

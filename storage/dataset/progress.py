@@ -20,11 +20,11 @@ from storage.dataset.dataset import Dataset, LocalFiles, open_dataset
 from storage.dataset.derived import derivation_of
 from storage.dataset.layout import DatasetFolder, numbered
 from storage.dataset.manifest import Manifest, read_manifest
+from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason, decode_failures
 from storage.records.sample import sample_key
-from storage.settings.dataset import SplitSettings
 
 _AT_WORK_S = 600.0
 """Older notes on unfinished views were left by a kill: a pass of samples takes less time."""

@@ -13,7 +13,7 @@ from storage.dataset.layout import numbered
 from storage.errors import TrilightError
 
 if TYPE_CHECKING:
-    from storage.settings.dataset import SplitSettings
+    from storage.dataset.settings import SplitSettings
 
 JUDGED_SPLIT = "test"
 """Split of whole sets that are judged by, never learnt from."""

@@ -8,6 +8,7 @@ preset: model=large with model.window_bundles=0.
 """
 
 import dataclasses
+import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -19,6 +20,14 @@ Settings = TypeVar("Settings")
 
 Change = tuple[Sequence[str], Any, str]
 """The way that is left to a value, the value, and the whole name."""
+
+
+def json_or_word(text: str) -> Any:
+    """Return the JSON value that a text is, or the text: what a person writes as a value."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
 
 
 def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:

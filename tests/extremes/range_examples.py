@@ -26,8 +26,8 @@ from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
+from storage.dataset.settings import SplitSettings
 from storage.records.scene import Scene
-from storage.settings.dataset import SplitSettings
 from storage.settings.ranges import Declared, declared_ranges
 from train.evaluation.evaluate import Contest
 from train.evaluation.order import EvaluationOrder

@@ -13,10 +13,10 @@ from pipeline.making.run import ShardJob, TaskOutcome
 from pipeline.making.runner import in_window
 from pipeline.making.tasks import MOST_TASKS, Piece, TaskSizes, cut_tasks
 from storage.dataset.dataset import open_dataset
+from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.splits import shards_for
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
-from storage.settings.dataset import MOST_SCENES, SplitSettings
 from tests.pipeline.flows.test_forms import _defaults
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 

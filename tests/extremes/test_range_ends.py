@@ -23,10 +23,10 @@ from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.settings import SceneSettings, ViewLaws
+from storage.dataset.settings import MOST_SCENES, SplitSettings
 from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.errors import Rejected, TrilightError
 from storage.settings.changes import changed
-from storage.settings.dataset import MOST_SCENES, SplitSettings
 from storage.settings.ranges import Declared
 from tests.extremes.range_examples import FIELDS, SCENE_REASONS, SMOKE, End
 from tests.model.kit import awake, random_scene, tiny_config

@@ -27,13 +27,13 @@ from infra.bench.experiments.sampling import DB, WORST, scenes
 from infra.bench.sides.packed_arrays import ARRAYS, COLOURS, SAMPLES, array_figures, sample_figures
 from infra.bench.sides.shots import fixed_samples, shots
 from infra.bench.workshop import Workshop
+from storage.dataset.settings import StorageSettings
 from storage.metrics import psnr_log_db
 from storage.records.exr import ExrCodec, decode_exr, encode_exr
 from storage.records.material import DIFFUSE, SPECULAR
 from storage.records.profiles import LAW_DB, PROFILES, pack_arrays, pack_picture
 from storage.records.sample import Sample
 from storage.records.scene import ARRAY_FIELDS, Scene
-from storage.settings.dataset import StorageSettings
 
 Picture = NDArray[np.float32]
 

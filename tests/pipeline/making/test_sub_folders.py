@@ -11,12 +11,12 @@ from storage.dataset import layout
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import index_shard, read_manifest
 from storage.dataset.progress import read_progress
+from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import shard_name
 from storage.dataset.staging import is_staged, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 from storage.records.sample import sample_key
-from storage.settings.dataset import SplitSettings
 from tests.pipeline.documents.dataset_by_hand import edit_manifest
 from tests.pipeline.making.test_publication import _dataset, _sample
 

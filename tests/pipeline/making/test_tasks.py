@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from pipeline.making.order import DatasetOrder
 from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
+from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.settings.dataset import SplitSettings
 
 
 def _scenes(tasks: list[tuple[Piece, ...]]) -> list[int]:

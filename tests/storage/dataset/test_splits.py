@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from storage.conventions import SPLITS
+from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import (
     require_objects,
     scenes_of_shard,
@@ -17,7 +18,6 @@ from storage.dataset.splits import (
 )
 from storage.errors import TrilightError
 from storage.seeds import rng_for, seed_for
-from storage.settings.dataset import SplitSettings
 
 SETTINGS = SplitSettings(scenes_per_shard=4)
 shard_indices = st.integers(0, 10_000)

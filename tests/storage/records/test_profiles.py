@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import open_dataset
 from storage.dataset.manifest import index_shard, write_manifest
+from storage.dataset.settings import StorageSettings
 from storage.dataset.shard import write_shard
 from storage.dataset.statistics import dataset_statistics
 from storage.errors import TrilightError
@@ -29,7 +30,6 @@ from storage.records.profiles import (
 )
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import ARRAY_FIELDS
-from storage.settings.dataset import StorageSettings
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 from tests.scenes_by_hand import tiny_sample
 
