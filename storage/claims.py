@@ -14,6 +14,9 @@ from pathlib import Path
 
 from storage.atomic import write_error
 
+_MOST_TRIES = 100
+"""To create a lock in a folder that others delete."""
+
 
 @contextlib.contextmanager
 def claimed(path: Path, *, wait: bool = False) -> Iterator[bool]:
@@ -40,17 +43,20 @@ def open_lock(path: Path) -> int:
     Raises:
         TrilightError: the folder cannot be written.
     """
+    tries = 0
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             return os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        except FileNotFoundError:  # the folder went between the two calls: its owner was done
-            continue
         except OSError as error:
-            # mkdir looks twice: what was there at first may be gone at the second look
-            if isinstance(error, FileExistsError) and not path.parent.is_file():
-                continue
-            raise write_error(path, error) from error
+            # Another process may delete the folder between the two calls, or between the two looks
+            # of mkdir. Some file systems say the same (ENOENT) of what can never be made.
+            tries += 1
+            vanished = isinstance(error, FileNotFoundError) or (
+                isinstance(error, FileExistsError) and not path.parent.is_file()
+            )
+            if not vanished or tries == _MOST_TRIES:
+                raise write_error(path, error) from error
 
 
 def flock_now(descriptor: int) -> bool:

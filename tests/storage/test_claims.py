@@ -15,7 +15,7 @@ import pytest
 from storage.atomic import atomic_writer, write_error
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
-from storage.errors import EnvironmentFailure
+from storage.errors import EnvironmentFailure, TrilightError
 from tests.conftest import ROOT
 
 HOLD = """
@@ -101,3 +101,9 @@ def test_what_may_pass_is_told_from_what_will_not(number: int, passes: bool) -> 
     """A scheduler tries the first kind again."""
     error = write_error(Path("a/b"), OSError(number, os.strerror(number)))
     assert isinstance(error, EnvironmentFailure) == passes
+
+
+def test_a_folder_that_can_never_be_made_is_said_at_once() -> None:
+    """Where /proc says of a folder that it does not exist, as a deleted one would, waiting ends."""
+    with pytest.raises(TrilightError, match="/proc/nowhere"), claimed(Path("/proc/nowhere/lock")):
+        pass

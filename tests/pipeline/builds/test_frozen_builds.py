@@ -140,7 +140,7 @@ def test_a_default_that_is_changed_later_changes_no_frozen_set() -> None:
         from scene_templates import families
         from scene_templates import rooms
         from scene_templates import separate_sides
-        from storage.settings import dataset as dataset_settings
+        from storage.dataset import settings as dataset_settings
         modules = (assets, builds, renders, scenes, families, rooms, separate_sides)
         kinds = {kind for module in (*modules, dataset_settings) for kind in vars(module).values()
                  if hasattr(kind, "__pydantic_fields__")}
