@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.machine import cores_owned
-from pipeline.making.order import DatasetOrder
 from pipeline.making.pipeline import make_task, prepare_dataset
 from pipeline.making.render_children import close_children
 from pipeline.making.run import ShardJob

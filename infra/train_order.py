@@ -34,11 +34,12 @@ class TrainOrder:
     """Folder with vgg16-397923af.pth and vgg.pth, or hub to download them; by default what
     TRILIGHT_LPIPS says."""
     device: Literal["cpu", "cuda"] | None = None
-    """What computes; by default cuda where there is one."""
+    """Device that computes; by default cuda where there is one."""
     steps: Annotated[int | None, Within(1, 10**9, unit="steps")] = None
     """How many steps; by default the run's. Fewer shorten its warm-up and intervals."""
     most_unusable: Annotated[int | None, Within(0, 10**9, unit="samples")] = None
-    """Replace up to so many damaged samples by others; by default the run stops at one."""
+    """Maximum number of damaged samples to replace by others; by default the first one stops the
+    run."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Other settings of the run by dotted name, such as loss.perceptual=none or model=large (values
     are JSON); by default none differ."""

@@ -75,16 +75,16 @@ class SceneSettings:
     """What becomes the centre of an object: the middle of its source's bounding box, or as
     published the mean of its vertices, which moves with the tessellation."""
     fill_to: Annotated[int | None, Within(1, MAX_TRIANGLES, unit="triangles")] = None
-    """Split the triangles of objects until the scene has so many, with the surface unchanged; a
-    scene that has more already stays as it is."""
+    """Split the triangles of objects, without changing the surface, until the scene has this many;
+    scenes with more stay as they are."""
     num_views: Annotated[int, Within(1, 1000, unit="cameras")] = 4
     """Cameras of every scene."""
     placement: PlacementSettings = field(default_factory=PlacementSettings)
     """How objects are put into the room."""
     materials: MaterialSettings = field(default_factory=MaterialSettings)
-    """What things are made of."""
+    """Materials of objects, floor and walls."""
     lights: LightSettings = field(default_factory=LightSettings)
-    """What shines on them."""
+    """Emitters of the scenes."""
     cameras: CameraSettings = field(default_factory=CameraSettings)
     """Cameras of the scenes."""
     views: ViewLaws = field(default_factory=ViewLaws)

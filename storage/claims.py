@@ -1,9 +1,9 @@
 """Claims: locks that tell processes in a shared folder which work is taken.
 
 A claim is a lock on a small file. It ends with the process that holds it, however that ends, so
-nothing has to be cleaned up after a kill. Claims spare work; they are not what keeps files right.
-Where a file system does not carry locks between machines, two of them may make the same scene, of
-the same bytes, and the first writer of a shard wins (storage.atomic).
+nothing has to be cleaned up after a kill. Claims only avoid that work is done twice. Where a file
+system does not carry locks between machines, two of them may make the same scene, of the same
+bytes. Correct files come from storage.atomic: the first finished writer of a shard wins.
 """
 
 import contextlib

@@ -34,7 +34,8 @@ class AugmentationSettings:
     light_scale: Annotated[float, Within(1, 1000)] = 1.0
     """Largest factor by which all light is made stronger or weaker, log-uniform."""
     light_mix: Annotated[float, Within(1, 1000)] = 1.0
-    """The same for each light alone; needs a dataset that keeps lights apart (`per_light`)."""
+    """Largest such factor for each light alone; needs a dataset that keeps lights apart
+    (`per_light`)."""
 
 
 Perceptual = Literal["lpips", "ms_ssim", "none"]
@@ -48,13 +49,15 @@ class LossSettings:
     perceptual: Perceptual
     """The second term, on tone-mapped pictures."""
     perceptual_weight: Annotated[float, Within(0, 1000)] = 0.05
-    """Its factor beside the first term, the L1 error of log10(1 + radiance)."""
+    """Weight of the perceptual term beside the L1 error of log10(1 + radiance)."""
     noise_half: Annotated[float, Within(0, 10)] = 0.0
-    """Root mean square noise of log10(1 + radiance) at which a view counts half; 0 weighs none."""
+    """Root mean square noise of log10(1 + radiance) at which a view has half the weight; 0: all
+    views have the same."""
 
 
 Precision = Literal["float32", "bfloat16"]
-"""Of the network's products. Positions, losses, weights and optimisers' memories stay float32."""
+"""Precision of the network's matrix products. Positions, losses, weights and optimisers' memories
+stay float32."""
 
 Count = Annotated[int, Within(1, 10**9)]
 """Of steps or of scenes; a billion is never reached."""
@@ -77,9 +80,9 @@ class TrainSettings:
     """Pixels across the training pictures: a divisor of the data's, a multiple of the bundle's, or
     of a window of bundles."""
     most_triangles: Annotated[int, Within(0, 1_000_000, unit="triangles")] = 0
-    """Scenes with more triangles are unusable; 0: none is."""
+    """Maximum number of triangles of a scene; others are unusable; 0: no limit."""
     seed: Seed = 0
-    """Of initial weights, order and augmentation."""
+    """Seed of the initial weights, the order of samples and augmentation."""
     loss: LossSettings
     """What is minimised."""
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
@@ -89,15 +92,15 @@ class TrainSettings:
     scenes_per_step: Annotated[int, Within(1, 65_536, unit="scenes")]
     """Scenes whose gradients are averaged into one update."""
     views_per_scene: Annotated[int, Within(1, 1000, unit="views")]
-    """Views of each, drawn anew at every visit; at most as many as the data holds."""
+    """Views of a scene in a step, drawn anew at every visit; at most as many as the data holds."""
     scenes_per_pass: Annotated[int, Within(1, 65_536, unit="scenes")] = 16
     """Most scenes that go through the network at once; gradients of the passes of a step add up."""
     precision: Precision = "float32"
-    """Of the network's products."""
+    """Precision of the network's matrix products."""
     learning_rate: Annotated[float, Within(0, 1, low_open=True)]
     """Peak learning rate."""
     muon_rate: Annotated[float, Within(0, 100, unit="x learning_rate")] = 0.0
-    """Rate of Muon, which then moves the matrices; 0: AdamW moves every weight."""
+    """Learning rate of Muon, which then updates the matrices; 0: AdamW updates every weight."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear rise to the peak."""
     final_rate_share: Share = 0.05
@@ -105,17 +108,19 @@ class TrainSettings:
     weight_decay: Annotated[float, Within(0, 10)] = 0.01
     """Decoupled decay of every weight (Loshchilov and Hutter 2019)."""
     betas: Annotated[tuple[float, float], BelowOne] = (0.9, 0.99)
-    """AdamW's memories."""
+    """Decay rates of AdamW's running means of the gradient and of its square."""
     grad_clip: Annotated[float, Within(0, 1e9, low_open=True)] = 1.0
-    """Longest gradient that is followed; a longer one is shortened to this."""
+    """Largest gradient norm; longer gradients are scaled down to it."""
     ema_decay: Annotated[float, BelowOne] = 0.0
-    """Of the running mean of the weights, which is then what is judged and kept; 0: no mean."""
+    """Decay of the moving average (EMA) of the weights, which is then judged and kept; 0: no
+    average."""
     recompute_activations: bool = False
     """Trade a third more time for memory: see RenderFormer.recompute_activations."""
     shuffle_shards: Annotated[int, Within(1, 100_000, unit="shards")] = 4
     """Shards that are open at the same time, among whose samples is shuffled."""
     most_unusable: Annotated[int, Within(0, 10**9, unit="samples")] = 0
-    """Damaged samples that may be replaced by others; at 0 the first one ends the run."""
+    """Maximum number of damaged samples that are replaced by others; 0: the first one ends the
+    run."""
     log_every: Count = 10
     """Steps between rows of metrics.jsonl."""
     validate_every: Count
@@ -125,7 +130,7 @@ class TrainSettings:
     checkpoints_kept: Count = 2
     """Newest checkpoints that stay; older ones are deleted."""
     keep_every: Annotated[int, Within(0, 10**9, unit="steps")] = 0
-    """Checkpoints at multiples of so many steps stay for good; 0: none does."""
+    """Steps between checkpoints that are kept for good; 0: none is."""
     validation_scenes: Count = 64
     """Most scenes of the validation split that are judged."""
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.records.sample import Sample

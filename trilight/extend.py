@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from pipeline.executors.registry import EXECUTORS as EXECUTORS
     from pipeline.executors.registry import Executor as Executor
     from pipeline.executors.threads import ThreadRunner as ThreadRunner
-    from pipeline.making.order import DatasetOrder as DatasetOrder
-    from pipeline.making.order import generate_words as generate_words
+    from pipeline.making.dataset_order import DatasetOrder as DatasetOrder
+    from pipeline.making.dataset_order import generate_words as generate_words
     from pipeline.making.pipeline import make_dataset as make_dataset
     from pipeline.making.pipeline import prepare_dataset as prepare_dataset
     from pipeline.making.run import Outcome as Outcome
@@ -78,7 +78,7 @@ _NAMES = {
     "pipeline.builds.named": "BUILDS named_build",
     "pipeline.executors.registry": "EXECUTORS Executor",
     "pipeline.executors.threads": "ThreadRunner",
-    "pipeline.making.order": "DatasetOrder generate_words",
+    "pipeline.making.dataset_order": "DatasetOrder generate_words",
     "pipeline.making.pipeline": "make_dataset prepare_dataset",
     "pipeline.making.run": "Outcome",
     "pipeline.exchange.formats": "FORMATS LoadedScene Pictures SceneFormat SceneSource",

@@ -94,7 +94,7 @@ def render_views(
         resolution, noise_floor_db, max_spp, seed, threads: as `render`, which says what comes back
             and what is refused.
     """
-    from pipeline.making.render_scene import PathTracer
+    from pipeline.making.path_tracer import PathTracer
     from pipeline.renders.variant import choose_variant
 
     rows = range(scene.num_views) if views is None else views

@@ -21,8 +21,8 @@ from infra.bench.subjects.named_scenes import described, first_sample, make_refe
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.making.attempt_scene import SceneRecipe, set_up_child
 from pipeline.making.environment import environment
-from pipeline.making.make_scene import SceneRecipe, set_up_child
 from pipeline.making.pipeline import accept_objects
 from pipeline.making.prepare_isolated import preload_mesh_libraries
 from pipeline.making.publication import begin

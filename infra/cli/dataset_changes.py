@@ -5,7 +5,7 @@ from typing import Any
 
 from infra.cli.changes import Shared, all_changes, dataset_record
 from pipeline.builds.named import named_build
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 
 _LICENCES = "allowed_licences"
 

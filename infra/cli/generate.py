@@ -9,7 +9,7 @@ from infra.cli.generate_progress import watched
 from infra.cli.generate_report import report
 from infra.cli.options import Shown, command
 from pipeline.executors.registry import find_executor
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import dataset_folder
 from storage.settings.described import checked

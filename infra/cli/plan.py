@@ -16,7 +16,7 @@ from infra.cli.dataset_changes import with_shared
 from infra.cli.extending import extend_words
 from infra.cli.leaving import temporary_folder
 from infra.cli.options import Shown, command
-from pipeline.making.order import DatasetOrder, generate_words
+from pipeline.making.dataset_order import DatasetOrder, generate_words
 from pipeline.making.price import CorePrice
 from storage.errors import TrilightError
 from storage.settings.described import checked

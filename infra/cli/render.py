@@ -7,7 +7,7 @@ from rich.progress import Progress
 
 from infra.cli.console import progress_bars
 from infra.cli.options import Shown, command
-from infra.rendering.asked import Asked
+from infra.rendering.request import Asked
 
 if TYPE_CHECKING:
     from pipeline.renders.renderer import Sampling

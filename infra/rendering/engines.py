@@ -21,7 +21,7 @@ from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
-    from pipeline.making.render_scene import PathTracer
+    from pipeline.making.path_tracer import PathTracer
     from pipeline.renders.renderer import Sampling
 
 Fact = str | int | float
@@ -92,7 +92,7 @@ class MitsubaPlan:
     name: str = "mitsuba"
 
     def start(self, sampled: "Callable[[Sampling], None]") -> "MitsubaEngine":
-        from pipeline.making.render_scene import PathTracer
+        from pipeline.making.path_tracer import PathTracer
 
         tracer = PathTracer(
             self.settings,

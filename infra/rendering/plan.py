@@ -5,11 +5,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from infra.rendering.asked import Asked, EngineChoice
 from infra.rendering.cameras import ShotCamera, camera_path, orbit, own_camera, paired
 from infra.rendering.engines import EnginePlan, MitsubaPlan, NeuralPlan
 from infra.rendering.look import Look
 from infra.rendering.places import PicturePlaces, place
+from infra.rendering.request import Asked, EngineChoice
 from infra.rendering.sources import scene_sources
 from infra.torch_library import require_torch
 from pipeline.exchange.open_scene import SceneSource, scene_source

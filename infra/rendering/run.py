@@ -6,7 +6,6 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from infra.rendering.asked import Asked
 from infra.rendering.cameras import own_camera
 from infra.rendering.comparison import Flicker, Frame, comparison_sheet, flicker, log_error
 from infra.rendering.engines import Engine, OpenedScene
@@ -19,6 +18,7 @@ from infra.rendering.picture_file import (
     write_picture,
 )
 from infra.rendering.plan import RenderPlan, Shot, plan_render
+from infra.rendering.request import Asked
 from infra.rendering.video import write_video
 from pipeline.documents.png import encode_png
 from pipeline.exchange.reader import SceneReader

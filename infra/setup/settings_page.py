@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
-from infra.rendering.asked import Asked
+from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.markdown import table

@@ -20,11 +20,11 @@ class BuildSettings:
     """The settings of one dataset. They stand in its manifest and never change."""
 
     build: str
-    """Name of the build that they come from."""
+    """Name of the build that the settings come from."""
     seed: Seed
-    """Seed of every draw."""
+    """Seed of objects, scenes, cameras and samples."""
     source: str | None = None
-    """Where objects must come from; by default the user says."""
+    """Source that objects must come from; by default the user names one."""
     allowed_licences: tuple[str, ...]
     """Licences of objects that may be used."""
     assets: AssetSettings

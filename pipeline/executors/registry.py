@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError, expected_one_of
 from storage.installation import module_name
 from storage.registry import Registry
@@ -82,7 +82,7 @@ def find_executor(name: str, address: str | None, workers: int | None) -> Execut
         )
     if workers is not None and not executor.takes_workers:
         raise TrilightError(
-            f"--workers is {workers}; expected it without --runner {name}: how many tasks run at a "
-            "time is how many threads the cluster's workers have. Leave it away."
+            f"--workers is {workers}; expected none with --runner {name}: the threads of the "
+            "cluster's workers set how many tasks run at once. Omit --workers."
         )
     return executor

@@ -1,10 +1,9 @@
-"""The part of a dataset that falls to one task of a Slurm array; each task runs on threads.
+"""`--runner slurm`: makes the shards that fall to one task of a Slurm array, on threads.
 
-    sbatch --array=0-63 ... trilight generate pretrain-256 --out /scratch/mine --runner slurm
-
-No task submits another, and none waits for another: they meet in the folder, or the bucket, that
-`--out` names, and whoever makes the last shard finishes the dataset. Nobody has run this on a real
-Slurm cluster yet; tests give it the variables that Slurm's manual promises.
+infra/slurm/generate.sbatch submits such an array. No task submits another, and none waits for
+another: they meet in the folder, or the bucket, that `--out` names, and whoever makes the last
+shard finishes the dataset. Nobody has run this on a real Slurm cluster yet; tests give it the
+variables that Slurm's manual promises.
 """
 
 import dataclasses
@@ -12,7 +11,7 @@ import os
 from collections.abc import Callable, Mapping
 
 from pipeline.executors.threads import ThreadRunner
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset, prepare_dataset
 from pipeline.making.run import Outcome
 from pipeline.making.tasks import shard_ranges
@@ -29,7 +28,7 @@ def make(order: DatasetOrder, address: str | None) -> Outcome:
     if order.shards is not None:
         raise TrilightError(
             f"--shards is {order.shards}; expected none with --runner slurm: the number of the "
-            "array task says which shards are made. Leave one of the two away."
+            "array task says which shards are made. Omit one of the two."
         )
     shards = shards_of_task(os.environ, lambda: prepare_dataset(order).publication.num_shards)
     return make_dataset(dataclasses.replace(order, shards=shards), ThreadRunner())

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset, make_task
 from pipeline.making.run import Outcome, ShardJob, TaskOutcome
 from pipeline.making.runner import in_window

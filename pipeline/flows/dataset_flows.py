@@ -17,7 +17,7 @@ from pipeline.flows.orders import (
 )
 from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.watching import make_watched
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import prepare_dataset
 from pipeline.making.run import Outcome
 from pipeline.making.tasks import shard_ranges

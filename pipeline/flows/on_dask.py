@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.flows.on_prefect import as_flow
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.render_children import close_idle_children
 from pipeline.making.run import Outcome
 from storage.atomic import write_atomically

@@ -6,7 +6,7 @@ The server is the one of PREFECT_API_URL; where that is not set, a private one f
 from typing import TYPE_CHECKING, Any
 
 from pipeline.flows.prefect_server import prefect_server, quiet_prefect
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 
 if TYPE_CHECKING:
     from pipeline.flows.prefect_runner import PrefectRunner

@@ -24,7 +24,7 @@ from prefect.artifacts import (
 )
 from prefect.logging import get_run_logger
 
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.price import PRICES, USD_PER_CORE_HOUR
 from pipeline.making.run import Outcome, Run, TaskOutcome

@@ -31,11 +31,11 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.making.accept_scene_files import accept_scene_files
+from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.making.bucket_publication import joined
+from pipeline.making.dataset_order import DatasetOrder, generate_words
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects, frozen_objects
 from pipeline.making.machine import cores_owned
-from pipeline.making.make_scene import MAX_ATTEMPTS, attempt_scene
-from pipeline.making.order import DatasetOrder, generate_words
 from pipeline.making.prepare_isolated import prepare_isolated
 from pipeline.making.publication import Publication
 from pipeline.making.render_children import close_children, cores_of_child, render_child

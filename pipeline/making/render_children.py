@@ -7,10 +7,10 @@ from typing import Any
 
 from pipeline.builds.settings import differences
 from pipeline.isolation import ChildLimits, IsolatedChild
+from pipeline.making.attempt_scene import SceneRecipe, set_up_child
 from pipeline.making.children import ChildPool
 from pipeline.making.environment import environment
 from pipeline.making.machine import cores_owned, visible_gpus
-from pipeline.making.make_scene import SceneRecipe, set_up_child
 from pipeline.making.run import ShardJob
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError

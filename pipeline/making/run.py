@@ -9,10 +9,10 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_folder import SceneFolder, find_scene_files
 from pipeline.making.accept_scene_files import settings_for_files
 from pipeline.making.bucket_publication import begin_dataset
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.environment import environment
 from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.machine import visible_gpus
-from pipeline.making.order import DatasetOrder
 from pipeline.making.publication import Publication
 from pipeline.objects.sources import look_at_source
 from pipeline.renders.variant import choose_variant

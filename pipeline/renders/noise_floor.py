@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from storage.metrics import object_psnr_log_db, psnr_linear_db, psnr_log_db
 
 _OUTLIER_FACTOR = 4.0
-"""What a raw value has beyond this many times the denoised one is outlying light."""
+"""The part of a raw value that exceeds this multiple of the denoised one is outlying light."""
 
 _HARMLESS_SHARE = 0.005
 """Up to this share of outlying light, PSNR(A, B) was no more than 1 dB too good in any view."""

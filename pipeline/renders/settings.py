@@ -57,7 +57,7 @@ class RenderSettings:
     max_depth: Depth = 10
     """Longest path in edges: 1 sees emitters alone, 2 adds direct light."""
     rr_depth: Depth = 2
-    """From this many edges on, paths go on by Russian roulette. 2 instead of 5 takes 20 % less
+    """Depth in edges from which Russian roulette may end a path. 2 instead of 5 takes 20 % less
     time for the same error on sampled scenes (docs/log)."""
     aux_spp: Annotated[int, Within(PASS_SPP[-1], PASS_SPP[0], unit="samples")] = 64
     """Samples per pixel of the albedo and normal pictures that guide the denoiser."""

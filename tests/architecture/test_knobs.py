@@ -9,7 +9,7 @@ from typing import Any
 from infra.bench.catalogue import every_experiment
 from infra.cli.render import render
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from train.settings import TrainSettings
 
 

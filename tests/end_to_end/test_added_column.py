@@ -20,7 +20,7 @@ from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.making.inspect_scene import _facts
-from pipeline.making.render_scene import PathTracer
+from pipeline.making.path_tracer import PathTracer
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
 from storage.dataset.dataset import Dataset

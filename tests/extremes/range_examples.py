@@ -7,7 +7,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from infra.rendering.asked import Asked
+from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
 from infra.setup.settings_page import ROOTS, reachable
 from model.config import ModelConfig, smoke, tiny

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from infra.planning import MeasuredScenes, measure_scenes, predict
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.machine import cores_owned
-from pipeline.making.order import DatasetOrder
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.tasks import MOST_TASKS
 from storage.dataset.dataset import open_dataset

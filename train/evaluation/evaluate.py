@@ -52,7 +52,7 @@ class Contest:
     lpips: SkipValidation[Lpips | None]
     """Likewise. None where its weights are not at hand: LPIPS is then n/a."""
     most_scenes: SceneCount
-    """The first so many scenes of the split are judged."""
+    """Maximum number of scenes that are judged, from the start of the split."""
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; one that is damaged ends it, since it would be another set."""

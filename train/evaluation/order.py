@@ -28,11 +28,11 @@ class EvaluationOrder:
     resolution: Width | None = None
     """Pixels across, a divisor of the data's; by default the run's if known, else the data's."""
     most_scenes: SceneCount = 10**6
-    """The first so many scenes of the split are judged."""
+    """Maximum number of scenes that are judged, from the start of the split."""
     lpips: str | None = None
     """Folder of LPIPS' weights, or hub to download them; by default what TRILIGHT_LPIPS says, and
     without it LPIPS is n/a."""
     device: Literal["cpu", "cuda"] | None = None
-    """What computes; by default cuda where there is one."""
+    """Device that computes; by default cuda where there is one."""
     out: Path = Path("evaluation")
     """Folder of the report."""

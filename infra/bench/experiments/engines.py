@@ -25,7 +25,7 @@ from infra.bench.sides.shots import SEED
 from infra.bench.workshop import Workshop
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
-from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of
+from pipeline.making.attempt_scene import MAX_ATTEMPTS, assets_of
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings

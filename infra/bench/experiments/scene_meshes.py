@@ -18,7 +18,7 @@ from infra.bench.experiments.meshes import NETWORK
 from infra.bench.experiments.sampling import DB, WORST
 from infra.bench.workshop import Workshop
 from pipeline.builds.training import pretrain_256, smoke
-from pipeline.making.make_scene import assets_of
+from pipeline.making.attempt_scene import assets_of
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within

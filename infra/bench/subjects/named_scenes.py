@@ -19,7 +19,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.builds.training import smoke
 from pipeline.exchange.scene_files import build_scene
 from pipeline.isolation import IsolatedChild
-from pipeline.making.make_scene import MAX_ATTEMPTS, assets_of, attempt_scene
+from pipeline.making.attempt_scene import MAX_ATTEMPTS, assets_of, attempt_scene
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.compose import compose_scene

@@ -1,10 +1,10 @@
 """Opens an untrusted USD file, and decides which other files it may read.
 
-A USD file can name other files, and the network. Which of them composition opens depends on all of
-them together; so none is predicted. Every file that any layer names for composition, used or
-not, is checked by the path that USD's own resolver gives, is refused outside of the folder, and is
-opened here first: the closure of all names holds every file that composition can ask for. When the
-stage stands, its layers are compared with the folder once more, before anything of it is used.
+A USD file can name other files, and the network. Which of them composition opens cannot
+be known beforehand, so every file that any layer names for composition, used or not, is checked by
+the path that USD's own resolver gives, is refused outside of the folder, and is opened here first:
+the closure of all names holds every file that composition can ask for. When the stage stands, its
+layers are compared with the folder once more, before anything of it is used.
 `pipeline.exchange.usd.composition` bounds the size of the stage. The bytes are still parsed by
 native code, so untrusted files are opened in a child process with limits (pipeline.isolation).
 `quietly` turns USD's own errors into one line that names the file and no folder of this machine.

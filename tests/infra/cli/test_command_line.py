@@ -80,7 +80,7 @@ MISTAKES = {
     "shards merg": "shards: command 'merg' is unknown; did you mean merge?",
     "generate smoke --objekts x": "option '--objekts' is unknown; did you mean --objects?",
     "verify": "verify: DATASET is missing; expected: The dataset, a folder",
-    "generate smoke --seed": "generate: --seed has no value; expected: Seed of every draw",
+    "generate smoke --seed": "generate: --seed has no value; expected: Seed of objects",
     "generate smoke --seed 1 --seed 2": "generate: --seed is given twice; expected it once.",
     "verify here there": "verify: 'there' is one argument too many",
     "verify here --fast=3": "verify: --fast is '3'; expected no value.",

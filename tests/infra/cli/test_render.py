@@ -15,7 +15,7 @@ from PIL import Image
 
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
-from pipeline.making import render_scene
+from pipeline.making import path_tracer
 from storage.conventions import preview_srgb8
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
@@ -285,6 +285,6 @@ def test_a_crash_in_native_code_is_one_line(
 ) -> None:
     source = tmp_path / "tiny.safetensors"
     source.write_bytes(encode_scene(tiny_scene()))
-    monkeypatch.setattr(render_scene, "_open_scene", _crash)
+    monkeypatch.setattr(path_tracer, "_open_scene", _crash)
     told = mistake(source, "--out", tmp_path / "x.exr", *SMALL)
     assert told.startswith("tiny.safetensors: rendering failed (crashed_signal_11")

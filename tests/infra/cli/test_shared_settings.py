@@ -10,7 +10,7 @@ from infra.cli.changes import Shared, all_changes
 from infra.cli.dataset_changes import with_shared
 from infra.cli.settings_file import read_settings_file
 from pipeline.builds.named import BUILDS, named_build
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
 from storage.settings.changes import changed

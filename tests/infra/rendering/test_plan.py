@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from infra.rendering.asked import Asked
 from infra.rendering.cameras import ShotCamera
 from infra.rendering.engines import MitsubaPlan, NeuralPlan
 from infra.rendering.plan import plan_render
+from infra.rendering.request import Asked
 from storage.errors import TrilightError
 from storage.records.scene_file import encode_scene
 from tests.conftest import ROOT

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.builds.named import BUILDS
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.make_scene import MAX_ATTEMPTS
+from pipeline.making.attempt_scene import MAX_ATTEMPTS
 from pipeline.making.prepare_isolated import prepare_isolated
 from pipeline.objects.generated import generate_objects
 from pipeline.scenes.compose import compose_scene

@@ -20,7 +20,7 @@ from pipeline.making.accept_scene_files import (
     build_once,
     settings_for_files,
 )
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.prepare_isolated import asset_child
 from pipeline.making.publication import begin
 from storage.dataset.layout import DatasetFolder

@@ -12,7 +12,7 @@ from tests.conftest import ROOT
 
 
 def test_what_an_executor_has_no_use_for_is_named() -> None:
-    with pytest.raises(TrilightError, match="--workers is 2; expected it without --runner dask"):
+    with pytest.raises(TrilightError, match="--workers is 2; expected none with --runner dask"):
         find_executor("dask", "tcp://127.0.0.1:1", 2)
     with pytest.raises(TrilightError, match="--address is tcp://a:1; expected .* --runner dask"):
         find_executor("slurm", "tcp://a:1", None)

@@ -12,7 +12,7 @@ from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare
 from pipeline.flows.forms import BuildChanges, changed_values
 from pipeline.flows.orders import dataset_order
 from pipeline.flows.prefect_runner import may_pass
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import EnvironmentFailure, TrilightError
 
 CANARY = "CANARY-7f3a"

@@ -6,7 +6,7 @@ from typing import Any, cast
 import pytest
 
 from pipeline.flows import on_dask
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 
 

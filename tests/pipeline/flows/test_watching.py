@@ -13,7 +13,7 @@ from PIL import Image
 from pipeline.flows import watching
 from pipeline.flows.prefect_runner import PrefectRunner
 from pipeline.flows.watching import Watched, report_url, small_picture, usd_per_core_hour
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.run import TaskOutcome
 from storage.errors import TrilightError
 

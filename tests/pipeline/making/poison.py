@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import attempt_in_child
-from pipeline.making.make_scene import SceneAttempt, attempt_scene
+from pipeline.making.attempt_scene import SceneAttempt, attempt_scene
 
 if TYPE_CHECKING:
     from pipeline.assets.prepare import AssetAttempt

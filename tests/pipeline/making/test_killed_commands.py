@@ -13,7 +13,7 @@ from pipeline.exchange.open_scene import SceneSource
 from pipeline.exchange.reader import SceneReader
 from pipeline.making import inspect_scene as inspecting
 from pipeline.making.inspect_scene import inspect_scene
-from pipeline.making.render_scene import PathTracer
+from pipeline.making.path_tracer import PathTracer
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, choose_variant
 from storage.dataset.shard import write_shard

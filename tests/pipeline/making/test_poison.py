@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.executors.threads import ThreadRunner
 from pipeline.making import pipeline
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.pipeline import make_dataset, prepare_dataset
 from pipeline.making.run import Outcome
 from storage.dataset.dataset import open_dataset

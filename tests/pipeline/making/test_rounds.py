@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from pipeline.making import pipeline, tasks
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.order import DatasetOrder
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.run import Run, ShardJob, TaskOutcome
 from pipeline.making.tasks import Piece

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece, TaskSizes, TasksLeft, cut_tasks
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard

@@ -14,8 +14,8 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.isolation import ChildFailed, IsolatedChild
 from pipeline.making import unfinished_shard
+from pipeline.making.attempt_scene import SceneAttempt
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.make_scene import SceneAttempt
 from pipeline.making.pipeline import make_piece
 from pipeline.making.run import ShardJob
 from pipeline.making.tasks import Piece

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from pipeline.executors.threads import ThreadRunner
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.order import DatasetOrder
 from pipeline.making.publication import Publication
 from storage.dataset.statistics import Statistics
 from storage.records.objects import Failure

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.making.order import DatasetOrder
+from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.remote import bucket as remote_bucket
 from storage.remote.tries import with_tries

@@ -38,11 +38,12 @@ class DatasetOrder:
     scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
     """How many scenes, rounded up to whole shards; by default the build's number."""
     seed: Seed | None = None
-    """Seed of every draw; by default the build's."""
+    """Seed of objects, scenes, cameras and samples; by default the build's."""
     resolution: Resolution | None = None
     """Width of a picture in pixels; by default the build's."""
     noise_floor_db: NoiseFloor | None = None
-    """Noise floor in dB (psnr_log_db) down to which is rendered; by default the build's."""
+    """Sampling stops at this measured noise floor in dB (psnr_log_db; higher is cleaner); by
+    default the build's."""
     allow_licences: tuple[str, ...] = ()
     """Licences allowed in addition to the build's, which are the default."""
     licence: str | None = None

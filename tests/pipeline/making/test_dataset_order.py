@@ -3,7 +3,7 @@
 import json
 
 from infra.cli.changes import parse_changes
-from pipeline.making.order import DatasetOrder, generate_words
+from pipeline.making.dataset_order import DatasetOrder, generate_words
 from tests.command_line import trilight
 
 ASKED = DatasetOrder(

@@ -31,21 +31,23 @@ class Asked:
     resolution: Resolution | None = None
     """Width of a picture in pixels; by default 512, or with a network what it was trained on."""
     noise_floor_db: NoiseFloor = 40.0
-    """mitsuba: noise floor in dB (psnr_log_db) down to which is rendered."""
+    """mitsuba: sampling stops at this measured noise floor in dB (psnr_log_db); higher is
+    cleaner."""
     max_spp: Samples = 4096
     """mitsuba: most samples per pixel."""
     view: Annotated[int, Within(0, 999)] = 0
     """Which camera of the scene, from 0."""
     orbit: Annotated[int | None, Within(1, 100_000, unit="pictures")] = None
-    """So many pictures on a circle around what the camera sees; by default one from the camera."""
+    """Number of pictures on a circle around what the camera sees; by default one from the
+    camera."""
     arc_deg: Annotated[float, Within(0, 360, low_open=True, unit="degrees")] = 360.0
-    """Angle of that circle; below 360 the camera is its middle."""
+    """Angle of the orbit; below 360 the camera stands at its middle."""
     cameras: str | None = None
     """A picture from each camera of this .json or scene; by default from that of the scene."""
     fps: Annotated[int, Within(1, 240, unit="pictures a second")] = 24
     """Pictures a second of a video."""
     tone_map: ToneMap = "plain"
-    """Of PNG and video: plain (sRGB, clipped), or filmic (ACES 2.0)."""
+    """Tone mapping of PNG and video: plain (sRGB, clipped), or filmic (ACES 2.0)."""
     exposure_ev: Annotated[float, Within(-32, 32, unit="stops")] = 0.0
     """Stops by which PNG and video are brightened, or darkened below 0: each doubles the light; EXR
     keeps radiance as it is."""
