@@ -19,34 +19,36 @@ class TrainOrder:
     """Which run to train, on what, and how."""
 
     run: str = "smoke"
-    """Named run, such as smoke or pretrain."""
+    """Name of a run (a named set of settings), such as smoke or pretrain."""
     data: tuple[str, ...] = ("data/smoke",)
-    """Root of a dataset, a folder or a URL; or shards, by name or pattern such as
+    """Dataset (a folder or a URL), or shards by name or pattern, such as
     s3://b/{train,validation}-{000000..000007}.tar."""
     out: str | None = None
-    """Folder of the run, as the worker sees it; by default runs/RUN."""
+    """Folder for the run, on the machine that trains; by default runs/RUN."""
     resume: bool = False
-    """Go on from the newest checkpoint."""
+    """Continue from the newest checkpoint."""
     begin_with: str | None = None
-    """Folder of a run, or checkpoint, whose weights a finetune run begins with; by default other
-    runs begin with random ones."""
+    """Folder of a run, or checkpoint, with the initial weights of a finetune run; by default, and
+    in all other runs, they are random."""
     lpips: str | None = None
-    """Folder with vgg16-397923af.pth and vgg.pth, or hub to download them; by default what
-    TRILIGHT_LPIPS says."""
+    """Folder of the LPIPS weights (vgg16-397923af.pth and vgg.pth), or hub to download them; by
+    default the value of TRILIGHT_LPIPS."""
     device: Literal["cpu", "cuda"] | None = None
-    """Device that computes; by default cuda where there is one."""
+    """Device to compute on; by default cuda if there is one, else cpu."""
     steps: Annotated[int | None, Within(1, 10**9, unit="steps")] = None
-    """How many steps; by default the run's. Fewer shorten its warm-up and intervals."""
+    """Number of steps; by default the run's. Fewer steps also shorten the warm-up and the
+    intervals."""
     most_unusable: Annotated[int | None, Within(0, 10**9, unit="samples")] = None
-    """Maximum number of damaged samples to replace by others; by default the first one stops the
+    """Maximum number of unusable samples to replace by others; by default the first one stops the
     run."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Other settings of the run by dotted name, such as loss.perceptual=none or model=large (values
-    are JSON); by default none differ."""
+    """Changes to the run's settings, by dotted name, such as loss.perceptual=none or model=large
+    (values are JSON); by default there are none."""
     workers: Annotated[int, Within(1, 1024, unit="threads")] = 1
     """Threads that decode samples."""
     processes: Annotated[int, Within(1, 1024, unit="processes")] = 1
-    """Processes on this machine, started by torchrun; one for each graphics card."""
+    """Number of processes on this machine, which torchrun starts; use one for each graphics card.
+    """
 
     def __post_init__(self) -> None:
         if not self.data:

@@ -22,12 +22,12 @@ NUM_TAPS = 4
 """Decoder layers that a DPT head reads (Ranftl et al. 2021)."""
 
 LAYERS = 256
-"""Most layers of a stage: twenty times the largest published network's."""
+"""Maximum number of layers of a stage: twenty times the largest published network's."""
 
 
 @checked("model config")
 class ModelConfig:
-    """All numbers of one network."""
+    """Sizes of one network."""
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "ModelConfig"]]] = {}
     """The named sizes, by which a setting of this kind may be given (storage.settings.changes)."""
@@ -42,19 +42,21 @@ class ModelConfig:
     hidden_width: Annotated[int, Within(1, 65_536)]
     """Width inside the SwiGLU."""
     num_registers: Annotated[int, Within(0, 4096)]
-    """Learned tokens that belong to no triangle."""
+    """Number of register tokens: learned tokens that belong to no triangle."""
     rope_num_freqs: Annotated[int, Within(1, 64)]
     """Rotary frequencies per coordinate; 2 x 9 x rope_num_freqs may not exceed the head width."""
     rope_max_freq: Annotated[float, Within(1, 1000, unit="radians per metre")]
     """Highest rotary frequency in radians per metre; the lowest is 1, the rest log-spaced."""
     register_eps: Annotated[float, Within(0, 1)] = 0.0
-    """Added to the number of triangles in the registers' mean position; published weights: 1e-5."""
+    """Added to the number of triangles by which the registers' mean position is divided; the
+    published weights use 1e-5."""
     normal_octaves: Annotated[int, Within(0, 16)] = 6
-    """Octaves of the sines that encode vertex normals."""
+    """Octaves of the sinusoidal encoding of vertex normals."""
     patch_px: Annotated[int, Within(1, 64, unit="pixels")] = 8
     """Width of a ray bundle in pixels."""
     window_bundles: Annotated[int, Within(0, 64, unit="bundles")] = 0
-    """Width in bundles of the Swin windows of the view stage; 0 where a bundle sees all others."""
+    """Width in ray bundles of the Swin windows of the view stage; with 0, every bundle attends to
+    all others."""
     head: Head
     """`dpt` mixes neighbouring bundles by convolution, `linear` reads each bundle alone."""
     dpt_features: Annotated[int, Within(0, 4096)] = 0
@@ -62,9 +64,9 @@ class ModelConfig:
     dpt_channels: Annotated[tuple[int, ...], Within(1, 8192)] = ()
     """Widths of the DPT's four grids, finest first; empty with a linear head."""
     dpt_taps: Annotated[tuple[int, ...], Within(0, LAYERS - 1)] = ()
-    """Decoder layers that feed those grids, in the same order; empty with a linear head."""
+    """Decoder layers that feed the DPT's four grids, finest first; empty with a linear head."""
     material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
-    """Columns of a material that the network reads, in the order of its input."""
+    """Material columns that the network reads, in the order of its input."""
 
     def __post_init__(self) -> None:
         if self.width % self.num_heads or self.head_width % 2:
@@ -97,7 +99,7 @@ class ModelConfig:
 
     @property
     def picture_px(self) -> int:
-        """Pictures are a multiple of so many pixels wide: one bundle, or one window of them."""
+        """Width of a ray bundle or window in pixels; pictures are a multiple of it wide."""
         return self.patch_px * max(1, self.window_bundles)
 
 

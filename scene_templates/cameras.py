@@ -37,14 +37,14 @@ class Sector:
 
 @checked("scene settings")
 class CameraSettings:
-    """What cameras are drawn from, as published."""
+    """Ranges from which cameras are drawn, as published."""
 
     distance: Annotated[Range, SIZE] = (1.5, 2.0)
-    """Distance from the camera to the point it looks at, world units."""
+    """Distance from the camera to the point it looks at, in world units."""
     target_jitter: Annotated[float, OFFSET] = 0.2
-    """Largest offset, per axis, of the point it looks at from the origin."""
+    """Maximum offset per axis from the origin of the point that a camera looks at."""
     up_jitter: Annotated[float, Within(0, 1)] = 0.1
-    """Largest offset, per axis, of a camera's up vector from +Z."""
+    """Maximum offset per axis of a camera's up vector from +Z."""
     fov_deg: Annotated[Range, Within(1, 170, unit="degrees")] = (30.0, 60.0)
     """Full field of view, horizontal and vertical."""
 

@@ -18,26 +18,25 @@ from storage.settings.ranges import Share, Within
 
 @checked("scene settings")
 class Family:
-    """One row of the table that scenes are drawn from."""
+    """A layout, how many objects of which size it holds, and how often it is drawn."""
 
     PRESETS: ClassVar[Mapping[str, Callable[[], "Family"]]] = {}
-    """Functions by name that return one (families.default_families), for
-    `storage.settings.changes`."""
+    """Functions that return a family, by its name, for `storage.settings.changes`."""
     name: str
-    """Unique, such as `corner-multi`."""
+    """Unique name, such as `corner-multi`."""
     template: str
-    """The layout: a name of scene_templates.templates."""
+    """Layout: the name of a template (scene_templates.templates)."""
     weight: Annotated[float, Within(1e-9, 1e9)] = 1.0
-    """How often it is drawn, relative to the others."""
+    """How often the family is drawn, relative to the others."""
     shell: SharedRoom | SeparateSides
     """How floor and walls are placed."""
     num_objects: Annotated[Counts, Within(0, 64, unit="objects")]
-    """Fewest and most objects, each count equally likely."""
+    """Minimum and maximum number of objects; each count is equally likely."""
     object_scale: Annotated[Range, SIZE]
-    """Diameter of an object's bounding sphere, before halving. Where no free place is found, the
-    sizes of all objects are drawn again."""
+    """Diameter of an object's bounding sphere, for a room of side 2. If an object finds no free
+    place, the sizes of all objects are drawn again."""
     smooth_share: Share = 0.5
-    """Share of objects and shell parts with interpolated normals; the others are flat."""
+    """Share of objects and shell parts with interpolated normals; the others are flat shaded."""
 
     def __post_init__(self) -> None:
         known = ", ".join(TEMPLATES)

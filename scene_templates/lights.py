@@ -32,30 +32,34 @@ PALEST = 0.2
 
 @checked("scene settings")
 class LightSettings:
-    """What emitters are drawn from."""
+    """Ranges and shares from which emitters are drawn."""
 
     count: Annotated[Counts, Within(1, MOST_LIGHTS, unit="emitters")] = (1, 8)
-    """Fewest and most emitters, each count equally likely."""
+    """Minimum and maximum number of emitters; each count is equally likely."""
     total_emission: Annotated[Range, Within(1e-3, 1e9)] = (2500.0, 5000.0)
-    """Radiance summed over the emitters: one of n emits a number from this range divided by n."""
+    """Range of the total radiance: each of n emitters gets a number from this range, divided by n.
+    """
     scale: Annotated[Range, SIZE] = (2.0, 2.5)
-    """Scale per axis of the emitter triangle (edge 0.0707), which is not halved."""
+    """Scale per axis of the emitter triangle, whose edge is 0.0707 world units at scale 1."""
     distance: Annotated[Range, SIZE] = (2.1, 2.7)
-    """Distance of an emitter from a point near the origin (see `target_jitter`), world units."""
+    """Distance of an emitter from its target near the origin (see `target_jitter`), in world units.
+    """
     target_jitter: Annotated[float, OFFSET] = 0.2
-    """Largest offset, per axis, of the point around which an emitter hangs from the origin."""
+    """Maximum offset per axis of an emitter's target from the origin."""
     spacing: Annotated[float, Within(0, 2 * SPACING_RADIUS)] = 0.3
-    """Least distance between two emitters as seen from the origin, on a sphere of radius 0.866."""
+    """Minimum distance between two emitters after projection from the origin onto a sphere of
+    radius 0.866."""
     orientation: Orientation = "uniform"
-    """How emitters are turned; see `PlacementSettings.orientation`."""
+    """Distribution of the emitters' rotations; see `PlacementSettings.orientation`."""
     coloured_share: Share = 0.0
-    """Share of emitters that are coloured at the same mean radiance. An option: published lights
-    are white, and a network trained on white ones alone has never seen another."""
+    """Share of emitters that are coloured instead of white, with the same mean radiance. An option:
+    published lights are white, and a network trained on white ones alone has never seen another."""
     reflectance: Share = 0.0
     """Diffuse albedo of an emitter. What shines at 300 need not reflect; the published ones do,
     with an albedo of 1."""
     num_inside: Annotated[int, Within(0, MOST_LIGHTS, unit="emitters")] = 0
-    """How many of the emitters hang in the middle of objects instead, for tests out of range."""
+    """Number of emitters that are placed in the middle of objects instead, for tests out of
+    distribution."""
 
 
 def emitters_rand(

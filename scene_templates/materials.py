@@ -18,29 +18,30 @@ from storage.settings.ranges import Share, Within
 
 @checked("scene settings")
 class MaterialSettings:
-    """What surfaces are drawn from."""
+    """Ranges and shares from which the materials of surfaces are drawn."""
 
     albedo_sum: Annotated[Range, Within(0, 1)] = (0.9, 1.0)
-    """Diffuse scale plus specular of a surface."""
+    """Sum of the diffuse scale and the specular albedo of a surface."""
     specular_ratio: Annotated[Range, Within(0, 1)] = (0.0, 1.0)
-    """Share of that sum which is specular."""
+    """Share of `albedo_sum` that is specular."""
     roughness_log: Annotated[Range, Within(1e-6, 2)] = (0.06, 1.055)
-    """Range whose logarithm is drawn evenly; `roughness_bias` is then taken off."""
+    """Log-uniform range of roughness, from which `roughness_bias` is then subtracted."""
     roughness_bias: Annotated[float, Within(0, 1)] = 0.05
-    """See `roughness_log`; makes smooth surfaces common without a pile at the smallest value."""
+    """Subtracted from the log-uniform roughness; makes smooth surfaces common without making many
+    equal to the smallest value."""
     roughness_clip: Annotated[Range, Within(0, 1)] = (0.01, 1.0)
-    """Least and greatest roughness."""
+    """Minimum and maximum roughness."""
     coloured_share: Share = 0.5
-    """Share of the surfaces with interpolated normals that have many colours: floors and walls one
-    for each triangle, objects one for each shading group or triangle."""
+    """Share of the surfaces with interpolated normals that have many colours: a floor or wall has
+    one for each triangle, an object one for each shading group or triangle."""
     triangle_colours_share: Share = 0.5
     """Share of the many-coloured objects with a colour for each triangle instead of each shading
-    group: one half as the paper says; the published code makes none."""
+    group; one half as in the paper (the published code makes none)."""
     coloured_specular_share: Share = 0.0
-    """Share of surfaces whose specular albedo is tinted: each channel uniform between 0 and what it
-    would be. An option: the published scenes have none, and so no metal but grey ones."""
+    """Share of surfaces whose specular albedo is tinted: each channel is uniform between 0 and the
+    untinted value. An option: the published scenes have none, and so no metal but grey ones."""
     smooth_angle_deg: Annotated[float, Within(0, 180, unit="degrees")] = 30.0
-    """An edge sharper than this separates shading groups."""
+    """Angle between faces above which an edge separates shading groups."""
 
     def __post_init__(self) -> None:
         low, bias = self.roughness_log[0], self.roughness_bias

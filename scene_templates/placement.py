@@ -1,4 +1,4 @@
-"""Where objects go: in the room, on the floor or over it, and clear of each other.
+"""Places objects in the room: resting or floating, and clear of each other.
 
 Sizes and rotations are drawn first, then places, the largest object first and each several times
 over, before sizes are given up and drawn anew. Drawing whole arrangements until one fits would be
@@ -34,17 +34,18 @@ TOUCHING = 1e-9
 
 @checked("scene settings")
 class PlacementSettings:
-    """How objects are put into the room."""
+    """How objects are placed in the room."""
 
     orientation: Orientation = "uniform"
-    """How objects are turned: uniformly on SO(3), where the published Euler angles prefer poles."""
+    """Distribution of the objects' rotations: `uniform` on SO(3), or `euler` as published, which
+    favours the poles."""
     resting_share: Share = 0.5
     """Share of objects that rest on the floor; the others float. The published ones all float."""
     overlap_share: Share = 0.1
-    """Share of scenes whose objects may run into each other, so that contact and penetration are
-    not unknown to a network. In the others no two meshes meet; in the published ones all may."""
+    """Share of scenes whose objects may intersect, so that a network sees contact and penetration
+    too. In the others no two meshes meet; in the published ones all may."""
     inside: bool = True
-    """Objects stay on the room's side of the floor and walls. Otherwise, as published, their
+    """Keep objects on the room's side of the floor and walls. Otherwise, as published, their
     centres are uniform in the cube [-0.5, 0.5]^3 and they may stick through."""
 
 
@@ -112,7 +113,7 @@ def poses_rand(
 
     Args:
         rng: where the numbers come from.
-        settings: how objects are put.
+        settings: how objects are placed.
         space: where.
         shapes: what they look like.
         object_scale: range of the bounding spheres' diameters, before halving.

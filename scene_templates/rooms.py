@@ -106,20 +106,22 @@ class Room:
 
 @checked("scene settings")
 class SharedRoom:
-    """Ranges of rooms whose parts meet."""
+    """Ranges of rooms whose floor and walls meet at their edges."""
 
     square_share: Share = 0.5
     """Share of scenes whose floor and walls are exact rectangles of one room, edge to edge."""
     scale: Annotated[Range, SIZE] = (1.0, 1.35)
-    """Size of the room per axis, before halving; shared by its parts, so that they meet."""
+    """Scale of the room per axis (1 is the nominal room); floor and walls share it, so that they
+    meet."""
     shift: Annotated[float, OFFSET] = 0.05
-    """How far the room is moved sideways at most, before halving."""
+    """Maximum sideways shift of the room, for a room of side 2."""
     raise_z: Annotated[Range, SHIFT] = (-0.05, 0.25)
-    """How far the room is raised, before halving: no fixed height of the floor to learn."""
+    """Upward shift of the room, for a room of side 2; it varies so that a network cannot learn a
+    fixed height of the floor."""
     tilt_deg: Annotated[float, Within(0, 10, unit="degrees")] = 3.0
-    """Most tilt of a floor or wall out of its plane, in rooms that are not square. The recipes
-    allow 10 for open layouts and 3 for the box; parts tilted by 10 must be half as large again
-    for their seams to stay closed."""
+    """Maximum tilt of a floor or wall out of its plane, in rooms that are not square. The recipes
+    allow 10 for open layouts and 3 for the box; parts tilted by 10 must be half as large again for
+    their seams to stay closed."""
 
     def room_rand(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
         """Draw a room with the parts `names`."""

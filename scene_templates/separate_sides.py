@@ -19,20 +19,20 @@ from storage.settings.ranges import Within
 
 @checked("scene settings")
 class SideRanges:
-    """Ranges from which the place of one floor or wall is drawn."""
+    """Ranges from which the placement of one floor or wall is drawn."""
 
     spin_deg: Annotated[float, Within(0, 180, unit="degrees")] = 0.0
-    """Largest turn about its own axis, in either direction."""
+    """Maximum rotation about its own normal, in either direction."""
     tilt_deg: Annotated[float, Within(0, 90, unit="degrees")] = 0.0
-    """Largest turn about each of the other two axes."""
+    """Maximum rotation about each of the other two axes."""
     scale: Annotated[Range, SIZE] = (1.0, 1.0)
-    """Size per axis, before halving."""
+    """Scale per axis; 1 fills the side of the nominal room."""
     shift_x: Annotated[Range, SHIFT] = (0.0, 0.0)
-    """Move along X, before halving."""
+    """Shift along X, for a room of side 2."""
     shift_y: Annotated[Range, SHIFT] = (0.0, 0.0)
-    """Move along Y, before halving."""
+    """Shift along Y, for a room of side 2."""
     shift_z: Annotated[Range, SHIFT] = (0.0, 0.0)
-    """Move along Z, before halving."""
+    """Shift along Z, for a room of side 2."""
 
     def placement_rand(self, rng: np.random.Generator, axis: int) -> PatchPlacement:
         """Draw the place of a side that is perpendicular to `axis` before it is turned."""
@@ -49,18 +49,18 @@ class SideRanges:
 
 @checked("scene settings")
 class SeparateSides:
-    """Ranges of each floor and wall."""
+    """Ranges of floor and walls that are drawn independently of each other, as published."""
 
     floor: SideRanges
-    """The floor."""
+    """Ranges of the floor."""
     wall0: SideRanges = SideRanges()
-    """The wall at +Y, where the template has one."""
+    """Ranges of the wall at +Y, if the template has one."""
     wall1: SideRanges = SideRanges()
-    """The wall at +X."""
+    """Ranges of the wall at +X."""
     wall2: SideRanges = SideRanges()
-    """The wall at -X."""
+    """Ranges of the wall at -X."""
     wall2_faces_out: bool = False
-    """Whether the wall at -X turns its front away from the room, as in the original policy."""
+    """Turn the front of the wall at -X away from the room, as in the original policy."""
 
     def room_rand(self, rng: np.random.Generator, names: Sequence[str]) -> Room:
         """Draw the sides `names`; the space between them is the nominal room."""

@@ -1,8 +1,8 @@
-"""`SceneSettings`: everything from which a scene is drawn, in the groups of this folder.
+"""`SceneSettings`: all settings from which a scene is drawn.
 
 Numbers follow the RenderFormer V1 recipes where they are known and sound; each deviation says why.
-World units throughout: the nominal shell is the cube [-0.5, 0.5]^3, so sizes that the recipes
-state for a cube of side 2 are halved on use (fields that hold such numbers say "before halving").
+The nominal shell is the cube [-0.5, 0.5]^3 in world units. The recipes state some sizes for a cube
+of side 2; fields that hold such numbers say so, and the numbers are halved on use.
 
 An excursion takes a scene beyond the usual range along one axis, while all else stays.
 """
@@ -24,14 +24,14 @@ from storage.settings.ranges import FLOAT32_MAX, Share, Within
 
 @checked("excursion")
 class Excursion:
-    """One value beyond the usual range, and the settings that make it."""
+    """One value beyond the usual range, and the settings that produce it."""
 
     axis: str
-    """What is varied, such as `fov_deg`; stands in the provenance of its scenes."""
+    """Name of what varies, such as `fov_deg`; recorded in the provenance of its scenes."""
     value: Annotated[int | float, Within(-FLOAT32_MAX, FLOAT32_MAX)]
-    """The value on the axis; also in the provenance."""
+    """The value itself; recorded in the provenance too."""
     changes: tuple[tuple[str, Any], ...]
-    """Dotted names of scene settings with their values (storage.settings.changes)."""
+    """Scene settings to change, by dotted name, with their values (storage.settings.changes)."""
 
 
 MAX_TRIANGLES = 65_535
@@ -44,43 +44,45 @@ MIN_TRIANGLES = 129
 
 @checked("scene settings")
 class ViewLaws:
-    """What a camera must see for its view to be rendered."""
+    """Conditions on what a camera sees; a camera that fails one is drawn again."""
 
     coverage_grid: Annotated[int, Within(1, 256, unit="rays")] = 32
-    """Camera rays per side with which a view is judged."""
+    """Camera rays per side of the square grid with which a view is checked."""
     min_coverage: Share = 0.02
-    """Least share of the camera rays that meet an object first, where the scene has objects."""
+    """Minimum share of the camera rays that hit an object first, in scenes that have objects."""
     min_lit: Share = 0.05
-    """Least share of what the camera sees that some emitter shines upon, on the side seen."""
+    """Minimum share of the visible surface points that some emitter lights on the visible side."""
     max_shell_back: Share = 0.1
-    """Greatest share of the camera rays that meet a floor or wall from behind."""
+    """Maximum share of the camera rays that hit a floor or wall from behind."""
     min_depth: Annotated[float, OFFSET] = 0.01
-    """Least distance from the camera to anything, and to the bounding box of any object."""
+    """Minimum distance from the camera to any surface, and to the bounding box of any object."""
 
 
 @checked("scene settings")
 class SceneSettings:
-    """What scenes are drawn from. Ranges are (low, high), both ends included."""
+    """Ranges and shares from which scenes are drawn. Ranges are (low, high), both ends included."""
 
     families: tuple[Family, ...]
-    """The layouts with their objects, drawn by weight."""
+    """Families (a layout with its objects) to draw scenes from, by weight."""
     families_in_turn: bool = False
-    """Take the families one after the other instead, so that each has exactly its share."""
+    """Take the families in turn and ignore their weights, so that each makes the same number of
+    scenes."""
     max_triangles: Annotated[int, Within(MIN_TRIANGLES, MAX_TRIANGLES, unit="triangles")] = 1536
-    """Most triangles of a whole scene, shell and emitters included."""
+    """Maximum number of triangles of a scene, shell and emitters included."""
     enough_error: Share = 0.005
-    """Distance to its source (99th percentile, share of the diagonal) from which an object gets no
-    finer: half a percent is about a pixel of a picture of 256. 0 gives all that the budget has."""
+    """Error at which an object gets no more triangles: the 99th percentile of the distance to its
+    source, as a share of the diagonal. Half a percent is about a pixel of a picture 256 pixels
+    wide; 0 spends the whole budget."""
     centring: Literal["vertex_mean", "box"] = "box"
-    """What becomes the centre of an object: the middle of its source's bounding box, or as
-    published the mean of its vertices, which moves with the tessellation."""
+    """Centre of an object: `box` is the middle of its source's bounding box; `vertex_mean`, as
+    published, is the mean of its vertices, which depends on the tessellation."""
     fill_to: Annotated[int | None, Within(1, MAX_TRIANGLES, unit="triangles")] = None
-    """Split the triangles of objects, without changing the surface, until the scene has this many;
-    scenes with more stay as they are."""
+    """Number of triangles up to which those of objects are subdivided, without changing the
+    surface; scenes with more stay as they are."""
     num_views: Annotated[int, Within(1, 1000, unit="cameras")] = 4
-    """Cameras of every scene."""
+    """Number of cameras of every scene."""
     placement: PlacementSettings = field(default_factory=PlacementSettings)
-    """How objects are put into the room."""
+    """Placement of objects in the room."""
     materials: MaterialSettings = field(default_factory=MaterialSettings)
     """Materials of objects, floor and walls."""
     lights: LightSettings = field(default_factory=LightSettings)
@@ -88,9 +90,10 @@ class SceneSettings:
     cameras: CameraSettings = field(default_factory=CameraSettings)
     """Cameras of the scenes."""
     views: ViewLaws = field(default_factory=ViewLaws)
-    """What a view must show."""
+    """Conditions that every view must meet."""
     excursions: tuple[Excursion, ...] = ()
-    """Where given, scenes leave the ranges above along one axis each, in turn."""
+    """Values beyond the usual ranges, for tests out of distribution: scenes take these excursions
+    in turn, one each."""
 
     def __post_init__(self) -> None:
         require(len(self.families) > 0, "families", self.families, "at least one")

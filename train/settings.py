@@ -19,40 +19,41 @@ orientation alike."""
 
 @checked("train settings")
 class AugmentationSettings:
-    """What is drawn anew at every visit of a scene. The default changes nothing."""
+    """Random augmentation, drawn anew at every visit of a scene. The default changes nothing."""
 
     rotation: Rotation = "none"
-    """How scene and cameras are turned together."""
+    """Distribution of the random rotation of scene and cameras together."""
     translation: Annotated[float, Within(0, 100, unit="metres")] = 0.0
-    """Standard deviation per axis of their common shift, metres."""
+    """Standard deviation per axis of the random translation of scene and cameras together."""
     mirror: bool = False
-    """Whether half of the visits see the mirrored scene."""
+    """Mirror the scene at half of the visits."""
     channels: bool = False
-    """Whether the colour channels are permuted."""
+    """Permute the colour channels at random."""
     vertex_order: bool = False
-    """Whether each triangle begins with any of its vertices."""
+    """Rotate the order of each triangle's vertices at random; its winding stays."""
     light_scale: Annotated[float, Within(1, 1000)] = 1.0
-    """Largest factor by which all light is made stronger or weaker, log-uniform."""
+    """Scale all light by one log-uniform factor between 1 / light_scale and light_scale."""
     light_mix: Annotated[float, Within(1, 1000)] = 1.0
-    """Largest such factor for each light alone; needs a dataset that keeps lights apart
-    (`per_light`)."""
+    """Scale each light by a log-uniform factor of its own between 1 / light_mix and light_mix;
+    above 1 it needs a dataset with a picture for each light (`per_light`)."""
 
 
 Perceptual = Literal["lpips", "ms_ssim", "none"]
-"""`lpips` is the recipe's and needs published weights; `ms_ssim` needs none and is another term."""
+"""`lpips` is the recipe's term and needs published weights; `ms_ssim` is another term, without
+weights."""
 
 
 @checked("train settings")
 class LossSettings:
-    """Terms of the loss (Zeng et al. 2025, section 4) and how views are weighed."""
+    """Terms of the loss (Zeng et al. 2025, section 4) and the weights of views."""
 
     perceptual: Perceptual
-    """The second term, on tone-mapped pictures."""
+    """Perceptual term of the loss, on tone-mapped pictures."""
     perceptual_weight: Annotated[float, Within(0, 1000)] = 0.05
     """Weight of the perceptual term beside the L1 error of log10(1 + radiance)."""
     noise_half: Annotated[float, Within(0, 10)] = 0.0
-    """Root mean square noise of log10(1 + radiance) at which a view has half the weight; 0: all
-    views have the same."""
+    """Root mean square noise of log10(1 + radiance) at which a view has half the weight of a
+    noiseless one; 0 gives all views the same weight."""
 
 
 Precision = Literal["float32", "bfloat16"]
@@ -60,67 +61,73 @@ Precision = Literal["float32", "bfloat16"]
 stay float32."""
 
 Count = Annotated[int, Within(1, 10**9)]
-"""Of steps or of scenes; a billion is never reached."""
+"""Number of steps or of scenes; no run reaches a billion."""
 
 BelowOne = Within(0, 1, high_open=True)
-"""Of the decay of a running mean; at 1 it would never move."""
+"""Range of the decay of a running mean; with a decay of 1 the mean would never move."""
 
 
 @checked("train settings")
 class TrainSettings:
-    """Everything that decides which weights come out, beside the data."""
+    """Everything besides the data that decides the trained weights."""
 
     run: str
     """Name of the run."""
     model: ModelConfig
-    """The network."""
+    """Sizes of the network, or the name of a preset."""
     from_weights: bool = False
-    """Whether the run begins with given weights (`begin_with`) instead of random ones."""
+    """Start from given weights (`begin_with`) instead of random ones."""
     resolution: Annotated[int, Within(1, 2048, unit="pixels")]
-    """Pixels across the training pictures: a divisor of the data's, a multiple of the bundle's, or
-    of a window of bundles."""
+    """Width of the training pictures in pixels: it divides the dataset's width, and is a multiple
+    of the ray bundle's (with Swin windows, of a window's) width."""
     most_triangles: Annotated[int, Within(0, 1_000_000, unit="triangles")] = 0
-    """Maximum number of triangles of a scene; others are unusable; 0: no limit."""
+    """Maximum number of triangles of a scene; larger scenes are unusable (see `most_unusable`); 0
+    sets no limit."""
     seed: Seed = 0
-    """Seed of the initial weights, the order of samples and augmentation."""
+    """Seed of the initial weights, the order of samples and the augmentation."""
     loss: LossSettings
-    """What is minimised."""
+    """The loss that training minimises."""
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
-    """Symmetries under which scenes are shown."""
+    """Random augmentation of the training scenes."""
     num_steps: Count
-    """Updates of the weights; the learning rate ends its cosine at the last one."""
+    """Number of steps, each one update of the weights; the cosine schedule of the learning rate
+    ends at the last one."""
     scenes_per_step: Annotated[int, Within(1, 65_536, unit="scenes")]
-    """Scenes whose gradients are averaged into one update."""
+    """Batch size: the number of scenes whose gradients are averaged into one update."""
     views_per_scene: Annotated[int, Within(1, 1000, unit="views")]
-    """Views of a scene in a step, drawn anew at every visit; at most as many as the data holds."""
+    """Views of each scene in a step, drawn anew at every visit; at most as many as the dataset has.
+    """
     scenes_per_pass: Annotated[int, Within(1, 65_536, unit="scenes")] = 16
-    """Most scenes that go through the network at once; gradients of the passes of a step add up."""
+    """Maximum number of scenes in one pass through the network; a step accumulates the gradients of
+    its passes."""
     precision: Precision = "float32"
     """Precision of the network's matrix products."""
     learning_rate: Annotated[float, Within(0, 1, low_open=True)]
     """Peak learning rate."""
     muon_rate: Annotated[float, Within(0, 100, unit="x learning_rate")] = 0.0
-    """Learning rate of Muon, which then updates the matrices; 0: AdamW updates every weight."""
+    """Learning rate of Muon, which updates the matrices, as a multiple of `learning_rate`; with 0,
+    AdamW updates every weight."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
-    """Steps of linear rise to the peak."""
+    """Steps of linear warm-up to the peak learning rate."""
     final_rate_share: Share = 0.05
     """Learning rate at the last step, as a share of the peak."""
     weight_decay: Annotated[float, Within(0, 10)] = 0.01
-    """Decoupled decay of every weight (Loshchilov and Hutter 2019)."""
+    """Decoupled weight decay, applied to every weight (Loshchilov and Hutter 2019)."""
     betas: Annotated[tuple[float, float], BelowOne] = (0.9, 0.99)
     """Decay rates of AdamW's running means of the gradient and of its square."""
     grad_clip: Annotated[float, Within(0, 1e9, low_open=True)] = 1.0
-    """Largest gradient norm; longer gradients are scaled down to it."""
+    """Maximum norm of the gradient; larger gradients are scaled down to it."""
     ema_decay: Annotated[float, BelowOne] = 0.0
-    """Decay of the moving average (EMA) of the weights, which is then judged and kept; 0: no
-    average."""
+    """Decay of the exponential moving average (EMA) of the weights, which is what is then evaluated
+    and saved; 0 keeps no average."""
     recompute_activations: bool = False
-    """Trade a third more time for memory: see RenderFormer.recompute_activations."""
+    """Recompute activations in the backward pass, which saves memory and takes a third more time
+    (see RenderFormer.recompute_activations)."""
     shuffle_shards: Annotated[int, Within(1, 100_000, unit="shards")] = 4
-    """Shards that are open at the same time, among whose samples is shuffled."""
+    """Number of shards that are open at the same time; samples are shuffled among them."""
     most_unusable: Annotated[int, Within(0, 10**9, unit="samples")] = 0
-    """Maximum number of damaged samples that are replaced by others; 0: the first one ends the
-    run."""
+    """Maximum number of unusable samples that are replaced by others; with 0, the first one stops
+    the run."""
     log_every: Count = 10
     """Steps between rows of metrics.jsonl."""
     validate_every: Count
@@ -128,11 +135,11 @@ class TrainSettings:
     checkpoint_every: Count
     """Steps between checkpoints."""
     checkpoints_kept: Count = 2
-    """Newest checkpoints that stay; older ones are deleted."""
+    """Number of newest checkpoints to keep; older ones are deleted."""
     keep_every: Annotated[int, Within(0, 10**9, unit="steps")] = 0
-    """Steps between checkpoints that are kept for good; 0: none is."""
+    """Steps between checkpoints that are never deleted; 0 keeps none of them."""
     validation_scenes: Count = 64
-    """Most scenes of the validation split that are judged."""
+    """Maximum number of scenes of the validation split that are evaluated."""
 
     def __post_init__(self) -> None:
         picture_px = self.model.picture_px

@@ -69,18 +69,18 @@ QUICK = dataclasses.replace(
 
 @checked()
 class Asked:
-    """What the user asks for besides the experiments and the effort."""
+    """The inputs of the experiments."""
 
     objects: tuple[str, ...] = ("builtin:",)
     """Sources of objects."""
     allow_licences: tuple[str, ...] = ()
-    """Licences of objects that are measured too; by default the usual ones are."""
+    """Licences of objects to allow in addition to the usual ones; by default there are none."""
     scenes: Path | None = None
-    """Folder of RenderFormer scenes that are rendered as well; by default none."""
+    """Folder of RenderFormer scenes to render as well; by default none."""
     checkpoint: str = "builtin:"
-    """Network that is measured; by default the one that comes with Trilight."""
+    """Network to measure; by default the one that comes with Trilight."""
     data: str | None = None
-    """Root of a finished dataset, for the experiment economy; by default none."""
+    """Finished dataset (a folder or a URL) for the experiment economy; by default none."""
 
     @property
     def allowed_licences(self) -> tuple[str, ...]:

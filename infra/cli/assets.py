@@ -42,22 +42,23 @@ class Meshes:
     """Which objects become meshes, and how."""
 
     source: str
-    """Source of 3D objects: a folder here or on a server, builtin:, or objaverse:."""
+    """Source of 3D objects: a folder or a URL, builtin:, or objaverse:."""
     out: Path
-    """Folder of the meshes."""
+    """Folder for the meshes."""
     budget: Annotated[int | None, _LEVELS] = None
-    """Most triangles of an object; by default 1400, or 4096 with --epsilon."""
+    """Maximum number of triangles of an object; by default 1400, or 4096 with --epsilon."""
     epsilon: str | None = None
-    """As few triangles as lie within this distance, such as 0.5% of the diagonal; by default as
-    many as the budget."""
+    """Maximum distance to the source, such as 0.5% of the diagonal: each object gets the fewest
+    triangles that keep it; by default the budget decides."""
     profile: Profile = "faithful"
-    """Whether triangles go where the shape needs them, or are of one size."""
+    """Method: faithful puts triangles where the shape needs them, uniform makes them about equally
+    large."""
     licence: str | None = None
-    """Licence of object files that come without any statement; by default they count as yours."""
+    """Licence of object files that state none; by default such files count as your own work."""
     allow_licences: tuple[str, ...] = ()
-    """Licences allowed in addition to the usual ones, which are the default."""
+    """Licences to allow in addition to the usual ones; by default there are none."""
     workers: Annotated[int | None, Within(1, 1024, unit="objects")] = None
-    """How many objects are worked on at a time; by default as many as there are cores."""
+    """Number of objects to work on at the same time; by default the number of cores."""
 
 
 @command("source")

@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 @checked()
 class Measured:
-    """What is measured."""
+    """The experiments, and where results go."""
 
     names: tuple[str, ...] = ()
-    """Experiments, or families of them; by default all are listed."""
+    """Names of experiments or of families of them; by default all are listed and none is run."""
     quick: bool = False
-    """Take minutes instead of measuring carefully."""
+    """Measure for minutes instead of carefully."""
     out: Path | None = None
-    """Folder of the results; by default docs/bench of the checkout."""
+    """Folder for the results; by default docs/bench of the checkout."""
     write_docs: bool = False
-    """Then write the blocks of README.md and docs that are made from the results."""
+    """Afterwards write the blocks of README.md and docs that are made from the results."""
 
 
 @command("names")

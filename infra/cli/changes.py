@@ -18,10 +18,10 @@ class Shared:
     """Settings from elsewhere, which other options and --set change further."""
 
     like: str | None = None
-    """The settings of this dataset (a folder or a URL), or for train of this run (its folder),
-    instead of the named ones, which are the default."""
+    """Dataset (a folder or a URL), or for train a run (its folder), whose settings to use; by
+    default those of the given name."""
     settings: str | None = None
-    """YAML file of settings that differ, nested or by dotted names; by default none do."""
+    """YAML file of changed settings, nested or by dotted names; by default there is none."""
 
     @property
     def is_given(self) -> bool:

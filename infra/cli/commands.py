@@ -22,27 +22,27 @@ COMMANDS = {
     "assets": "Turn objects into clean meshes within a budget or an error; writes quality.html.",
     "generate": "Turn objects into a verified, resumable dataset; run it again to resume after any "
     "stop.",
-    "plan": "Measure a few scenes and predict time, cores, bytes and cost, each with an interval.",
+    "plan": "Measure a few scenes and predict time, bytes and cost of all, each with an interval.",
     "render": "Render scenes: path traced to a measured noise floor, or by a trained network.",
     "convert": "Convert by extension, and report what could not be carried over.",
     "verify": "Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."
     "\n\nAn unfinished dataset is checked as far as it exists; the exit status is 1 then too.",
     "inspect": "Rewrite report, gallery and contact sheet, and print what the dataset holds."
-    "\n\nOf a dataset that is read-only or on a server, only a summary is printed, unless --out "
-    "names a folder. Of a scene file, its summary and what a scene could not carry over.",
+    "\n\nFor a dataset that is read-only or on a server, only a summary is printed, unless --out "
+    "names a folder. For a scene file, its summary and what could not be carried over are printed.",
     "model": "Print parameters, FLOPs and memory by precision of a named size or of a checkpoint.",
     "status": "Report a dataset's progress, estimated finish and failures; needs no server.",
     "train": "Train a model; writes checkpoints, metrics.jsonl, TensorBoard curves and a sheet."
-    "\n\nFor processes on several machines: torchrun -m trilight train ...",
-    "evaluate": "Judge a network; writes evaluation.json, evaluation.md and sheets of pictures.",
+    "\n\nTo train with processes on several machines, run torchrun -m trilight train ...",
+    "evaluate": "Evaluate a network; writes evaluation.json, evaluation.md and sheets of pictures.",
     "bench": "Measure cost against error; an interrupted run resumes. Without a name, list all.",
-    "shards": "Make new datasets of finished ones.",
+    "shards": "Make new datasets from finished ones.",
 }
-"""What each does. It is the function of its name, or for a group of commands `app`, in the file of
-its name."""
+"""The commands with their help. A command is the function of its name in the file of its name; a
+group of commands is the `app` in that file."""
 
 GROUPS = ("shards",)
-"""Commands that have commands."""
+"""Commands with subcommands."""
 
 app = App(
     name="trilight",

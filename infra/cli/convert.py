@@ -12,7 +12,7 @@ from storage.settings.ranges import Within
 
 @checked()
 class Conversion:
-    """What is converted to what."""
+    """The scene to convert, and the file to write."""
 
     source: str
     """Scene .usda .usdc .usdz .usd, RenderFormer .json or .h5, .safetensors, a shard .tar, or one
@@ -20,12 +20,13 @@ class Conversion:
     target: Path
     """File .usda .usdc .usdz .json .h5 or .safetensors."""
     budget: Annotated[int | None, Within(1, 2**31 - 1, unit="triangles")] = None
-    """Most triangles of each scene, where emitters stay whole; by default as many as there are."""
+    """Maximum number of triangles of each scene, reached by simplifying what is not an emitter; by
+    default nothing is simplified."""
     usd_folder: Path | None = None
-    """Folder below which a USD stage may read files; by default its own."""
+    """Folder below which a USD stage may read files; by default the folder of the stage."""
     albedo_over_one: AlbedoOverOne = "scale"
-    """What to do with a material of a RenderFormer scene whose diffuse and specular albedos add up
-    to more than 1: scale multiplies both by one number, refuse leaves the scene out."""
+    """How to treat a material of a RenderFormer scene whose diffuse and specular albedos add up to
+    more than 1: scale multiplies both by one factor, refuse leaves the scene out."""
 
 
 @command("source", "target")

@@ -17,14 +17,15 @@ from storage.settings.described import checked
 
 @checked()
 class ExecutorChoice:
-    """Who does the work."""
+    """The executor of the tasks."""
 
     runner: str = "threads"
-    """Who runs the tasks: threads of this process; slurm, where this command is a task of an array
-    and makes its share; prefect, as a flow run at PREFECT_API_URL; the workers of a dask cluster;
-    or an executor of your own (--extend)."""
+    """Executor of the tasks: threads, in this process; slurm, if this command is one task of a job
+    array, which makes its share; prefect, as a flow run at PREFECT_API_URL; dask, on the workers of
+    a cluster; or an executor of your own (--extend)."""
     address: str | None = None
-    """With --runner dask: the scheduler, such as tcp://host:8786; by default there is none."""
+    """With --runner dask: address of the scheduler, such as tcp://host:8786; by default there is
+    none."""
 
 
 @command("build")

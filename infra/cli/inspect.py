@@ -33,18 +33,19 @@ _READ_ONLY = "It cannot be written there: choose a folder for report and sheet w
 
 @checked()
 class Inspected:
-    """What is looked at, and what is drawn of it."""
+    """The dataset or scene, and the pictures to write."""
 
     source: str
     """A dataset (folder or URL), or one scene in any form that render reads."""
     scenes: Annotated[int, Within(1, 10_000, unit="scenes")] = 16
-    """How many scenes are on the contact sheet."""
+    """Number of scenes on the contact sheet."""
     by_template: Annotated[int | None, Within(1, 1000, unit="scenes")] = None
-    """Write templates.png too, with so many scenes of each layout; by default it is not written."""
+    """Number of scenes of each layout on a second sheet, templates.png; by default it is not
+    written."""
     out: Path | None = None
     """Folder for the report and the sheet; by default the dataset's own."""
     turntable: Path | None = None
-    """Of one scene: write its views from all sides into this X.png; by default they are not drawn.
+    """For one scene: picture X.png to write, with views from all sides; by default none is written.
     """
 
 

@@ -22,29 +22,29 @@ if TYPE_CHECKING:
 
 @checked()
 class Counted:
-    """Which network, and what it renders."""
+    """The network, and the scene whose cost is computed."""
 
     network: str
     """A size (smoke, tiny, small, base, large) or a checkpoint."""
     triangles: Annotated[int, Within(1, 2**31 - 1, unit="triangles")] = 1536
-    """Triangles of the scene that is counted."""
+    """Number of triangles of the scene whose cost is computed."""
     resolution: Annotated[int, Within(8, 8192, unit="pixels")] = 256
-    """Pixels across a view."""
+    """Width of a view in pixels."""
     views: Annotated[int, Within(1, 100_000, unit="views")] = 1
-    """Views of that scene."""
+    """Number of views of that scene."""
 
 
 @checked()
 class Written:
-    """What else is measured or written."""
+    """Further measurements and files."""
 
     errors: bool = False
-    """Measure each precision against float64 too, layer by layer."""
+    """Also measure the error of each precision against float64, layer by layer."""
     plot: Path | None = None
-    """Draw those errors into this picture, which implies --errors; by default they are not drawn.
-    """
+    """Picture of those errors to write, which implies --errors; by default none is written."""
     publish: Path | None = None
-    """Write the checkpoint here too, under the published names; by default it is not written."""
+    """Folder to export the checkpoint to, under the published names; by default it is not exported.
+    """
 
 
 @command("network")

@@ -42,7 +42,7 @@ _METAVARS = {int: "INT", float: "NUMBER"}
 
 @checked()
 class Shown:
-    """What is printed."""
+    """The form of the output."""
 
     json: bool = False
     """Print the outcome as one JSON document, and nothing else."""

@@ -25,12 +25,12 @@ from storage.settings.ranges import Within
 
 @checked()
 class Prognosis:
-    """What is predicted from what."""
+    """The measurement, and the machines to predict for."""
 
     samples: Annotated[int, Within(4, 10_000, unit="scenes")] = 12
-    """How many scenes are measured."""
+    """Number of scenes to measure."""
     cores: Annotated[int, Within(1, 10**7, unit="cores")] = 64
-    """Cores of the fleet, all of them."""
+    """Total number of cores of all machines."""
 
 
 @command("build")

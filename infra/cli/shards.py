@@ -27,7 +27,7 @@ class NewDataset:
 
 @checked()
 class Datasets:
-    """What it is made of."""
+    """The source datasets."""
 
     datasets: tuple[Path, ...]
     """Folders of finished datasets."""
@@ -35,26 +35,27 @@ class Datasets:
 
 @checked()
 class Selected:
-    """Which scenes are kept."""
+    """The dataset, and the scenes to keep."""
 
     dataset: Path
     """Folder of a finished dataset."""
     split: Literal["train", "validation", "test"] | None = None
-    """Scenes of this split only; by default all."""
+    """Keep only the scenes of this split; by default all."""
     template: str | None = None
-    """Scenes of this layout only, such as plane; by default all."""
+    """Keep only the scenes of this layout, such as plane; by default all."""
     min_noise_floor_db: Annotated[float | None, Within(-100, 200, unit="dB")] = None
-    """Scenes whose every view has at least this noise floor (psnr_log_db); by default all."""
+    """Keep only the scenes whose views all have at least this noise floor (psnr_log_db); by default
+    all."""
 
 
 @checked()
 class Resharded:
-    """What is divided anew."""
+    """The dataset, and the size of its new shards."""
 
     dataset: Path
     """Folder of a finished dataset."""
     scenes_per_shard: Annotated[int, Within(1, 10**9, unit="scenes")]
-    """Scenes of each new shard."""
+    """Number of scenes in each new shard."""
 
 
 @app.command(

@@ -13,7 +13,7 @@ from storage.settings.described import checked
 
 @checked()
 class StatusOrder:
-    """What is looked at."""
+    """The dataset."""
 
     dataset: str
     """The dataset, a folder or a URL."""

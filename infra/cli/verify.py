@@ -22,19 +22,18 @@ from storage.settings.described import checked
 
 @checked()
 class Checked:
-    """What is checked, and how far."""
+    """The dataset, and what to check."""
 
     dataset: str
     """The dataset, a folder or a URL."""
     fast: bool = False
-    """Compare sizes and counts only."""
+    """Check sizes and counts only."""
     repair: bool = False
-    """Make the shards that are missing or bad anew, and check again."""
+    """Make missing and bad shards anew, and check again."""
     objects: str | None = None
-    """With --repair: the source of objects, by default that of generate."""
+    """With --repair: source of objects; by default that of the generate command."""
     scenes_from: str | None = None
-    """With --repair: the folder of scene files, where the dataset was made of one; by default none.
-    """
+    """With --repair: folder of the scene files that the dataset was made of; by default none."""
 
 
 @command("dataset")

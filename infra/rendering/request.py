@@ -16,54 +16,57 @@ EngineChoice = Literal["mitsuba", "neural", "both"]
 
 @checked()
 class Asked:
-    """What is rendered, and how."""
+    """What to render, and how."""
 
     source: str
     """Scene .usda .usdc .usdz .usd, RenderFormer .json or .h5, .safetensors, or SHARD.tar::KEY; for
     many pictures also a shard, a folder of scenes, or 'NAME{000..119}.json'."""
     out: Path
-    """X.exr for one picture (X.png is written beside it for looking, enlarged below 256 pixels); a
-    folder, X.mp4 or X.webp for many: numbered, and kept where they are there already."""
+    """X.exr for one picture (a PNG for viewing is written beside it, enlarged below 256 pixels);
+    for many a folder, X.mp4 or X.webp, where pictures that exist already are kept."""
     engine: EngineChoice = "mitsuba"
-    """Path traced by Mitsuba, by a network, or both side by side."""
+    """Renderer: mitsuba (a path tracer), neural (a network), or both side by side."""
     checkpoint: str | None = None
-    """neural: model.safetensors of a run; by default the small network that is shipped."""
+    """neural: model.safetensors of a run; by default the small network that comes with Trilight."""
     resolution: Resolution | None = None
-    """Width of a picture in pixels; by default 512, or with a network what it was trained on."""
+    """Width of a picture in pixels; by default 512, or with a network the width that it was trained
+    on."""
     noise_floor_db: NoiseFloor = 40.0
-    """mitsuba: sampling stops at this measured noise floor in dB (psnr_log_db); higher is
-    cleaner."""
+    """mitsuba: measured noise floor in dB at which sampling stops (psnr_log_db; higher is cleaner).
+    """
     max_spp: Samples = 4096
-    """mitsuba: most samples per pixel."""
+    """mitsuba: maximum number of samples per pixel."""
     view: Annotated[int, Within(0, 999)] = 0
-    """Which camera of the scene, from 0."""
+    """Number of the scene's camera, counted from 0."""
     orbit: Annotated[int | None, Within(1, 100_000, unit="pictures")] = None
-    """Number of pictures on a circle around what the camera sees; by default one from the
-    camera."""
+    """Number of pictures from a circle of cameras around the point that the camera looks at; by
+    default one picture, from the camera itself."""
     arc_deg: Annotated[float, Within(0, 360, low_open=True, unit="degrees")] = 360.0
-    """Angle of the orbit; below 360 the camera stands at its middle."""
+    """Angle of the orbit; below 360 the scene's camera is in the middle of the arc."""
     cameras: str | None = None
-    """A picture from each camera of this .json or scene; by default from that of the scene."""
+    """A .json or scene file from each of whose cameras a picture is made; by default only the
+    scene's camera is used."""
     fps: Annotated[int, Within(1, 240, unit="pictures a second")] = 24
-    """Pictures a second of a video."""
+    """Frames per second of a video."""
     tone_map: ToneMap = "plain"
     """Tone mapping of PNG and video: plain (sRGB, clipped), or filmic (ACES 2.0)."""
     exposure_ev: Annotated[float, Within(-32, 32, unit="stops")] = 0.0
-    """Stops by which PNG and video are brightened, or darkened below 0: each doubles the light; EXR
-    keeps radiance as it is."""
+    """Exposure of PNG and video in stops, each of which doubles the brightness; EXR always keeps
+    the radiance."""
     precision: Literal["float32", "bfloat16", "tf32", "float16"] = "float32"
-    """neural: precision of products; tf32 and float16 need CUDA."""
+    """neural: precision of matrix products; tf32 and float16 need CUDA."""
     lights_per_pass: Annotated[int, Within(1, 65_535, unit="triangles")] = 8
-    """neural: most emitting triangles at once; groups are added up."""
+    """neural: maximum number of emitting triangles in one pass; the pictures of the passes are
+    added up."""
     skip_empty_bundles: bool = False
-    """neural: leave black what no triangle reaches, which is faster and less exact."""
+    """neural: leave ray bundles that no triangle reaches black, which is faster and less exact."""
     albedo_over_one: AlbedoOverOne = "scale"
-    """What to do with a material of a RenderFormer scene whose diffuse and specular albedos add up
-    to more than 1: scale multiplies both by one number, refuse leaves the scene out."""
+    """How to treat a material of a RenderFormer scene whose diffuse and specular albedos add up to
+    more than 1: scale multiplies both by one factor, refuse leaves the scene out."""
     seed: Seed = 0
     """mitsuba: seed of the samples."""
     threads: Annotated[int | None, Within(1, 1024, unit="threads")] = None
-    """Threads of the processor; by default as many as there are cores."""
+    """Number of CPU threads; by default one for each core."""
 
     def __post_init__(self) -> None:
         if self.orbit is not None and self.cameras is not None:

@@ -1,4 +1,4 @@
-"""Writes docs/reference/settings.md: everything that a person may set, and what it may be."""
+"""Writes docs/reference/settings.md: every setting with its meaning, range and default."""
 
 import dataclasses
 import inspect
@@ -17,7 +17,6 @@ from pipeline.making.price import CorePrice
 from storage.records.scene import Scene
 from storage.settings.described import described, field_sentences
 from storage.settings.ranges import declared_ranges, shown_number
-from train.evaluation.evaluate import Contest
 from train.evaluation.order import EvaluationOrder
 from train.settings import TrainSettings
 
@@ -29,9 +28,9 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Render": (Asked,),
     "Plan": (CorePrice,),
     "Train": (TrainOrder, TrainSettings),
-    "Evaluate": (EvaluationOrder, Contest),
+    "Evaluate": (EvaluationOrder,),
 }
-"""What each command is told; the settings within settings are found from here."""
+"""The settings of each command; `reachable` finds the settings within them."""
 
 _HEAD = """# Settings
 

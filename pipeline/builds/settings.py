@@ -24,7 +24,7 @@ class BuildSettings:
     seed: Seed
     """Seed of objects, scenes, cameras and samples."""
     source: str | None = None
-    """Source that objects must come from; by default the user names one."""
+    """Source that the objects must come from; by default the user chooses one."""
     allowed_licences: tuple[str, ...]
     """Licences of objects that may be used."""
     assets: AssetSettings
@@ -54,15 +54,15 @@ class BuildSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class NamedBuild:
-    """What a name on the command line stands for."""
+    """A build that the command line knows by name."""
 
     settings: Callable[[], BuildSettings]
-    """Returns the settings."""
+    """A function that returns the settings."""
     num_scenes: int
-    """How many scenes are made where the user does not say."""
+    """Number of scenes to make unless the user asks for another."""
     scene_digest: str | None = None
-    """What the scenes of a frozen set must add up to (storage.dataset.statistics), if there are so
-    many."""
+    """Expected digest of the scenes of a frozen set (storage.dataset.statistics), checked when the
+    dataset has `num_scenes` scenes."""
 
 
 def differences(

@@ -1,4 +1,4 @@
-"""Flow parameters to orders: the forms of Prefect's page and our own records."""
+"""Converts the parameters of a flow run (from Prefect's forms) to orders."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -27,12 +27,12 @@ DATASET_FORMS: Mapping[str, Any] = {
 
 @checked()
 class DatasetInRuns(DatasetOrder):
-    """A dataset whose ranges of shards are flow runs of their own, for as many workers."""
+    """A dataset made by several flow runs, each of which makes a range of the shards."""
 
     flow_runs: Annotated[int, Within(1, MAX_SHARDS, unit="flow runs")] = 1
-    """Flow runs in all: this one, and one run of the deployment for each of the other ranges."""
+    """Total number of flow runs: this one, and one run of the deployment for each other range."""
     deployment: str = "generate-scenes/local"
-    """The deployment that makes the other ranges, as FLOW/DEPLOYMENT."""
+    """Deployment that makes the other ranges, as FLOW/DEPLOYMENT."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

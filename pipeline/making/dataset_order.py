@@ -1,4 +1,4 @@
-"""`DatasetOrder`: what a person says of a dataset, on the command line or in a scheduler's form."""
+"""`DatasetOrder`: the options of `trilight generate`, also for a scheduler's form."""
 
 import re
 from collections.abc import Mapping
@@ -18,7 +18,8 @@ from storage.settings.ranges import Seed, Share, Within
 
 _RANGE = re.compile(r"(\d+):(\d+)")
 _ELSEWHERE = ("build", "out", "shards", "workers")
-"""What another machine says otherwise: where, which part, with how many processes."""
+"""Fields that differ from machine to machine: the folder, the part to make, the number of
+processes."""
 
 
 @checked()
@@ -26,49 +27,51 @@ class DatasetOrder:
     """Which dataset to make, or which part of it, and how."""
 
     build: str = "smoke"
-    """Named settings, such as smoke or pretrain-256."""
+    """Name of a build (a named set of settings), such as smoke or pretrain-256."""
     objects: str | None = None
-    """Source of 3D objects: a folder here or on a server, builtin:, objaverse:, or
-    env:TRILIGHT_SOURCE_NAME for what that environment variable of the worker says. By default what
-    the build demands, or else builtin:."""
+    """Source of 3D objects: a folder or a URL, builtin:, objaverse:, or env:TRILIGHT_SOURCE_NAME,
+    which reads the source from that environment variable of the worker. By default the source that
+    the build requires, or else builtin:."""
     out: str | None = None
-    """Folder of the dataset, as the worker sees it, or a bucket such as s3://bucket/folder; by
-    default data/BUILD. With a bucket, machines that work at the same time should make different
-    shards, or they waste work."""
+    """Folder for the dataset, on the machine that makes it, or a bucket such as s3://bucket/folder;
+    by default data/BUILD. Machines that write to one bucket at the same time should make different
+    shards, or they make the same scenes twice."""
     scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
-    """How many scenes, rounded up to whole shards; by default the build's number."""
+    """Number of scenes, rounded up to whole shards; by default the build's."""
     seed: Seed | None = None
     """Seed of objects, scenes, cameras and samples; by default the build's."""
     resolution: Resolution | None = None
     """Width of a picture in pixels; by default the build's."""
     noise_floor_db: NoiseFloor | None = None
-    """Sampling stops at this measured noise floor in dB (psnr_log_db; higher is cleaner); by
+    """Measured noise floor in dB at which sampling stops (psnr_log_db; higher is cleaner); by
     default the build's."""
     allow_licences: tuple[str, ...] = ()
-    """Licences allowed in addition to the build's, which are the default."""
+    """Licences to allow in addition to the build's; by default there are none."""
     licence: str | None = None
-    """Licence of object files that come without any statement; by default they count as yours."""
+    """Licence of object files that state none; by default such files count as your own work."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
-    """Render processes that share the cores; by default one, or one for each graphics card."""
+    """Number of render processes, which share the cores; by default one, or one for each graphics
+    card."""
     failure_budget: Share = 0.1
-    """Share of scenes that may be given up before the run stops."""
+    """Share of scenes that may fail for good before the run stops."""
     accept_environment: bool = False
-    """Go on with a dataset that was begun with other library versions."""
+    """Continue a dataset that was started with other library versions."""
     scenes_from: str | None = None
-    """Folder of scene files (RenderFormer JSON) to render instead of new scenes, which are the
-    default: scene k is the k-th *.json, all are of the split test, and the build's limits on scenes
-    do not apply."""
+    """Folder of scene files (RenderFormer JSON) to render; by default scenes are composed of
+    objects. Scene k is the k-th *.json, all scenes belong to the split test, and the build's limits
+    on scenes do not apply."""
     views: Annotated[int | None, Within(1, 1000, unit="cameras")] = None
-    """First cameras of each scene file; by default as many as every file has."""
+    """Number of cameras to use of each scene file, from its first; by default the smallest number
+    of cameras in any file."""
     albedo_over_one: AlbedoOverOne = "scale"
-    """What to do with a material of a scene file whose diffuse and specular albedos add up to more
-    than 1: scale multiplies both by one number, refuse leaves the file out."""
+    """How to treat a material of a scene file whose diffuse and specular albedos add up to more
+    than 1: scale multiplies both by one factor, refuse leaves the file out."""
     shards: str | None = None
-    """A range of shards A:B, from A up to but not B: make these only, by default all. Whoever makes
-    the last missing shard of a dataset finishes it."""
+    """Range A:B of the shards to make, from A up to but not including B; by default all. The run
+    that makes the last missing shard finishes the dataset."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Other settings of the build by dotted name, such as scenes.lights.coloured_share=0.5 (values
-    are JSON); by default none differ."""
+    """Changes to the build's settings, by dotted name, such as scenes.lights.coloured_share=0.5
+    (values are JSON); by default there are none."""
 
     def __post_init__(self) -> None:
         BUILDS.find(self.build)

@@ -1,4 +1,4 @@
-"""What computing costs: one range for the options and the environment."""
+"""The price of computing: one range for the options and the environment."""
 
 from typing import Annotated
 
@@ -6,14 +6,14 @@ from storage.settings.described import checked
 from storage.settings.ranges import Within
 
 USD_PER_CORE_HOUR = 0.04
-"""Unless somebody says otherwise."""
+"""Default price of a core-hour."""
 PRICES = Within(0, 1000, unit="USD per core-hour")
-"""Ten thousand times what a core is rented for."""
+"""Range of prices; its upper end is ten thousand times the usual rent of a core."""
 
 
 @checked()
 class CorePrice:
-    """What computing costs."""
+    """The price of computing."""
 
     price: Annotated[float, PRICES] = USD_PER_CORE_HOUR
-    """USD for an hour of one core."""
+    """Price of one core for an hour, in USD."""

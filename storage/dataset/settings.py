@@ -1,4 +1,7 @@
-"""How a dataset is divided and packed: settings, apart from what reads shards without pydantic."""
+"""Settings of splits, shards and storage profiles.
+
+They are apart from the code that reads shards, which does not import pydantic.
+"""
 
 from typing import Annotated
 
@@ -13,24 +16,27 @@ MOST_SCENES = 1_000_000_000
 
 @checked()
 class SplitSettings:
-    """How objects and scenes are divided."""
+    """How objects and scenes are divided into splits and shards."""
 
     scenes_per_shard: Annotated[int, Within(1, 1_000_000, unit="scenes")]
-    """Scenes in every shard; a shard holds one split."""
+    """Number of scenes in a shard; all of them belong to one split."""
     shards_per_cycle: Annotated[int, Within(TEST_SLOT + 1, 1_000_000, unit="shards")] = 8
-    """Of this many shards in a row one is for validation and one is for testing."""
+    """Length of the cycle of splits: of this many consecutive shards, one is for validation and one
+    for testing."""
     held_out_objects: Annotated[float, Within(0, 0.5, low_open=True, high_open=True)] = 0.125
-    """Share of objects kept for validation, and again for testing."""
+    """Share of objects held out for validation; the same share is held out for testing."""
     one_split: bool = False
-    """All objects and scenes are of the split `test`: a set to be judged by."""
+    """Put all objects and scenes into the split `test`, for a dataset that only serves evaluation.
+    """
     listed_scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
-    """How many scenes there are where they come from files instead of being drawn: the last shard
-    may hold fewer, and the dataset cannot grow."""
+    """Number of scenes, if they come from scene files: the last shard may then hold fewer, and the
+    dataset cannot grow."""
 
 
 @checked()
 class StorageSettings:
-    """How a dataset is packed."""
+    """How arrays and pictures are packed."""
 
     profile: Profile = "compact"
-    """`lossless`, or `compact`: about five times smaller, within the law of the tenth."""
+    """`lossless`, or `compact`: about five times smaller, and adds at most a tenth of the noise
+    that a picture already has."""

@@ -29,7 +29,6 @@ from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, Vi
 from storage.dataset.settings import SplitSettings
 from storage.records.scene import Scene
 from storage.settings.ranges import Declared, declared_ranges
-from train.evaluation.evaluate import Contest
 from train.evaluation.order import EvaluationOrder
 from train.runs import named_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
@@ -41,9 +40,6 @@ ASKED = Asked(
     noise_floor_db=40.0, max_spp=64, view=0, orbit=None, arc_deg=360.0, cameras=None, fps=24,
     tone_map="plain", exposure_ev=0.0, precision="float32", lights_per_pass=8,
     skip_empty_bundles=False, seed=0, threads=None,
-)  # fmt: skip
-CONTEST: Any = Contest(
-    network=None, shards=None, resolution=64, rivals=None, lpips=None, most_scenes=1  # type: ignore[arg-type]
 )  # fmt: skip
 SMOKE = named_build("smoke")
 RUN = named_run("smoke")
@@ -72,7 +68,6 @@ EXAMPLES: dict[type, Any] = {
     ModelConfig: tiny(),
     LossSettings: RUN.loss,
     AugmentationSettings: RUN.augmentation,
-    Contest: CONTEST,
     EvaluationOrder: EvaluationOrder(checkpoint="a", data=("b",)),
 }  # fmt: skip
 """A valid value of every class that declares a range, but for `Scene`."""

@@ -9,30 +9,32 @@ from storage.settings.ranges import Within
 Width = Annotated[int, Within(1, 8192, unit="pixels")]
 """Pixels across a picture."""
 SceneCount = Annotated[int, Within(1, 10**9, unit="scenes")]
-"""How many scenes are judged."""
+"""Maximum number of scenes to evaluate."""
 
 
 @checked()
 class EvaluationOrder:
-    """Which network is judged, on what."""
+    """Which network to evaluate, and on which data."""
 
     checkpoint: str
-    """Folder of a run, model.safetensors or a checkpoint; builtin: for the network that is shipped.
-    """
+    """Folder of a run, model.safetensors or a checkpoint; builtin: is the network that comes with
+    Trilight."""
     data: tuple[str, ...]
-    """Root of a dataset, or shards by name or pattern; folders or URLs."""
+    """Dataset (a folder or a URL), or shards by name or pattern."""
     split: Literal["train", "validation", "test"] = "test"
-    """Which split is judged."""
+    """Split to evaluate on."""
     train_data: tuple[str, ...] = ()
-    """Data whose training pictures the rivals know; by default the same, if it has any."""
+    """Datasets whose training pictures the baselines use; by default those of --data, if they have
+    any."""
     resolution: Width | None = None
-    """Pixels across, a divisor of the data's; by default the run's if known, else the data's."""
+    """Width of a picture in pixels, which divides the dataset's; by default the run's if known,
+    else the dataset's."""
     most_scenes: SceneCount = 10**6
-    """Maximum number of scenes that are judged, from the start of the split."""
+    """Maximum number of scenes to evaluate, taken from the start of the split."""
     lpips: str | None = None
-    """Folder of LPIPS' weights, or hub to download them; by default what TRILIGHT_LPIPS says, and
-    without it LPIPS is n/a."""
+    """Folder of the LPIPS weights, or hub to download them; by default the value of TRILIGHT_LPIPS,
+    and without either LPIPS is n/a."""
     device: Literal["cpu", "cuda"] | None = None
-    """Device that computes; by default cuda where there is one."""
+    """Device to compute on; by default cuda if there is one, else cpu."""
     out: Path = Path("evaluation")
-    """Folder of the report."""
+    """Folder for the report."""
