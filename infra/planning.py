@@ -20,13 +20,11 @@ from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.machine import cores_owned
 from pipeline.making.pipeline import make_task, prepare_dataset
 from pipeline.making.render_children import close_children
-from pipeline.making.run import ShardJob
 from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import index_shard
 from storage.dataset.splits import planned_scenes, shard_name, shards_for
 from storage.dataset.staging import read_staged_scene
-from storage.extensions import recorded
 from storage.records.sample import sample_key
 from storage.seeds import rng_for
 
@@ -117,15 +115,7 @@ def measure_scenes(
     # begun as large as it will be, so that a lack of objects is reported now and not by `generate`
     scenes = max(count, _num_scenes(order))
     run = prepare_dataset(dataclasses.replace(order, out=str(place), scenes=scenes))
-    job = ShardJob(
-        folder=run.publication.folder,
-        settings=run.settings,
-        environment={},
-        extensions=recorded("data"),
-        accepted=run.accepted,
-        lock_sha256=run.publication.manifest.objects_lock_sha256,
-        num_at_once=1,
-    )
+    job = run.job(1)
     splits = run.settings.splits
     core_s, sizes = [], []
     try:

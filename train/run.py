@@ -21,7 +21,8 @@ from storage.settings.described import settings_record
 from train.data.scenes import training_scene
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable, first_samples
-from train.evaluation.judge import Judge, median_picture
+from train.evaluation.judge import Judge
+from train.evaluation.rivals import median_picture
 from train.folder import RunFolder
 from train.loop.checkpoints import (
     Checkpoint,
@@ -202,7 +203,7 @@ def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable)
     if VALIDATION not in data.splits:
         return None
     training = [
-        training_scene(sample, settings.resolution)
+        training_scene(sample, settings.resolution).target_VRR3.numpy()
         for sample in first_samples(data.split("train"), MEDIAN_SCENES, unusable)
     ]
     # no damage is allowed here: a score over fewer scenes would be another score

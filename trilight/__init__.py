@@ -17,6 +17,8 @@ are linear with Rec.709 primaries. `trilight.extend` serves extensions: template
 from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
+from trilight.lazy import offered_names
+
 if TYPE_CHECKING:
     from trilight.compose import SceneBuilder as SceneBuilder
     from trilight.datasets import Dataset as Dataset
@@ -52,21 +54,9 @@ if TYPE_CHECKING:
     from trilight.scenes import within_budget as within_budget
     from trilight.scenes import write_scene as write_scene
 
-_NAMES = {
-    "compose": "SceneBuilder",
-    "datasets": "Dataset DatasetOrder Outcome Sample Statistics "
-    "dataset_statistics generate open_dataset",
-    "errors": "TrilightError",
-    "learning": "Judgement TrainResult TrainSettings "
-    "judge_network named_run train_network write_judgement",
-    "parts": "Material",
-    "pictures": "FirstHits NeuralRenderer RenderedView "
-    "first_hits open_network preview_srgb8 render render_views write_picture",
-    "scenes": "Scene SceneObject read_scene read_scenes within_budget write_scene",
-}
-"""What there is, by the module of this package that has it. No name is one of a package of ours:
-an installed wheel has `trilight.train` and the other packages as subpackages."""
-_HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
+_HOME = offered_names(__file__)
+"""The module of this package that has each name. No name is one of a package of ours: an installed
+wheel has `trilight.train` and the other packages as subpackages."""
 
 __all__ = sorted(["__version__", *_HOME])  # noqa: PLE0605
 
@@ -76,7 +66,7 @@ def __getattr__(name: str) -> Any:
         return metadata.version("trilight")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    value = getattr(import_module(_HOME[name]), name)
     globals()[name] = value
     return value
 

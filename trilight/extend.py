@@ -1,15 +1,15 @@
-"""What files of your own are made of that add a template, a build, a source or a metric.
+"""Building blocks for extensions: your own templates, builds, sources, metrics and runs.
 
-A file of a user's imports from `trilight` alone: the packages behind it have other names in a
-checkout than in an installed wheel. What has a table (TEMPLATES, BUILDS, METRICS ...) is added with
-`TABLE.register(name, entry)`; docs/how-to has a page for each, examples/ a file. A module is loaded
-when one of its names is asked for: a template needs no torch.
+An extension imports from `trilight` alone, because the packages behind it have other names in a
+checkout than in an installed wheel. Entries of a table (TEMPLATES, BUILDS, METRICS ...) are added
+with `TABLE.register(name, entry)`; docs/how-to has a page and examples/ a file for each table. A
+module is loaded when one of its names is first used, so a template needs no torch.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from storage.installation import module_name
+from trilight.lazy import offered_names
 
 if TYPE_CHECKING:
     from model.config import SIZES as SIZES
@@ -72,45 +72,7 @@ if TYPE_CHECKING:
     from train.runs import named_run as named_run
     from train.settings import TrainSettings as TrainSettings
 
-_NAMES = {
-    "model.config": "ModelConfig SIZES",
-    "pipeline.assets.settings": "AssetSettings",
-    "pipeline.builds.named": "BUILDS named_build",
-    "pipeline.executors.registry": "EXECUTORS Executor",
-    "pipeline.executors.threads": "ThreadRunner",
-    "pipeline.making.dataset_order": "DatasetOrder generate_words",
-    "pipeline.making.pipeline": "make_dataset prepare_dataset",
-    "pipeline.making.run": "Outcome",
-    "pipeline.exchange.formats": "FORMATS LoadedScene Pictures SceneFormat SceneSource",
-    "pipeline.builds.settings": "BuildSettings NamedBuild",
-    "pipeline.objects.listing": "Listing",
-    "pipeline.objects.sources": "SourceQuery ObjectSource SOURCES",
-    "pipeline.renders.settings": "RenderSettings",
-    "scene_templates.lights": "LightSettings",
-    "scene_templates.families": "FAMILIES Family",
-    "scene_templates.settings": "SceneSettings",
-    "scene_templates.rooms": "SharedRoom",
-    "scene_templates.separate_sides": "SeparateSides SideRanges",
-    "scene_templates.templates": "TEMPLATES Template",
-    "scene_templates.cameras": "Sector",
-    "storage.atomic": "write_atomically",
-    "storage.settings.changes": "changed",
-    "storage.dataset.settings": "SplitSettings StorageSettings",
-    "storage.errors": "TrilightError",
-    "storage.extensions": "load_extension",
-    "storage.records.material": "COLUMNS EMISSION MaterialColumn",
-    "pipeline.objects.ply": "encode_ply",
-    "storage.settings.ranges": "Within",
-    "storage.records.objects": "Failure ObjectRecord",
-    "storage.records.scene": "Scene SceneObject",
-    "storage.seeds": "rng_for",
-    "storage.settings.described": "checked",
-    "train.evaluation.metrics": "JudgedPicture METRICS Metric",
-    "train.runs": "RUNS changed_run named_run",
-    "train.settings": "TrainSettings",
-}
-"""What there is, by the module that has it."""
-_HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
+_HOME = offered_names(__file__)
 
 __all__ = sorted(_HOME)  # noqa: PLE0605
 
@@ -118,7 +80,7 @@ __all__ = sorted(_HOME)  # noqa: PLE0605
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(module_name(_HOME[name])), name)
+    return getattr(import_module(_HOME[name]), name)
 
 
 def __dir__() -> list[str]:

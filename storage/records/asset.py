@@ -10,7 +10,7 @@ catalogue (`objects.jsonl`), so that the output folder is itself a source of obj
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+from storage.errors import TrilightError
 from storage.records.objects import NamedObject
 from storage.records.safe_read import read_safetensors
 
@@ -144,8 +145,23 @@ def encode_asset(asset: Asset) -> bytes:
 
 
 def decode_asset(data: bytes) -> Asset:
-    """Return the asset of a file; raises TrilightError where it is not one."""
+    """Return the asset of a file.
+
+    Raises:
+        TrilightError: the file is damaged, or another kind of safetensors file.
+    """
     arrays, metadata = read_safetensors(data)
+    try:
+        return _asset(arrays, metadata)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise TrilightError(
+            f"asset: a safetensors file with arrays {', '.join(arrays) or 'none'} does not hold "
+            f"one ({type(error).__name__}: {error}); expected a file of the asset store. Delete "
+            "it, and it is made anew."
+        ) from error
+
+
+def _asset(arrays: Mapping[str, NDArray], metadata: Mapping[str, str]) -> Asset:
     header = json.loads(metadata["asset"])
     records: Sequence[LevelRecord] = [
         LevelRecord(**{**row, "quality": LevelQuality(**row["quality"])})

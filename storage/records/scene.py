@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from storage.errors import TrilightError
 from storage.records.material import (
@@ -121,37 +121,6 @@ class Scene:
     def with_provenance(self, provenance: Mapping[str, Any]) -> "Scene":
         """Return the same scene with another record of its origin."""
         return dataclasses.replace(self, provenance=provenance)
-
-    def transformed(self, rotation: ArrayLike, translation: ArrayLike) -> "Scene":
-        """Return the same scene and cameras after a rigid motion x -> R x + t.
-
-        It looks the same from its cameras. Sums are taken in float64 and rounded once.
-
-        Args:
-            rotation: [3, 3] R.
-            translation: [3] t, world units.
-
-        Raises:
-            TrilightError: where R is no rotation: not orthonormal within POSE_TOLERANCE, or
-                mirroring.
-        """
-        turn, shift = np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
-        if turn.shape != (3, 3) or shift.shape != (3,):
-            _broken(f"the motion has shapes {turn.shape} and {shift.shape}", "(3, 3) and (3,)")
-        off = np.abs(np.einsum("ji,jk->ik", turn, turn) - np.eye(3)).max()
-        if not off <= POSE_TOLERANCE or np.linalg.det(turn) < 0:
-            _broken(f"rotation is {turn.tolist()}", "an orthonormal matrix without mirroring")
-        pose = self.c2w.astype(np.float64)
-        pose[:, :3] = np.einsum("ij,cjk->cik", turn, pose[:, :3])
-        pose[:, :3, 3] += shift
-        positions = np.einsum("ij,vj->vi", turn, self.vertex_positions.astype(np.float64)) + shift
-        normals = np.einsum("ij,vj->vi", turn, self.vertex_normals.astype(np.float64))
-        return dataclasses.replace(
-            self,
-            vertex_positions=positions.astype(np.float32),
-            vertex_normals=normals.astype(np.float32),
-            c2w=pose.astype(np.float32),
-        )
 
     def check(self) -> None:
         """Raise TrilightError at the first broken law.

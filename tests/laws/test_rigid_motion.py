@@ -10,6 +10,7 @@ from scene_templates.settings import SceneSettings
 from storage.records.scene import Scene
 from tests.pipeline.renders.sampling import assert_agree, render_blocks
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
+from tests.rigid_motion import moved
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES, num_views=1)
 
@@ -22,15 +23,15 @@ def _scene(scene_index: int) -> Scene:
 def test_rendering_commutes_with_motion(scene_index: int) -> None:
     scene = _scene(scene_index)
     rotation = uniform_rotation(np.random.default_rng(scene_index))
-    moved = scene.transformed(rotation, [0.3, -0.2, 0.1])
+    there = moved(scene, rotation, [0.3, -0.2, 0.1])
     # Frames around normals turn differently, so that the same seed means other samples.
-    assert_agree(render_blocks(moved), render_blocks(scene, first_seed=99))
+    assert_agree(render_blocks(there), render_blocks(scene, first_seed=99))
 
 
 def test_what_a_camera_sees_commutes_with_motion() -> None:
     scene = _scene(0)
-    moved = scene.transformed(uniform_rotation(np.random.default_rng(5)), [1.0, 2.0, -3.0])
-    before, after = (Sight(s).facts(s.c2w[0], float(s.fov_deg[0]), 64) for s in (scene, moved))
+    there = moved(scene, uniform_rotation(np.random.default_rng(5)), [1.0, 2.0, -3.0])
+    before, after = (Sight(s).facts(s.c2w[0], float(s.fov_deg[0]), 64) for s in (scene, there))
     # 4096 rays: a few graze an edge and fall on the other side after rounding.
     for name in ("coverage", "shell_back", "lit"):
         assert abs(getattr(before, name) - getattr(after, name)) < 0.005, name

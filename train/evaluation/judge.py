@@ -95,16 +95,6 @@ def score_pictures(pictures: Sequence[NDArray], judged: Sequence[JudgedScene]) -
     ]
 
 
-def median_picture(scenes: Sequence[TrainingScene]) -> NDArray[np.float64]:
-    """Return the radiance [R, R, 3] that is, pixel by pixel, the median over all views.
-
-    Of all fixed pictures it has the least L1 error, in any monotonic space: who does not beat it on
-    unseen scenes has learned nothing about scenes.
-    """
-    log10_MRR3 = np.concatenate([scene.target_VRR3.numpy() for scene in scenes])
-    return radiance_from_log10(np.median(log10_MRR3, axis=0))
-
-
 CHUNK = 256
 """Triangles at a time, which bounds memory at R * R * CHUNK numbers a product."""
 

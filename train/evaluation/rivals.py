@@ -4,7 +4,7 @@ The nearest training view is the training picture closest to the target itself. 
 up a training picture by the scene can do better.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,18 +26,28 @@ class Rivals:
         found = [scene.target_VRR3.numpy().astype(np.float16) for scene in scenes]
         self._log10_MRR3 = np.concatenate(found)
         self._small_MRR3 = _small(self._log10_MRR3)
-        self.median_RR3 = radiance_from_log10(
-            np.median(self._log10_MRR3, axis=0).astype(np.float64)
-        )
+        self._median_RR3 = median_picture(found)
 
     def pictures(self, target_rgb: NDArray) -> dict[str, NDArray[np.float64]]:
         """Return what each rival shows in place of a target [R, R, 3], linear radiance."""
         small = _small(log10_radiance(target_rgb)[None])
         nearest = int(np.abs(self._small_MRR3 - small).mean(axis=(1, 2, 3)).argmin())
         return {
-            MEDIAN: self.median_RR3,
+            MEDIAN: self._median_RR3,
             NEAREST: radiance_from_log10(self._log10_MRR3[nearest].astype(np.float64)),
         }
+
+
+def median_picture(log10_pictures: Sequence[NDArray]) -> NDArray[np.float64]:
+    """Return the radiance [R, R, 3] that is, pixel by pixel, the median over all views.
+
+    No other fixed picture has a smaller L1 error, in any monotonic space.
+
+    Args:
+        log10_pictures: log10(1 + radiance) of the views [V, R, R, 3] of each scene.
+    """
+    median_RR3 = np.median(np.concatenate(log10_pictures), axis=0)
+    return radiance_from_log10(median_RR3.astype(np.float64))
 
 
 def _small(log10_MRR3: NDArray) -> NDArray[np.float32]:

@@ -6,6 +6,7 @@ import io
 import numpy as np
 import pytest
 import trimesh
+from safetensors.numpy import save
 
 from pipeline.objects.ply import encode_ply
 from storage.errors import TrilightError
@@ -56,6 +57,25 @@ def test_equal_assets_have_equal_files(asset: Asset) -> None:
 def test_what_is_no_asset_is_said_to_be_none(data: bytes) -> None:
     with pytest.raises(TrilightError):
         decode_asset(data)
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        None,
+        {"asset": "not JSON"},
+        {"asset": "[]"},
+        {"asset": "{}"},
+        {"asset": '{"levels": [{}]}'},
+        {"asset": '{"levels": [{"quality": {}}]}'},
+        {"asset": '{"levels": [], "source": {}}'},
+        {"asset": '{"levels": [], "source": 3}'},
+    ],
+)
+def test_another_safetensors_file_is_refused_in_one_line(metadata: dict[str, str] | None) -> None:
+    with pytest.raises(TrilightError, match="asset: .*weight.* does not hold one") as refused:
+        decode_asset(save({"weight": np.zeros(3, np.float32)}, metadata))
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("keep", [0.2, 0.9])

@@ -12,7 +12,8 @@ from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.train.toy import toy_sample, toy_scene
 from train.data.scenes import training_scene
-from train.evaluation.judge import CHUNK, hit_masks, median_picture
+from train.evaluation.judge import CHUNK, hit_masks
+from train.evaluation.rivals import median_picture
 from train.evaluation.scores import ViewScore, lead, score_view, share_better, summarise
 from train.evaluation.sheet import (
     ERROR_WHITE,
@@ -121,12 +122,13 @@ def test_a_summary_shows_the_bad_ones() -> None:
 
 def test_no_fixed_picture_has_less_l1_error_than_the_median() -> None:
     scenes = [training_scene(toy_sample(index), 8) for index in range(7)]
-    targets = np.concatenate([scene.target_VRR3.numpy() for scene in scenes])
+    pictures = [scene.target_VRR3.numpy() for scene in scenes]
+    targets = np.concatenate(pictures)
 
     def error(radiance_rgb: np.ndarray) -> float:
         return float(np.abs(log10_radiance(radiance_rgb) - targets).mean())
 
-    median = median_picture(scenes)
+    median = median_picture(pictures)
     rng = rng_for(0, "rivals")
     middle = 10 ** np.sort(targets, axis=0)[len(targets) // 2] - 1
     rivals = [np.zeros_like(median), middle, 10 ** targets.mean(axis=0) - 1, *(10**targets - 1)]
