@@ -19,6 +19,6 @@ def require_torch(what: str) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if importlib.util.find_spec("torch") is None:
         raise TrilightError(
-            f"{what} needs PyTorch, which is not installed; expected it: make setup-all, or "
+            f"{what} needs PyTorch, which is not installed. Run make setup-all, or "
             "pip install 'trilight[train]'."
         )

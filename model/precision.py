@@ -68,7 +68,7 @@ def set_precision(model: "RenderFormer", name: str) -> "RenderFormer":
     if precision.needs_cuda and device.type != "cuda":
         raise TrilightError(
             f"precision {name}: the network is on {device.type}, which has no fast path for it; "
-            "expected a CUDA device. Take bfloat16."
+            "expected a CUDA device. Use bfloat16."
         )
     for part in rounded_parts(model):
         part.to(precision.dtype)

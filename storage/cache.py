@@ -31,7 +31,7 @@ def private_folder(path: Path) -> Path:
             path.chmod(0o700)
     except OSError as error:
         raise TrilightError(
-            f"{path} cannot be kept to yourself ({error.strerror}); expected a folder of your own."
+            f"{path} cannot be made private ({error.strerror}); expected a folder of your own."
         ) from error
     return path
 

@@ -53,13 +53,14 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         extension = loading()
         if extension is None and self._decides:
             raise TrilightError(
-                f"{self.what} {name!r} is registered by no extension, so that nothing made of it "
-                "could record where it comes from; expected this in a file that --extend names, or "
+                f"{self.what} {name!r} is registered outside an extension, so what is made with it "
+                "could not record its origin; expected the call in a file that --extend names, or "
                 "that storage.extensions.load_extension loads."
             )
         if not isinstance(name, str) or not _NAME.fullmatch(name):
             raise TrilightError(
-                f"{self.what} {name!r}: no name; expected up to 64 letters, digits and _ . + : -"
+                f"{self.what} {name!r}: not a valid name; expected up to 64 letters, digits and "
+                "_ . + : -"
             )
         if name in self._entries:
             origin = self._origins.get(name)
@@ -73,7 +74,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         own = getattr(entry, "name", name)
         if own != name:
             raise TrilightError(
-                f"{self.what} {name!r} calls itself {own!r}; expected one name for both."
+                f"{self.what} {name!r} has the name {own!r} itself; expected the same."
             )
         self._entries[name] = entry
         if extension:

@@ -30,11 +30,11 @@ class Start:
             return
         if settings.from_weights and self.begin_with is None:
             raise TrilightError(
-                f"run {settings.run}: begins with a trained network; name one with begin_with, "
-                f"or begin with random weights: {_HOW}=false."
+                f"run {settings.run}: begins with trained weights, and none are named; expected "
+                f"begin_with, or {_HOW}=false to begin with random weights."
             )
         if self.begin_with is not None and not settings.from_weights:
             raise TrilightError(
-                f"run {settings.run}: begins with random weights, but begin_with names "
-                f"{self.begin_with}; to begin with those: {_HOW}=true."
+                f"run {settings.run}: begins with random weights, but begin_with is "
+                f"{self.begin_with}; expected none, or {_HOW}=true to begin with those."
             )

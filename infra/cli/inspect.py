@@ -81,7 +81,7 @@ def _require_shards(opened: Dataset) -> None:
     if not opened.manifest.shards:
         raise TrilightError(
             f"{opened.shown}: the dataset is empty, since none of its shards is finished; expected "
-            f"at least one. See how it goes on: `trilight status {shlex.quote(opened.shown)}`."
+            f"at least one. See its progress with `trilight status {shlex.quote(opened.shown)}`."
         )
 
 

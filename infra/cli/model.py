@@ -99,8 +99,8 @@ def _open(name: str) -> "RenderFormer":
 def _require_pictures(config: "ModelConfig", resolution: int) -> None:
     if resolution % config.picture_px:
         raise TrilightError(
-            f"model: --resolution {resolution}; this network's pictures are a multiple of "
-            f"{config.picture_px} wide."
+            f"--resolution is {resolution}; expected a multiple of {config.picture_px}, as this "
+            "network's ray bundles and windows need."
         )
 
 

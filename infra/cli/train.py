@@ -103,7 +103,7 @@ def _launch(order: TrainOrder, shown: Shown) -> NoReturn:
     """Become torchrun, which starts this command once for each process."""
     if "RANK" in os.environ:
         raise TrilightError(
-            f"--processes is {order.processes} under torchrun; expected one of the two: omit it."
+            f"--processes is {order.processes} under torchrun, which sets their number; omit it."
         )
     words = [*order.command(), *option_words(shown)]
     os.execv(words[0], words)

@@ -76,8 +76,8 @@ def next_command() -> str:
 def _require_no_other_link() -> None:
     if LINK.exists() and not LINK.is_symlink() and not os.environ.get("TRILIGHT_STATE"):
         raise TrilightError(
-            f"make serve: {LINK} is a file of your own; expected none, since the commands find the "
-            "server's password there. Move what it says to your profile (prefect config set)."
+            f"make serve: {LINK} is a file of your own; expected none, because a link to the "
+            "server's password goes there. Move its settings to your profile (prefect config set)."
         )
 
 

@@ -71,7 +71,7 @@ def start(*, host: str, port: int, workers: int) -> str:
             then the other parts are ended again.
     """
     if running():
-        raise TrilightError("make serve: it runs already; expected nothing. Try make stop first.")
+        raise TrilightError("make serve: the server runs already; run make stop first.")
     if shutil.which("prefect") is None:
         raise TrilightError("make serve: there is no command `prefect`; run make setup.")
     _require_free(host, port)
@@ -230,8 +230,8 @@ def _require_free(host: str, port: int) -> None:
         time.sleep(0.1)
     if refused:
         raise TrilightError(
-            f"make serve: {host}:{port} cannot be had ({refused}); expected an address of "
-            "this machine and a port at which nobody listens. Set TRILIGHT_PORT to another port, "
+            f"make serve: {host}:{port} cannot be opened ({refused}); expected an address "
+            "of this machine and a free port. Set TRILIGHT_PORT to another port, "
             "or mend TRILIGHT_HOST."
         )
 

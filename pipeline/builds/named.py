@@ -98,8 +98,8 @@ def object_source(settings: BuildSettings, objects: str | None) -> str:
         return objects or (BENCHMARK if settings.splits.one_split else BUILTIN)
     if objects is not None and objects != settings.source:
         raise TrilightError(
-            f"--objects is {safe_url(objects)!r}; expected {settings.source!r}, which "
-            f"{settings.build} is frozen with: leave --objects away, or choose another build."
+            f"--objects is {safe_url(objects)!r}; expected {settings.source!r}, the "
+            f"fixed source of {settings.build}. Omit --objects, or choose another build."
         )
     return settings.source
 

@@ -162,7 +162,9 @@ def _chunks(array: H5Array, plan: Any) -> Iterator[tuple[tuple[slice, ...], NDAr
     _require_memory(array, math.prod(size) * array.dtype.itemsize, MAX_BLOCK_BYTES)
     counts = [-(-length // chunk) for length, chunk in zip(array.shape, size, strict=True)]
     if math.prod(counts) > MAX_CHUNKS:
-        raise TrilightError(f"{array.name}: has {math.prod(counts)} chunks, over {MAX_CHUNKS}.")
+        raise TrilightError(
+            f"{array.name}: has {math.prod(counts)} chunks; expected up to {MAX_CHUNKS}."
+        )
     stored = _stored(array)
     for at in itertools.product(*(range(count) for count in counts)):
         offset = tuple(i * chunk for i, chunk in zip(at, size, strict=True))

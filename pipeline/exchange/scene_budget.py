@@ -45,8 +45,8 @@ def within_budget(scene: Scene, budget: int) -> tuple[Scene, tuple[str, ...]]:
     total = sum(len(piece.mesh.faces) for piece in pieces)
     if total > budget:
         raise TrilightError(
-            f"--budget is {budget}; the scene has {total} triangles at the least, of which "
-            f"emitters take {counts[emits].sum()}."
+            f"--budget is {budget}; expected at least {total}, the fewest triangles of this scene "
+            f"(emitters take {counts[emits].sum()} of them)."
         )
     reduced = Scene(
         **joined(pieces),

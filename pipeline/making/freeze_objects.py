@@ -110,7 +110,7 @@ def _require_tried(source: str, passing: list[Failure]) -> None:
     """Refuse to judge an object of the dataset where the environment has kept it from us."""
     for failure in passing:
         raise EnvironmentFailure(
-            f"objects {source!r}: {failure.item!r}, of which the dataset was begun, could not be "
+            f"objects {source!r}: {failure.item!r}, which the dataset was begun with, could not be "
             f"prepared this time ({failure.reason}: {failure.message}). Nothing has changed; run "
             "the same command again."
         )

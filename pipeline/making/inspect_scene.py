@@ -57,7 +57,7 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
             sheet = call_with_retries(child, _turntable, source, choose_variant())
             write_atomically(turntable, encode_png(sheet))
     except ChildFailed as failure:
-        raise TrilightError(f"{source.name}: cannot be looked at ({failure}).") from failure
+        raise TrilightError(f"{source.name}: cannot be inspected ({failure}).") from failure
     except Rejected as rejection:
         raise TrilightError(f"{source.name}: cannot be rendered ({rejection}).") from rejection
     finally:

@@ -157,7 +157,7 @@ def _require_ours(folder: AssetFolder) -> None:
         raise TrilightError(f"{folder.root}: is a file; expected a folder. Choose another --out.")
     if folder.root.is_dir() and any(folder.root.iterdir()) and not folder.summary.exists():
         raise TrilightError(
-            f"{folder.root}: holds files that are not of `trilight assets`; expected a new or "
+            f"{folder.root}: holds files that `trilight assets` did not write; expected a new or "
             "empty folder. Choose another --out."
         )
 

@@ -95,7 +95,7 @@ def require_environment(expected: Mapping[str, Any], here: Mapping[str, Any]) ->
     """Raise TrilightError where a machine would make other bytes than the dataset's."""
     for name, wanted, found in differences(expected, here):
         raise TrilightError(
-            f"this worker differs from where the run was started: {name} is {found!r}; expected "
-            f"{wanted!r}. Use machines of one kind and one image, or accept pictures that agree "
-            "only within their noise floors with --accept-environment."
+            f"this worker differs from the machine that began the run: {name} is {found!r}; "
+            f"expected {wanted!r}. Use machines of one kind and one image, or accept pictures that "
+            "agree only within their noise floors with --accept-environment."
         )

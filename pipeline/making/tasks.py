@@ -85,8 +85,9 @@ class TasksLeft:
         """
         if self._left == 0:
             raise EnvironmentFailure(
-                f"this run has handed out its {MOST_TASKS} tasks, and others were at what is still "
-                "missing. What was finished is safe: run the same command again."
+                f"this run has handed out all of its {MOST_TASKS} tasks, and other runs hold "
+                "claims on the missing scenes. What was finished is safe: run the same command "
+                "again."
             )
         most = self._left - self._left // 10
         for task in cut_tasks(shards, splits, sizes, most=most, at_once=at_once):

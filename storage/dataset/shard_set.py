@@ -44,7 +44,7 @@ class OpenShard:
         end = max(member.offset + member.num_bytes for member in members.values())
         data = os.pread(self._stream.fileno(), end - first, first)
         if len(data) != end - first:
-            raise TrilightError(f"{self.name}: became shorter while it was read.")
+            raise TrilightError(f"{self.name}: became shorter while it was read. Copy it anew.")
         return {
             suffix: data[member.offset - first : member.offset - first + member.num_bytes]
             for suffix, member in members.items()

@@ -84,6 +84,8 @@ def decode_lights_exr(data: bytes, shape: tuple[int, int, int]) -> NDArray[np.fl
 
     channels = decode_channels(data, names, check, separate=True)
     if any(channel.shape != (height, width) for channel in channels.values()):
-        raise TrilightError(f"lights: a channel is no {[height, width]} pixels; expected all.")
+        raise TrilightError(
+            f"lights: a channel has other pixels than {[height, width]}; expected none."
+        )
     planes = np.stack([np.asarray(channels[name], np.float32) for name in names])
     return np.moveaxis(planes.reshape(num, 3, height, width), 1, -1).copy()

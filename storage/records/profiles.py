@@ -97,7 +97,8 @@ def unpack_arrays(members: Mapping[str, bytes]) -> bytes:
     found = [suffix for suffix in (PLAIN, PACKED) if suffix in members]
     if len(found) != 1:
         raise TrilightError(
-            f"member {PLAIN} is {'there twice' if found else 'missing'}; expected it, or {PACKED}."
+            f"member {PLAIN} is {'there in two forms' if found else 'missing'}; expected it "
+            f"or {PACKED}."
         )
     data = members[found[0]]
     if found == [PLAIN]:

@@ -74,5 +74,5 @@ def safetensors_header(
     except (ValueError, RecursionError) as error:
         raise TrilightError(f"{name}: unreadable ({error}).") from error
     if not isinstance(header, dict):
-        raise TrilightError(f"{name}: the header is no JSON object.")
+        raise TrilightError(f"{name}: the header is not a JSON object.")
     return header

@@ -115,8 +115,9 @@ def _within(value: Any, changes: Sequence[Change]) -> Any:
                 )
         return _changed(value, changes)
     if not isinstance(value, tuple) or not all(map(dataclasses.is_dataclass, value)):
-        _, _, name = changes[0]
-        raise TrilightError(f"setting {name!r} does not exist: it leads into a single setting.")
+        path, _, name = changes[0]
+        plain = ".".join(name.split(".")[: -len(path)])
+        raise TrilightError(f"setting {name!r} does not exist: {plain!r} has no settings within.")
     own: list[list[Change]] = [[] for _ in value]
     for path, new, name in changes:
         for index in _entries(path[0], len(value), name):

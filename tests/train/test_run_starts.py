@@ -40,9 +40,11 @@ def test_a_second_stage_begins_with_the_first(dataset: Dataset, tmp_path: Path) 
         # a learning rate of 1e-12 moves nothing that float32 shows but numbers near 0
         torch.testing.assert_close(weight, before.state_dict()[name], rtol=1e-6, atol=1e-10)
     run(second, dataset, tmp_path / "second", Start(resume=True))
-    with pytest.raises(TrilightError, match="trained network; name one with begin_with"):
+    with pytest.raises(
+        TrilightError, match="trained weights, and none are named; expected begin_with"
+    ):
         run(second, dataset, tmp_path / "third", Start())
-    with pytest.raises(TrilightError, match="to begin with those: --set from_weights=true"):
+    with pytest.raises(TrilightError, match="or --set from_weights=true to begin with those"):
         run(tiny_run(), dataset, tmp_path / "third", Start(begin_with=place))
     with pytest.raises(TrilightError, match="no such file or folder"):
         run(second, dataset, tmp_path / "third", Start(begin_with=str(tmp_path / "none")))
@@ -62,7 +64,7 @@ def test_a_run_without_the_weights_it_asks_for_does_not_begin(
 def test_a_dead_start_is_said_early_and_once(dataset: Dataset, tmp_path: Path) -> None:
     """A learning rate of nearly nothing leaves the black start black."""
     dead = tiny_run(num_steps=60, warmup_steps=2, learning_rate=1e-12, checkpoint_every=60)
-    with pytest.raises(TrilightError, match=r"the start went dead: after 52 steps .*--resume"):
+    with pytest.raises(TrilightError, match=r"collapsed at the start: after 52 steps .*--resume"):
         run(dead, dataset, tmp_path / "dead", Start())
     assert saved_steps((tmp_path / "dead") / "checkpoints") == [52]
     run(dead, dataset, tmp_path / "dead", Start(resume=True))

@@ -59,9 +59,9 @@ class StartWatch:
         if not brightest < DEAD_BRIGHTNESS:
             return None
         return TrilightError(
-            f"training: the start went dead: after {step} steps the pictures are still black, with "
-            f"at most {brightest:.2%} of the brightness of their targets. Start again with another "
-            "seed or learning_rate; --resume goes on all the same."
+            f"training: collapsed at the start: after {step} steps the pictures are still black, "
+            f"with at most {brightest:.2%} of the brightness of their targets. Start again with "
+            "another seed or learning_rate; --resume continues all the same."
         )
 
 

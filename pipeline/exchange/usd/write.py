@@ -113,7 +113,7 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> None:
 def _require_text(*texts: str) -> None:
     for text in texts:
         if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-            raise TrilightError(f"objects: {text!r:.80} holds a letter that USD cannot keep.")
+            raise TrilightError(f"objects: {text!r:.80} has a character that USD cannot store.")
 
 
 def _new_layer(path: Path, root: str) -> Any:

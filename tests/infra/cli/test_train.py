@@ -54,7 +54,7 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
 
     assert "run 'smok': no such run; did you mean smoke?" in said("smok")[1]
     assert "setting 'widht' does not exist" in said("smoke", "--set", "widht=3")[1]
-    assert "name one with begin_with" in said("finetune")[1]
+    assert "expected begin_with" in said("finetune")[1]
     words, mistake = said("smoke", "--steps", "24")
     assert "warmup_steps=3, log_every=1, validate_every=4, checkpoint_every=4" in words
     assert "Run smoke: 24 steps of 4 scenes at 64 pixels. Loading torch" in words

@@ -70,8 +70,8 @@ def test_a_wrong_form_is_refused_before_a_run_exists(
         ({"changes": {"resolution": 60}}, "resolution is 60; expected a multiple of 8"),
         ({"changes": {"validate_every": 7}}, "validate_every is 7; expected a multiple"),
         ({"steps": 50, "changes": {"warmup_steps": 50}}, "warmup_steps is 50; expected 0 to 49"),
-        ({"run": "finetune"}, "name one with begin_with"),
-        ({"run": "pretrain", "begin_with": "runs/x"}, "begin_with names runs/x"),
+        ({"run": "finetune"}, "expected begin_with"),
+        ({"run": "pretrain", "begin_with": "runs/x"}, "begin_with is runs/x"),
     ],
 )
 def test_laws_between_settings_are_checked_before_the_command(

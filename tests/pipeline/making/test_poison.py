@@ -112,7 +112,7 @@ def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
     shutil.rmtree(cold / "cache")
     deaths.write_text("3")
     with pytest.raises(
-        EnvironmentFailure, match="'knot0', of which .* begun.*killed.*run the same"
+        EnvironmentFailure, match="'knot0', which .* begun with.*killed.*run the same"
     ):
         prepare_dataset(order(workshop, cold / "with", **small))
     assert open_dataset(str(cold / "with")).failures() == []

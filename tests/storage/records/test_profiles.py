@@ -137,7 +137,10 @@ def test_the_digest_of_scenes_does_not_know_the_profile(tmp_path: Path) -> None:
 PLAIN = b"the arrays of a scene" * 100
 HOSTILE = {
     "missing": ({}, "is missing"),
-    "there twice": ({"scene.safetensors": PLAIN, **pack_arrays(PLAIN, "compact")}, "there twice"),
+    "there twice": (
+        {"scene.safetensors": PLAIN, **pack_arrays(PLAIN, "compact")},
+        "there in two forms",
+    ),
     "no gzip": ({"scene.safetensors.gz": PLAIN}, "damaged"),
     "zlib without its gzip header": ({"scene.safetensors.gz": zlib.compress(PLAIN)}, "damaged"),
     "cut short": ({"scene.safetensors.gz": gzip.compress(PLAIN)[:-9]}, "cut short"),

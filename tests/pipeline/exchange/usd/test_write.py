@@ -278,7 +278,7 @@ def test_what_was_added_is_no_longer_ours(tmp_path: Path) -> None:
                 objects=(SceneObject(name="a\0b", kind="shell"), tiny_scene().objects[1]),
             ),
             "a.usda",
-            "letter that USD cannot keep",
+            "a character that USD cannot store",
         ),
     ],
 )
