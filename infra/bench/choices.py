@@ -30,7 +30,7 @@ class Choice:
 
 CHOICES = (
     Choice("a first look at a training, in minutes", "`--noise-floor 34`", "noise-floor", "34 dB"),
-    Choice("targets to train on for weeks", "`pretrain-256` as it is", "noise-floor", "46 dB"),
+    Choice("targets for weeks of training", "`pretrain-256` as it is", "noise-floor", "46 dB"),
     Choice(
         "pictures to judge networks by",
         "`--noise-floor 50` with a high cap",
@@ -51,7 +51,7 @@ CHOICES = (
         "4096 triangles",
     ),
     Choice(
-        "meshes for somewhere else, within a known distance",
+        "meshes for other uses, within a known distance of their source",
         "`trilight assets --epsilon 0.5%`",
         "epsilon",
         "0.5 %",
@@ -71,14 +71,14 @@ CHOICES = (
         "HTJ2K is smaller and as exact, but few programs read it yet",
     ),
     Choice(
-        "lights to be mixed anew while training",
+        "lights that training mixes anew",
         "`--set renders.per_light=true`",
         "lights",
         "one picture of each light",
     ),
     Choice("as many different scenes as possible", "`--set scenes.num_views=1`", "views", "1"),
     Choice(
-        "a large network's picture soon",
+        "a large network's picture in less time",
         "`trilight render --engine neural --precision bfloat16`",
         "precision",
         "bfloat16",
@@ -90,7 +90,7 @@ CHOICES = (
         "40 dB",
     ),
     Choice(
-        "to see what a network has learnt",
+        "a look at what a network has learned",
         "`trilight render --engine neural`",
         "engines",
         "network",

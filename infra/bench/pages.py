@@ -96,7 +96,7 @@ def _reading(folder: Path) -> Iterator[str]:
         f"has less error for at most {percent} more, nor the same error for more than {percent} "
         "less: smaller differences in core-seconds are noise. In the figures the line is the "
         "front, the default is ringed, a triangle at the lower edge has no known error, and a "
-        "cross is no setting."
+        "cross marks a yardstick that is not a setting."
     )
     results = {one.name: newest_run(folder, one.name) for one in every_experiment()}
     quick = [name for name, found in results.items() if found and _is_quick(found[0])]

@@ -67,7 +67,10 @@ EXPERIMENTS = (
     Experiment(
         name="composing",
         title="Composing scenes beside rendering them",
-        about="One thread; the last row is four views a scene of the cheapest build.",
+        about=(
+            "Composing a scene in one thread; for comparison, the last row renders four views "
+            "of a scene with the cheapest build."
+        ),
         cost=Column(name="core-seconds a scene", figure="core_s"),
         columns=(
             Column(name="scenes a second", figure="core_s", then=lambda s: 1 / s),

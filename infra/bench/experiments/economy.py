@@ -259,8 +259,11 @@ EXPERIMENTS = (
     Experiment(
         name="economy",
         title="What a set left out",
-        about="Means per scene of one finished dataset (`--data SET`), from its manifest, samples "
-        "and the asset store: what every part would take with nothing left out, and takes.",
+        about=(
+            "Means per scene of one finished dataset (`--data SET`), from its manifest, "
+            "samples and the asset store: what each part takes, and what it would take with "
+            "nothing left out."
+        ),
         cost=Column(name="what is kept", figure="kept"),
         columns=(
             Column(name="with everything", figure="everything"),

@@ -183,7 +183,7 @@ EXPERIMENTS = (
     Experiment(
         name="engines",
         title="Path tracer and denoiser, or a network",
-        about=f"Scenes of objects of `{BENCHMARK}`, which no network learnt from, at the width "
+        about=f"Scenes of objects of `{BENCHMARK}`, which no network was trained on, at the width "
         "that the network was trained on.",
         covers=("render.engine", "render.checkpoint"),
         cost=Column(
@@ -192,10 +192,12 @@ EXPERIMENTS = (
         ),
         error=DB,
         better="higher",
-        against="converged pictures. All rows have the network's error: the path tracer is given "
-        "as many samples as it needs for that, guide pictures and one denoise. Where one sample is "
-        "better already, its cost stands, which is too high; where no measured number of samples "
-        "is as good, that of the most, too low",
+        against=(
+            "converged pictures. Every row reaches the network's error: the path tracer gets "
+            "as many samples as that needs, guide pictures and one denoising pass. Where one "
+            "sample is better already, the stated cost is too high; where no measured number "
+            "of samples is good enough, the cost of the largest is stated, which is too low"
+        ),
         columns=(
             Column(name="a further view, core-s", figure="view_s"),
             Column(name="log L1", figure="log_l1"),
@@ -213,11 +215,13 @@ EXPERIMENTS = (
                 then=percent,
             ),
         ),
-        because="Default: the path tracer, since the error of its picture is chosen and measured, "
-        "that of a network is what its training left. The published factor of about 50 compares "
-        "seconds on a graphics card with a fixed, high number of samples; at equal error the path "
-        "tracer is asked for far fewer. A network is worth it where one scene is shown from many "
-        "sides, since it is encoded once, and where its error will do.",
+        because=(
+            "Default: the path tracer, since the error of its picture is chosen and measured, "
+            "while a network's is whatever training left. The published factor of about 50 "
+            "compares seconds on a graphics card with a fixed, high number of samples; at equal "
+            "error the path tracer needs far fewer. A network pays off where one scene is shown "
+            "from many sides, since the scene is encoded once, and where its error is acceptable."
+        ),
         points=lambda effort: [
             Point(name=name, default=name == DENOISED) for name in (NETWORK, DENOISED, RAW)
         ],

@@ -100,8 +100,8 @@ EXPERIMENTS = (
     Experiment(
         name="exchange",
         title="Writing and reading a scene in each form",
-        about=f"A scene of about {TRIANGLES} triangles, beside `numpy.save` and `load` of its "
-        "arrays.",
+        about=f"A scene of about {TRIANGLES} triangles in each form, beside `numpy.save` and "
+        "`numpy.load` of its arrays.",
         cost=Column(name="core-ms of writing and reading", figure="core_s", then=_ms),
         columns=(
             Column(name="export ms, on the clock", figure="out_s", then=_ms),

@@ -96,7 +96,10 @@ EXPERIMENTS = (
     Experiment(
         name="mesh-stage",
         title="The mesh stage",
-        about="All objects from their files to measured meshes, in children, into an empty store.",
+        about=(
+            "All objects, from their files to measured meshes in an empty asset store, "
+            "prepared in child processes."
+        ),
         cost=Column(name="seconds an object, on the clock", figure="an_object_s"),
         columns=(
             Column(name="objects a minute", figure="an_object_s", then=lambda s: 60 / s),
@@ -113,7 +116,10 @@ EXPERIMENTS = (
     Experiment(
         name="mesh-growth",
         title="The mesh stage by size of the source",
-        about="A closed tube of so many triangles, from its file to one level of 1400.",
+        about=(
+            "A closed tube with a growing number of triangles, from its file to one level of "
+            "1400 triangles."
+        ),
         cost=Column(name="core-seconds", figure="cpu_s"),
         points=lambda effort: [
             Point(name=f"{faces} triangles", settings=faces)

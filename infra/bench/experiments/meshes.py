@@ -129,8 +129,11 @@ EXPERIMENTS = (
     _of_objects(
         name="budget",
         title="Triangles of an object",
-        about="Objects at budgets, priced by the network's time for two of them in a scene; the "
-        "largest few are path traced beside their source, alone on a floor under a lamp.",
+        about=(
+            "Objects at several budgets; the cost is the network's time for a scene with two "
+            "of them. The largest few are also path traced beside their source, alone on a "
+            "floor under a lamp."
+        ),
         covers=("build.assets.budgets",),
         cost=NETWORK,
         columns=(
@@ -140,9 +143,9 @@ EXPERIMENTS = (
             Column(name="making it, core-ms", figure="cpu_s", then=_times_1000),
         ),
         because="Default: six levels are kept of every object, so the budget is not chosen once. "
-        "Each scene takes the finest levels that it can hold, and the table marks the finest of "
-        f"which a scene of 1536 triangles holds {OBJECTS}. Making them costs milliseconds; what "
-        "triangles cost is the network's time, at every visit.",
+        "Each scene takes the finest levels that fit into its own budget; the table marks the "
+        f"finest level of which a scene of 1536 triangles holds {OBJECTS}. Making the levels costs "
+        "milliseconds; the price of triangles is the network's time at every visit.",
         points=_budgets,
         measure=_measure_budget,
         needs=("torch",),
@@ -150,20 +153,25 @@ EXPERIMENTS = (
     _of_objects(
         name="profile",
         title="How objects are made coarser, at 512 triangles",
-        about="Objects decimated in each of our ways, and by the reference recipe: isotropic "
-        "remeshing at 0.5 %, then quadric collapse.",
+        about=(
+            "Objects simplified by each of our methods, and by the reference recipe: isotropic "
+            "remeshing at 0.5 %, then quadric collapse."
+        ),
         covers=("build.assets.profile",),
         cost=_CPU,
         columns=_REMESHED,
-        because="Default: `faithful`, the least error for the triangles, which every visit pays. "
-        "`uniform` is for who needs even triangles, at more error and more time.",
+        because=(
+            "Default: `faithful`, which has the least error for its triangles; triangles are "
+            "paid for at every visit. `uniform` is for uses that need even triangles, at more "
+            "error and more time."
+        ),
         points=lambda effort: _recipes(512, LARGE),
         measure=one_by_one(_remeshed),
     ),
     _of_objects(
         name="profile-4096",
         title="How large objects are made coarser, at 4096 triangles",
-        about="As above, of the objects that have more triangles than that.",
+        about="As above, for the objects that have more than 4096 triangles.",
         cost=_CPU,
         columns=_REMESHED,
         points=lambda effort: _recipes(4096, VERY_LARGE),
@@ -180,8 +188,11 @@ EXPERIMENTS = (
             Column(name="largest error %", figure="error_p99", over="most", then=percent),
             Column(name="making it, core-s", figure="cpu_s", over="mean"),
         ),
-        because="Default: none in the builds, since scenes choose among six levels by their own "
-        "budget already. `trilight assets --epsilon` is for meshes that go elsewhere.",
+        because=(
+            "Default: no bound in the builds, since each scene already chooses among six "
+            "levels by its own budget. `trilight assets --epsilon` is for meshes that are used "
+            "elsewhere."
+        ),
         points=lambda effort: [
             Point(
                 name="none" if epsilon is None else f"{100 * epsilon:g} %",

@@ -166,9 +166,11 @@ EXPERIMENTS = (
         covers=("train.precision", "render.precision"),
         cost=CORE_S,
         against="the same network in float32 (100 dB is the same picture)",
-        because="Default: float32, for references and small networks; bfloat16 from Base up, whose "
-        "rounding is far below what any network gets wrong, trained ones too. tf32 and float16 "
-        "exist on CUDA only.",
+        because=(
+            "Default: float32, for references and small networks; bfloat16 from Base up, where "
+            "its rounding is far below the error of any network, trained ones included. tf32 "
+            "and float16 exist on CUDA only."
+        ),
         points=lambda effort: _PRECISION_POINTS,
         turns=repeats,
         measure=_measure_precision,
@@ -194,8 +196,10 @@ EXPERIMENTS = (
         cost=Column(name="core-seconds of one attention layer", figure="core_s"),
         error=Column(name="largest absolute error", figure="error"),
         against="attention written out in float64, of normal numbers",
-        because="Default: torch's fused kernel in the precision of the network, without a mask. "
-        "Scenes of a batch are chosen of like length, and one scene alone has none.",
+        because=(
+            "Default: torch's fused kernel in the precision of the network, without a mask. "
+            "Scenes of a batch are chosen of similar length, and a single scene needs no mask."
+        ),
         points=lambda effort: [Point(name=name, default=name == "fused") for name in ATTENTION],
         turns=repeats,
         measure=_measure_attention,
@@ -210,8 +214,10 @@ EXPERIMENTS = (
         cost=Column(name="core-seconds of the view stage", figure="core_s", over="mean"),
         against="the same network with all bundles (100 dB is the same picture)",
         columns=(Column(name="empty bundles %", figure="empty"),),
-        because="Default: none skipped. Bundles attend to each other, so that leaving out the "
-        "empty ones changes what the others show, far more than the time that it saves is worth.",
+        because=(
+            "Default: none skipped. Bundles attend to each other, so leaving out the empty "
+            "ones changes what the others show, by far more than the saved time is worth."
+        ),
         points=lambda effort: [
             Point(name=WHOLE, settings=False, default=True),
             Point(name=SKIPPING, settings=True),

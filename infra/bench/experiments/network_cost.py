@@ -167,7 +167,7 @@ EXPERIMENTS = (
     _of_passes(
         name="network-growth",
         title="How the network's cost grows",
-        about="Base with random weights by triangles, views and pixels, one at a time.",
+        about="Base with random weights; triangles, views and pixels grow one at a time.",
         columns=(_MEMORY,),
         points=_growth,
         turns=lambda effort: ["round 1"],  # neighbours on a curve bear each other out

@@ -276,8 +276,11 @@ EXPERIMENTS = (
     Experiment(
         name="workers",
         title="Workers against throughput",
-        about="Views an hour of N workers of one core each, rendering four views of 64 x 64 a "
-        "scene; and of tasks that only wait, N at a time, each of which stands for a scene.",
+        about=(
+            "Views per hour of N workers of one core each, which render four views of 64 x 64 "
+            "pixels for each scene; and of tasks that only wait, N at a time, each in place of "
+            "a scene."
+        ),
         cost=Column(name="seconds a view, on the clock", figure="view_s"),
         columns=(
             Column(name="views an hour", figure="view_s", then=lambda s: 3600 / s),

@@ -100,7 +100,7 @@ EXPERIMENTS = (
     Experiment(
         name="resolution",
         title="Resolution",
-        about="Views of a few scenes to the floor of `smoke`, at several widths.",
+        about="Views of a few scenes at several widths, sampled to the noise floor of `smoke`.",
         covers=(
             "build.renders.resolution",
             "order.resolution",
@@ -116,8 +116,11 @@ EXPERIMENTS = (
             Column(name="samples", figure="spp", over="mean"),
             Column(name="kB", figure="kb", over="mean"),
         ),
-        because="Default: the published stages, 256 and then 512. Pictures are box averages, so a "
-        "smaller one can always be had from a larger one, and never the other way round.",
+        because=(
+            "Default: the published stages, 256 and then 512. Pixels are box averages, so a "
+            "smaller picture can always be made from a larger one, and never the other way "
+            "round."
+        ),
         points=_widths,
         turns=lambda effort: sampled_names(max(2, effort.scenes // 3)),
         measure=_measure_resolution,
@@ -134,9 +137,11 @@ EXPERIMENTS = (
         "scenes",
         columns=(Column(name="kB", figure="kb", over="mean"),),
         also_cost=("kB",),
-        because="Default: off, since it costs as many pictures as there are lights. On where "
-        "training is to mix lights anew at every visit (`light_mix`), which is exact and otherwise "
-        "impossible.",
+        because=(
+            "Default: off, since it costs as many pictures as there are lights. Turn it on for "
+            "a training that mixes lights anew at every visit (`light_mix`), which is exact "
+            "and otherwise impossible."
+        ),
         points=_lights,
         turns=lambda effort: scenes(effort)[:4],
         measure=measure,
@@ -144,16 +149,21 @@ EXPERIMENTS = (
     Experiment(
         name="views",
         title="Views of each scene",
-        about="Composing, loading and rendering scenes of `smoke`, shared out among their views.",
+        about=(
+            "Cost of composing, loading and rendering scenes of `smoke`, divided by their "
+            "number of views."
+        ),
         covers=("build.scenes.num_views", "order.views", "train.views_per_scene"),
         cost=Column(name="core-seconds a view, with its share", figure="core_s", over="mean"),
         error=Column(name="different scenes in 1000 views", figure="kinds"),
         better="higher",
-        against="nothing: it is variety that is lost, which only training can weigh",
+        against="nothing: what is lost is variety, which only training can weigh",
         columns=(Column(name="share of scene %", figure="share", over="mean"),),
-        because="Default: 4. Composing and loading are so small a share of a view that more views "
-        "save hardly anything; four let a step see a scene from several sides after encoding it "
-        "once.",
+        because=(
+            "Default: 4. Composing and loading are so small a share of a view's cost that more "
+            "views save hardly anything; four let a training step see a scene from several "
+            "sides after encoding it once."
+        ),
         points=lambda effort: [
             Point(name=f"{views}", settings=views, default=views == smoke().scenes.num_views)
             for views in VIEWS

@@ -156,7 +156,9 @@ EXPERIMENTS = (
     Experiment(
         name="calibration",
         title="How often a stated floor is wrong",
-        about="Views of scenes that nothing was tuned on, against references of other samples.",
+        about=(
+            "Views of scenes that no constant was tuned on, against references with other samples."
+        ),
         cost=CORE_S,
         error=Column(
             name="stated floors wrong by over 1 dB, %", figure="wrong", over="mean", then=percent
@@ -189,8 +191,10 @@ EXPERIMENTS = (
     Experiment(
         name="path-cost",
         title="What a million camera paths cost",
-        about="Tracing alone, one axis at a time, on two objects in a room: the product's passes "
-        "with their quarter of light paths, no denoiser.",
+        about=(
+            "Tracing alone, of two objects in a room, varied along one axis at a time: the "
+            "product's passes with their quarter of light paths, without a denoiser."
+        ),
         cost=Column(name="core-seconds per million paths", figure="core_s"),
         columns=(Column(name="loading, core-seconds", figure="load_s"),),
         points=lambda effort: [

@@ -239,7 +239,10 @@ EXPERIMENTS = (
     Experiment(
         name="sample-parts",
         title="What a sample's processor time is spent on",
-        about="One thread, from the bytes of a sample to an augmented one of 64 pixels.",
+        about=(
+            "Processor time of one thread, from the bytes of a sample to an augmented sample "
+            "of 64 pixels."
+        ),
         cost=Column(name="ms a sample", figure="ms"),
         points=lambda effort: [
             Point(name=name)

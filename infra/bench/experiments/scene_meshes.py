@@ -213,10 +213,12 @@ EXPERIMENTS = (
             Column(name="median error %", figure="middle", then=percent),
             Column(name="triangles", figure="triangles"),
         ),
-        because="Default: 1536 in the first stage as published, 4096 in the second. Attention "
-        "grows with the square, and the worst objects decide what a budget loses. Scenes "
-        "are not filled up (`fill_to`): triangles that change no surface cost the network "
-        "the same.",
+        because=(
+            "Default: 1536 in the first stage as published, 4096 in the second. The cost of "
+            "attention grows with the square of the triangles, and the worst objects decide "
+            "what a budget loses. Scenes are not filled up (`fill_to`): triangles that change "
+            "no surface cost the network the same."
+        ),
         points=lambda effort: [
             Point(
                 name=f"{budget} triangles",
@@ -238,16 +240,20 @@ EXPERIMENTS = (
         cost=NETWORK,
         error=DB,
         better="higher",
-        against="the path traced picture of the finest meshes (at most 1400 triangles each); "
-        "median over the scenes. The last row is that picture itself with other samples: nothing "
-        "can be told above it",
+        against=(
+            "the path traced picture of the finest meshes (at most 1400 triangles each); "
+            "median over the scenes. The last row is that picture itself with other samples: "
+            "no better agreement can be measured"
+        ),
         columns=(
             WORST,
             Column(name="object triangles", figure="triangles", over="mean"),
         ),
-        because="Default: 0.5 % at 256 pixels, 0.25 % at 512. Facets and outlines move highlights "
-        "long before a distance is seen; but every picture of a set is of the very triangles that "
-        "the network is given, so this is no error of the labels.",
+        because=(
+            "Default: 0.5 % at 256 pixels, 0.25 % at 512. Facets and outlines move highlights "
+            "long before a distance becomes visible; but every picture of a set is of the very "
+            "triangles that the network is given, so this is no error of the labels."
+        ),
         points=_details,
         turns=lambda effort: [f"smoke {index}" for index in range(max(2, effort.scenes // 2))],
         measure=_measure_detail,

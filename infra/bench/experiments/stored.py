@@ -231,9 +231,12 @@ EXPERIMENTS = (
                 then=percent,
             ),
         ),
-        because="Default: `compact`. For each view the coarsest level of DWAB that adds at most a "
-        "tenth of the noise that is there (10 dB below it), tested on what decodes. Sets to be "
-        "judged by stay `lossless`. HTJ2K is smaller without loss, but few programs read it yet.",
+        because=(
+            "Default: `compact`. For each view it takes the coarsest level of DWAB that adds "
+            "at most a tenth of the noise already in the picture (10 dB below it), tested on "
+            "the decoded picture. Datasets for evaluation stay `lossless`. HTJ2K is smaller "
+            "without loss, but few programs read it yet."
+        ),
         points=lambda effort: [
             Point(name=name, default=name == f"profile {StorageSettings.profile}")
             for name in codecs()
