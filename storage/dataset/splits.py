@@ -59,11 +59,6 @@ def scenes_of_shard(shard_index: int, settings: "SplitSettings") -> range:
     return range(first, last)
 
 
-def shard_of_scene(scene_index: int, settings: "SplitSettings") -> str:
-    """Return the name of the shard of a scene."""
-    return shard_name(scene_index // settings.scenes_per_shard, settings)
-
-
 def planned_scenes(num_scenes: int, settings: "SplitSettings") -> int:
     """Return how many scenes are made when `num_scenes` are wanted: those of whole shards."""
     if settings.listed_scenes is not None:

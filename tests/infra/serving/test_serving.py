@@ -77,6 +77,7 @@ def test_stop_leaves_it_to_the_starter_to_tell_what_may_save(
 def test_a_port_of_somebody_else_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local.shutil, "which", lambda name: name)
     monkeypatch.setattr(local, "_launch", lambda *arguments: pytest.fail("launched"))
+    monkeypatch.setattr(local, "_RELEASE_S", 0.2)  # this stranger never releases the port
     with socket.create_server(("127.0.0.1", 0)) as stranger:
         port = stranger.getsockname()[1]
         with pytest.raises(TrilightError, match=rf"127.0.0.1:{port} cannot.*Set TRILIGHT_PORT"):
