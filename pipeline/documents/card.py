@@ -24,6 +24,8 @@ _SETTINGS = (
     ("objects from", "source"),
     ("picture width, pixels", "renders.resolution"),
     ("target noise floor, dB", "renders.noise_floor_db"),
+    ("target as linear PSNR, dB", "renders.noise_floor_linear_db"),
+    ("target over geometry, dB", "renders.noise_floor_objects_db"),
     ("most samples per pixel", "renders.max_spp"),
     ("longest light path", "renders.max_depth"),
     ("views of a scene", "scenes.num_views"),
@@ -135,8 +137,7 @@ def _by_split(manifest: Manifest, found: Distributions) -> str:
         floors = found.values[split]["noise_floor_db"]
         numbers = summary(floors)
         shards = [shard for shard in manifest.shards if shard.split == split]
-        target = found.targets["noise_floor_db"]
-        reached = float((floors >= target).mean()) if target is not None and len(floors) else None
+        reached = found.reached(split)
         rows.append(
             (
                 split,
@@ -144,7 +145,7 @@ def _by_split(manifest: Manifest, found: Distributions) -> str:
                 len(floors),
                 len(shards),
                 *(f"{numbers[name]:.1f}" if name in numbers else "" for name in ("median", "p5")),
-                "" if reached is None else f"{reached:.0%}",
+                "" if reached is None else f"{reached.mean():.0%}",
                 f"{found.views_at_cap.get(split, 0) / max(len(floors), 1):.0%}",
             )
         )

@@ -46,7 +46,7 @@ class _Renderer:
         self.turns += 1
         if 2 <= self.turns <= 3:
             raise Rejected("black_view", f"seed {seed}")
-        yield Sampling(spp=8, expected_spp=8, noise_floor_db=None)
+        yield Sampling(spp=8, expected_spp=8, missing_db=None)
         return RenderedView(
             radiance_rgb=np.full((16, 16, 3), 0.5, np.float32),
             spp=8,
