@@ -59,14 +59,14 @@ class RenderSettings:
     resolution: Resolution
     """Width and height in pixels, a multiple of 8 up to MAX_RESOLUTION."""
     noise_floor_db: NoiseFloor | None
-    """Sampling goes on until the measured floor (psnr_log_db) reaches this; none: do not ask for
-    it, but for one of the other two."""
+    """Sampling goes on until the measured floor (psnr_log_db) reaches this; none where only the
+    other two count."""
     noise_floor_linear_db: NoiseFloor | None = None
-    """Sampling also goes on until psnr_linear_db reaches this: the PSNR of radiance clamped to
-    [0, 1], some 10 dB below psnr_log_db in one picture."""
+    """Sampling also goes on until the floor as psnr_linear_db reaches this: that of radiance
+    clamped to [0, 1], 5 to 10 dB below psnr_log_db in most pictures."""
     noise_floor_objects_db: NoiseFloor | None = None
-    """Sampling also goes on until object_psnr_log_db reaches this: the floor over pixels that show
-    geometry, so that empty background does not count."""
+    """Sampling also goes on until the floor as object_psnr_log_db reaches this: that of pixels
+    which show geometry, so that empty background does not count."""
     min_spp: Samples
     """Samples per pixel, both halves together, before the floor is measured first. From 32 on it is
     honest in views without rare bright paths, and goes by what it finds in the others."""

@@ -14,6 +14,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from infra.rendering.request import Asked
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.making import path_tracer
@@ -25,6 +26,7 @@ from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene, scene_digest
+from storage.settings.described import option_words
 from tests.command_line import trilight
 from tests.infra.rendering.render_kit import SMALL, mistake, render
 from tests.scenes_by_hand import tiny_sample, tiny_scene
@@ -180,6 +182,22 @@ def test_a_linear_target_alone_governs_and_is_said_beside_what_came_of_it(tmp_pa
     both = trilight([*words, *asked], env=WIDE).output
     assert "clamped to [0, 1]; reached 5 dB)" in both
     assert "geometry is seen; the cap came before 95 dB)" in both
+
+
+def test_the_words_of_what_was_asked_give_the_picture_again(tmp_path: Path) -> None:
+    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
+    source.write_bytes(encode_scene(tiny_scene()))
+    asked = Asked(
+        source=str(source), out=out, resolution=16, max_spp=256, noise_floor_linear_db=22.5,
+        noise_floor_objects_db=20.25,
+    )  # fmt: skip
+    typed = ["--noise-floor-linear", "22.5", "--noise-floor-objects", "20.25", "--max-spp", "256"]
+    typed += ["--resolution", "16", "--out", str(out)]
+    pictures = []
+    for words in (typed, option_words(asked, leave_out=("source",))):
+        assert trilight(["render", str(source), *words]).exit_code == 0
+        pictures.append(out.read_bytes())
+    assert pictures[0] == pictures[1]
 
 
 def test_a_picture_made_before_there_were_other_targets_is_kept(tmp_path: Path) -> None:
