@@ -1,9 +1,10 @@
 """When the sampling of a view ends: at its targets, at all of them, or at the cap.
 
 Targets and measured floors go by the name of their metric (storage.metrics). One view may need many
-more samples by one metric than by another: bright lamps count little in the linear PSNR, and empty
-background raises every mean but the one over objects. So each target that is missed is extrapolated
-by what a doubling of the samples bought in its own metric, and the one that needs most governs.
+more samples by one metric than by another: the linear PSNR weighs bright pixels more, up to
+radiance 1, and empty background raises every mean but the one over objects. So each target that is
+missed is extrapolated by what a doubling of the samples bought in its own metric, and the one that
+needs most samples governs.
 """
 
 import math

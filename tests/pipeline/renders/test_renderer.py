@@ -131,7 +131,6 @@ def test_a_view_says_how_far_it_is() -> None:
 
 
 def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
-    """As the lamp is bright, the same picture has some dB less by the linear measure."""
     easy = dataclasses.replace(CHEAP, noise_floor_db=10.0, max_spp=4096)
     first = _render(simple_scene(), easy)
     wanted = first.noise_floor_linear_db + 2
