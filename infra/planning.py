@@ -189,6 +189,8 @@ def _settings(order: DatasetOrder) -> BuildSettings:
         order.build,
         resolution=order.resolution,
         noise_floor_db=order.noise_floor_db,
+        noise_floor_linear_db=order.noise_floor_linear_db,
+        noise_floor_objects_db=order.noise_floor_objects_db,
         changes=order.changes,
     )
 

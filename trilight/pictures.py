@@ -39,7 +39,9 @@ def render(
     *,
     view: int = 0,
     resolution: int = 256,
-    noise_floor_db: float = 40.0,
+    noise_floor_db: float | None = None,
+    noise_floor_linear_db: float | None = None,
+    noise_floor_objects_db: float | None = None,
     max_spp: int = 4096,
     seed: int = 0,
     threads: int | None = None,
@@ -53,13 +55,16 @@ def render(
         scene: passes `Scene.check`.
         view: row of `scene.c2w`.
         resolution: width and height in pixels, a multiple of 8.
-        noise_floor_db: sampling stops when the measured error (psnr_log_db) reaches this.
+        noise_floor_db: sampling stops when the measured error (psnr_log_db) reaches this; by
+            default 40, or none where another floor is given.
+        noise_floor_linear_db: the same as psnr_linear_db; of several, all are reached.
+        noise_floor_objects_db: the same as object_psnr_log_db: where geometry is seen.
         max_spp: sampling also stops at this many samples per pixel.
         seed: of the samples.
         threads: of the processor; all cores by default.
 
     Returns:
-        `radiance_rgb` [R, R, 3] float32 linear radiance, `noise_floor_db`, `spp` and more.
+        `radiance_rgb` [R, R, 3] float32 linear radiance, its three floors, `spp` and more.
 
     Raises:
         TrilightError: a number that is refused, or a scene that cannot be rendered.
@@ -69,6 +74,8 @@ def render(
         views=[view],
         resolution=resolution,
         noise_floor_db=noise_floor_db,
+        noise_floor_linear_db=noise_floor_linear_db,
+        noise_floor_objects_db=noise_floor_objects_db,
         max_spp=max_spp,
         seed=seed,
         threads=threads,
@@ -81,7 +88,9 @@ def render_views(
     *,
     views: Sequence[int] | None = None,
     resolution: int = 256,
-    noise_floor_db: float = 40.0,
+    noise_floor_db: float | None = None,
+    noise_floor_linear_db: float | None = None,
+    noise_floor_objects_db: float | None = None,
     max_spp: int = 4096,
     seed: int = 0,
     threads: int | None = None,
@@ -91,8 +100,8 @@ def render_views(
     Args:
         scene: passes `Scene.check`.
         views: rows of `scene.c2w`; all by default.
-        resolution, noise_floor_db, max_spp, seed, threads: as `render`, which says what comes back
-            and what is refused.
+        resolution, noise_floor_db, noise_floor_linear_db, noise_floor_objects_db, max_spp, seed,
+            threads: as `render`, which says what comes back and what is refused.
     """
     from pipeline.making.path_tracer import PathTracer
     from pipeline.renders.variant import choose_variant
@@ -101,7 +110,13 @@ def render_views(
     cameras = [own_camera(scene, row, named="view") for row in rows]
     scene.check()
     tracer = PathTracer(
-        one_picture(resolution=resolution, noise_floor_db=noise_floor_db, max_spp=max_spp),
+        one_picture(
+            resolution=resolution,
+            max_spp=max_spp,
+            noise_floor_db=noise_floor_db,
+            noise_floor_linear_db=noise_floor_linear_db,
+            noise_floor_objects_db=noise_floor_objects_db,
+        ),
         seed=seed,
         variant=choose_variant(),
         threads=threads or os.cpu_count() or 1,

@@ -6,6 +6,7 @@ from typing import Any
 from infra.cli.changes import Shared, all_changes, dataset_record
 from pipeline.builds.named import named_build
 from pipeline.making.dataset_order import DatasetOrder
+from pipeline.renders.settings import asked_floors
 
 _LICENCES = "allowed_licences"
 
@@ -28,9 +29,9 @@ def with_shared(order: DatasetOrder, shared: Shared) -> DatasetOrder:
 
 def _options(order: DatasetOrder) -> dict[str, Any]:
     """Return the settings that an order's own options state: they count more than a file's."""
-    stated = {
-        "seed": order.seed,
-        "renders.resolution": order.resolution,
-        "renders.noise_floor_db": order.noise_floor_db,
-    }
-    return {name: value for name, value in stated.items() if value is not None}
+    stated = {"seed": order.seed, "renders.resolution": order.resolution}
+    floors = asked_floors(
+        order.noise_floor_db, order.noise_floor_linear_db, order.noise_floor_objects_db
+    )
+    found: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+    return found | {f"renders.{name}": db for name, db in floors.items()}

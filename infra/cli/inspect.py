@@ -6,6 +6,9 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
+from numpy.typing import NDArray
+
 from infra.cli.console import (
     first_words,
     look_at,
@@ -136,7 +139,9 @@ def _as_json(opened: Dataset, statistics: Statistics, found: "Distributions") ->
         "dataset_digest": opened.digest,
         "distributions": found.as_json(),
         "licences": Counter(entry.licence for entry in found.objects),
-        "noise_floor_db": [round(float(v), 2) for v in statistics.noise_floor_db],
+        "noise_floor_db": _rounded(statistics.noise_floor_db),
+        "noise_floor_linear_db": _rounded(statistics.noise_floor_linear_db),
+        "object_noise_floor_db": _rounded(statistics.object_noise_floor_db),
         "objects_by_split": Counter(entry.split for entry in found.objects),
         "rejections": [list(row) for row in count_by_reason(found.failures)],
         "scenes_by_split": statistics.scenes_by_split,
@@ -160,3 +165,7 @@ def _print_summary(
         ("dataset digest", opened.digest),
     ]
     print_rows(title, rows)
+
+
+def _rounded(floors_db: NDArray[np.float64]) -> list[float]:
+    return [round(float(value), 2) for value in floors_db]

@@ -34,6 +34,8 @@ ALIASES = {
     "min_noise_floor_db": "--min-noise-floor",
     "most_unusable": "--skip-unusable",
     "noise_floor_db": "--noise-floor",
+    "noise_floor_linear_db": "--noise-floor-linear",
+    "noise_floor_objects_db": "--noise-floor-objects",
 }
 """Second, shorter words for options; the first is always the name of the field."""
 

@@ -37,11 +37,11 @@ class _Bars:
         self._bars.update(self._pictures, completed=done, total=total, visible=self._visible)
 
     def sampled(self, now: "Sampling") -> None:
-        floor = "" if now.noise_floor_db is None else f"floor {now.noise_floor_db:.1f} dB"
+        note = "" if now.missing_db is None else f"{now.missing_db:.1f} dB to go"
         self._bars.update(
             self._samples,
             completed=now.spp,
             total=now.expected_spp,
-            note=floor,
+            note=note,
             visible=self._visible,
         )

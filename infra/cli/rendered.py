@@ -17,6 +17,18 @@ from infra.rendering.run import FinishedShot, RenderOutcome
 
 Rows = list[tuple[str, str]]
 
+_FLOORS = {
+    "noise_floor_db": "psnr_log_db",
+    "noise_floor_linear_db": "psnr_linear_db",
+    "object_noise_floor_db": "object_psnr_log_db",
+}
+"""The metric of each floor that a path traced picture states."""
+
+_MEANING = {
+    "psnr_linear_db": ": linear, clamped to [0, 1]",
+    "object_psnr_log_db": ": where geometry is seen",
+}
+
 
 def print_outcome(outcome: RenderOutcome, seconds: float, *, as_json: bool) -> None:
     """Print files and figures: of the only picture, or summed up over all."""
@@ -89,23 +101,44 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
     rows += [("wall time", f"{seconds:.1f} s"), ("scene digest", scene.digest)]
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
-    console.print(f"\nLook at {done.shot.png}; measure with {measure}", style="bold")
+    _print_last(f"Look at {done.shot.png}; measure with {measure}", _floors([done]))
 
 
 def _engine(engine: EnginePlan, facts: Facts) -> Rows:
     match engine:
         case MitsubaPlan():
-            reached = "the cap came before" if facts["at_cap"] else "reached"
-            target = f"{reached} {engine.settings.noise_floor_db:g} dB"
-            return [
-                ("samples per pixel", f"{facts['spp']}"),
-                ("noise floor", f"{facts['noise_floor_db']:.1f} dB (psnr_log_db; {target})"),
-                ("", f"{facts['object_noise_floor_db']:.1f} dB where geometry is seen"),
-                ("", f"{facts['noise_floor_linear_db']:.1f} dB linear, clamped to [0, 1]"),
-            ]
+            floors = [_floor(engine, facts, name, metric) for name, metric in _FLOORS.items()]
+            rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
+            return [("samples per pixel", f"{facts['spp']}"), *rows]
         case NeuralPlan():
             return [("network", f"{engine.checkpoint}; passes: {facts['passes']}")]
     raise TypeError(f"{engine.name} is an engine without a description")
+
+
+def _floor(engine: MitsubaPlan, facts: Facts, name: str, metric: str) -> str:
+    """Return one floor of a picture, and what came of its target if there is one."""
+    floor_db, target_db = float(facts[name]), engine.settings.targets_db.get(metric)
+    text = f"{floor_db:.1f} dB ({metric}{_MEANING.get(metric, '')}"
+    if target_db is None:
+        return f"{text})"
+    reached = floor_db >= target_db or not facts["at_cap"]  # facts are rounded
+    return f"{text}; {'reached' if reached else 'the cap came before'} {target_db:g} dB)"
+
+
+def _floors(shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
+    """Return the floors of all pictures by metric; empty where none is path traced."""
+    traced = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
+    names = _FLOORS.items() if traced else ()
+    return {metric: [float(facts[name]) for facts in traced] for name, metric in names}
+
+
+def _print_last(look: str, floors: Mapping[str, Sequence[float]]) -> None:
+    """Print where to look, and all three floors: one of them alone says little."""
+    if floors:
+        log, linear, objects = (np.median(values) for values in floors.values())
+        which = "noise floor" if len(floors["psnr_log_db"]) == 1 else "median noise floor"
+        look += f"; {which} {log:.1f} dB (linear {linear:.1f}, objects {objects:.1f})"
+    console.print(f"\n{look}", style="bold")
 
 
 def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: float) -> None:
@@ -115,26 +148,24 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
         ("pictures", f"{len(shots)} of {plan.resolution} x {plan.resolution}"),
         ("files", f"{len(pictures)}, of which {kept} were there already"),
     ]
-    floors = [
-        float(picture.facts["noise_floor_db"])
-        for picture in pictures
-        if "noise_floor_db" in picture.facts
-    ]
+    floors = _floors(shots)
     agreements = [shot.psnr_log_db for shot in shots if shot.psnr_log_db is not None]
-    rows += _spread("noise floor", floors) + _spread("agreement", agreements)
+    for metric, values in floors.items():
+        rows += _spread("noise floor" if metric == "psnr_log_db" else "", values, metric)
+    rows += _spread("agreement", agreements, "psnr_log_db")
     rows += _flicker([shot.flicker for shot in shots if shot.flicker is not None])
     rows.append(("wall time", f"{seconds:.1f} s"))
     print_rows("Rendered", rows)
     folder = plan.place.folder
     look = plan.place.video or folder
-    console.print(f"\nLook at {look}; measure with the pictures in {folder}", style="bold")
+    _print_last(f"Look at {look}; measure with the pictures in {folder}", floors)
 
 
-def _spread(name: str, values_db: Sequence[float]) -> Rows:
+def _spread(name: str, values_db: Sequence[float], metric: str) -> Rows:
     if not values_db:
         return []
     median, low = np.median(values_db), np.percentile(values_db, 5)
-    return [(name, f"median {median:.1f} dB, 5th percentile {low:.1f} dB (psnr_log_db)")]
+    return [(name, f"median {median:.1f} dB, 5th percentile {low:.1f} dB ({metric})")]
 
 
 def _flicker(found: Sequence[Flicker]) -> Rows:

@@ -77,7 +77,11 @@ def plan_render(asked: Asked, reader: SceneReader) -> RenderPlan:
     """
     checkpoint, resolution = _network_and_width(asked)
     settings = one_picture(
-        resolution=resolution, noise_floor_db=asked.noise_floor_db, max_spp=asked.max_spp
+        resolution=resolution,
+        max_spp=asked.max_spp,
+        noise_floor_db=asked.noise_floor_db,
+        noise_floor_linear_db=asked.noise_floor_linear_db,
+        noise_floor_objects_db=asked.noise_floor_objects_db,
     )
     look = Look(tone_map=asked.tone_map, exposure_ev=asked.exposure_ev)
     if asked.out.suffix.lower() == ".exr":

@@ -31,9 +31,15 @@ class Asked:
     resolution: Resolution | None = None
     """Width of a picture in pixels; by default 512, or with a network the width that it was trained
     on."""
-    noise_floor_db: NoiseFloor = 40.0
-    """mitsuba: measured noise floor in dB at which sampling stops (psnr_log_db; higher is cleaner).
-    """
+    noise_floor_db: NoiseFloor | None = None
+    """mitsuba: sampling stops at this measured noise floor in dB (psnr_log_db; higher is cleaner);
+    by default 40, unless another floor is asked for. Of several, all are reached."""
+    noise_floor_linear_db: NoiseFloor | None = None
+    """mitsuba: sampling stops at this floor as psnr_linear_db, of radiance clamped to [0, 1]: 5 to
+    10 dB below psnr_log_db in most pictures."""
+    noise_floor_objects_db: NoiseFloor | None = None
+    """mitsuba: sampling stops at this floor as object_psnr_log_db, in which empty background does
+    not count."""
     max_spp: Samples = 4096
     """mitsuba: maximum number of samples per pixel."""
     view: Annotated[int, Within(0, 999)] = 0

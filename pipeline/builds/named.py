@@ -10,6 +10,7 @@ from pipeline.builds.settings import BuildSettings, NamedBuild
 from pipeline.builds.training import TRAINING_BUILDS
 from pipeline.objects.generated import BENCHMARK
 from pipeline.objects.generated import PREFIX as BUILTIN
+from pipeline.renders.settings import asked_floors
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.registry import Registry
@@ -56,6 +57,8 @@ def named_build(
     seed: int | None = None,
     resolution: int | None = None,
     noise_floor_db: float | None = None,
+    noise_floor_linear_db: float | None = None,
+    noise_floor_objects_db: float | None = None,
     allow_licences: tuple[str, ...] = (),
     changes: Mapping[str, Any] | None = None,
 ) -> BuildSettings:
@@ -63,7 +66,9 @@ def named_build(
 
     Args:
         name: one of BUILDS.
-        seed, resolution, noise_floor_db: replace the build's value where not None.
+        seed, resolution: replace the build's value where not None.
+        noise_floor_db, noise_floor_linear_db, noise_floor_objects_db: where one is a number, they
+            replace the build's, so that those left out do not count.
         allow_licences: allowed in addition to the build's.
         changes: any other settings by dotted name, such as `scenes.lights.coloured_share`.
 
@@ -77,12 +82,11 @@ def named_build(
             f"own; expected another name, such as dataclasses.replace(..., "
             f"build='my-{build.build}')."
         )
-    named = {
-        "seed": seed,
-        "renders.resolution": resolution,
-        "renders.noise_floor_db": noise_floor_db,
-    }
-    build = changed(build, {key: value for key, value in named.items() if value is not None})
+    named = {"seed": seed, "renders.resolution": resolution}
+    wanted: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+    floors = asked_floors(noise_floor_db, noise_floor_linear_db, noise_floor_objects_db)
+    wanted |= {f"renders.{name}": db for name, db in floors.items()}
+    build = changed(build, wanted)
     licences = tuple(sorted({*build.allowed_licences, *allow_licences}))
     return changed(dataclasses.replace(build, allowed_licences=licences), changes or {})
 

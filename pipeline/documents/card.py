@@ -6,7 +6,7 @@ It tells nothing of the clock, the machine or the order of work: equal datasets 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.documents.distributions import Distributions
+from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.markdown import code, front_matter, table, text
 from pipeline.documents.quantities import summary
 from pipeline.documents.rights import Rights, hub_licence, rights_markdown
@@ -24,6 +24,8 @@ _SETTINGS = (
     ("objects from", "source"),
     ("picture width, pixels", "renders.resolution"),
     ("target noise floor, dB", "renders.noise_floor_db"),
+    ("target as linear PSNR, dB", "renders.noise_floor_linear_db"),
+    ("target over geometry, dB", "renders.noise_floor_objects_db"),
     ("most samples per pixel", "renders.max_spp"),
     ("longest light path", "renders.max_depth"),
     ("views of a scene", "scenes.num_views"),
@@ -69,8 +71,10 @@ def encode_card(
 
 _NOISE_FLOOR = (
     "The **noise floor** of a view is the measured error of its picture, as the PSNR of "
-    "log10(1 + radiance): differences below it say nothing about a model. Floors stand in each "
-    "scene's JSON; `report.html` shows all distributions."
+    "log10(1 + radiance): differences below it say nothing about a model. The same error is also "
+    "stated as PSNR of linear radiance clamped to [0, 1] (linear), and over the pixels that show "
+    "geometry (objects). All three stand in each scene's JSON; `report.html` shows all "
+    "distributions."
 )
 _PICTURES = (
     "Pictures are path-traced with Mitsuba 3 and denoised. The noise floor comes from two "
@@ -132,27 +136,31 @@ def _lead(manifest: Manifest) -> str:
 def _by_split(manifest: Manifest, found: Distributions) -> str:
     rows: list[Sequence[object]] = []
     for split in found.splits:
-        floors = found.values[split]["noise_floor_db"]
-        numbers = summary(floors)
+        floors = {name: summary(found.values[split][name]) for name in MEASURED.values()}
+        num_views = int(floors["noise_floor_db"]["count"])
         shards = [shard for shard in manifest.shards if shard.split == split]
-        target = found.targets["noise_floor_db"]
-        reached = float((floors >= target).mean()) if target is not None and len(floors) else None
+        reached = found.reached(split)
         rows.append(
             (
                 split,
                 sum(shard.num_samples for shard in shards),
-                len(floors),
+                num_views,
                 len(shards),
-                *(f"{numbers[name]:.1f}" if name in numbers else "" for name in ("median", "p5")),
-                "" if reached is None else f"{reached:.0%}",
-                f"{found.views_at_cap.get(split, 0) / max(len(floors), 1):.0%}",
+                *(_three(floors, name) if num_views else "" for name in ("median", "p5")),
+                f"{reached.mean():.0%}" if reached is not None and num_views else "",
+                f"{found.views_at_cap.get(split, 0) / max(num_views, 1):.0%}",
             )
         )
     head = (
-        "split", "scenes", "views", "shards", "median noise floor, dB", "5th percentile",
-        "reach the target", "stopped at the cap",
+        "split", "scenes", "views", "shards", "median noise floor, dB (linear, objects)",
+        "5th percentile", "reach the target", "stopped at the cap",
     )  # fmt: skip
     return table(head, rows, numbers=7)
+
+
+def _three(floors: Mapping[str, Mapping[str, float]], statistic: str) -> str:
+    log, linear, objects = (numbers[statistic] for numbers in floors.values())
+    return f"{log:.1f} ({linear:.1f}, {objects:.1f})"
 
 
 def _contents(manifest: Manifest, found: Distributions) -> str:

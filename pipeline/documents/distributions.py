@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.documents.quantities import QUANTITIES, summary
 from pipeline.documents.scene_facts import Values, scene_values, surfaces
@@ -36,13 +37,22 @@ class Distributions:
     failures: Sequence[Failure]
     """What was rejected."""
     targets: Mapping[str, float | None]
-    """What the settings ask for: max_triangles, noise_floor_db, min_spp, max_spp; None where the
-    manifest does not say."""
+    """What the settings ask for: max_triangles, the three noise floors, min_spp, max_spp; None
+    where the manifest does not say."""
 
     def all(self, name: str) -> Values:
         """Return the values of one quantity over all splits."""
         chunks = [by_name[name] for by_name in self.values.values()]
         return np.concatenate(chunks) if chunks else np.zeros(0, np.float32)
+
+    def reached(self, split: str) -> NDArray[np.bool_] | None:
+        """Return whether each view of a split reaches all targets; None where there is none."""
+        met = [
+            self.values[split][measured] >= target
+            for name, measured in MEASURED.items()
+            if (target := self.targets[name]) is not None
+        ]
+        return np.logical_and.reduce(met) if met else None
 
     @property
     def splits(self) -> list[str]:
@@ -103,6 +113,13 @@ class Distributions:
 
 
 SURFACE_COUNTS = ("all", "smooth", "many_colours")
+
+MEASURED = {
+    "noise_floor_db": "noise_floor_db",
+    "noise_floor_linear_db": "noise_floor_linear_db",
+    "noise_floor_objects_db": "object_noise_floor_db",
+}
+"""What is measured of a view, by the name of its target in the settings of renders."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -174,12 +191,8 @@ def _concatenated(rows: Sequence[Mapping[str, Values]]) -> Mapping[str, Values]:
 
 def _targets(manifest: Manifest) -> dict[str, float | None]:
     """Return what the settings ask for; a dataset that was not generated here may not say."""
-    places = {
-        "max_triangles": "scenes",
-        "noise_floor_db": "renders",
-        "min_spp": "renders",
-        "max_spp": "renders",
-    }
+    places = {"max_triangles": "scenes"}
+    places |= dict.fromkeys((*MEASURED, "min_spp", "max_spp"), "renders")
     found: dict[str, float | None] = {}
     for name, group in places.items():
         settings = manifest.settings.get(group)

@@ -34,6 +34,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     "fov_deg": Quantity("field of view, degrees", 1),
     "coverage": Quantity("share of the view on objects", 3),
     "noise_floor_db": Quantity("noise floor, dB", 1),
+    "noise_floor_linear_db": Quantity("noise floor as linear PSNR, dB", 1),
     "object_noise_floor_db": Quantity("noise floor over geometry, dB", 1),
     "spp": Quantity("samples per pixel", 0),
     "camera_attempt": Quantity("cameras rejected before", 0),

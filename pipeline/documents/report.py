@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from pipeline.documents import report_sections
-from pipeline.documents.distributions import Distributions
+from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.gallery import write_gallery
 from pipeline.documents.html import Markup, element, joined, page, table
-from pipeline.documents.quantities import summary
+from pipeline.documents.quantities import QUANTITIES, summary
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
@@ -85,15 +85,16 @@ def _overview(dataset: Dataset, found: Distributions) -> Markup:
     per_split = {split: 0 for split in found.splits}
     for (_, split), count in found.scenes.items():
         per_split[split] += count
-    floors = summary(found.all("noise_floor_db"))
     scenes = ", ".join(f"{count} {split}" for split, count in per_split.items())
     rows = [
         ("scenes", f"{sum(per_split.values())} ({scenes or 'none'})"),
-        ("views", f"{floors['count']:.0f}, {manifest.num_views} of each scene"),
+        ("views", f"{len(found.all('noise_floor_db'))}, {manifest.num_views} of each scene"),
     ]
-    if floors["count"]:
-        text = f"median {floors['median']:.1f} dB, 5th percentile {floors['p5']:.1f} dB"
-        rows.append(("noise floor", f"{text} (psnr_log_db)"))
+    for name in MEASURED.values():
+        floors = summary(found.all(name))
+        if floors["count"]:
+            text = f"median {floors['median']:.1f} dB, 5th percentile {floors['p5']:.1f} dB"
+            rows.append((QUANTITIES[name].label.removesuffix(", dB"), text))
     rows += [
         ("objects", f"{len(found.objects)}, {len(found.placements)} of them in scenes"),
         ("rejections", f"{len(found.failures)}"),

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.documents.distributions import SURFACE_COUNTS, Distributions
+from pipeline.documents.distributions import MEASURED, SURFACE_COUNTS, Distributions
 from pipeline.documents.figures import drawing, encoded, histogram, panels, rose, stacked_bars
 from pipeline.documents.html import Cell, Markup, element, joined, table
 from pipeline.documents.quantities import QUANTITIES, STATISTICS, summary
@@ -116,21 +116,17 @@ def cameras_section(found: Distributions) -> Markup:
 
 def pictures_section(found: Distributions) -> Markup:
     """Return the measured errors of the pictures and what they cost."""
-    target, cap = found.targets["noise_floor_db"], found.targets["max_spp"]
-    at_target = {f"target {target:g} dB": target} if target is not None else None
-    at_cap = {f"cap {cap:g}": cap} if cap is not None else None
-    floors, spp = found.all("noise_floor_db"), found.all("spp")
+    marks = {measured: found.targets[name] for name, measured in MEASURED.items()}
+    marks |= {"spp": found.targets["max_spp"], "coverage": None}
     with drawing():
-        figure, axes = panels(4)
-        label = "noise floor, dB (psnr_log_db)"
-        histogram(axes[0], floors, label, ylabel="views", marks=at_target)
-        histogram(axes[1], spp, "samples per pixel", ylabel="views", marks=at_cap)
-        for panel, name in zip(axes[2:], ("object_noise_floor_db", "coverage"), strict=True):
-            histogram(panel, found.all(name), QUANTITIES[name].label, ylabel="views")
+        figure, axes = panels(len(marks))
+        for panel, (name, mark) in zip(axes, marks.items(), strict=True):
+            label = "" if mark is None else f"{'cap' if name == 'spp' else 'target'} {mark:g}"
+            values, xlabel = found.all(name), QUANTITIES[name].label
+            histogram(panel, values, xlabel, ylabel="views", marks={label: mark})
         picture = encoded(figure, "noise floors, samples per pixel and coverage")
-    names = ("noise_floor_db", "object_noise_floor_db", "spp", "coverage")
-    numbers = _summaries(found, *names, statistics=STATISTICS)
-    return _section("pictures", "Pictures", picture, numbers, _floors_by_split(found, target))
+    numbers = _summaries(found, *marks, statistics=STATISTICS)
+    return _section("pictures", "Pictures", picture, numbers, _floors_by_split(found))
 
 
 def rejections_section(found: Distributions) -> Markup:
@@ -182,18 +178,18 @@ def _most_used(found: Distributions) -> Markup:
     return joined([heading, table(head, rows, numbers=1)])
 
 
-def _floors_by_split(found: Distributions, target: float | None) -> Markup:
+def _floors_by_split(found: Distributions) -> Markup:
     rows: list[list[Cell]] = []
     for split in found.splits:
         floors = found.values[split]["noise_floor_db"]
         numbers = summary(floors)
-        reached = int((floors >= target).sum()) if target is not None else 0
+        reached = found.reached(split)
         rows.append(
             [
                 split,
                 len(floors),
                 *(f"{numbers[name]:.1f}" if name in numbers else "" for name in ("median", "p5")),
-                _share(reached, len(floors)) if target is not None else "",
+                "" if reached is None else _share(int(reached.sum()), len(floors)),
                 _share(found.views_at_cap.get(split, 0), len(floors)),
             ]
         )

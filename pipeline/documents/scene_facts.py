@@ -163,6 +163,7 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
         "fov_deg": [camera.fov_deg for camera in seen_from],
         "coverage": [view.coverage for view in record.views],
         "noise_floor_db": [view.noise_floor_db for view in record.views],
+        "noise_floor_linear_db": [view.noise_floor_linear_db for view in record.views],
         "object_noise_floor_db": [view.object_noise_floor_db for view in record.views],
         "spp": [view.spp for view in record.views],
         "camera_attempt": [view.camera_attempt for view in record.views],

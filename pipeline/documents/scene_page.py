@@ -131,6 +131,7 @@ def _views(sample: Sample) -> Markup:
                 record.spp,
                 f"{float(record.noise_floor_db):.2f}",
                 f"{float(record.noise_floor_linear_db):.2f}",
+                f"{float(record.object_noise_floor_db):.2f}",
                 f"{record.coverage:.2f}",
                 "yes" if record.at_cap else "no",
                 record.camera_attempt,
@@ -139,7 +140,7 @@ def _views(sample: Sample) -> Markup:
         )
     head = (
         "view", "camera at, m", "distance", "elevation °", "azimuth °", "fov °", "spp",
-        "floor dB", "linear dB", "coverage", "at cap", "attempt", "seed",
+        "floor dB", "linear dB", "objects dB", "coverage", "at cap", "attempt", "seed",
     )  # fmt: skip
     return table(head, rows, numbers=len(head) - 1)
 

@@ -43,8 +43,15 @@ class DatasetOrder:
     resolution: Resolution | None = None
     """Width of a picture in pixels; by default the build's."""
     noise_floor_db: NoiseFloor | None = None
-    """Measured noise floor in dB at which sampling stops (psnr_log_db; higher is cleaner); by
-    default the build's."""
+    """Sampling stops at this measured noise floor in dB (psnr_log_db; higher is cleaner); by
+    default the build's, unless another floor is asked for. Of several, all are reached."""
+    noise_floor_linear_db: NoiseFloor | None = None
+    """Sampling stops at this floor as psnr_linear_db, of radiance clamped to [0, 1], 5 to 10 dB
+    below psnr_log_db in most pictures; by default the build's, unless another floor is asked
+    for."""
+    noise_floor_objects_db: NoiseFloor | None = None
+    """Sampling stops at this floor as object_psnr_log_db, in which empty background does not
+    count; by default the build's, unless another floor is asked for."""
     allow_licences: tuple[str, ...] = ()
     """Licences to allow in addition to the build's; by default there are none."""
     licence: str | None = None

@@ -4,7 +4,6 @@ This process asks the child for one pass of samples after another, so that it ca
 picture is.
 """
 
-import dataclasses
 from collections.abc import Callable, Generator, Mapping
 from typing import Any
 
@@ -18,6 +17,7 @@ from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate
 from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
+from storage.settings.described import settings_record
 
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=3600, calls_per_child=1 << 30)
 """One call takes the scene, each of the others is one pass of samples; the child keeps its state,
@@ -48,7 +48,7 @@ class PathTracer:
         self._settings, self._seed, self._sampled = settings, seed, sampled
         self.identity: Mapping[str, Any] = {
             "seed": str(seed),  # the integers of an EXR header end at 2^31
-            "settings": dataclasses.asdict(settings),
+            "settings": settings_record(settings),
             "environment": environment(variant),
         }
         """All that decides a picture beside scene and camera, as JSON values."""

@@ -170,6 +170,8 @@ def settings_of(
         seed=order.seed,
         resolution=order.resolution,
         noise_floor_db=order.noise_floor_db,
+        noise_floor_linear_db=order.noise_floor_linear_db,
+        noise_floor_objects_db=order.noise_floor_objects_db,
         allow_licences=order.allow_licences,
         changes=order.changes,
     )

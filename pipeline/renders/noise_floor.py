@@ -9,7 +9,6 @@ such outliers, and with how few samples there are. docs/log has the calibration.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,23 +31,13 @@ twice this, with a quarter three times."""
 
 _MATURE_SPP = 64
 
-_DB_PER_DOUBLING = 1.2
-"""The true error falls by 0.9 to 2.0 dB per doubling of the samples, not by 3. This low guess is
-used until the view itself has been measured twice."""
-
-_SLOWEST_DB, _FASTEST_DB = 0.6, 3.0
-"""Bounds of the gain per doubling that is read off two floors of a view, which are noisy."""
-
-_MAX_GROWTH = 4.0
-"""The samples grow at most by this between two measurements."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredFloor:
     """The measured error of one picture, in dB."""
 
     log_db: float
-    """As psnr_log_db: this one is meant by "noise floor", and stops the sampling."""
+    """As psnr_log_db: this one is meant by "noise floor"."""
     linear_db: float
     """As psnr_linear_db."""
     object_log_db: float
@@ -100,49 +89,3 @@ def common_error_db(outlying: float, spp: int) -> float:
     beyond = math.log10(max(outlying / _HARMLESS_SHARE, 1.0))
     immature = max(math.log2(_MATURE_SPP / (spp / 2)), 0.0)
     return min(_DB_PER_DECADE * beyond, _MOST_DB) * (1 + immature)
-
-
-def slope_db(measured: Sequence[tuple[int, float]]) -> float:
-    """Return what a doubling of the samples buys in this view, in dB, from its last two floors.
-
-    Args:
-        measured: (samples per pixel, floor in dB) of this view so far, in order; one is enough.
-    """
-    if len(measured) < 2:
-        return _DB_PER_DOUBLING
-    (before, lower_db), (now, upper_db) = measured[-2:]
-    return min(max((upper_db - lower_db) / math.log2(now / before), _SLOWEST_DB), _FASTEST_DB)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Goal:
-    """When sampling ends."""
-
-    target_db: float
-    """The floor to reach."""
-    step: int
-    """Samples per pixel of one pass of both halves."""
-    max_spp: int
-    """The cap, a multiple of `step`."""
-
-
-def next_spp(measured: Sequence[tuple[int, float]], goal: Goal) -> int:
-    """Return how many samples to go on to before the floor is measured again.
-
-    Args:
-        measured: as for `slope_db`; the last one is below the goal's target, and has a multiple of
-            its step below its cap.
-        goal: when sampling ends.
-    """
-    spp, step = measured[-1][0], goal.step
-    growth = max(step * math.ceil(spp * _MAX_GROWTH / step), spp + step)
-    return min(expected_spp(measured, goal), growth)
-
-
-def expected_spp(measured: Sequence[tuple[int, float]], goal: Goal) -> int:
-    """Return at how many samples the floor should reach its target, or the cap; as `next_spp`."""
-    spp, floor_db = measured[-1]
-    gap_db = goal.target_db - floor_db
-    doublings = min(gap_db / slope_db(measured), math.log2(goal.max_spp / spp) + 1)
-    wanted = goal.step * math.ceil(spp * 2**doublings / goal.step)
-    return min(goal.max_spp, max(wanted, spp + goal.step))

@@ -3,10 +3,11 @@
 It renders the camera that it is given, or refuses its picture; who chooses cameras, and which one
 comes next, is not known here (pipeline.making.render_sample).
 
-A picture is sampled as two halves that share nothing. They are denoised apart to measure the floor
-(pipeline.renders.noise_floor), until it reaches the target or the samples reach the cap. The
-picture itself is one denoise of the mean of all samples, which is better than the mean of two.
-With `per_light` all of this is done for each emitter alone, and the picture is their sum.
+A picture is sampled as two halves that share nothing. They are denoised apart to measure its floors
+(pipeline.renders.noise_floor), until these reach their targets or the samples reach the cap
+(pipeline.renders.stopping). The picture itself is one denoise of the mean of all samples, which is
+better than the mean of two. With `per_light` all of this is done for each emitter alone, and the
+picture is their sum.
 
 Mitsuba is imported inside functions only: `activate` must come first.
 """
@@ -20,16 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise, set_denoiser_threads
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.noise_floor import (
-    Goal,
-    Half,
-    MeasuredFloor,
-    expected_spp,
-    measure_floor,
-    next_spp,
-)
+from pipeline.renders.noise_floor import Half, MeasuredFloor, measure_floor
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
 from pipeline.renders.tracer import Features, Tracer
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected
@@ -53,7 +48,7 @@ class RenderedView:
     object_noise_floor_db: float
     """Measured error as object_psnr_log_db, over `hits`."""
     at_cap: bool
-    """Whether sampling ended at max_spp with the floor below its target."""
+    """Whether sampling ended at max_spp with a floor below its target."""
     hits: NDArray[np.bool_]
     """[R, R] whether the ray through the pixel's centre meets geometry (emitters do not count)."""
     lights_rgb: NDArray[np.float32] | None = None
@@ -68,9 +63,9 @@ class Sampling:
     spp: int
     """Samples per pixel so far."""
     expected_spp: int
-    """Samples at which the floor should reach its target, or the cap; a guess that improves."""
-    noise_floor_db: float | None
-    """The floor when it was measured last, or None."""
+    """Samples at which all targets should be reached, or the cap; a guess that improves."""
+    missing_db: float | None
+    """The widest gap to a target when the floors were measured last; None before that."""
 
 
 _MAX_RAW = 1e13
@@ -133,14 +128,14 @@ class SceneRenderer:
         )
         first_pass_of_both = 2 * samples.pass_spp
         for _ in samples.passes_to(first_pass_of_both):
-            yield Sampling(spp=samples.spp, expected_spp=settled, noise_floor_db=None)
+            yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
         self._refuse_black(samples)
         for _ in samples.passes_to(settled):
-            yield Sampling(spp=samples.spp, expected_spp=settled, noise_floor_db=None)
+            yield Sampling(spp=samples.spp, expected_spp=settled, missing_db=None)
         aux_seed = seed_for(seed, "features")
         features = self._tracer.features(camera, seed=aux_seed, spp=settings.aux_spp)
         hits = self._tracer.hits(camera)
-        floor = yield from self._sample_to_target(samples, features, hits)
+        floor = yield from self._sample_to_targets(samples, features, hits)
         self._refuse_noisy(floor)
         parts = self._denoised(samples.mean(), features)
         lights = rounded_to_half(_representable(parts)) if settings.per_light else None
@@ -151,7 +146,7 @@ class SceneRenderer:
             noise_floor_db=floor.log_db,
             noise_floor_linear_db=floor.linear_db,
             object_noise_floor_db=floor.object_log_db,
-            at_cap=floor.log_db < settings.noise_floor_db,
+            at_cap=bool(gaps_db(settings.targets_db, _by_metric(floor))),
             hits=hits,
             lights_rgb=lights,
         )
@@ -163,29 +158,30 @@ class SceneRenderer:
             raise Rejected("black_view", f"mean radiance {mean:.2g} is below {bound:.2g}")
 
     def _refuse_noisy(self, floor: MeasuredFloor) -> None:
-        target_db = self._settings.noise_floor_db
-        if self._settings.reject_at_cap and floor.log_db < target_db:
-            raise Rejected("floor_not_reached", f"{floor.log_db:.1f} dB; expected {target_db:g}")
+        targets_db, floors_db = self._settings.targets_db, _by_metric(floor)
+        missed = [
+            f"{metric} is {floors_db[metric]:.1f} dB; expected {targets_db[metric]:g}"
+            for metric in gaps_db(targets_db, floors_db)
+        ]
+        if self._settings.reject_at_cap and missed:
+            raise Rejected("floor_not_reached", ", ".join(missed))
 
-    def _sample_to_target(
+    def _sample_to_targets(
         self, samples: HalfSamples, features: Features, hits: NDArray[np.bool_]
     ) -> Generator[Sampling, None, MeasuredFloor]:
-        settings = self._settings
-        measured: list[tuple[int, float]] = []
+        targets_db, max_spp = self._settings.targets_db, self._settings.max_spp
+        measured: list[tuple[int, Floors]] = []
         while True:
             half_a, half_b = (self._half(raw, features) for raw in samples.half_means())
             floor = measure_floor(half_a, half_b, hits, samples.spp)
-            measured.append((samples.spp, floor.log_db))
-            if floor.log_db >= settings.noise_floor_db or samples.spp == settings.max_spp:
+            measured.append((samples.spp, _by_metric(floor)))
+            gaps = gaps_db(targets_db, _by_metric(floor))
+            if not gaps or samples.spp == max_spp:
                 return floor
-            goal = Goal(
-                target_db=settings.noise_floor_db,
-                step=2 * samples.pass_spp,
-                max_spp=settings.max_spp,
-            )
-            expected = expected_spp(measured, goal)
+            goal = Goal(targets_db=targets_db, step=2 * samples.pass_spp, max_spp=max_spp)
+            expected, missing_db = expected_spp(measured, goal), max(gaps.values())
             for _ in samples.passes_to(next_spp(measured, goal)):
-                yield Sampling(spp=samples.spp, expected_spp=expected, noise_floor_db=floor.log_db)
+                yield Sampling(spp=samples.spp, expected_spp=expected, missing_db=missing_db)
 
     def _half(self, raw_rgb: NDArray[np.float32], features: Features) -> Half:
         denoised = self._denoised(raw_rgb, features)
@@ -209,6 +205,14 @@ class SceneRenderer:
         alone = np.stack([denoise(part, features, quality) for part in parts_rgb])
         together = denoise(parts_rgb.sum(axis=0), features, quality)
         return together * _shares_of(alone)
+
+
+def _by_metric(floor: MeasuredFloor) -> Floors:
+    return {
+        "psnr_log_db": floor.log_db,
+        "psnr_linear_db": floor.linear_db,
+        "object_psnr_log_db": floor.object_log_db,
+    }
 
 
 def _tracer_of_each_light(tracer: Tracer, scene: Scene) -> list[Tracer]:

@@ -1,6 +1,8 @@
 """`RenderSettings`: how good a picture must be, and how much it may cost."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
+
+import pydantic
 
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
@@ -30,6 +32,19 @@ Resolution = Annotated[int, Within(8, MAX_RESOLUTION, unit="pixels")]
 NoiseFloor = Annotated[float, Within(0, MAX_DB, low_open=True, high_open=True, unit="dB")]
 """A target for the measured error of a picture."""
 
+USUAL_FLOOR_DB = 40.0
+"""psnr_log_db of a picture that a person asks for without any target."""
+
+_METRICS = {
+    "noise_floor_db": "psnr_log_db",
+    "noise_floor_linear_db": "psnr_linear_db",
+    "noise_floor_objects_db": "object_psnr_log_db",
+}
+"""The metric of each target (storage.metrics)."""
+
+_LATER = ("noise_floor_linear_db", "noise_floor_objects_db")
+"""Settings that no record holds where they are None, so that digests of earlier builds stay."""
+
 Samples = Annotated[int, Within(2 * PASS_SPP[-1], MAX_SPP, unit="samples")]
 """Of both halves of a picture together, per pixel."""
 
@@ -43,16 +58,23 @@ class RenderSettings:
 
     resolution: Resolution
     """Width and height in pixels, a multiple of 8 up to MAX_RESOLUTION."""
-    noise_floor_db: NoiseFloor
-    """Sampling stops when the measured floor (psnr_log_db) reaches this."""
+    noise_floor_db: NoiseFloor | None
+    """Sampling goes on until the measured floor (psnr_log_db) reaches this; none where only the
+    other two count."""
+    noise_floor_linear_db: NoiseFloor | None = None
+    """Sampling also goes on until the floor as psnr_linear_db reaches this: that of radiance
+    clamped to [0, 1], 5 to 10 dB below psnr_log_db in most pictures."""
+    noise_floor_objects_db: NoiseFloor | None = None
+    """Sampling also goes on until the floor as object_psnr_log_db reaches this: that of pixels
+    which show geometry, so that empty background does not count."""
     min_spp: Samples
     """Samples per pixel, both halves together, before the floor is measured first. From 32 on it is
     honest in views without rare bright paths, and goes by what it finds in the others."""
     max_spp: Samples
-    """The cap: sampling stops here whatever the floor is."""
+    """The cap: sampling stops here whatever the floors are."""
     reject_at_cap: bool = False
-    """Reject a view that misses its floor at the cap (floor_not_reached; its camera is tried
-    again), after all of its samples, instead of keeping it with the floor that it has. A set
+    """Reject a view that misses one of its floors at the cap (floor_not_reached; its camera is
+    tried again), after all of its samples, instead of keeping it with the floors that it has. A set
     without its hard views is another distribution: keep them unless every picture must be good."""
     max_depth: Depth = 10
     """Longest path in edges: 1 sees emitters alone, 2 adds direct light."""
@@ -85,22 +107,61 @@ class RenderSettings:
             f"and a cap of a multiple of {2 * PASS_SPP[0]} for the best sampling",
         )
         _require(self.aux_spp in PASS_SPP, f"aux_spp is {self.aux_spp}; expected one of {PASS_SPP}")
+        _require(
+            bool(self.targets_db),
+            f"noise_floor_db is None; expected one of {', '.join(_METRICS)} to be a number",
+        )
+
+    @property
+    def targets_db(self) -> dict[str, float]:
+        """The targets that are set, in dB by metric: sampling ends when all of them are reached."""
+        targets = {metric: getattr(self, name) for name, metric in _METRICS.items()}
+        return {metric: db for metric, db in targets.items() if db is not None}
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        record: dict[str, Any] = as_usual(self)
+        return {k: value for k, value in record.items() if value is not None or k not in _LATER}
 
 
-def one_picture(*, resolution: int, noise_floor_db: float, max_spp: int) -> RenderSettings:
+def asked_floors(
+    noise_floor_db: float | None,
+    noise_floor_linear_db: float | None,
+    noise_floor_objects_db: float | None,
+) -> dict[str, float | None]:
+    """Return all three targets by name where one of them is asked for, else none.
+
+    Whoever asks for one wants it in place of those that are there: the others become None.
+    """
+    asked = (noise_floor_db, noise_floor_linear_db, noise_floor_objects_db)
+    return {} if asked == (None, None, None) else dict(zip(_METRICS, asked, strict=True))
+
+
+def one_picture(
+    *,
+    resolution: int,
+    max_spp: int,
+    noise_floor_db: float | None = None,
+    noise_floor_linear_db: float | None = None,
+    noise_floor_objects_db: float | None = None,
+) -> RenderSettings:
     """Return the settings of a picture that a person asks for, who gets it even where it is dark.
 
     Args:
         resolution: width and height in pixels, a multiple of 8.
-        noise_floor_db: target of the measured error (psnr_log_db).
         max_spp: most samples per pixel.
+        noise_floor_db, noise_floor_linear_db, noise_floor_objects_db: targets; where all are None,
+            psnr_log_db of USUAL_FLOOR_DB.
 
     Raises:
         TrilightError: a value that is refused; the message names it.
     """
+    asked = (noise_floor_db, noise_floor_linear_db, noise_floor_objects_db)
     return RenderSettings(
         resolution=resolution,
-        noise_floor_db=noise_floor_db,
+        noise_floor_db=USUAL_FLOOR_DB if asked == (None, None, None) else noise_floor_db,
+        noise_floor_linear_db=noise_floor_linear_db,
+        noise_floor_objects_db=noise_floor_objects_db,
         min_spp=min(FIRST_SPP, max_spp),
         max_spp=max_spp,
         min_mean_radiance=0.0,

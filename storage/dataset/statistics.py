@@ -37,6 +37,10 @@ class Statistics:
     """[views] samples per pixel."""
     noise_floor_db: NDArray[np.float64]
     """[views] psnr_log_db."""
+    noise_floor_linear_db: NDArray[np.float64]
+    """[views] psnr_linear_db."""
+    object_noise_floor_db: NDArray[np.float64]
+    """[views] object_psnr_log_db."""
     at_cap: NDArray[np.bool_]
     """[views] whether sampling ended at the cap."""
 
@@ -50,13 +54,14 @@ class Statistics:
             return [("scenes", "0")]
         excursions = _counts(self.scenes_by_excursion)
         beyond = [("beyond the range", excursions)] if excursions else []
-        median, low = np.percentile(self.noise_floor_db, [50, 5])
         return [
             ("scenes", f"{self.num_scenes} ({_counts(self.scenes_by_split)})"),
             ("templates", _counts(self.scenes_by_template)),
             *beyond,
             ("views", f"{self.num_views}"),
-            ("noise floor", f"median {median:.1f} dB, 5th percentile {low:.1f} dB (psnr_log_db)"),
+            ("noise floor", _spread(self.noise_floor_db, "psnr_log_db")),
+            ("linear noise floor", _spread(self.noise_floor_linear_db, "psnr_linear_db")),
+            ("noise floor of objects", _spread(self.object_noise_floor_db, "object_psnr_log_db")),
             ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),
             ("samples per pixel", f"median {np.median(self.spp):.0f}, most {self.spp.max()}"),
             ("scene digest", self.scene_digest),
@@ -87,7 +92,9 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
         scene_digest=digest_of_scenes(tally.scene_members),
         num_bytes=dataset.manifest.num_bytes,
         spp=np.array([view["spp"] for view in tally.views], np.int64),
-        noise_floor_db=np.array([view["noise_floor_db"] for view in tally.views], np.float64),
+        noise_floor_db=_column(tally.views, "noise_floor_db"),
+        noise_floor_linear_db=_column(tally.views, "noise_floor_linear_db"),
+        object_noise_floor_db=_column(tally.views, "object_noise_floor_db"),
         at_cap=np.array([view["at_cap"] for view in tally.views], np.bool_),
     )
 
@@ -131,6 +138,15 @@ def digest_of_scenes(members: Mapping[str, str]) -> str:
     """Return the digest of scenes from the sha256 of each unpacked `KEY.scene.safetensors`."""
     lines = (f"{name} {digest}" for name, digest in sorted(members.items()))
     return sha256_hex("\n".join(lines).encode())
+
+
+def _column(views: Sequence[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
+    return np.array([view[name] for view in views], np.float64)
+
+
+def _spread(floors_db: NDArray[np.float64], metric: str) -> str:
+    median, low = np.percentile(floors_db, [50, 5])
+    return f"median {median:.1f} dB, 5th percentile {low:.1f} dB ({metric})"
 
 
 def _counts(counts: Mapping[str, int]) -> str:

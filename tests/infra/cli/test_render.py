@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
+from infra.rendering.request import Asked
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.exchange.renderformer_h5 import write_renderformer_h5
 from pipeline.making import path_tracer
@@ -24,11 +26,13 @@ from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene, scene_digest
+from storage.settings.described import option_words
 from tests.command_line import trilight
 from tests.infra.rendering.render_kit import SMALL, mistake, render
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
 FLOOR = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3 4\n"
+WIDE = {"COLUMNS": "300"}
 LAMP = "v -0.1 -0.1 2\nv 0 0.1 2\nv 0.1 -0.1 2\nf 1 2 3\n"
 
 
@@ -152,6 +156,62 @@ def test_a_person_is_told_where_to_look(tmp_path: Path) -> None:
         assert text in printed.replace("\n", "")
 
 
+def test_the_last_line_says_all_three_floors(tmp_path: Path) -> None:
+    source = tmp_path / "tiny.safetensors"
+    source.write_bytes(encode_scene(tiny_scene()))
+    words = ["render", str(source), "--resolution", "16", "--max-spp", "8"]
+    of_one = trilight([*words, "--out", str(tmp_path / "x.exr")], env=WIDE).output
+    floors = r"noise floor -?\d+\.\d dB \(linear -?\d+\.\d, objects -?\d+\.\d\)$"
+    assert re.search(rf"measure with \S+x\.exr; {floors}", of_one.strip())
+    of_two = trilight([*words, "--orbit", "2", "--out", str(tmp_path / "turn")], env=WIDE).output
+    assert re.search(rf"median {floors}", of_two.strip())
+    for metric in ("psnr_log_db", "psnr_linear_db", "object_psnr_log_db"):
+        assert f"({metric}" in of_one and f"({metric})" in of_two
+
+
+def test_a_linear_target_alone_governs_and_is_said_beside_what_came_of_it(tmp_path: Path) -> None:
+    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
+    source.write_bytes(encode_scene(tiny_scene()))
+    words = ["render", str(source), "--out", str(out), "--resolution", "16"]
+    printed = trilight([*words, "--noise-floor-linear", "5", "--max-spp", "64"], env=WIDE).output
+    assert "clamped to [0, 1]; reached 5 dB)" in printed and "(psnr_log_db)" in printed
+    header = OpenEXR.File(io.BytesIO(out.read_bytes()), header_only=True).header()
+    settings = json.loads(header["trilight.settings"])
+    assert (settings["noise_floor_db"], settings["noise_floor_linear_db"]) == (None, 5)
+    asked = ("--noise-floor-linear", "5", "--noise-floor-objects", "95", "--max-spp", "8")
+    both = trilight([*words, *asked], env=WIDE).output
+    assert "clamped to [0, 1]; reached 5 dB)" in both
+    assert "geometry is seen; the cap came before 95 dB)" in both
+
+
+def test_the_words_of_what_was_asked_give_the_picture_again(tmp_path: Path) -> None:
+    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
+    source.write_bytes(encode_scene(tiny_scene()))
+    asked = Asked(
+        source=str(source), out=out, resolution=16, max_spp=256, noise_floor_linear_db=22.5,
+        noise_floor_objects_db=20.25,
+    )  # fmt: skip
+    typed = ["--noise-floor-linear", "22.5", "--noise-floor-objects", "20.25", "--max-spp", "256"]
+    typed += ["--resolution", "16", "--out", str(out)]
+    pictures = []
+    for words in (typed, option_words(asked, leave_out=("source",))):
+        assert trilight(["render", str(source), *words]).exit_code == 0
+        pictures.append(out.read_bytes())
+    assert pictures[0] == pictures[1]
+
+
+def test_a_picture_made_before_there_were_other_targets_is_kept(tmp_path: Path) -> None:
+    """Its request names no target that it was not asked for, so that its digest is the same."""
+    source = tmp_path / "tiny.safetensors"
+    source.write_bytes(encode_scene(tiny_scene()))
+    render(source, "--out", tmp_path / "x.exr")
+    header = OpenEXR.File(io.BytesIO((tmp_path / "x.exr").read_bytes()), header_only=True).header()
+    assert set(json.loads(header["trilight.settings"])) == {
+        "resolution", "noise_floor_db", "min_spp", "max_spp", "reject_at_cap", "max_depth",
+        "rr_depth", "aux_spp", "denoiser", "min_mean_radiance", "per_light",
+    }  # fmt: skip
+
+
 def _nothing(folder: Path) -> None:
     pass
 
@@ -255,6 +315,11 @@ def test_mistakes_on_the_command_line_are_one_line(tmp_path: Path) -> None:
         (("--resolution", "20"), "resolution is 20; expected a multiple of 8"),
         (("--max-spp", "100"), "max_spp 100; expected multiples of 8"),
         (("--noise-floor", "0"), "--noise-floor-db is 0.0; expected a number above 0"),
+        (("--noise-floor-linear", "0"), "--noise-floor-linear-db is 0.0; expected a number above"),
+        (("--noise-floor-linear", "101"), "--noise-floor-linear-db is 101.0; expected a number"),
+        (("--noise-floor-linear", "nan"), "--noise-floor-linear-db is nan"),
+        (("--noise-floor-objects", "-3"), "--noise-floor-objects-db is -3.0; expected a number"),
+        (("--noise-floor-objects", "loud"), "--noise-floor-objects-db is 'loud'"),
         (("--seed", "-1"), "--seed is -1"),
         (("--threads", "0"), "--threads is 0"),
     ):

@@ -60,6 +60,19 @@ def test_a_dataset_is_followed_and_options_count_more(tmp_path: Path) -> None:
     assert settings.scenes.num_views == record["scenes"]["num_views"]
 
 
+def test_a_floor_that_is_asked_for_replaces_those_of_a_file(tmp_path: Path) -> None:
+    file = _file(tmp_path, "renders: {noise_floor_db: 44, noise_floor_objects_db: 43}\n")
+    order = with_shared(DatasetOrder(noise_floor_linear_db=36.0), Shared(settings=file))
+    assert named_build("smoke", changes=order.changes).renders.targets_db == {
+        "psnr_linear_db": 36.0
+    }
+    as_filed = with_shared(DatasetOrder(), Shared(settings=file)).changes
+    assert named_build("smoke", changes=as_filed).renders.targets_db == {
+        "psnr_log_db": 44.0,
+        "object_psnr_log_db": 43.0,
+    }
+
+
 def test_a_preset_takes_the_place_of_single_settings(tmp_path: Path) -> None:
     file = _file(tmp_path, "model: {width: 60}\nloss.perceptual: none\n")
     changes = all_changes(named_run("smoke"), Shared(settings=file), {}, {"model": "tiny"})

@@ -12,6 +12,7 @@ from pipeline.builds.settings import BuildSettings, differences
 from storage.dataset.splits import split_of_object, split_of_shard
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
+from storage.settings.described import from_record
 from tests.scene_templates.published import STAGE_1, STAGE_2
 
 RENDERFORMER = [name for name in BUILDS if name.startswith("renderformer-v1")]
@@ -32,7 +33,9 @@ def test_settings_survive_the_manifest(name: str) -> None:
 def _rebuilt(like: Any, stored: Any) -> Any:
     """Settings of the kind of `like` from JSON values; nothing may be lost on the way."""
     if dataclasses.is_dataclass(like) and not isinstance(like, type):
-        names = [field.name for field in dataclasses.fields(like)]
+        unset = {"noise_floor_linear_db", "noise_floor_objects_db"} - set(stored)
+        assert all(getattr(like, name, None) is None for name in unset)
+        names = [field.name for field in dataclasses.fields(like) if field.name not in unset]
         assert set(stored) == set(names)
         values = {name: _rebuilt(getattr(like, name), stored[name]) for name in names}
         return dataclasses.replace(like, **values)
@@ -57,6 +60,16 @@ def test_what_is_named_changes_and_nothing_else(name: str) -> None:
     expected |= {"renders.noise_floor_db": 33.0, "scenes.num_views": 3}
     assert found == expected
     assert after.digest != before.digest
+
+
+def test_the_floors_that_are_asked_for_replace_those_of_the_build() -> None:
+    plain = named_build("smoke").renders
+    linear = named_build("smoke", noise_floor_linear_db=33.0)
+    assert linear.renders.targets_db == {"psnr_linear_db": 33.0}
+    added = named_build("smoke", changes={"renders.noise_floor_linear_db": 33.0})
+    assert added.renders.targets_db == {**plain.targets_db, "psnr_linear_db": 33.0}
+    assert from_record(BuildSettings, linear.as_json()) == linear
+    assert len({each.digest for each in (named_build("smoke"), linear, added)}) == 3
 
 
 def test_licences_are_added_and_sorted() -> None:
@@ -196,5 +209,7 @@ def _statistics(*, num_scenes: int, scene_digest: str) -> Statistics:
         num_bytes=0,
         spp=np.zeros(0, np.int64),
         noise_floor_db=np.zeros(0),
+        noise_floor_linear_db=np.zeros(0),
+        object_noise_floor_db=np.zeros(0),
         at_cap=np.zeros(0, np.bool_),
     )

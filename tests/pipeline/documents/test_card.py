@@ -81,8 +81,8 @@ def test_the_body_counts_by_split_and_licence(tmp_path: Path) -> None:
     """By hand: 8 training views, two of them at 38 dB and the cap; the target is 40 dB."""
     dataset = five_scenes(tmp_path)
     _, body = card_of(dataset)
-    assert "| train | 4 | 8 | 2 | 41.5 | 38.0 | 75% | 25% |" in body
-    assert "| test | 1 | 2 | 1 | 44.0 | 44.0 | 100% | 0% |" in body
+    assert "| train | 4 | 8 | 2 | 41.5 (33.2, 40.5) | 38.0 (33.2, 40.5) | 75% | 25% |" in body
+    assert "| test | 1 | 2 | 1 | 44.0 (33.2, 40.5) | 44.0 (33.2, 40.5) | 100% | 0% |" in body
     assert "| asks for |" in body and "| attribution, changes | 1 |" in body
     assert "| nothing | 3 |" in body
     assert "- **attribution**:" in body and "share-alike" not in body

@@ -56,6 +56,7 @@ def test_uses_of_objects(found: Distributions) -> None:
         ("azimuth_deg", [0, 90] * 5),
         ("fov_deg", [45, 40] * 5),
         ("noise_floor_db", [38, 38, 42, 42, 41.5, 41.5, 41.5, 41.5, 44, 44]),
+        ("noise_floor_linear_db", [33.25] * 10),
         ("object_noise_floor_db", [40.5] * 10),
         ("coverage", [0.25] * 8 + [0.5] * 2),
         ("spp", [256, 256] + [128] * 8),
@@ -93,8 +94,23 @@ def test_rejections_by_stage_reason_and_attempt(found: Distributions) -> None:
 
 
 def test_targets_are_those_of_the_settings(found: Distributions) -> None:
-    wanted = {"max_triangles": 9, "noise_floor_db": 40.0, "min_spp": 64, "max_spp": 256}
-    assert found.targets == wanted
+    floors = {"noise_floor_db": 40.0, "noise_floor_linear_db": None, "noise_floor_objects_db": None}
+    assert found.targets == {"max_triangles": 9, **floors, "min_spp": 64, "max_spp": 256}
+
+
+def test_a_view_has_reached_its_targets_when_it_has_reached_all(found: Distributions) -> None:
+    def reached(**targets: float) -> list[bool]:
+        asked = dataclasses.replace(found, targets={**found.targets, **targets})
+        each = asked.reached("train")
+        assert each is not None
+        return [bool(view) for view in each]
+
+    assert reached() == [False] * 2 + [True] * 6  # the first scene states 38 dB
+    assert reached(noise_floor_linear_db=33.0) == reached()
+    assert reached(noise_floor_linear_db=33.5) == [False] * 8
+    assert reached(noise_floor_objects_db=41.0) == [False] * 8
+    nothing = dataclasses.replace(found, targets=dict.fromkeys(found.targets))
+    assert nothing.reached("train") is None
 
 
 def test_json_holds_all_of_it(found: Distributions) -> None:

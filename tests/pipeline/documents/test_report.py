@@ -140,7 +140,7 @@ def test_a_scene_has_its_facts(five: dict[str, Tags]) -> None:
     tags = five["000000001"]
     text = text_of(tags)
     assert "train, template wall, 7 triangles" in text
-    assert "0 2.000, 0.000, 1.000 2.236 26.6 0.0 45.0 128 42.00 33.25 0.25 no 0 7" in text
+    assert "0 2.000, 0.000, 1.000 2.236 26.6 0.0 45.0 128 42.00 33.25 40.50 0.25 no 0 7" in text
     assert "0 a object a CC0-1.0 flat 2 1 b object b CC0-1.0 flat 2" in text
     assert "light 0.000, -0.033, 2.000 2.000 100.0, 100.0, 100.0 0.02000" in text
     assert text.count("no_room") == 2  # both rejected attempts at it

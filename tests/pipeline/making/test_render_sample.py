@@ -11,9 +11,11 @@ from pipeline.making import render_sample as module
 from pipeline.making.render_sample import render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.renderer import RenderedView, Sampling
+from pipeline.renders.variant import activate, choose_variant
 from pipeline.scenes.compose import compose_scene
 from storage.errors import Rejected
 from storage.records.objects import Failure
+from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 from tests.pipeline.scenes.small_pool import small_pool
@@ -46,7 +48,7 @@ class _Renderer:
         self.turns += 1
         if 2 <= self.turns <= 3:
             raise Rejected("black_view", f"seed {seed}")
-        yield Sampling(spp=8, expected_spp=8, noise_floor_db=None)
+        yield Sampling(spp=8, expected_spp=8, missing_db=None)
         return RenderedView(
             radiance_rgb=np.full((16, 16, 3), 0.5, np.float32),
             spp=8,
@@ -56,6 +58,23 @@ class _Renderer:
             at_cap=False,
             hits=np.ones((16, 16), np.bool_),
         )
+
+
+def test_a_record_says_all_three_floors_and_the_target_that_was_missed(scene: Scene) -> None:
+    activate(choose_variant())
+    changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.noise_floor_db": 1.0}
+    missed = {**changes, "renders.noise_floor_linear_db": 95.0, "renders.min_mean_radiance": 0}
+    reached = {**missed, "renders.noise_floor_linear_db": 0.1}
+    records = []
+    for each in (missed, reached):
+        build = named_build("smoke", resolution=16, changes=each)
+        sample = render_sample(KEY, scene, build, [], ViewProgress(None, 0))
+        records.append(decode_sample(KEY, encode_sample(sample)).views)
+    assert [view.at_cap for view in records[0]] == [True] * scene.num_views
+    assert [view.at_cap for view in records[1]] == [False] * scene.num_views
+    for view in (*records[0], *records[1]):
+        floors = (view.noise_floor_db, view.noise_floor_linear_db, view.object_noise_floor_db)
+        assert len(set(floors)) == 3
 
 
 def test_a_refused_camera_is_replaced_and_told(

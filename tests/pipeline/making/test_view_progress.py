@@ -16,7 +16,7 @@ DONE: Any = object()
 
 def _steps() -> Generator[Sampling, None, RenderedView]:
     for spp in (32, 64, 96, 256):
-        yield Sampling(spp=spp, expected_spp=128, noise_floor_db=None)
+        yield Sampling(spp=spp, expected_spp=128, missing_db=None)
     return DONE
 
 

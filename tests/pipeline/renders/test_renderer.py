@@ -15,6 +15,7 @@ from storage.conventions import look_at_c2w
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene
+from storage.settings.changes import changed
 from tests.conftest import ROOT
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
 
@@ -124,8 +125,59 @@ def test_a_view_says_how_far_it_is() -> None:
     # passes of 16 to 64 samples a half, then one of 64 of each half
     assert [step.spp for step in seen] == [*range(16, 129, 16), 192, 256]
     assert all(step.spp <= step.expected_spp <= 256 for step in seen)
-    assert [step.noise_floor_db is None for step in seen] == [True] * 2 + [False] * 8
+    assert [step.missing_db is None for step in seen] == [True] * 2 + [False] * 8
+    assert all(0 < (step.missing_db or 0) < 95 for step in seen[2:])
     assert digest(view) == digest(_render(scene, settings))
+
+
+def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
+    easy = dataclasses.replace(CHEAP, noise_floor_db=10.0, max_spp=4096)
+    first = _render(simple_scene(), easy)
+    wanted = first.noise_floor_linear_db + 2
+    both = _render(simple_scene(), dataclasses.replace(easy, noise_floor_linear_db=wanted))
+    assert both.spp > first.spp == 32
+    assert both.noise_floor_linear_db >= wanted and not both.at_cap
+    alone = dataclasses.replace(easy, noise_floor_db=None, noise_floor_linear_db=wanted)
+    assert digest(_render(simple_scene(), alone)) == digest(both)
+
+
+def test_a_target_over_objects_goes_on_where_most_is_background() -> None:
+    scene = simple_scene()
+    far = dataclasses.replace(scene, fov_deg=np.array([110.0], np.float32))
+    easy = dataclasses.replace(CHEAP, max_spp=4096)
+    first = _render(far, dataclasses.replace(easy, noise_floor_db=10.0))
+    assert first.hits.mean() < 0.25
+    assert first.object_noise_floor_db < first.noise_floor_db - 6
+    reached = first.noise_floor_db - 0.1
+    whole = _render(far, dataclasses.replace(easy, noise_floor_db=reached))
+    objects = _render(
+        far, dataclasses.replace(easy, noise_floor_db=reached, noise_floor_objects_db=reached)
+    )
+    assert whole.spp == 32 < objects.spp
+    assert objects.object_noise_floor_db >= reached
+
+
+def test_a_target_that_is_reached_costs_nothing() -> None:
+    easy = dataclasses.replace(CHEAP, noise_floor_db=40.0, max_spp=4096)
+    first = _render(simple_scene(), easy)
+    more = dataclasses.replace(easy, noise_floor_linear_db=5.0, noise_floor_objects_db=5.0)
+    assert digest(_render(simple_scene(), more)) == digest(first)
+
+
+@pytest.mark.parametrize(
+    ("name", "metric"),
+    [
+        ("noise_floor_linear_db", "psnr_linear_db"),
+        ("noise_floor_objects_db", "object_psnr_log_db"),
+    ],
+)
+def test_every_target_counts_at_the_cap(name: str, metric: str) -> None:
+    easy = dataclasses.replace(CHEAP, noise_floor_db=10.0, reject_at_cap=True)
+    assert not _render(simple_scene(), changed(easy, {name: 5.0})).at_cap
+    with pytest.raises(Rejected, match=f"^floor_not_reached: {metric} is .* dB; expected 95$"):
+        _render(simple_scene(), changed(easy, {name: 95.0}))
+    view = _render(simple_scene(), changed(easy, {name: 95.0, "reject_at_cap": False}))
+    assert view.at_cap and view.noise_floor_db > 10
 
 
 def test_the_measured_floor_is_below_the_true_agreement_here() -> None:
