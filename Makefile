@@ -18,8 +18,8 @@ dataset: setup  ## 24 scenes of built-in objects, verified
 	trilight generate smoke --objects builtin: --out data/smoke --scenes 24
 	trilight verify data/smoke
 
-test: setup-all  ## the tests that take minutes, on two cores; a third of that is waiting for children
-	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python -m pytest -n 3 --dist worksteal
+test: setup-all  ## the tests that take minutes, on two cores; a third of that is waiting, hence four workers
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python -m pytest -n 4 --dist worksteal
 
 test-slow: setup-all  ## the others
 	python -m pytest -m slow -n 2 --dist worksteal

@@ -41,6 +41,7 @@ def test_objects_to_shards_to_a_model(trilight: Trilight, tmp_path: Path) -> Non
     assert json.loads(again.stdout[again.stdout.index("{") :])["seconds"] < outcome["seconds"]
 
 
+@pytest.mark.slow
 def test_real_objects_with_their_licences(trilight: Trilight, shared: Path, tmp_path: Path) -> None:
     source = str(shared / "objects")
     small = (*SMALL[:-1], "4")

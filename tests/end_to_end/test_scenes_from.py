@@ -30,6 +30,7 @@ def scenes(shared: Path, tmp_path: Path) -> Path:
     return tmp_path / "scenes"
 
 
+@pytest.mark.slow
 def test_existing_scenes_become_a_dataset(
     trilight: Trilight, refused: Callable[..., str], scenes: Path, tmp_path: Path
 ) -> None:
