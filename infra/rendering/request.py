@@ -36,10 +36,10 @@ class Asked:
     by default 40, unless another floor is asked for. Of several, all are reached."""
     noise_floor_linear_db: NoiseFloor | None = None
     """mitsuba: sampling stops at this floor as psnr_linear_db, of radiance clamped to [0, 1]: 5 to
-    10 dB below psnr_log_db in most pictures."""
+    10 dB below psnr_log_db in most pictures. It governs only if given; by default it does not."""
     noise_floor_objects_db: NoiseFloor | None = None
     """mitsuba: sampling stops at this floor as object_psnr_log_db, in which empty background does
-    not count."""
+    not count. It governs only if given; by default it does not."""
     max_spp: Samples = 4096
     """mitsuba: maximum number of samples per pixel."""
     view: Annotated[int, Within(0, 999)] = 0

@@ -4,6 +4,8 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from tests.end_to_end.conftest import Trilight
 
 SMALL = (
@@ -12,6 +14,7 @@ SMALL = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_bad_and_missing_shards_are_made_anew(
     trilight: Trilight, refused: Callable[..., str], tmp_path: Path
 ) -> None:

@@ -185,7 +185,7 @@ def test_sets_to_be_judged_by_have_objects_of_their_own() -> None:
     assert object_source(named_build("out-of-range"), "folder") == "folder"
     for name in JUDGED:
         assert object_source(named_build(name), None) == "builtin:benchmark-v1"
-    with pytest.raises(TrilightError, match="leave --objects away"):
+    with pytest.raises(TrilightError, match="Omit --objects"):
         object_source(named_build("benchmark-v1"), "builtin:")
 
 
