@@ -8,6 +8,7 @@ served deployment, a team's server) that server is used instead.
 
 import contextlib
 import fcntl
+import http.client
 import os
 import secrets
 import socket
@@ -97,7 +98,7 @@ def wait_until_healthy(url: str, server: "subprocess.Popen[bytes]", log: Path) -
     """Return when a server answers; raises TrilightError where it ends, or takes too long."""
     deadline = time.monotonic() + _START_UP_S
     while time.monotonic() < deadline and server.poll() is None:
-        with contextlib.suppress(urllib.error.URLError, OSError):
+        with contextlib.suppress(urllib.error.URLError, OSError, http.client.HTTPException):
             with urllib.request.urlopen(f"{url}/health", timeout=2):
                 if server.poll() is None:  # else it was somebody else who answered
                     return
