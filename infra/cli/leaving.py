@@ -16,19 +16,13 @@ _temporary: set[Path] = set()
 def leave(message: str, status: int) -> NoReturn:
     """End at once: every child ends with its parent, and every file is whole or absent."""
     out, errors = sys.__stdout__ or sys.stdout, sys.__stderr__ or sys.stderr
-    # A signal that arrives in the middle of a write must not write by the same stream: Python
-    # raises RuntimeError there. What was being written is then left as it is.
+    # A signal may arrive in the middle of a write, and Python refuses (RuntimeError) to write or
+    # flush the same stream then: hence the descriptors, which no progress bar redraws either.
     with contextlib.suppress(RuntimeError):
         sys.stdout.flush()
     if out.isatty():  # a progress bar hides the cursor, which stands behind it
-        with contextlib.suppress(RuntimeError):
-            out.write(f"{_SHOW_CURSOR}\n")
-            out.flush()
-    try:
-        errors.write(f"{message}\n")  # not by way of a bar, which would draw itself again below it
-        errors.flush()
-    except RuntimeError:
-        os.write(errors.fileno(), f"{message}\n".encode())
+        os.write(out.fileno(), f"{_SHOW_CURSOR}\n".encode())
+    os.write(errors.fileno(), f"{message}\n".encode())
     for folder in _temporary:
         shutil.rmtree(folder, ignore_errors=True)
     os._exit(status)
