@@ -71,7 +71,7 @@ def focal_px(fov_deg: ArrayLike, resolution: int) -> NDArray[np.float64]:
 
 
 def camera_rays(
-    c2w: ArrayLike, fov_deg: float, resolution: int
+    c2w: ArrayLike, fov_deg: float, resolution: int, rows: slice = slice(None)
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the rays through the pixel centres of one camera, in world space.
 
@@ -79,16 +79,48 @@ def camera_rays(
         c2w: [4, 4].
         fov_deg: full field of view in degrees.
         resolution: width and height in pixels.
+        rows: of the picture; all by default.
 
     Returns:
-        origin [3] and unit directions [resolution, resolution, 3] (row 0 on top), float64.
+        origin [3] and unit directions [rows, resolution, 3] (row 0 on top), float64.
     """
     pose = np.asarray(c2w, np.float64)
     offset = np.arange(resolution) + 0.5 - 0.5 * resolution
-    x, y = np.meshgrid(offset, -offset)
+    x, y = np.meshgrid(offset, -offset[rows])
     local = np.stack([x, y, np.full_like(x, -focal_px(fov_deg, resolution))], axis=-1)
     directions = local @ pose[:3, :3].T
     return pose[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def in_camera(positions: ArrayLike, c2w: ArrayLike) -> NDArray[np.float64]:
+    """Return world positions [..., 3] in the axes of a camera, which looks along -Z, in metres."""
+    pose = np.asarray(c2w, np.float64)
+    offset = np.asarray(positions, np.float64) - pose[:3, 3]
+    local: NDArray[np.float64] = offset @ np.linalg.inv(pose[:3, :3]).T
+    return local
+
+
+def pixel_places(
+    positions: ArrayLike, c2w: ArrayLike, fov_deg: float, resolution: int
+) -> NDArray[np.float64]:
+    """Return where a camera's picture shows world positions: the inverse of `camera_rays`.
+
+    Args:
+        positions: [..., 3] in metres.
+        c2w: [4, 4].
+        fov_deg: full field of view in degrees.
+        resolution: width and height in pixels.
+
+    Returns:
+        x from the left and y from the top [..., 2] in pixels, float64, where the centre of pixel
+        (i, j) is (j + 0.5, i + 0.5). Places may lie outside the picture; what is not before the
+        camera has NaN.
+    """
+    local = in_camera(positions, c2w)
+    with np.errstate(invalid="ignore"):
+        depth = np.where(local[..., 2] < 0, -local[..., 2], np.nan)
+    scale = focal_px(fov_deg, resolution) / depth
+    return 0.5 * resolution + np.stack([local[..., 0], -local[..., 1]], axis=-1) * scale[..., None]
 
 
 def log10_radiance(radiance_rgb: ArrayLike) -> NDArray:

@@ -40,12 +40,15 @@ if TYPE_CHECKING:
     from trilight.parts import Material as Material
     from trilight.pictures import FirstHits as FirstHits
     from trilight.pictures import NeuralRenderer as NeuralRenderer
+    from trilight.pictures import Pass as Pass
     from trilight.pictures import RenderedView as RenderedView
+    from trilight.pictures import declared_passes as declared_passes
     from trilight.pictures import first_hits as first_hits
     from trilight.pictures import open_network as open_network
     from trilight.pictures import preview_srgb8 as preview_srgb8
     from trilight.pictures import render as render
     from trilight.pictures import render_views as render_views
+    from trilight.pictures import view_passes as view_passes
     from trilight.pictures import write_picture as write_picture
     from trilight.scenes import Scene as Scene
     from trilight.scenes import SceneObject as SceneObject

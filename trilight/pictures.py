@@ -16,6 +16,8 @@ from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8
 from storage.errors import TrilightError
 from storage.records.first_hits import FirstHits, first_hits
+from storage.records.passes.declared import Pass, declared_passes
+from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 
 if TYPE_CHECKING:
@@ -24,12 +26,15 @@ if TYPE_CHECKING:
 __all__ = [
     "FirstHits",
     "NeuralRenderer",
+    "Pass",
     "RenderedView",
+    "declared_passes",
     "first_hits",
     "open_network",
     "preview_srgb8",
     "render",
     "render_views",
+    "view_passes",
     "write_picture",
 ]
 
@@ -43,6 +48,8 @@ def render(
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
     max_spp: int = 4096,
+    split: bool = False,
+    split_lobes: bool = False,
     seed: int = 0,
     threads: int | None = None,
 ) -> RenderedView:
@@ -60,11 +67,15 @@ def render(
         noise_floor_linear_db: the same as psnr_linear_db; of several, all are reached.
         noise_floor_objects_db: the same as object_psnr_log_db: where geometry is seen.
         max_spp: sampling also stops at this many samples per pixel.
+        split: also return direct and indirect light, whose sum is the picture.
+        split_lobes: also return the light of the diffuse and of the specular lobe of the visible
+            surface; with `split` there are four parts.
         seed: of the samples.
         threads: of the processor; all cores by default.
 
     Returns:
-        `radiance_rgb` [R, R, 3] float32 linear radiance, its three floors, `spp` and more.
+        `radiance_rgb` [R, R, 3] float32 linear radiance, its three floors, `spp` and more; where
+        parts are asked for, `parts_rgb` and `part_floors` by their names.
 
     Raises:
         TrilightError: a number that is refused, or a scene that cannot be rendered.
@@ -77,6 +88,8 @@ def render(
         noise_floor_linear_db=noise_floor_linear_db,
         noise_floor_objects_db=noise_floor_objects_db,
         max_spp=max_spp,
+        split=split,
+        split_lobes=split_lobes,
         seed=seed,
         threads=threads,
     )
@@ -92,6 +105,8 @@ def render_views(
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
     max_spp: int = 4096,
+    split: bool = False,
+    split_lobes: bool = False,
     seed: int = 0,
     threads: int | None = None,
 ) -> list[RenderedView]:
@@ -100,8 +115,8 @@ def render_views(
     Args:
         scene: passes `Scene.check`.
         views: rows of `scene.c2w`; all by default.
-        resolution, noise_floor_db, noise_floor_linear_db, noise_floor_objects_db, max_spp, seed,
-            threads: as `render`, which says what comes back and what is refused.
+        resolution, noise_floor_db, noise_floor_linear_db, noise_floor_objects_db, max_spp, split,
+            split_lobes, seed, threads: as `render`, which says what comes back and what is refused.
     """
     from pipeline.making.path_tracer import PathTracer
     from pipeline.renders.variant import choose_variant
@@ -116,6 +131,8 @@ def render_views(
             noise_floor_db=noise_floor_db,
             noise_floor_linear_db=noise_floor_linear_db,
             noise_floor_objects_db=noise_floor_objects_db,
+            split=split,
+            split_lobes=split_lobes,
         ),
         seed=seed,
         variant=choose_variant(),

@@ -124,14 +124,41 @@ def _base(experiment: Experiment, known: Sequence[Point]) -> Point:
 
 
 def _values(experiment: Experiment, run: Run, point: str) -> dict[str, float]:
-    turns = [run.turns[turn][point] for turn in run.whole_turns()]
+    whole = run.whole_turns()
+    turns = [run.turns[turn][point] for turn in whole]
+    clusters = [experiment.cluster(turn) for turn in whole]
     found = dict(run.columns.get(point, {}))
     for column in columns_of(experiment):
         figures = [turn[column.figure] for turn in turns if column.figure in turn]
         if figures:
-            value = float(_OVER[column.over](figures))
+            value = _over(column, figures, clusters)
             found[column.name] = column.then(value) if column.then else value
     return found
+
+
+def _over(column: Column, figures: Sequence[float], clusters: Sequence[str]) -> float:
+    if column.over in ("low", "high"):
+        return mean_interval(figures, clusters)[column.over == "high"]
+    return float(_OVER[column.over](figures))
+
+
+def mean_interval(figures: Sequence[float], clusters: Sequence[str]) -> tuple[float, float]:
+    """Return the 95 % interval of a mean whose figures are alike within clusters.
+
+    It is bootstrapped over whole clusters (2000 times, of a fixed seed).
+
+    Args:
+        figures: one for each turn.
+        clusters: the name of each turn's cluster.
+    """
+    names = sorted(set(clusters))
+    rows = np.array([names.index(name) for name in clusters])
+    sums = np.bincount(rows, weights=np.asarray(figures, np.float64))
+    counts = np.bincount(rows)
+    drawn = np.random.default_rng(0).integers(len(names), size=(2000, len(names)))
+    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
 
 
 def _cost_spread(experiment: Experiment, run: Run, point: str) -> Spread | None:

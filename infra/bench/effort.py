@@ -40,6 +40,10 @@ class Effort:
     """Pixels across the pictures of the network."""
     repeats: int
     """Counted rounds where the same is done several times."""
+    judged_scenes: int
+    """Scenes of each source of objects whose stated floors are judged."""
+    reference_spp: int
+    """Samples per pixel of the references of those, at 256 pixels."""
     growth: int
     """How far sizes that double go: largest source of a mesh, triangles and views of a network."""
 
@@ -59,11 +63,13 @@ CAREFUL = Effort(
     network_triangles=1536,
     network_px=256,
     repeats=3,
+    judged_scenes=30,
+    reference_spp=512,
     growth=4,
 )
 QUICK = dataclasses.replace(
     CAREFUL, name="quick", scenes=4, max_spp=512, fixed_spp=128, picture_px=128, objects=6,
-    samples=2, composed=40, repeats=1, growth=2,
+    samples=2, composed=40, repeats=1, judged_scenes=3, reference_spp=256, growth=2,
 )  # fmt: skip
 
 

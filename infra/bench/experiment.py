@@ -19,7 +19,9 @@ Figures = Mapping[str, float]
 TurnFigures = Iterable[tuple[str, Figures]]
 """The figures of every point in one turn, in order, by the name of the point."""
 
-Over = Literal["median", "mean", "least", "most", "p5", "p95"]
+Over = Literal["median", "mean", "least", "most", "p5", "p95", "low", "high"]
+"""How the figures of all turns become one number; `low` and `high` bound the mean: its 95 %
+interval, bootstrapped over clusters of turns."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +90,8 @@ class Experiment:
     covers: tuple[str, ...] = ()
     """Dotted names of the settings that this is about: `build.` as in `--set` of generate, `order.`
     what a dataset order says, `train.` as in `--set` of train, `render.` an option."""
+    cluster: Callable[[str], str] = str
+    """Names what turns have in common whose figures are alike; by default nothing."""
     warm_up: bool = False
     """Whether one turn that is not counted comes first, where all turns are repeats."""
     takes_scenes: bool = False

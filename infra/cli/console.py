@@ -2,9 +2,9 @@
 
 import json
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.progress import (
@@ -134,6 +134,18 @@ def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
     table.add_column(overflow="fold")
     for name, value in rows:
         table.add_row(name, Text(value))
+    console.print(table)
+
+
+def print_table(title: str, rows: Sequence[Mapping[str, object]]) -> None:
+    """Print rows that have the same names as a table with these names above."""
+    console.print(Text(title, style="bold"))
+    table = Table(box=None, padding=(0, 1, 0, 0))
+    for name in rows[0] if rows else ():
+        side: Literal["left", "right"] = "left" if isinstance(rows[0][name], str) else "right"
+        table.add_column(name, justify=side, no_wrap=True)
+    for row in rows:
+        table.add_row(*(Text(str(value)) for value in row.values()))
     console.print(table)
 
 

@@ -29,11 +29,15 @@ def watched(folder: DatasetFolder, *, silent: bool) -> Iterator[None]:
 
 def _watch(folder: DatasetFolder, bars: Bars, ended: threading.Event, silent: bool) -> None:
     drawn = _Drawn(bars, silent=silent)
+    waits = not silent and not folder.contact_sheet.exists()
     last = False
     while not last:
         last = ended.wait(_POLL_S)
         with contextlib.suppress(OSError, ValueError):  # a file may vanish between two looks
             drawn.show(read_progress(folder))
+        if waits and folder.contact_sheet.exists():
+            waits = False
+            bars.console.print(f"First pictures: {folder.contact_sheet}", soft_wrap=True)
 
 
 class _Drawn:

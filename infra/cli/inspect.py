@@ -142,6 +142,9 @@ def _as_json(opened: Dataset, statistics: Statistics, found: "Distributions") ->
         "noise_floor_db": _rounded(statistics.noise_floor_db),
         "noise_floor_linear_db": _rounded(statistics.noise_floor_linear_db),
         "object_noise_floor_db": _rounded(statistics.object_noise_floor_db),
+        "part_noise_floor_db": {
+            part: _rounded(floors_db) for part, floors_db in statistics.part_noise_floor_db.items()
+        },
         "objects_by_split": Counter(entry.split for entry in found.objects),
         "rejections": [list(row) for row in count_by_reason(found.failures)],
         "scenes_by_split": statistics.scenes_by_split,

@@ -109,10 +109,20 @@ def _engine(engine: EnginePlan, facts: Facts) -> Rows:
         case MitsubaPlan():
             floors = [_floor(engine, facts, name, metric) for name, metric in _FLOORS.items()]
             rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
-            return [("samples per pixel", f"{facts['spp']}"), *rows]
+            mean = f"{facts['mean_radiance']:.4g} (radiance), that of its samples"
+            rows = [("samples per pixel", f"{facts['spp']}"), *rows, ("mean brightness", mean)]
+            return [*rows, *_layers(engine, facts)]
         case NeuralPlan():
             return [("network", f"{engine.checkpoint}; passes: {facts['passes']}")]
     raise TypeError(f"{engine.name} is an engine without a description")
+
+
+def _layers(engine: MitsubaPlan, facts: Facts) -> Rows:
+    """Return the layers of the file with their floors."""
+    return [
+        (f"layer {part}", f"{float(facts[f'{part}.noise_floor_db']):.1f} dB (psnr_log_db)")
+        for part in engine.settings.part_names
+    ]
 
 
 def _floor(engine: MitsubaPlan, facts: Facts, name: str, metric: str) -> str:

@@ -6,15 +6,28 @@ from typing import Annotated, Literal
 
 from cyclopts import App
 
-from infra.cli.console import first_words, next_step, print_json, print_rows, progress_bars
+from infra.cli.console import (
+    first_words,
+    next_step,
+    note,
+    print_json,
+    print_rows,
+    print_table,
+    progress_bars,
+)
 from infra.cli.options import Shown, command
 from pipeline.shards.derive import Derive
+from pipeline.shards.finished import open_finished
+from pipeline.shards.listing import listed_scenes
 from pipeline.shards.plans import Selection
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
 app = App(name="shards", help_epilogue="")
+
+_MOST_LISTED = 40
+"""Most scenes that a person is shown."""
 
 
 @checked()
@@ -46,6 +59,19 @@ class Selected:
     min_noise_floor_db: Annotated[float | None, Within(-100, 200, unit="dB")] = None
     """Keep only the scenes whose views all have at least this noise floor (psnr_log_db); by default
     all."""
+    where: str | None = None
+    """Keep only the scenes for which this condition holds, such as "max(roughness) < 0.3 and
+    lights_per_scene > 1" (docs/reference/quantities.md has the names); by default all."""
+
+    @property
+    def selection(self) -> Selection:
+        """What is to be kept."""
+        return Selection(
+            split=self.split,
+            template=self.template,
+            min_noise_floor_db=self.min_noise_floor_db,
+            where=self.where,
+        )
 
 
 @checked()
@@ -71,15 +97,42 @@ def merge(sources: Datasets, new: NewDataset, shown: Shown) -> None:
 @app.command(help="Keep the scenes that meet every condition, under their keys.")
 @command("dataset")
 def select(chosen: Selected, new: NewDataset, shown: Shown) -> None:
-    selection = Selection(
-        split=chosen.split,
-        template=chosen.template,
-        min_noise_floor_db=chosen.min_noise_floor_db,
-    )
-    if selection == Selection():
-        raise TrilightError("select: expected --split, --template or --min-noise-floor-db.")
-    derive = Derive(operation="select", selection=selection)
+    if chosen.selection == Selection():
+        raise TrilightError("select: expected --where, --split, --template or --min-noise-floor.")
+    derive = Derive(operation="select", selection=chosen.selection)
     _run([chosen.dataset], derive, new.out, as_json=shown.json)
+
+
+@app.command(
+    name="list", help="List the scenes that `select` would keep, by default all; nothing is made."
+)
+@command("dataset")
+def list_scenes(chosen: Selected, shown: Shown) -> None:
+    first_words(f"Reading {chosen.dataset}", silent=shown.json)
+    with progress_bars() as bars:
+        task = bars.add_task("shards", total=None, note="", visible=not shown.json)
+        scenes = listed_scenes(
+            open_finished(str(chosen.dataset)),
+            chosen.selection,
+            progress=lambda done, total: bars.update(task, completed=done, total=total),
+        )
+    if shown.json:
+        print_json({"of": scenes.of, "scenes": list(scenes.rows)})
+        return
+    title = f"{len(scenes.rows)} of {scenes.of} scenes; of several views the least, most spp"
+    print_table(title, scenes.rows[:_MOST_LISTED])
+    if len(scenes.rows) > _MOST_LISTED:
+        note(f"the first {_MOST_LISTED} are shown; --json lists all")
+    if scenes.rows:
+        words = ["shards", "select", str(chosen.dataset), "--out", f"{chosen.dataset}-selected"]
+        options = {
+            "--split": chosen.split,
+            "--template": chosen.template,
+            "--min-noise-floor": chosen.min_noise_floor_db,
+            "--where": chosen.where,
+        }
+        given = [(name, str(value)) for name, value in options.items() if value is not None]
+        next_step([*words, *(word for pair in given for word in pair)])
 
 
 @app.command(help="Divide the scenes of every split into shards of another size, under their keys.")

@@ -5,7 +5,7 @@ engine opens one scene after the other, and an opened scene gives the pictures o
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -36,6 +36,8 @@ class Rendered:
     radiance_rgb: NDArray[np.float32]
     """[R, R, 3] linear radiance that half floats can hold."""
     facts: Facts
+    layers_rgb: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    """[R, R, 3] of other pictures that stand in the same file, by name: the parts of this one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,8 +135,17 @@ class MitsubaEngine:
             "noise_floor_linear_db": round(view.noise_floor_linear_db, 3),
             "object_noise_floor_db": round(view.object_noise_floor_db, 3),
             "at_cap": int(view.at_cap),
+            "mean_radiance": float(f"{view.radiance_rgb.mean(dtype=np.float64):.6g}"),
         }
-        return Rendered(radiance_rgb=view.radiance_rgb, facts=facts)
+        for part, floor in (view.part_floors or {}).items():
+            facts |= {
+                f"{part}.noise_floor_db": round(floor.log_db, 3),
+                f"{part}.noise_floor_linear_db": round(floor.linear_db, 3),
+                f"{part}.object_noise_floor_db": round(floor.object_log_db, 3),
+            }
+        return Rendered(
+            radiance_rgb=view.radiance_rgb, facts=facts, layers_rgb=view.parts_rgb or {}
+        )
 
     def close(self) -> None:
         self._tracer.close()

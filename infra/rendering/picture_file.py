@@ -15,7 +15,7 @@ from infra.rendering.engines import Fact, Facts, Rendered
 from storage.atomic import write_atomically
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
-from storage.records.exr import decode_exr, encode_exr
+from storage.records.layers import decode_picture, encode_picture
 from storage.records.lights import rounded_to_half
 
 Radiance = NDArray[np.float32]
@@ -80,7 +80,8 @@ def kept_picture(path: Path, wanted: Request) -> tuple[PictureFile, Radiance] | 
         header = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()
         if header.get(_PREFIX + _REQUEST) != wanted.header[_REQUEST]:
             return None
-        radiance_rgb = decode_exr(data)
+        names = {channel.name.rpartition(".")[0] for channel in header["channels"]}
+        radiance_rgb = decode_picture(data, names - {""})
     except (OSError, RuntimeError, ValueError, TrilightError):
         return None
     described = {_PREFIX + name for name in wanted.header}
@@ -103,7 +104,8 @@ def write_picture(path: Path, wanted: Request, rendered: Rendered) -> tuple[Pict
     header = {
         _PREFIX + name: value for name, value in (wanted.header | dict(rendered.facts)).items()
     }
-    write_atomically(path, encode_exr(rendered.radiance_rgb, attributes=header))
+    picture = encode_picture(rendered.radiance_rgb, rendered.layers_rgb, header)
+    write_atomically(path, picture)
     radiance_rgb = rounded_to_half(rendered.radiance_rgb)
     return _remembered(path, rendered.facts, radiance_rgb, was_kept=False), radiance_rgb
 

@@ -82,6 +82,8 @@ def plan_render(asked: Asked, reader: SceneReader) -> RenderPlan:
         noise_floor_db=asked.noise_floor_db,
         noise_floor_linear_db=asked.noise_floor_linear_db,
         noise_floor_objects_db=asked.noise_floor_objects_db,
+        split=asked.split,
+        split_lobes=asked.split_lobes,
     )
     look = Look(tone_map=asked.tone_map, exposure_ev=asked.exposure_ev)
     if asked.out.suffix.lower() == ".exr":

@@ -42,6 +42,12 @@ class Asked:
     not count. It governs only if given; by default it does not."""
     max_spp: Samples = 4096
     """mitsuba: maximum number of samples per pixel."""
+    split: bool = False
+    """mitsuba: write direct and indirect light into the EXR as layers as well, whose sum is the
+    picture."""
+    split_lobes: bool = False
+    """mitsuba: write the light of the diffuse and of the specular lobe of the visible surface as
+    layers as well; with --split there are four."""
     view: Annotated[int, Within(0, 999)] = 0
     """Number of the scene's camera, counted from 0."""
     orbit: Annotated[int | None, Within(1, 100_000, unit="pictures")] = None
@@ -80,4 +86,9 @@ class Asked:
         if self.checkpoint is not None and self.engine == "mitsuba":
             raise TrilightError(
                 f"--checkpoint is {self.checkpoint}; expected --engine neural or both beside it."
+            )
+        if (self.split or self.split_lobes) and self.engine == "neural":
+            raise TrilightError(
+                "--split or --split-lobes is given; expected --engine mitsuba or both beside it, "
+                "since a network makes all light together."
             )

@@ -66,6 +66,8 @@ BUILD_V1 = BuildSettings(
         denoiser="high",
         min_mean_radiance=0.01,
         per_light=False,
+        split=False,
+        split_lobes=False,
     ),
     splits=SplitSettings(
         scenes_per_shard=256,
@@ -74,7 +76,7 @@ BUILD_V1 = BuildSettings(
         one_split=False,
         listed_scenes=None,
     ),
-    storage=StorageSettings(profile="compact"),
+    storage=StorageSettings(profile="compact", passes=()),
 )
 """What the published sets have in common; each says what it changes of it."""
 

@@ -11,7 +11,7 @@ from pipeline.objects.generated import BENCHMARK
 from scene_templates.out_of_range import out_of_range_settings
 from storage.dataset.settings import StorageSettings
 
-_EXACT = StorageSettings(profile="lossless")
+_EXACT = StorageSettings(profile="lossless", passes=())
 
 
 def out_of_range() -> BuildSettings:

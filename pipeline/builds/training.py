@@ -32,14 +32,14 @@ from storage.dataset.settings import SplitSettings
 
 
 def smoke() -> BuildSettings:
-    """Minutes on a laptop: small shards, 256 pixels, pictures to 40 dB or 256 samples."""
+    """Minutes on a laptop: small shards, 256 pixels, pictures to 38 dB or 256 samples."""
     return BuildSettings(
         build="smoke",
         seed=0,
         allowed_licences=DEFAULT_ALLOWED,
         assets=AssetSettings(budgets=(1400, 1000, 700, 500, 340, 240)),
         scenes=SceneSettings(families=DEFAULT_FAMILIES, max_triangles=1536, num_views=4),
-        renders=RenderSettings(resolution=256, noise_floor_db=40.0, min_spp=32, max_spp=256),
+        renders=RenderSettings(resolution=256, noise_floor_db=38.0, min_spp=64, max_spp=256),
         splits=SplitSettings(scenes_per_shard=4),
     )
 
@@ -50,7 +50,7 @@ def pretrain_256() -> BuildSettings:
     return dataclasses.replace(
         build,
         build="pretrain-256",
-        renders=dataclasses.replace(build.renders, noise_floor_db=46.0, max_spp=4096),
+        renders=dataclasses.replace(build.renders, noise_floor_db=46.0, max_spp=4096, aux_spp=64),
         splits=SplitSettings(scenes_per_shard=256, shards_per_cycle=64, held_out_objects=0.02),
     )
 

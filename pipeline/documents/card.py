@@ -8,12 +8,12 @@ from typing import Any
 
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.markdown import code, front_matter, table, text
-from pipeline.documents.quantities import summary
 from pipeline.documents.rights import Rights, hub_licence, rights_markdown
 from storage.dataset.derived import Derivation, derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest
 from storage.records.profiles import PACKED, PLAIN
+from storage.records.quantities import summary
 
 _TAGS = (
     "neural-rendering", "path-tracing", "renderformer", "3d", "hdr", "openexr", "webdataset",

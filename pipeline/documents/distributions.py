@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.documents.quantities import QUANTITIES, summary
-from pipeline.documents.scene_facts import Values, scene_values, surfaces
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import Manifest
 from storage.errors import TrilightError
 from storage.records.objects import Failure, LockedObject
+from storage.records.quantities import QUANTITIES, summary
 from storage.records.sample import SceneRecord
+from storage.records.scene_facts import Values, scene_values, surfaces
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -23,7 +23,7 @@ class Distributions:
     """Counts and values over all scenes of a dataset."""
 
     values: Mapping[str, Mapping[str, Values]]
-    """By split, then by name (pipeline.documents.quantities): every value, float32."""
+    """By split, then by name (storage.records.quantities): every value, float32."""
     scenes: Mapping[tuple[str, str], int]
     """Scenes by (template, split)."""
     placements: Mapping[str, int]

@@ -12,10 +12,10 @@ from pipeline.documents import report_sections
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.gallery import write_gallery
 from pipeline.documents.html import Markup, element, joined, page, table
-from pipeline.documents.quantities import QUANTITIES, summary
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
+from storage.records.quantities import QUANTITIES, summary
 
 _STYLE = """
 .pair { display: flex; gap: 2rem; align-items: flex-start }

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.documents.distributions import MEASURED, SURFACE_COUNTS, Distributions
 from pipeline.documents.figures import drawing, encoded, histogram, panels, rose, stacked_bars
 from pipeline.documents.html import Cell, Markup, element, joined, table
-from pipeline.documents.quantities import QUANTITIES, STATISTICS, summary
+from storage.records.quantities import QUANTITIES, STATISTICS, summary
 
 _MOST_USED = 20
 _SHOWN = tuple(name for name in STATISTICS if name not in ("p5", "p95"))

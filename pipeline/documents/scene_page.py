@@ -19,12 +19,12 @@ from pipeline.documents.html import (
     png_uri,
     table,
 )
-from pipeline.documents.scene_facts import cameras, lights, surfaces
 from storage.conventions import preview_srgb8, srgb8
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
 from storage.records.sample import Sample
 from storage.records.scene import Scene
+from storage.records.scene_facts import cameras, lights, surfaces
 
 _PICTURE_PX = 384
 _MOST_SWATCHES = 128
@@ -73,6 +73,7 @@ def encode_scene_page(
         element("div", *_figures(sample), class_="views"),
         element("h2", "Views"),
         _views(sample),
+        *_parts(sample),
         element("h2", "Objects"),
         _objects(scene),
         element("h2", "Materials"),
@@ -143,6 +144,29 @@ def _views(sample: Sample) -> Markup:
         "floor dB", "linear dB", "objects dB", "coverage", "at cap", "attempt", "seed",
     )  # fmt: skip
     return table(head, rows, numbers=len(head) - 1)
+
+
+def _parts(sample: Sample) -> list[Markup]:
+    """Return the pictures of the parts that are stored, with their floors."""
+    if sample.parts_rgb is None:
+        return []
+    figures, rows = [], list[list[Cell]]()
+    for view, record in enumerate(sample.views):
+        for part, floor in (record.parts or {}).items():
+            picture = sample.parts_rgb[part][view]
+            together = picture.sum(axis=0) if picture.ndim == 4 else picture
+            name = f"view {view}, {part}"
+            shown = image(png_uri(preview(together, _PICTURE_PX)), name)
+            figures.append(element("figure", shown, element("figcaption", name)))
+            floors = (
+                floor.noise_floor_db,
+                floor.noise_floor_linear_db,
+                floor.object_noise_floor_db,
+            )
+            rows.append([view, part, *(f"{float(floor_db):.2f}" for floor_db in floors)])
+    head = ("view", "part", "floor dB", "linear dB", "objects dB")
+    pictures = element("div", *figures, class_="views")
+    return [element("h2", "Parts"), pictures, table(head, rows, numbers=3)]
 
 
 def _objects(scene: Scene) -> Markup:

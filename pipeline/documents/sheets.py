@@ -62,6 +62,27 @@ def write_contact_sheet(
     write_atomically((out or dataset.folder).contact_sheet, encode_png(np.asarray(sheet)))
 
 
+def write_first_pictures(folder: DatasetFolder, sample: Sample, *, build: str, split: str) -> None:
+    """Write `contact_sheet.png` of one scene, for whoever looks before the dataset is finished.
+
+    Args:
+        folder: the dataset in the making.
+        sample: its first finished scene.
+        build: name of the build.
+        split: of the scene.
+
+    Raises:
+        TrilightError: the folder cannot be written.
+    """
+    width = len(sample.views) * _TILE_PX + 2 * _MARGIN_PX
+    height = _TITLE_PX + _TILE_PX + _CAPTION_PX + _MARGIN_PX
+    sheet = Image.new("RGB", (width, height), _BACKGROUND)
+    _write(sheet, _MARGIN_PX, 8, f"{build}: the first scene", 20)
+    _write(sheet, _MARGIN_PX, 36, "the dataset is still being made", 14, _FAINT)
+    _draw_cell(sheet, sample, split, _MARGIN_PX, _TITLE_PX)
+    write_atomically(folder.contact_sheet, encode_png(np.asarray(sheet)))
+
+
 def write_template_sheet(
     dataset: Dataset, *, per_template: int, out: DatasetFolder | None = None
 ) -> None:

@@ -29,6 +29,7 @@ from dataclasses import replace
 from pipeline.builds.named import object_source
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.dataset_documents import write_documents
+from pipeline.documents.sheets import write_first_pictures
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.making.accept_scene_files import accept_scene_files
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
@@ -57,6 +58,7 @@ from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.dataset.statistics import Statistics
+from storage.errors import TrilightError
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
 
@@ -204,6 +206,10 @@ def make_piece(job: ShardJob, piece: Piece, child: IsolatedChild) -> tuple[int, 
                 scene_index, sample, failures, profile, began=began, cores=cores_of_child(job)
             )
             scenes += 1
+            if sample and not job.folder.contact_sheet.exists():
+                build = job.settings.build
+                with contextlib.suppress(TrilightError):  # a courtesy must not end the run
+                    write_first_pictures(job.folder, sample, build=build, split=shard.split)
     return scenes, shard.pack()
 
 

@@ -25,7 +25,7 @@ from storage.records.objects import (
     write_failures,
     write_objects_lock,
 )
-from storage.settings.described import from_record, settings_record
+from storage.settings.described import from_record
 
 _LOOKS = 7
 """For a shard that a worker says it has packed; network file systems may show it a minute later."""
@@ -234,7 +234,7 @@ def _require_same_dataset(
 ) -> None:
     _require_generated(folder, manifest)
     require_same_extensions(folder.shown, manifest.extensions, recorded("data"))
-    begun = settings_record(from_record(BuildSettings, manifest.settings))  # fields may come later
+    begun = from_record(BuildSettings, manifest.settings).as_json()  # fields may come later
     _require_same(folder, "setting", begun, settings.as_json(), "choose another --out")
     if not accept_environment:
         _require_same(

@@ -4,9 +4,11 @@ Choosing a camera wraps rendering. A `SceneRenderer` makes the picture of one ca
 and knows of no other camera; `cameras_of_view` knows of no picture.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.view_progress import ViewProgress
@@ -15,7 +17,9 @@ from pipeline.scenes.sight import Sight
 from pipeline.scenes.views import ViewCamera, cameras_of_view, with_cameras
 from storage.errors import Rejected
 from storage.records.objects import Failure
-from storage.records.sample import Sample, ViewRecord
+from storage.records.parts import Parts
+from storage.records.passes.stored import passes_exr
+from storage.records.sample import PartFloor, Sample, ViewRecord
 from storage.records.scene import Scene
 from storage.seeds import seed_for
 
@@ -74,12 +78,25 @@ def render_sample(
     seen = with_cameras(scene, [view.camera for view in views])
     seen.check()
     lights = [view.rendered.lights_rgb for view in views if view.rendered.lights_rgb is not None]
+    parts = [view.rendered.parts_rgb for view in views if view.rendered.parts_rgb is not None]
     return Sample(
         key=key,
         scene=seen.with_provenance({**seen.provenance, "settings_sha256": settings.digest}),
         radiance_rgb=np.stack([view.rendered.radiance_rgb for view in views]),
         views=tuple(_record(view, sight, settings.scenes.views.coverage_grid) for view in views),
         lights_rgb=np.stack(lights) if lights else None,
+        parts_rgb=_stacked(parts) if parts else None,
+        passes_exr=_passes_exr(seen, settings),
+    )
+
+
+def _passes_exr(scene: Scene, settings: BuildSettings) -> tuple[bytes, ...] | None:
+    names, resolution = settings.storage.passes, settings.renders.resolution
+    if not names:
+        return None
+    return tuple(
+        passes_exr(scene, names, view=view, resolution=resolution)
+        for view in range(scene.num_views)
     )
 
 
@@ -95,4 +112,22 @@ def _record(view: _TakenView, sight: Sight, coverage_grid: int) -> ViewRecord:
         at_cap=rendered.at_cap,
         seed=view.seed,
         camera_attempt=camera.attempt,
+        parts=_part_floors(rendered),
     )
+
+
+def _part_floors(rendered: RenderedView) -> dict[str, PartFloor] | None:
+    if rendered.part_floors is None:
+        return None
+    return {
+        name: PartFloor(
+            noise_floor_db=round(floor.log_db, 3),
+            noise_floor_linear_db=round(floor.linear_db, 3),
+            object_noise_floor_db=round(floor.object_log_db, 3),
+        )
+        for name, floor in rendered.part_floors.items()
+    }
+
+
+def _stacked(views: Sequence[Parts]) -> dict[str, NDArray[np.float32]]:
+    return {name: np.stack([parts[name] for parts in views]) for name in views[0]}

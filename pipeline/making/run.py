@@ -189,12 +189,15 @@ def begun_publication(
     """Begin the dataset of an order, or go on with the one that is there.
 
     Raises:
-        TrilightError: the dataset was begun otherwise, or has not got the shards of the order.
+        TrilightError: the dataset was begun otherwise, has not got the shards of the order, or
+            cannot be rendered here.
     """
+    variant = choose_variant()
+    settings.renders.require_variant(variant.name)
     publication = begin_dataset(
         folder,
         settings,
-        environment(choose_variant()),
+        environment(variant),
         BUILDS[order.build].num_scenes if order.scenes is None else order.scenes,
         accept_environment=order.accept_environment,
     )

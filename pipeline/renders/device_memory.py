@@ -20,6 +20,13 @@ def own_floats(values: NDArray) -> Any:
     return copy
 
 
+def own_integers(values: NDArray) -> Any:
+    """Return whole numbers from 0 as a mi.UInt32, as `own_floats` does with floats."""
+    copy = mi.UInt32(np.ascontiguousarray(values, np.uint32).ravel()) + dr.opaque(mi.UInt32, 0)
+    dr.eval(copy)
+    return copy
+
+
 def read_back(values: Any) -> NDArray:
     """Return an array of Dr.Jit, or the components of a vector of arrays side by side, flat.
 

@@ -97,6 +97,13 @@ def evaluate(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> tuple[Any,
     return dr.select(above, reflected, 0), dr.select(above, density, 0)
 
 
+def diffuse_share(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
+    """Return the share (Color3f) of the diffuse lobe in what `evaluate` reflects; 1 of nothing."""
+    reflected, _ = evaluate(lobes, wi, wo, geometric)
+    diffuse = lobes.diffuse * (_INV_PI * dr.maximum(wo.z, 0))
+    return dr.select(reflected > diffuse, diffuse / reflected, 1)
+
+
 def reverse_density(lobes: KernelLobes, wi: Any, wo: Any, geometric: Any) -> Any:
     """Return the density with which `sample`, for a path that comes from wo, draws wi (Float).
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 from pipeline.renders.emission_cone import EmissionCone
 from pipeline.renders.emitter_table import EmitterTable
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
+from pipeline.renders.guide_table import GuideTable
 from pipeline.renders.surface_table import SurfacePoint, SurfaceTable
 
 MAX_SURVIVAL = 0.95
@@ -41,6 +42,7 @@ class KernelScene:
         num_surfaces: int,
         max_depth: int,
         rr_depth: int,
+        guide: GuideTable | None = None,
     ) -> None:
         """Bring the parts together.
 
@@ -53,12 +55,14 @@ class KernelScene:
             num_surfaces: the first triangle number that emits.
             max_depth: longest path in edges.
             rr_depth: edges after which a path goes on by Russian roulette.
+            guide: the directions in which camera paths look for light; None: by the BRDF alone.
         """
         self.surfaces = surfaces
         self.everything = everything
         self.table = table
         self.emitters = emitters
         self.cone = cone
+        self.guide = guide
         self.albedo = AlbedoLookup()
         self.num_surfaces = dr.opaque(mi.UInt32, num_surfaces)
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
@@ -70,6 +74,12 @@ class Vertex:
     """A vertex of a path, lane by lane."""
 
     point: SurfacePoint
+    triangle: Any
+    """UInt32."""
+    barycentric: Any
+    """Point2f: weights of the 2nd and 3rd corner."""
+    front: Any
+    """Bool: whether the ray came to the front of the triangle, by its winding."""
     frame: Any
     """Frame3f: shading frame, turned over with the triangle to face the incoming ray."""
     geometric: Any
@@ -94,6 +104,9 @@ def vertex_at(
     frame = mi.Frame3f(dr.select(behind, -normal, normal))
     return Vertex(
         point=point,
+        triangle=triangle,
+        barycentric=barycentric,
+        front=dr.dot(point.geometric_normal, direction) < 0,
         frame=frame,
         geometric=frame.to_local(dr.select(behind, -geometric, geometric)),
         incoming=frame.to_local(-direction),
@@ -109,11 +122,23 @@ def off_surface(point: SurfacePoint, direction: Any) -> Any:
 
 
 def roulette(
-    scene: KernelScene, throughput: Any, depth: Any, u: Any, active: Any
+    scene: KernelScene, throughput: Any, depth: Any, u: Any, active: Any, guided: Any = 1.0
 ) -> tuple[Any, Any]:
-    """Return the throughput (Color3f) of paths that go on after `depth` edges, and which do."""
+    """Return the throughput (Color3f) of paths that go on after `depth` edges, and which do.
+
+    Args:
+        scene: the scene.
+        throughput: Color3f.
+        depth: UInt32.
+        u: Float, uniform.
+        active: the paths in question.
+        guided: Float, the density of the directions of a guided path divided by that of BRDF
+            samples. A guided path has a small throughput because it goes where the light is: if
+            that ended it, guiding would gain nothing (Vorba and Krivanek 2016). So it survives by
+            the throughput that it would have had without guiding.
+    """
     plays = depth >= scene.rr_depth
-    survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
+    survival = dr.minimum(dr.max(throughput) * guided, MAX_SURVIVAL)
     active &= ~plays | (u < survival)
     throughput = dr.select(plays & active, throughput / survival, throughput)
     return throughput, active & (dr.max(throughput) > 0)

@@ -2,14 +2,16 @@
 
 It finds what the path tracer meets by luck only: light that a glossy surface throws on another one
 (caustics). A path has vertices x1..xk, of which the camera sees x1 and xk is on an emitter. The
-path tracer *hits* xk with a BRDF sample or *picks* it from the table of emitters; a light path sets
-out from xk and *lands* on x1. Whichever of the three finds a path is weighed by its density among
-those of all three (power heuristic, exponent 2: Veach and Guibas 1995): all light is counted once,
-mostly by the strategy that finds it best. With
+path tracer *hits* xk in a direction that it draws or *picks* it from the table of emitters; a light
+path sets out from xk and *lands* on x1. Whichever of the three finds a path is weighed by its
+density among those of all three (power heuristic, exponent 2: Veach and Guibas 1995): all light is
+counted once, mostly by the strategy that finds it best. With
 
     P      pixels per area at x1              L      light paths for each sample of a pixel
     a, e   densities with which a light path picks xk (per area) and leaves it (per steradian)
-    c_i    density (per steradian) of a BRDF sample of the path tracer at x_i, towards x_(i+1)
+    c_i    density (per steradian) with which the path tracer draws the direction from x_i towards
+           x_(i+1): of a BRDF sample, and where the path is guided (i > 1) of the mixture of those
+           with directions from pipeline.renders.guide_table
     r_i    that of a light path, towards x_(i-1)
     C+_i, C-_i   cosines of the triangle's normal at x_i to x_(i+1) and to x_(i-1)
     d_i    distance from x_i to x_(i+1)
@@ -29,6 +31,7 @@ arrives by the cosine of the shading normal but spreads by that of the triangle,
 C-/C+ at each vertex (Veach 1996).
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -38,6 +41,8 @@ import mitsuba as mi
 from pipeline.renders import ggx
 from pipeline.renders.emitter_table import EmitterPoint
 from pipeline.renders.film import Film
+from pipeline.renders.guide_table import GuideTable
+from pipeline.renders.kernel_parts import KernelParts
 from pipeline.renders.kernel_scene import (
     MOST_ODDS,
     SMALLEST_COSINE,
@@ -55,22 +60,24 @@ from pipeline.renders.surface_table import SurfacePoint
 def trace_light(
     scene: KernelScene,
     film: Film,
+    parts: KernelParts,
     light_paths: Any,
     emitter: EmitterPoint,
     u_direction: Any,
     sampler: Any,
-    splats: Splats,
+    splats: Sequence[Splats],
 ) -> None:
     """Add the light that lands to `splats`: radiance times the samples of a pixel.
 
     Args:
         scene: the scene.
         film: the camera.
+        parts: what is kept apart; all light that lands is indirect.
         light_paths: Float, light paths for each sample of a pixel, as `trace` was told.
         emitter: where the path of each lane begins.
         u_direction: Point2f, uniform, for the directions in which they leave.
         sampler: mi.Sampler with a lane for each path.
-        splats: the sums.
+        splats: the sum of each lobe, or of both.
     """
     direction = scene.cone.sample(emitter.position, emitter.normal, u_direction)
     leaving = scene.cone.density(emitter.position, emitter.normal, direction)
@@ -93,12 +100,13 @@ def trace_light(
         visible = active & (triangle < scene.num_surfaces)
         landing = visible & (depth > 1) & (depth < scene.max_depth)
         odds = dr.minimum(dr.hypot(hit_odds, pick_odds), MOST_ODDS) / light_paths
-        value, pixel, landing = _landed(scene, film, light_paths, vertex, odds, landing)
-        splats.add(throughput * strength * value, pixel, landing)
+        place = film, light_paths, vertex, odds, landing
+        value, share, pixel, landing = _landed(scene, parts, *place)
+        _add(splats, parts.by_lobe(throughput * strength * value, share), pixel, landing)
         depth += 1
         active &= depth < scene.max_depth
         u_lobe, u_local = sampler.next_1d(active), sampler.next_2d(active)
-        local, reflected, forward, ratio = _bounce(scene, vertex, u_lobe, u_local, active)
+        local, reflected, forward, ratio = bounce(scene, vertex, u_lobe, u_local, active)
         throughput *= reflected * ratio
         hit_odds = dr.minimum(hit_odds * forward * ratio, MOST_ODDS)
         onwards = dr.select(depth == 2, 1, forward)  # from x_(k-1) a path is picked, not drawn
@@ -111,10 +119,23 @@ def trace_light(
         triangle, barycentric = mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
 
 
+def _add(splats: Sequence[Splats], values: list[Any], pixel: Any, active: Any) -> None:
+    for total, value in zip(splats, values, strict=True):
+        total.add(value, pixel, active)
+
+
 def _landed(
-    scene: KernelScene, film: Film, light_paths: Any, vertex: Vertex, odds: Any, active: Any
-) -> tuple[Any, Any, Any]:
+    scene: KernelScene,
+    parts: KernelParts,
+    film: Film,
+    light_paths: Any,
+    vertex: Vertex,
+    odds: Any,
+    active: Any,
+) -> tuple[Any, Any, Any, Any]:
     """Return what the camera sees of light at a vertex (Color3f), in which pixel, and whether.
+
+    The second of these four is the share of the diffuse lobe in it.
 
     Args:
         odds: Float, the square root of (hit^2 + pick^2) / land^2, without P and c_1.
@@ -123,7 +144,7 @@ def _landed(
     distance_sq = dr.squared_norm(to_camera)
     direction = to_camera * dr.rsqrt(distance_sq)
     local = vertex.frame.to_local(direction)
-    reflected, forward, _ = _viewed(scene, vertex, local, active)
+    reflected, forward, _ = _viewed(scene, vertex, local, active, None)
     pixels = film.density(-direction) * dr.abs(dr.dot(vertex.geometric, local)) / distance_sq
     share = 1 / (1 + dr.square(pixels * odds * forward))
     pixel, inside = film.pixel(vertex.point.position)
@@ -133,23 +154,41 @@ def _landed(
     ray = mi.Ray3f(start, mi.Vector3f(dr.normalize(remaining)))
     ray.maxt = dr.norm(remaining)
     active &= ~scene.surfaces.ray_test(ray, active=active)
-    return reflected * (share * pixels / light_paths), pixel, active
+    of_diffuse = parts.share(*_faced(scene, vertex, local, active))
+    return reflected * (share * pixels / light_paths), of_diffuse, pixel, active
 
 
-def _bounce(
+def bounce(
     scene: KernelScene, vertex: Vertex, u_lobe: Any, u_direction: Any, active: Any
 ) -> tuple[Any, Any, Any, Any]:
     """Return a direction (in the frame), f and c of a viewer there, and C- / r (0: absorbed)."""
     faced = dr.select(vertex.incoming.z > 0, vertex.lobes.weight, 0)
     lobes = replace(vertex.lobes, weight=faced)
     local = ggx.sample(lobes, vertex.incoming, u_lobe, u_direction)
-    reflected, forward, drawn = _viewed(scene, vertex, local, active)
+    reflected, forward, drawn = _viewed(scene, vertex, local, active, scene.guide)
     across = dr.abs(dr.dot(vertex.geometric, local))
     return local, reflected, forward, dr.select(active & (drawn > 0), across / drawn, 0)
 
 
-def _viewed(scene: KernelScene, vertex: Vertex, view: Any, active: Any) -> tuple[Any, Any, Any]:
+def _viewed(
+    scene: KernelScene, vertex: Vertex, view: Any, active: Any, guide: GuideTable | None
+) -> tuple[Any, Any, Any]:
     """Return f cos (Color3f), c and r for light that comes from `incoming` and goes to `view`.
+
+    `guide` is what guides the viewer's path.
+    """
+    seen, wo = _faced(scene, vertex, view, active)
+    reflected, density = ggx.evaluate(seen.lobes, seen.incoming, wo, seen.geometric)
+    if guide is not None:
+        guidance = guide.at(vertex.triangle, vertex.barycentric, seen.front, seen.lobes, active)
+        to_light = vertex.frame.to_world(vertex.incoming)
+        density = guide.mixture(guidance, density, to_light, active)
+    back = ggx.reverse_density(seen.lobes, seen.incoming, wo, seen.geometric)
+    return reflected, density, back
+
+
+def _faced(scene: KernelScene, vertex: Vertex, view: Any, active: Any) -> tuple[Vertex, Any]:
+    """Return the vertex as a viewer in direction `view` has it, and where light comes from.
 
     The surface is turned to the side of the viewer, as the path tracer has it. The BRDF is the same
     around the normal, so that mirroring z is enough.
@@ -159,5 +198,5 @@ def _viewed(scene: KernelScene, vertex: Vertex, view: Any, active: Any) -> tuple
     wi, wo, geometric = view * turn, vertex.incoming * turn, vertex.geometric * turn * side
     albedo = scene.albedo(wi.z, vertex.lobes.alpha, active)
     lobes = ggx.seen_from(vertex.lobes, wi, albedo)
-    reflected, density = ggx.evaluate(lobes, wi, wo, geometric)
-    return reflected, density, ggx.reverse_density(lobes, wi, wo, geometric)
+    front = vertex.front ^ (side < 0)
+    return replace(vertex, lobes=lobes, incoming=wi, geometric=geometric, front=front), wo

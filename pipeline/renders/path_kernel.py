@@ -7,7 +7,8 @@ virtual calls makes it 1.8 times as fast (docs/log), and one kernel serves every
 number of emitters.
 
 Both are weighed against light tracing too (pipeline.renders.light_kernel has the formulas), unless
-there are no light paths.
+there are no light paths. Where the scene has a guide, half of the directions of rough surfaces come
+from its table (pipeline.renders.guide_table), which makes another kernel.
 """
 
 from dataclasses import replace
@@ -18,6 +19,8 @@ import mitsuba as mi
 
 from pipeline.renders import ggx
 from pipeline.renders.film import Film
+from pipeline.renders.guide_table import Guidance
+from pipeline.renders.kernel_parts import KernelParts
 from pipeline.renders.kernel_scene import (
     MOST_ODDS,
     SMALLEST_COSINE,
@@ -34,12 +37,15 @@ _SHORTENING = 1e-4
 
 
 @dr.syntax
-def trace(scene: KernelScene, film: Film, light_paths: Any, sampler: Any, ray: Any) -> Any:
-    """Return the radiance (Color3f) along camera rays; emitters themselves are not seen.
+def trace(
+    scene: KernelScene, film: Film, parts: KernelParts, light_paths: Any, sampler: Any, ray: Any
+) -> list[Any]:
+    """Return the radiance (Color3f) of each part along camera rays; emitters are not seen.
 
     Args:
         scene: the scene.
         film: the camera.
+        parts: what is kept apart.
         light_paths: Float, light paths for each sample of a pixel. What they may find is left out
             in proportion.
         sampler: mi.Sampler with a lane for each ray.
@@ -47,11 +53,10 @@ def trace(scene: KernelScene, film: Film, light_paths: Any, sampler: Any, ray: A
     """
     hit = scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
     active = mi.Bool(hit.is_valid())
-    distance, triangle = mi.Float(hit.t), mi.UInt32(hit.prim_index)
-    barycentric = mi.Point2f(hit.prim_uv)
+    distance, triangle, barycentric = _met(hit)
     origin, direction = mi.Point3f(ray.o), mi.Vector3f(ray.d)
-    radiance, throughput = mi.Color3f(0), mi.Color3f(1)
-    density, depth = mi.Float(0), mi.UInt32(0)
+    radiance, throughput, share = parts.dark(), mi.Color3f(1), parts.first_share()
+    density, depth, guided = mi.Float(0), mi.UInt32(0), mi.Float(1)
     odds = light_paths * dr.square(distance) / film.density(direction)
     while active:
         point = scene.table.point(triangle, barycentric, active)
@@ -59,31 +64,48 @@ def trace(scene: KernelScene, film: Film, light_paths: Any, sampler: Any, ray: A
         emits = active & (triangle >= scene.num_surfaces)
         landing = dr.select(depth > 1, odds, 0)
         seen = _seen_emission(scene, point, triangle, direction, distance, density, landing, emits)
-        radiance += throughput * seen
+        radiance = parts.add(radiance, throughput * seen, depth, share)
         depth += 1
         active &= depth < scene.max_depth
-        vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
-        vertex = _viewed(scene, vertex, active)
-        lit = _direct_light(scene, vertex, odds, depth, sampler.next_2d(active), active)
-        radiance += throughput * lit
-        local = ggx.sample(
-            vertex.lobes, vertex.incoming, sampler.next_1d(active), sampler.next_2d(active)
-        )
-        reflected, density = _reflected(vertex, local)
+        vertex = _viewed(scene, point, triangle, barycentric, direction, active)
+        guidance = _guidance(scene, vertex, active & (depth > 1))
+        u = sampler.next_2d(active)
+        lit, local = _direct_light(scene, vertex, guidance, odds, depth, u, active)
+        lit_share = parts.carried(vertex, local, depth, share)
+        radiance = parts.add(radiance, throughput * lit, depth, lit_share)
+        u_lobe, u_local = sampler.next_1d(active), sampler.next_2d(active)
+        local = _drawn(scene, vertex, guidance, u_lobe, u_local, active)
+        reflected, unguided = _reflected(vertex, local)
+        density = _density(scene, vertex, guidance, unguided, local, active)
+        share = parts.carried(vertex, local, depth, share)
         active &= density > 0
+        guided *= _ratio(guidance, density, unguided)
         throughput = dr.select(active, throughput * reflected / density, throughput)
         odds = dr.minimum(odds * _turned_back(vertex, local, depth) / density, MOST_ODDS)
-        throughput, active = roulette(scene, throughput, depth, sampler.next_1d(active), active)
+        u_end = sampler.next_1d(active)
+        throughput, active = roulette(scene, throughput, depth, u_end, active, guided)
         direction = mi.Vector3f(vertex.frame.to_world(local))
         origin = off_surface(point, direction)
         hit = scene.everything.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
         active &= hit.is_valid()
-        distance, triangle = mi.Float(hit.t), mi.UInt32(hit.prim_index)
-        barycentric = mi.Point2f(hit.prim_uv)
+        distance, triangle, barycentric = _met(hit)
     return radiance
 
 
-def _viewed(scene: KernelScene, vertex: Vertex, active: Any) -> Vertex:
+def _met(hit: Any) -> tuple[Any, Any, Any]:
+    """Return the distance, the triangle, and where on it a ray has met it."""
+    return mi.Float(hit.t), mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
+
+
+def _viewed(
+    scene: KernelScene,
+    point: SurfacePoint,
+    triangle: Any,
+    barycentric: Any,
+    direction: Any,
+    active: Any,
+) -> Vertex:
+    vertex = vertex_at(scene, point, triangle, barycentric, direction, active)
     albedo = scene.albedo(vertex.incoming.z, vertex.lobes.alpha, active)
     return replace(vertex, lobes=ggx.seen_from(vertex.lobes, vertex.incoming, albedo))
 
@@ -98,7 +120,7 @@ def _seen_emission(
     landing: Any,
     emits: Any,
 ) -> Any:
-    """Return the emission that a BRDF sample ran into, weighed against the other strategies."""
+    """Return the emission that a drawn direction ran into, weighed against the other strategies."""
     row = dr.select(emits, triangle - scene.num_surfaces, 0)
     area_density, emitted = scene.emitters.density_and_radiance(row, emits)
     cosine = dr.abs(dr.dot(point.geometric_normal, direction))
@@ -107,6 +129,50 @@ def _seen_emission(
     others = dr.square(emitter_density / density) + dr.square(landing * area_density * leaving)
     shines = emits & (dr.max(emitted) > 0)  # one that is off has no density: 0/0 at grazing angles
     return dr.select(shines, emitted / (1 + others), 0)
+
+
+def _guidance(scene: KernelScene, vertex: Vertex, active: Any) -> Guidance | None:
+    if scene.guide is None:
+        return None
+    place = vertex.triangle, vertex.barycentric, vertex.front
+    return scene.guide.at(*place, vertex.lobes, active)
+
+
+def _drawn(
+    scene: KernelScene,
+    vertex: Vertex,
+    guidance: Guidance | None,
+    u_lobe: Any,
+    u_local: Any,
+    active: Any,
+) -> Any:
+    """Return the direction (in the frame) in which a path goes on."""
+    if scene.guide is None or guidance is None:
+        return ggx.sample(vertex.lobes, vertex.incoming, u_lobe, u_local)
+    guided = u_lobe < guidance.share
+    world = scene.guide.sample(guidance, u_local, active & guided)
+    u_rest = (u_lobe - guidance.share) / (1 - guidance.share)
+    local = ggx.sample(vertex.lobes, vertex.incoming, u_rest, u_local)
+    return mi.Vector3f(dr.select(guided, vertex.frame.to_local(world), local))
+
+
+def _density(
+    scene: KernelScene,
+    vertex: Vertex,
+    guidance: Guidance | None,
+    unguided: Any,
+    local: Any,
+    active: Any,
+) -> Any:
+    """Return the density of `_drawn` from that of a BRDF sample."""
+    if scene.guide is None or guidance is None:
+        return unguided
+    return scene.guide.mixture(guidance, unguided, vertex.frame.to_world(local), active)
+
+
+def _ratio(guidance: Guidance | None, density: Any, unguided: Any) -> Any:
+    """Return by how much guiding has changed the density of a direction; 1 if nothing is seen."""
+    return 1 if guidance is None else dr.select(unguided > 0, density / unguided, 1)
 
 
 def _reflected(vertex: Vertex, local: Any) -> tuple[Any, Any]:
@@ -120,16 +186,26 @@ def _turned_back(vertex: Vertex, local: Any, depth: Any) -> Any:
 
 
 def _direct_light(
-    scene: KernelScene, vertex: Vertex, odds: Any, depth: Any, u: Any, active: Any
-) -> Any:
-    """Return the light of one sampled emitter point, weighed against the other strategies."""
+    scene: KernelScene,
+    vertex: Vertex,
+    guidance: Guidance | None,
+    odds: Any,
+    depth: Any,
+    u: Any,
+    active: Any,
+) -> tuple[Any, Any]:
+    """Return the light of one sampled emitter point, and its direction in the frame.
+
+    It is weighed against the other strategies.
+    """
     emitter = scene.emitters.sample(u, active)
     to_emitter = emitter.position - vertex.point.position
     distance_sq = dr.squared_norm(to_emitter)
     direction = to_emitter * dr.rsqrt(distance_sq)
     emitter_density = emitter.area_density * distance_sq / dr.abs(dr.dot(emitter.normal, direction))
     local = vertex.frame.to_local(direction)
-    reflected, density = _reflected(vertex, local)
+    reflected, unguided = _reflected(vertex, local)
+    density = _density(scene, vertex, guidance, unguided, local, active)
     leaving = scene.cone.density(emitter.position, emitter.normal, -direction)
     landing = odds * _turned_back(vertex, local, depth) * leaving / distance_sq
     others = dr.square(density / emitter_density) + dr.square(dr.select(depth > 1, landing, 0))
@@ -140,4 +216,5 @@ def _direct_light(
     shadow_ray = mi.Ray3f(start, mi.Vector3f(remaining / length))
     shadow_ray.maxt = length * (1 - _SHORTENING)
     lit = useful & ~scene.everything.ray_test(shadow_ray, active=useful)
-    return dr.select(lit, reflected * emitter.radiance / (emitter_density * (1 + others)), 0)
+    weighed = reflected * emitter.radiance / (emitter_density * (1 + others))
+    return dr.select(lit, weighed, 0), local

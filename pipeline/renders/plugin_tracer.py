@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.plugin_scene import plugin_feature_scene, plugin_scene
-from pipeline.renders.tracer import Features, HostSum
+from pipeline.renders.tracer import Chosen, Features, HostSum
 from storage.records.scene import Scene
 
 _BLOCK_SIZE = 8
@@ -45,14 +45,26 @@ class PluginTracer:
         tracer._scene = plugin_scene(self._record, only_light=row)
         return tracer
 
-    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
-        return _render(self._scene, self._path, camera, seed=seed, spp=spp)
+    def apart(self, *, bounces: bool, lobes: bool) -> "PluginTracer":
+        """Raise NotImplementedError: Mitsuba's integrator returns all light together.
+
+        Users hear of it before anything is loaded (RenderSettings.require_variant).
+        """
+        raise NotImplementedError("the stock integrator returns all light together")
+
+    def radiance(
+        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+    ) -> NDArray[np.float32]:
+        picture = _render(self._scene, self._path, camera, seed=seed, spp=spp)
+        return picture if chosen is None else picture * chosen[..., None]
 
     def pass_sum(self, camera: Camera) -> HostSum:
         return HostSum(self, camera)
 
-    def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
-        channels = _render(self._feature_scene, self._features, camera, seed=seed, spp=spp)
+    def features(self, camera: Camera, *, spp: int) -> Features:
+        channels = _render(
+            self._feature_scene, self._features, camera, seed=0, spp=spp, jitter=False
+        )
         return Features(albedo=channels[..., 0:3].copy(), normal=channels[..., 3:6].copy())
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
@@ -68,7 +80,8 @@ def _render(
     scene: Any, integrator: Any, camera: Camera, *, seed: int, spp: int, jitter: bool = True
 ) -> NDArray[np.float32]:
     """Return the picture [R, R, channels]; without jitter, samples lie on a regular grid."""
-    sensor = stock_sensor(camera, {"type": "multijitter", "sample_count": spp, "jitter": jitter})
+    kind = "multijitter" if jitter else "stratified"
+    sensor = stock_sensor(camera, {"type": kind, "sample_count": spp, "jitter": jitter})
     picture = mi.render(scene, sensor=sensor, integrator=integrator, seed=mi.UInt32(seed), spp=spp)
     return np.array(picture)
 

@@ -1,5 +1,6 @@
 """`RenderSettings`: how good a picture must be, and how much it may cost."""
 
+import math
 from typing import Annotated, Any, Literal
 
 import pydantic
@@ -7,8 +8,12 @@ import pydantic
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.metrics import MAX_DB
+from storage.records.parts import part_names
 from storage.settings.described import checked
 from storage.settings.ranges import Within
+
+Filtered = Literal["high", "fast", "off"]
+"""Quality of Open Image Denoise, or no denoiser."""
 
 PASS_SPP = (64, 16, 4)
 """Samples per pixel of one pass of a half, from best to cheapest: squares, as the sampler needs.
@@ -17,8 +22,12 @@ A pass of 64 is stratified finer than four of 16: 0.1 to 0.3 dB less error on sa
 to 2 dB in the median pixel of the easy ones (docs/log). The small ones are for quick previews.
 """
 
-FIRST_SPP = 2 * PASS_SPP[1]
-"""Samples of a picture before its floor is measured; of fewer, the noise floor may flatter."""
+FIRST_SPP = 64
+"""Samples of a picture before its floor is measured. With 32, in pictures of 256 pixels, 5 of 50
+floors that were reached at once were over 1 dB too good: no sample had met a glint (docs/log)."""
+
+_MANY_PIXELS_PX = 128
+"""A narrower picture has too few pixels for FIRST_SPP samples of each to tell its error."""
 
 MAX_RESOLUTION = 2048
 """Largest picture: one pass of 64 samples takes 3.3 GB there, and that grows with the area."""
@@ -42,8 +51,13 @@ _METRICS = {
 }
 """The metric of each target (storage.metrics)."""
 
-_LATER = ("noise_floor_linear_db", "noise_floor_objects_db")
-"""Settings that no record holds where they are None, so that digests of earlier builds stay."""
+_LATER = {
+    "noise_floor_linear_db": None,
+    "noise_floor_objects_db": None,
+    "split": False,
+    "split_lobes": False,
+}
+"""Settings that no record holds at these values, so that digests of earlier builds stay."""
 
 Samples = Annotated[int, Within(2 * PASS_SPP[-1], MAX_SPP, unit="samples")]
 """Of both halves of a picture together, per pixel."""
@@ -68,10 +82,12 @@ class RenderSettings:
     """Sampling also goes on until the floor as object_psnr_log_db reaches this: that of pixels
     which show geometry, so that empty background does not count."""
     min_spp: Samples
-    """Samples per pixel, both halves together, before the floor is measured first. From 32 on it is
-    honest in views without rare bright paths, and goes by what it finds in the others."""
+    """Samples per pixel, both halves together, before the floor of a picture of 128 pixels or more
+    is measured first; a smaller one takes as many times more as it is narrower, up to `max_spp`:
+    128 at 64 pixels for 64, since fewer pixels meet fewer of the rare bright paths."""
     max_spp: Samples
-    """The cap: sampling stops here whatever the floors are."""
+    """The cap: sampling stops here whatever the floors are. It bounds the mean over the pixels that
+    show anything; those that need most may get twice as many."""
     reject_at_cap: bool = False
     """Reject a view that misses one of its floors at the cap (floor_not_reached; its camera is
     tried again), after all of its samples, instead of keeping it with the floors that it has. A set
@@ -81,15 +97,22 @@ class RenderSettings:
     rr_depth: Depth = 2
     """Depth in edges from which Russian roulette may end a path. 2 instead of 5 takes 20 % less
     time for the same error on sampled scenes (docs/log)."""
-    aux_spp: Annotated[int, Within(PASS_SPP[-1], PASS_SPP[0], unit="samples")] = 64
-    """Samples per pixel of the albedo and normal pictures that guide the denoiser."""
-    denoiser: Literal["high", "fast", "off"] = "high"
+    aux_spp: Annotated[int, Within(PASS_SPP[-1], PASS_SPP[0], unit="samples")] = 16
+    """Rays per pixel for the albedo and normal pictures that guide the denoiser, on a regular grid.
+    16 cost a quarter of 64 and are 0.06 dB worse at 256 samples; pictures beyond 60 dB want 64."""
+    denoiser: Filtered = "high"
     """Quality of Open Image Denoise; `fast` costs 1 to 2 dB and saves 0.3 core-seconds."""
     min_mean_radiance: Annotated[float, Within(0, HALF_FLOAT_MAX)] = 0.01
     """A view whose first samples are darker than this on average is rejected as black_view."""
     per_light: bool = False
     """Render each emitter alone as well, and make the picture their sum (storage.records.lights).
     It takes about as many times as long as there are emitters."""
+    split: bool = False
+    """Store direct light (lamp, surface, camera) and indirect light apart as well, each with its
+    floors, and make the picture their sum (storage.records.parts)."""
+    split_lobes: bool = False
+    """Store what the diffuse and what the specular lobe of the visible surface reflects apart as
+    well; with `split` there are four parts."""
 
     def __post_init__(self) -> None:
         _require(
@@ -113,6 +136,25 @@ class RenderSettings:
         )
 
     @property
+    def first_spp(self) -> int:
+        """Samples per pixel before the first measurement, both halves together."""
+        narrower = max(1, math.ceil(_MANY_PIXELS_PX / self.resolution))
+        return min(self.min_spp * narrower, self.max_spp)
+
+    @property
+    def part_names(self) -> tuple[str, ...]:
+        """Names of the parts that are stored (storage.records.parts); empty where none are."""
+        return part_names(bounces=self.split, lobes=self.split_lobes)
+
+    def require_variant(self, name: str) -> None:
+        """Raise TrilightError where this variant of Mitsuba cannot render what is asked for."""
+        if name == "scalar_rgb" and self.part_names:
+            raise TrilightError(
+                "renders.split or renders.split_lobes is true; expected false where no LLVM "
+                "library is found. Install one: `trilight doctor` says how."
+            )
+
+    @property
     def targets_db(self) -> dict[str, float]:
         """The targets that are set, in dB by metric: sampling ends when all of them are reached."""
         targets = {metric: getattr(self, name) for name, metric in _METRICS.items()}
@@ -121,7 +163,7 @@ class RenderSettings:
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
         record: dict[str, Any] = as_usual(self)
-        return {k: value for k, value in record.items() if value is not None or k not in _LATER}
+        return {k: value for k, value in record.items() if k not in _LATER or value != _LATER[k]}
 
 
 def asked_floors(
@@ -144,6 +186,8 @@ def one_picture(
     noise_floor_db: float | None = None,
     noise_floor_linear_db: float | None = None,
     noise_floor_objects_db: float | None = None,
+    split: bool = False,
+    split_lobes: bool = False,
 ) -> RenderSettings:
     """Return the settings of a picture that a person asks for, who gets it even where it is dark.
 
@@ -152,6 +196,7 @@ def one_picture(
         max_spp: most samples per pixel.
         noise_floor_db, noise_floor_linear_db, noise_floor_objects_db: targets; where all are None,
             psnr_log_db of USUAL_FLOOR_DB.
+        split, split_lobes: what is kept apart.
 
     Raises:
         TrilightError: a value that is refused; the message names it.
@@ -165,6 +210,8 @@ def one_picture(
         min_spp=min(FIRST_SPP, max_spp),
         max_spp=max_spp,
         min_mean_radiance=0.0,
+        split=split,
+        split_lobes=split_lobes,
     )
 
 

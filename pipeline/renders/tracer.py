@@ -5,7 +5,8 @@ is Mitsuba's stock path integrator: it is what `scalar_rgb` can run, and the ind
 the other is tested against. Both estimate the same integral.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -23,21 +24,52 @@ class Features:
     """[R, R, 3] diffuse + specular albedo of the first surface, 0 where there is none."""
     normal: NDArray[np.float32]
     """[R, R, 3] its shading normal in world space, 0 where there is none."""
+    lobes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    """[R, R, 3] the diffuse and the specular albedo by these names, where lobes are apart."""
+
+    def of_part(self, name: str) -> "Features":
+        """Return what guides the denoiser of a part (storage.records.parts), by its name.
+
+        A lobe is guided by its own albedo, and by no normal where it has none: there it is black.
+        """
+        albedo = self.lobes.get(name.partition("_")[0])
+        if albedo is None:
+            return self
+        normal = np.where(albedo.any(axis=-1, keepdims=True), self.normal, np.float32(0))
+        return Features(albedo=albedo, normal=normal)
+
+
+Chosen = NDArray[np.bool_] | None
+"""[R, R] the pixels of a pass, one at least; None means all of them."""
 
 
 class PassSum(Protocol):
     """The growing sum of the passes of one view, in the memory where they are traced."""
 
-    def add(self, *, seed: int, spp: int) -> None:
+    def add(self, *, seed: int, spp: int, chosen: Chosen = None) -> None:
         """Add all samples of one pass: `Tracer.radiance` times `spp`.
 
         It may return before they are traced.
         """
 
-    def read(self) -> NDArray[np.float64]:
-        """Return the sum over all samples, [R, R, 3]; not finite where any sample was not.
+    def guide(self) -> None:
+        """Let the passes from now on be guided (pipeline.renders.guide_table), if they can be.
 
-        It waits until they are traced, and equals the sum in float64 of the passes, one by one.
+        Their expected value stays the same. The first call for a scene learns it.
+        """
+
+    def read(self) -> NDArray[np.float64]:
+        """Return the sum over all samples of each part (`Tracer.apart`), [Q, R, R, 3]; else Q = 1.
+
+        It is not finite where any sample was not. It waits until they are traced, and equals the
+        sum in float64 of the passes, one by one.
+        """
+
+    def read_squares(self) -> NDArray[np.float64]:
+        """Return the sum over the passes of samples times squared grey mean, [R, R].
+
+        Grey is the mean of the three channels of all parts together. With `read` it gives the
+        spread between passes.
         """
 
 
@@ -53,22 +85,37 @@ class Tracer(Protocol):
             Rejected: "unlit_scene" where it has no area.
         """
 
-    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
-        """Return the mean of one pass of samples, linear radiance [R, R, 3].
+    def apart(self, *, bounces: bool, lobes: bool) -> "Tracer":
+        """Return the same loaded scene, whose sums of passes are by part.
 
-        Equal arguments give equal bits, whatever the number of threads.
+        Args:
+            bounces: keep direct and indirect light apart.
+            lobes: keep the diffuse and the specular lobe of the visible surface apart.
+
+        Raises:
+            NotImplementedError: this tracer cannot do that.
+        """
+
+    def radiance(
+        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+    ) -> NDArray[np.float32]:
+        """Return the mean of one pass of samples, linear radiance [R, R, 3]; 0 if not chosen.
+
+        Equal arguments give equal bits, whatever the number of threads. With other pixels chosen,
+        a pixel's samples may be others.
 
         Args:
             camera: the view.
             seed: 31 bits; passes with different seeds are independent.
             spp: samples per pixel, a square of a power of two.
+            chosen: the pixels that are wanted. A tracer may trace the others too.
         """
 
     def pass_sum(self, camera: Camera) -> PassSum:
         """Return an empty sum of passes of a view."""
 
-    def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
-        """Return the albedo and normal pictures."""
+    def features(self, camera: Camera, *, spp: int) -> Features:
+        """Return the albedo and normal pictures, of `spp` evenly spread rays in each pixel."""
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
         """Return whether the ray through each pixel's centre hits a surface, [R, R]."""
@@ -80,12 +127,22 @@ class HostSum:
     def __init__(self, tracer: Tracer, camera: Camera) -> None:
         self._tracer, self._camera = tracer, camera
         self._total = np.zeros((camera.resolution, camera.resolution, 3))
+        self._squares = np.zeros((camera.resolution, camera.resolution))
 
-    def add(self, *, seed: int, spp: int) -> None:
-        self._total += spp * self._tracer.radiance(self._camera, seed=seed, spp=spp)
+    def add(self, *, seed: int, spp: int, chosen: Chosen = None) -> None:
+        means = self._tracer.radiance(self._camera, seed=seed, spp=spp, chosen=chosen)
+        mean = means.astype(np.float64)
+        self._total += spp * mean
+        self._squares += spp * np.square(mean.mean(axis=-1))
+
+    def guide(self) -> None:
+        """Do nothing: other tracers are not guided."""
 
     def read(self) -> NDArray[np.float64]:
-        return self._total.copy()
+        return self._total[None].copy()
+
+    def read_squares(self) -> NDArray[np.float64]:
+        return self._squares.copy()
 
 
 def split_triangles(scene: Scene) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

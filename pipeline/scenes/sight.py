@@ -1,20 +1,18 @@
 """What a camera sees of a scene: ray casting on a coarse grid, without materials.
 
-Embree answers in single precision, in its robust mode, in which no ray slips between two triangles
-of one edge. A grid of 32 x 32 rays costs about a millisecond, and says whether a picture is worth
-rendering, not what is in it: what is smaller than a grid cell may be missed.
+A grid of 32 x 32 rays costs about a millisecond, and says whether a picture is worth rendering, not
+what is in it: what is smaller than a grid cell may be missed. Everything is computed in the single
+precision of storage.records.surfaces: which cameras a dataset has depends on each bit of it.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.records.scene import Scene
+from storage.records.surfaces import MISS, MetSurfaces, Surfaces
 
 SHADOW_OFFSET = 1e-4
 """Where shadow rays start above a surface; hits in single precision are good to about 1e-6."""
@@ -39,15 +37,13 @@ class ViewFacts:
 
 
 class Sight:
-    """A scene prepared for ray casting. Emitters are left out: no camera sees them."""
+    """A scene prepared for judging cameras."""
 
     def __init__(self, scene: Scene) -> None:
-        solid = ~scene.triangle_emits
         kinds = np.array([entry.kind for entry in scene.objects])[scene.object_index]
-        self._face_is_object = kinds[solid] == "object"
-        self._embree = EmbreeScene(robust=True)
-        TriangleMesh(self._embree, scene.vertex_positions, scene.faces[solid])
-        self._lights = scene.vertex_positions[scene.faces[~solid]].mean(axis=1)
+        self._face_is_object = kinds == "object"
+        self._surfaces = Surfaces(scene)
+        self._lights = scene.vertex_positions[scene.faces[scene.triangle_emits]].mean(axis=1)
         self._boxes = _object_boxes(scene)
 
     def facts(self, c2w: NDArray[np.float32], fov_deg: float, grid: int) -> ViewFacts:
@@ -55,12 +51,11 @@ class Sight:
         origin, directions = camera_rays(c2w, fov_deg, grid)
         toward = directions.reshape(-1, 3).astype(np.float32)
         start = np.tile(origin.astype(np.float32), (len(toward), 1))
-        hits = self._embree.run(start, toward, output=True)
-        met = hits["primID"] >= 0
-        is_object = met.copy()
-        is_object[met] = self._face_is_object[hits["primID"][met]]
-        behind = met & (np.sum(hits["Ng"] * toward, axis=1) > 0)
-        nearest = float(hits["tfar"][met].min(initial=np.inf))
+        hits = self._surfaces.met(start, toward)
+        met = hits.triangle != MISS
+        is_object = met & self._face_is_object[hits.triangle]
+        behind = met & (np.sum(hits.normal * toward, axis=1) > 0)
+        nearest = float(hits.distance_m[met].min(initial=np.inf))
         return ViewFacts(
             coverage=float(is_object.mean()),
             shell_back=float((behind & ~is_object).mean()),
@@ -72,7 +67,7 @@ class Sight:
         self,
         start: NDArray[np.float32],
         toward: NDArray[np.float32],
-        hits: dict[str, Any],
+        hits: MetSurfaces,
         met: NDArray[np.bool_],
         grid: int,
     ) -> float:
@@ -80,21 +75,19 @@ class Sight:
         asked = np.flatnonzero(met & (row % LIT_STEP == 0) & (column % LIT_STEP == 0))
         if len(asked) == 0:
             return 0.0
-        geometric = hits["Ng"][asked]
+        geometric = hits.normal[asked]
         normal = geometric / np.sqrt(np.sum(np.square(geometric), axis=1, keepdims=True))
         normal *= np.where(np.sum(normal * toward[asked], axis=1, keepdims=True) > 0, -1, 1)
-        point = start[asked] + hits["tfar"][asked, None] * toward[asked] + SHADOW_OFFSET * normal
+        point = start[asked] + hits.distance_m[asked, None] * toward[asked] + SHADOW_OFFSET * normal
         ray = self._lights[None] - point[:, None]
         distance = np.sqrt(np.sum(np.square(ray), axis=-1))
         on_side = np.sum(ray * normal[:, None], axis=-1) > 0
-        answer = self._embree.run(
+        free = self._surfaces.is_free(
             np.repeat(point, len(self._lights), axis=0).astype(np.float32),
             (ray / distance[..., None]).reshape(-1, 3).astype(np.float32),
-            dists=distance.reshape(-1).astype(np.float32),
-            query="OCCLUDED",
+            distance.reshape(-1).astype(np.float32),
         )
-        free = answer.reshape(on_side.shape) < 0
-        return float((free & on_side).any(axis=1).mean())
+        return float((free.reshape(on_side.shape) & on_side).any(axis=1).mean())
 
 
 def _object_boxes(scene: Scene) -> NDArray[np.float64]:

@@ -40,8 +40,14 @@ from storage.records.objects import (
 
 Operation = Literal["merge", "select", "reshard"]
 
-_SAME = ("renders.resolution", "renders.per_light")
-"""Settings that all pictures of a dataset share."""
+_SAME = (
+    "renders.resolution",
+    "renders.per_light",
+    "renders.split",
+    "renders.split_lobes",
+    "storage.passes",
+)
+"""Settings that all samples of a dataset share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +88,9 @@ def derive_shards(
     _require_alike(sources)
     total, done = sum(len(source.manifest.shards) for source in sources), itertools.count(1)
     taken = taken_scenes(sources, derive.selection, shard_done=lambda: progress(next(done), total))
+    if not taken:
+        found = sum(source.manifest.num_samples for source in sources)
+        raise TrilightError(f"none of the {found} scenes is selected; expected at least one.")
     objects = sorted(
         used_objects(sources, taken), key=lambda row: canonical_json(dataclasses.asdict(row))
     )

@@ -2,11 +2,12 @@
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+from pipeline.shards.scene_values import asked_values
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
 from storage.dataset.progress import planned_shards
@@ -14,6 +15,7 @@ from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, read_objects_lock
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
+from storage.records.sample import decode_scene
 from storage.remote.safe_url import safe_url
 
 
@@ -37,6 +39,7 @@ class SceneFacts:
     noise_floor_db: float  # noise floor of its worst view, as psnr_log_db
     uids: tuple[str, ...]  # objects that stand in it
     arrays_sha256: str  # digest of its unpacked arrays: equal for equal scenes
+    values: Mapping[str, Any]  # what was asked of it, by name (pipeline.shards.expression)
 
 
 def open_finished(place: str) -> FinishedDataset:
@@ -68,10 +71,13 @@ def open_finished(place: str) -> FinishedDataset:
     return FinishedDataset(folder=folder, manifest=manifest, objects=objects)
 
 
-def read_facts(dataset: FinishedDataset, *, shard_done: Callable[[], None]) -> Iterator[SceneFacts]:
-    """Yield the facts of every scene, after checking the digest of its shard.
+def read_facts(
+    dataset: FinishedDataset, *, asked: Collection[str], shard_done: Callable[[], None]
+) -> Iterator[SceneFacts]:
+    """Yield the facts of every scene, with the values that are asked for by name.
 
-    Memory is that of one scene. Pictures are hashed with the shard and not decoded.
+    The digest of a shard is checked before. Memory is that of one scene. Pictures are hashed with
+    the shard and not decoded.
 
     Raises:
         TrilightError: a shard is missing or its bytes are not those of the manifest, or the record
@@ -86,7 +92,7 @@ def read_facts(dataset: FinishedDataset, *, shard_done: Callable[[], None]) -> I
             )
         with contextlib.closing(SampleReader(dataset)) as reader:
             for key in shard.index:
-                yield _facts(shard, key, reader.members(shard, key, ("json", PLAIN, PACKED)))
+                yield _facts(shard, key, reader.members(shard, key, ("json", PLAIN, PACKED)), asked)
         shard_done()
 
 
@@ -119,7 +125,10 @@ class SampleReader:
             self._stream.close()
 
 
-def _facts(shard: ShardEntry, key: str, members: Mapping[str, bytes]) -> SceneFacts:
+def _facts(
+    shard: ShardEntry, key: str, members: Mapping[str, bytes], asked: Collection[str]
+) -> SceneFacts:
+    values = asked_values(decode_scene(key, members), shard.split, asked) if asked else {}
     try:
         record = json.loads(members["json"])
         return SceneFacts(
@@ -131,6 +140,7 @@ def _facts(shard: ShardEntry, key: str, members: Mapping[str, bytes]) -> SceneFa
                 sorted({str(row["uid"]) for row in record["objects"] if row["kind"] == "object"})
             ),
             arrays_sha256=sha256_hex(unpack_arrays(members)),
+            values=values,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise TrilightError(

@@ -7,6 +7,7 @@ manifest states: `key_offset`. So every scene can be found in its source, and no
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from pipeline.shards.expression import Condition, condition
 from pipeline.shards.finished import FinishedDataset, SceneFacts, read_facts
 from storage.conventions import SPLITS
 from storage.errors import TrilightError
@@ -22,10 +23,18 @@ class Selection:
     template: str | None = None  # take only scenes of this layout
     min_noise_floor_db: float | None = None
     """Take only scenes whose views all have at least this noise floor (psnr_log_db)."""
+    where: str | None = None
+    """Take only scenes for which this condition holds (pipeline.shards.expression)."""
 
     def __post_init__(self) -> None:
         if self.split not in (None, *SPLITS):
             raise TrilightError(f"--split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
+        if self.where is not None:
+            self.condition()
+
+    def condition(self) -> Condition | None:
+        """Return what `where` says; raises TrilightError where it says nothing."""
+        return None if self.where is None else condition(self.where)
 
     def takes(self, facts: SceneFacts) -> bool:
         return (
@@ -48,19 +57,27 @@ def taken_scenes(
     sources: Sequence[FinishedDataset],
     selection: Selection,
     *,
+    asked: Sequence[str] = (),
     shard_done: Callable[[], None],
 ) -> list[Taken]:
     """Return the scenes to take, in the order of the sources and of their shards.
 
+    Args:
+        sources: finished datasets.
+        selection: which scenes are taken.
+        asked: names of values that the facts of the scenes shall hold beside those of its `where`.
+        shard_done: called after each shard.
+
     Raises:
-        TrilightError: no scene is taken, the same scene is there twice, or a source is damaged.
+        TrilightError: the same scene is there twice, or a source is damaged.
     """
-    offsets = key_offsets(sources)
+    offsets, where = key_offsets(sources), selection.condition()
+    names = {*asked, *(where.names if where else ())}
     taken: list[Taken] = []
     seen: dict[str, Taken] = {}
     for row, source in enumerate(sources):
-        for facts in read_facts(source, shard_done=shard_done):
-            if not selection.takes(facts):
+        for facts in read_facts(source, asked=names, shard_done=shard_done):
+            if not selection.takes(facts) or not (where is None or where.holds(facts.values)):
                 continue
             entry = Taken(source=row, facts=facts, key=raised_key(facts.key, offsets[row]))
             first = seen.setdefault(facts.arrays_sha256, entry)
@@ -71,9 +88,6 @@ def taken_scenes(
                     "the datasets out, or generate it with another --seed."
                 )
             taken.append(entry)
-    if not taken:
-        found = sum(source.manifest.num_samples for source in sources)
-        raise TrilightError(f"none of the {found} scenes is selected; expected at least one.")
     return taken
 
 

@@ -3,9 +3,12 @@
 They are apart from the code that reads shards, which does not import pydantic.
 """
 
-from typing import Annotated
+from typing import Annotated, Any
+
+import pydantic
 
 from storage.dataset.splits import TEST_SLOT
+from storage.records.passes.declared import pass_names
 from storage.records.profiles import Profile
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -40,3 +43,15 @@ class StorageSettings:
     profile: Profile = "compact"
     """`lossless`, or `compact`: about five times smaller, and adds at most a tenth of the noise
     that a picture already has."""
+    passes: tuple[str, ...] = ()
+    """Passes to store beside each picture, such as [depth,normal,object]; by default none, since
+    they can be computed from a stored scene at any time (docs/reference/passes.md)."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "passes", pass_names(self.passes))
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `passes` out where there are none: digests of earlier builds stay."""
+        record: dict[str, Any] = as_usual(self)
+        return {name: value for name, value in record.items() if name != "passes" or value}

@@ -43,6 +43,8 @@ class Statistics:
     """[views] object_psnr_log_db."""
     at_cap: NDArray[np.bool_]
     """[views] whether sampling ended at the cap."""
+    part_noise_floor_db: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """[views] psnr_log_db of each part that is stored; empty where none is."""
 
     @property
     def num_views(self) -> int:
@@ -62,6 +64,10 @@ class Statistics:
             ("noise floor", _spread(self.noise_floor_db, "psnr_log_db")),
             ("linear noise floor", _spread(self.noise_floor_linear_db, "psnr_linear_db")),
             ("noise floor of objects", _spread(self.object_noise_floor_db, "object_psnr_log_db")),
+            *(
+                (f"noise floor, {part}", _spread(floors_db, "psnr_log_db"))
+                for part, floors_db in self.part_noise_floor_db.items()
+            ),
             ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),
             ("samples per pixel", f"median {np.median(self.spp):.0f}, most {self.spp.max()}"),
             ("scene digest", self.scene_digest),
@@ -96,6 +102,7 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
         noise_floor_linear_db=_column(tally.views, "noise_floor_linear_db"),
         object_noise_floor_db=_column(tally.views, "object_noise_floor_db"),
         at_cap=np.array([view["at_cap"] for view in tally.views], np.bool_),
+        part_noise_floor_db=_of_parts([view.get("parts", {}) for view in tally.views]),
     )
 
 
@@ -142,6 +149,14 @@ def digest_of_scenes(members: Mapping[str, str]) -> str:
 
 def _column(views: Sequence[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
     return np.array([view[name] for view in views], np.float64)
+
+
+def _of_parts(views: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float64]]:
+    """Return the floors of the parts that every view has."""
+    names = (
+        sorted(views[0]) if views and all(view.keys() == views[0].keys() for view in views) else ()
+    )
+    return {name: _column([view[name] for view in views], "noise_floor_db") for name in names}
 
 
 def _spread(floors_db: NDArray[np.float64], metric: str) -> str:

@@ -9,6 +9,7 @@ from tempfile import TemporaryFile
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
@@ -20,12 +21,19 @@ from storage.errors import TrilightError
 from storage.licences import mixed_share_alike
 from storage.records.lights import sum_of_lights
 from storage.records.objects import LockedObject, decode_objects_lock
+from storage.records.parts import part_names, sum_of_parts
+from storage.records.passes.stored import COVERAGE, decode_passes_exr, picture_passes
 from storage.records.sample import Sample, decode_sample
 from storage.remote.fetch import download
 from storage.remote.tries import TransferFailed
 
 REMOTE_THREADS = 8
 """Shards of a server that are fetched, or asked for, at the same time."""
+
+MOST_DIFFERENT = 0.02
+"""Maximum share of the pixels in which a stored pass may differ from the scene's: on another
+processor, a ray at an edge may meet the neighbour. A pass of another camera differs nearly
+everywhere."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,6 +247,10 @@ def check_sample(
     if not (np.isfinite(sample.radiance_rgb).all() and (sample.radiance_rgb >= 0).all()):
         yield f"sample {sample.key}: a picture holds a value that is not finite or negative"
     yield from _check_lights(sample, apart=bool(renders.get("per_light")))
+    bounces, lobes = (bool(renders.get(name)) for name in ("split", "split_lobes"))
+    yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
+    stored = manifest.settings.get("storage")
+    yield from _check_passes(sample, stored.get("passes") if isinstance(stored, Mapping) else ())
     if mixed := mixed_share_alike(entry.licence for entry in sample.scene.objects):
         yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
     for entry in sample.scene.objects:
@@ -259,10 +271,68 @@ def _check_lights(sample: Sample, *, apart: bool) -> Iterator[str]:
     if sample.lights_rgb is None:
         return
     for view, lights in enumerate(sample.lights_rgb):
-        differs = (sum_of_lights(lights) != sample.radiance_rgb[view]).any(axis=-1)
-        if differs.any():
-            row, column = (int(index) for index in np.argwhere(differs)[0])
+        yield from _differing(
+            f"sample {sample.key}: view {view} is not the sum of its lights",
+            sum_of_lights(lights) != sample.radiance_rgb[view],
+        )
+
+
+def _check_parts(sample: Sample, names: tuple[str, ...]) -> Iterator[str]:
+    """Yield the faults of the pictures of parts, which the settings name."""
+    stored = tuple(sample.parts_rgb or ())
+    floors = {tuple(view.parts or ()) for view in sample.views}
+    if stored != names or floors != {names}:
+        found, wanted = ", ".join(stored) or "none", ", ".join(names) or "none"
+        yield f"sample {sample.key}: parts are {found}; the settings and every view expect {wanted}"
+        return
+    if sample.parts_rgb is None:
+        return
+    apart = sample.lights_rgb
+    differs = sum_of_parts(sample.parts_rgb) != (sample.radiance_rgb if apart is None else apart)
+    of_what = "picture" if apart is None else "light"
+    for view, wrong in enumerate(differs):
+        yield from _differing(
+            f"sample {sample.key}: view {view} has a {of_what} that is not the sum of its parts",
+            wrong.any(axis=0) if apart is not None else wrong,
+        )
+
+
+def _differing(what: str, differs: NDArray[np.bool_]) -> Iterator[str]:
+    """Yield a fault where any pixel of [R, R, 3] differs."""
+    pixels = np.argwhere(differs.any(axis=-1))
+    if len(pixels):
+        row, column = (int(index) for index in pixels[0])
+        yield f"{what} in {len(pixels)} pixels, first in ({row}, {column})"
+
+
+def _check_passes(sample: Sample, names: Sequence[str] | None) -> Iterator[str]:
+    """Yield the faults of stored passes; settings without that field ask for none."""
+    if sample.passes_exr is None or not names:
+        if names or sample.passes_exr is not None:
+            has = "lacks" if names else "has"
+            yield f"sample {sample.key}: {has} passes; storage.passes is {list(names or ())}"
+        return
+    resolution = sample.radiance_rgb.shape[2]
+    for view, packed in enumerate(sample.passes_exr):
+        try:
+            found = decode_passes_exr(packed, resolution)
+            expected = picture_passes(sample.scene, [*found], view=view, resolution=resolution)
+        except TrilightError as error:
+            yield f"sample {sample.key}: view {view}: {error}"
+            continue
+        if set(found) != {COVERAGE, *names}:
             yield (
-                f"sample {sample.key}: view {view} is not the sum of its lights in "
-                f"{int(differs.sum())} pixels, first in ({row}, {column})"
+                f"sample {sample.key}: view {view} has the passes {', '.join(sorted(found))}; "
+                f"expected {', '.join(sorted({COVERAGE, *names}))}"
             )
+        for name, picture in found.items():
+            if (share := _share_that_differs(picture, expected[name])) > MOST_DIFFERENT:
+                yield (
+                    f"sample {sample.key}: view {view}: pass {name} is not what the scene says in "
+                    f"{share:.1%} of the pixels"
+                )
+
+
+def _share_that_differs(found: NDArray, expected: NDArray) -> float:
+    same = np.isclose(found, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
+    return 1 - float(np.mean(same if same.ndim == 2 else same.all(axis=-1)))

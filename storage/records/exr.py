@@ -4,9 +4,10 @@ The file itself says how it is packed, so a reader need not be told. Which codec
 `storage.records.profiles`. Equal pictures give equal bytes: the header holds nothing of the clock.
 """
 
+import contextlib
 import io
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,7 +97,7 @@ def to_half(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
 
 
 def encode_channels(
-    channels: Mapping[str, NDArray[np.float16]],
+    channels: Mapping[str, NDArray[np.float16] | NDArray[np.float32]],
     codec: ExrCodec = ZIP,
     *,
     attributes: Attributes | None = None,
@@ -129,6 +130,16 @@ def _require_held(name: str, value: str | int | float) -> None:
         raise TrilightError(
             f"picture: attribute {name} is {value!r}; expected a number {within}, or text."
         )
+
+
+def channel_names(data: bytes) -> list[str]:
+    """Return the names of the channels of an OpenEXR file of one part; reads no pixel.
+
+    Raises:
+        TrilightError: not an EXR file, truncated, or of several parts.
+    """
+    with _readable():
+        return [str(channel.name) for channel in _only_header(data)["channels"]]
 
 
 def decode_exr(data: bytes) -> NDArray[np.float32]:
@@ -172,14 +183,27 @@ def decode_channels(
         TrilightError: not an EXR file, truncated, of several parts, with other channels, larger
             than MAX_RESOLUTION, of more than 3 GiB, or refused by `check`.
     """
-    try:
-        parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
-        if len(parts) != 1:
-            raise TrilightError(f"picture: the file has {len(parts)} parts; expected one.")
-        check(parts[0].header)
-        _check_pixels(parts[0].header, names)
+    with _readable():
+        header = _only_header(data)
+        check(header)
+        _check_pixels(header, names)
         file = OpenEXR.File(io.BytesIO(data), num_threads=0, separate_channels=separate)
         return {name: channel.pixels for name, channel in file.channels().items()}
+
+
+def _only_header(data: bytes) -> Header:
+    parts = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).parts
+    if len(parts) != 1:
+        raise TrilightError(f"picture: the file has {len(parts)} parts; expected one.")
+    header: Header = parts[0].header
+    return header
+
+
+@contextlib.contextmanager
+def _readable() -> Iterator[None]:
+    """Turn what the library raises of damaged files into one sentence."""
+    try:
+        yield
     except (RuntimeError, ValueError, KeyError) as error:
         if isinstance(error, TrilightError):
             raise

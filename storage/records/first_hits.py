@@ -1,11 +1,12 @@
 """What the pixels of a camera see first: triangle, object, depth, position, normals, material.
 
-Embree finds the triangle, in single precision and its robust mode; where on it, is then computed in
-double precision from the triangle's stored corners. Emitters are hidden from cameras, so rays pass
-through them. Rays go through the centres of pixels, as those of the renderer's own `hits`.
+Embree finds the triangle, in single precision (storage.records.surfaces); where on it, is then
+computed in double precision from the triangle's stored corners. Emitters are hidden from cameras,
+so rays pass through them. Each quantity is computed when it is first asked for.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,32 +14,79 @@ from numpy.typing import NDArray
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
 from storage.records.scene import Scene
+from storage.records.surfaces import MISS, Surfaces
 
-MISS = -1
-"""Triangle and object of a ray that meets nothing."""
+
+class SeenFrom:
+    """A scene seen from one place: its surfaces, and tables of its triangles.
+
+    Each table has T + 1 rows. The last one, which MISS picks, stands for nothing: NaN.
+    """
+
+    def __init__(self, scene: Scene, origin: NDArray[np.float64]) -> None:
+        self.scene, self.origin = scene, origin
+        self.surfaces = Surfaces(scene)
+
+    def hits(self, directions: NDArray[np.float64]) -> "FirstHits":
+        """Return what rays along unit `directions` [..., 3] meet first."""
+        toward = directions.reshape(-1, 3).astype(np.float32)
+        start = np.tile(self.origin.astype(np.float32), (len(toward), 1))
+        triangle = self.surfaces.met(start, toward).triangle
+        return FirstHits(
+            seen=self, directions=directions, triangle=triangle.reshape(directions.shape[:-1])
+        )
+
+    @cached_property
+    def corners(self) -> NDArray[np.float64]:
+        """[T + 1, 3, 3] positions in metres."""
+        return corner_table(self.scene, self.scene.vertex_positions)
+
+    @cached_property
+    def corner_normals(self) -> NDArray[np.float64]:
+        """[T + 1, 3, 3] unit vectors."""
+        return corner_table(self.scene, self.scene.vertex_normals)
+
+    @cached_property
+    def across(self) -> NDArray[np.float64]:
+        """[T + 1, 3, 3] vectors whose products with a direction are as the corners' shares.
+
+        A ray meets the triangle a, b, c, given relative to its origin, where its direction is a
+        sum of a, b and c with positive weights; that of a is in proportion to its product with
+        b x c (Cramer's rule).
+        """
+        b, c = np.roll(self.corners, -1, axis=1), np.roll(self.corners, -2, axis=1)
+        # b x c with the difference taken first, or small triangles far away would lose digits
+        return np.cross(b - self.origin, c - b)
+
+    @cached_property
+    def normals(self) -> NDArray[np.float64]:
+        """[T + 1, 3] unit vectors; NaN for triangles without an area."""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        with np.errstate(invalid="ignore"):
+            return _unit(np.cross(b - a, c - a))
+
+    @cached_property
+    def objects(self) -> NDArray[np.int64]:
+        """[T + 1] rows of `Scene.objects`; MISS for nothing."""
+        return np.append(self.scene.object_index.astype(np.int64), MISS)
+
+    @cached_property
+    def materials(self) -> NDArray[np.float32]:
+        """[T + 1, M] material rows."""
+        rows = self.scene.materials[self.scene.material_index]
+        return np.append(rows, np.full((1, rows.shape[1]), np.nan, np.float32), axis=0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FirstHits:
     """The first surface along rays, [...] standing for [R, R], or for nothing of a single pixel."""
 
+    seen: SeenFrom
+    """The scene and the rays' origin."""
+    directions: NDArray[np.float64]
+    """[..., 3] unit vectors in world space."""
     triangle: NDArray[np.int64]
     """[...] row of `Scene.faces`, or MISS."""
-    object: NDArray[np.int64]
-    """[...] row of `Scene.objects`, or MISS."""
-    barycentric: NDArray[np.float64]
-    """[..., 3] shares of the triangle's corners, which add up to 1; NaN where nothing is met."""
-    depth_m: NDArray[np.float64]
-    """[...] distance along the ray; infinite where nothing is met."""
-    position: NDArray[np.float64]
-    """[..., 3] in world space, metres; NaN where nothing is met."""
-    geometric_normal: NDArray[np.float64]
-    """[..., 3] unit, in world space, towards the side from which the triangle's corners run
-    counter-clockwise; NaN where nothing is met."""
-    shading_normal: NDArray[np.float64]
-    """[..., 3] unit, in world space, interpolated between the corners; NaN where nothing is met."""
-    material: NDArray[np.float32]
-    """[..., M] row of `Scene.materials` (storage.conventions); NaN where nothing is met."""
 
     @property
     def met(self) -> NDArray[np.bool_]:
@@ -46,11 +94,71 @@ class FirstHits:
         met: NDArray[np.bool_] = np.asarray(self.triangle != MISS)
         return met
 
+    @property
+    def object(self) -> NDArray[np.int64]:
+        """[...] row of `Scene.objects`, or MISS."""
+        return self.seen.objects[self.triangle]
+
+    @cached_property
+    def barycentric(self) -> NDArray[np.float64]:
+        """[..., 3] shares of the triangle's corners, which add up to 1; NaN where nothing is met.
+
+        A ray that Embree saw meeting a triangle's rim in single precision may pass it by a
+        rounding; then it is brought back to the rim. For a ray in the very plane of a triangle,
+        its middle stands.
+        """
+        weights = np.einsum("...ci,...i->...c", self.seen.across[self.triangle], self.directions)
+        total = weights.sum(axis=-1, keepdims=True)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.clip(np.where(total == 0, 1 / 3, weights / total), 0, 1)
+        return shares / shares.sum(axis=-1, keepdims=True)
+
+    @cached_property
+    def position(self) -> NDArray[np.float64]:
+        """[..., 3] in world space, metres; NaN where nothing is met."""
+        return self.interpolated(self.seen.corners)
+
+    @cached_property
+    def depth_m(self) -> NDArray[np.float64]:
+        """[...] distance along the ray; infinite where nothing is met."""
+        along = np.einsum("...i,...i->...", self.position - self.seen.origin, self.directions)
+        return np.where(self.met, along, np.inf)
+
+    @cached_property
+    def geometric_normal(self) -> NDArray[np.float64]:
+        """[..., 3] unit normal of the triangle's plane, in world space.
+
+        It points to the side from which the corners run counter-clockwise; NaN where nothing is
+        met.
+        """
+        return self.seen.normals[self.triangle]
+
+    @cached_property
+    def shading_normal(self) -> NDArray[np.float64]:
+        """[..., 3] unit, in world space, interpolated between the corners.
+
+        It is not turned to the camera. NaN where nothing is met, or where the corners' normals
+        cancel out.
+        """
+        with np.errstate(invalid="ignore"):
+            return _unit(self.interpolated(self.seen.corner_normals))
+
+    @cached_property
+    def material(self) -> NDArray[np.float32]:
+        """[..., M] row of `Scene.materials`; NaN where nothing is met."""
+        return self.seen.materials[self.triangle]
+
+    def interpolated(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return [..., K] between the corners of a table [T + 1, 3, K]."""
+        return np.einsum("...c,...ci->...i", self.barycentric, corners[self.triangle])
+
 
 def first_hits(
     scene: Scene, *, view: int = 0, resolution: int = 256, pixel: tuple[int, int] | None = None
 ) -> FirstHits:
     """Return what a camera of a scene sees, in all pixels of its picture or in one.
+
+    Rays go through the centres of pixels, as those of the renderer's own `hits`.
 
     Args:
         scene: passes `Scene.check`.
@@ -61,83 +169,25 @@ def first_hits(
     Raises:
         TrilightError: there is no such view or pixel.
     """
-    _require("view", view, scene.num_views)
+    require_row("view", view, scene.num_views)
     origin, directions = camera_rays(scene.c2w[view], float(scene.fov_deg[view]), resolution)
     if pixel is not None:
         for name, value in zip(("row", "column"), pixel, strict=True):
-            _require(f"pixel {name}", value, resolution)
+            require_row(f"pixel {name}", value, resolution)
         directions = directions[pixel]
-    return _hits(scene, origin, directions)
+    return SeenFrom(scene, origin).hits(directions)
 
 
-def _require(name: str, value: int, count: int) -> None:
+def require_row(name: str, value: int, count: int) -> None:
+    """Raise TrilightError unless `value` is one of `count` rows."""
     if not 0 <= value < count:
         raise TrilightError(f"{name} is {value}; expected 0 to {count - 1}.")
 
 
-def _hits(scene: Scene, origin: NDArray[np.float64], directions: NDArray[np.float64]) -> FirstHits:
-    """Return what rays from `origin` [3] along unit `directions` [..., 3] meet first."""
-    triangle = _triangles(scene, origin, directions.reshape(-1, 3)).reshape(directions.shape[:-1])
-    met = triangle != MISS
-    faces = scene.faces[np.where(met, triangle, 0)]
-    corners = scene.vertex_positions[faces].astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):  # rays that meet nothing meet triangle 0
-        barycentric, depth_m = _on_triangle(corners, origin, directions)
-        across = np.cross(corners[..., 1, :] - corners[..., 0, :], _edge(corners))
-        normals = scene.vertex_normals[faces].astype(np.float64)
-        shading = _unit(np.einsum("...c,...ci->...i", barycentric, normals))
-    rows = scene.material_index[np.where(met, triangle, 0)]
-    seen = met[..., None]
-    return FirstHits(
-        triangle=triangle,
-        object=np.where(met, scene.object_index[np.where(met, triangle, 0)], MISS).astype(np.int64),
-        barycentric=np.where(seen, barycentric, np.nan),
-        depth_m=np.where(met, depth_m, np.inf),
-        position=np.where(seen, np.einsum("...c,...ci->...i", barycentric, corners), np.nan),
-        geometric_normal=np.where(seen, _unit(across), np.nan),
-        shading_normal=np.where(seen, shading, np.nan),
-        material=np.where(seen, scene.materials[rows], np.float32(np.nan)),
-    )
-
-
-def _triangles(
-    scene: Scene, origin: NDArray[np.float64], directions: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Return the triangle [N] that each of N rays meets first, or MISS."""
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
-    solid = np.flatnonzero(~scene.triangle_emits)
-    if len(solid) == 0:
-        return np.full(len(directions), MISS)
-    embree = EmbreeScene(robust=True)
-    TriangleMesh(embree, scene.vertex_positions, scene.faces[solid])
-    start = np.tile(origin.astype(np.float32), (len(directions), 1))
-    found = embree.run(start, directions.astype(np.float32))
-    return np.where(found >= 0, solid[found], MISS)
-
-
-def _on_triangle(
-    corners: NDArray[np.float64], origin: NDArray[np.float64], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return barycentrics [..., 3] and distances [...] at which rays meet planes of triangles.
-
-    By Moeller and Trumbore (1997). A ray that Embree saw meeting a triangle's rim in single
-    precision may pass it by a rounding; then it is brought back to the rim.
-    """
-    along, across = corners[..., 1, :] - corners[..., 0, :], _edge(corners)
-    p = np.cross(directions, across)
-    t = origin - corners[..., 0, :]
-    q = np.cross(t, along)
-    scale = np.sum(along * p, axis=-1)
-    u, v = np.sum(t * p, axis=-1) / scale, np.sum(directions * q, axis=-1) / scale
-    shares = np.clip(np.stack([1 - u - v, u, v], axis=-1), 0, 1)
-    return shares / shares.sum(axis=-1, keepdims=True), np.sum(across * q, axis=-1) / scale
-
-
-def _edge(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    edge: NDArray[np.float64] = corners[..., 2, :] - corners[..., 0, :]
-    return edge
+def corner_table(scene: Scene, of_vertices: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the rows of vertices [V, 3] at the corners of triangles, [T + 1, 3, 3], last NaN."""
+    corners = of_vertices[scene.faces].astype(np.float64)
+    return np.append(corners, np.full((1, 3, 3), np.nan), axis=0)
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.errors import TrilightError
-from storage.records.exr import Header, decode_channels, encode_channels, to_half, window_size
+from storage.records.exr import to_half
+from storage.records.layers import decode_layers, encode_layers
 from storage.records.scene import Scene
 
 MAX_LIGHTS = 64
@@ -51,14 +52,7 @@ def encode_lights_exr(lights_rgb: NDArray[np.float32]) -> bytes:
     Raises:
         TrilightError: a value is not finite, negative, or too large for a half float.
     """
-    half = to_half(lights_rgb)
-    return encode_channels(
-        {
-            f"light{i}.{name}": np.ascontiguousarray(light[..., channel])
-            for i, light in enumerate(half)
-            for channel, name in enumerate("RGB")
-        }
-    )
+    return encode_layers(_layers(len(lights_rgb)), lights_rgb)
 
 
 def decode_lights_exr(data: bytes, shape: tuple[int, int, int]) -> NDArray[np.float32]:
@@ -74,18 +68,8 @@ def decode_lights_exr(data: bytes, shape: tuple[int, int, int]) -> NDArray[np.fl
     num, height, width = shape
     if num > MAX_LIGHTS:
         raise TrilightError(f"lights: {num} emitters; expected at most {MAX_LIGHTS}.")
-    names = [f"light{i}.{name}" for i in range(num) for name in "RGB"]
+    return decode_layers(data, _layers(num), (height, width), "lights")
 
-    def check(header: Header) -> None:
-        if window_size(header) != (height, width):
-            raise TrilightError(
-                f"lights: {list(window_size(header))} pixels; expected {[height, width]}."
-            )
 
-    channels = decode_channels(data, names, check, separate=True)
-    if any(channel.shape != (height, width) for channel in channels.values()):
-        raise TrilightError(
-            f"lights: a channel has other pixels than {[height, width]}; expected none."
-        )
-    planes = np.stack([np.asarray(channels[name], np.float32) for name in names])
-    return np.moveaxis(planes.reshape(num, 3, height, width), 1, -1).copy()
+def _layers(num: int) -> list[str]:
+    return [f"light{light}" for light in range(num)]

@@ -4,6 +4,8 @@
     000000123.json                schema version, objects, provenance, one record per view
     000000123.0.exr ...           linear radiance of each view, half-float RGB OpenEXR
     000000123.0.lights.exr ...    optional: each emitter's part of it (storage.records.lights)
+    000000123.0.parts.exr ...     optional: direct, indirect, ... light (storage.records.parts)
+    000000123.0.passes.exr ...    optional: what its pixels see (storage.records.passes.stored)
 
 How both are packed is `storage.records.profiles`. The key is everything before the first dot, as
 WebDataset reads names.
@@ -12,7 +14,7 @@ WebDataset reads names.
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +25,10 @@ from storage.conventions import SCHEMA_VERSION, require_readable
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
+from storage.records.first_hits import require_row
 from storage.records.lights import decode_lights_exr, encode_lights_exr, num_lights
+from storage.records.parts import KNOWN_PARTS, Parts, decode_parts_exr, encode_parts_exr
+from storage.records.passes.stored import picture_passes
 from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
 from storage.records.scene import Scene
 from storage.records.scene_file import (
@@ -42,6 +47,18 @@ _EXPECTED: Mapping[Any, str] = {
     bool: "true or false",
     float: f"a number between {-_FAR:.0f} and {_FAR:.0f}",
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartFloor:
+    """How far to trust one part of a picture, of all lights together."""
+
+    noise_floor_db: float
+    """Measured error as psnr_log_db."""
+    noise_floor_linear_db: float
+    """The same error as psnr_linear_db."""
+    object_noise_floor_db: float
+    """The same error as object_psnr_log_db."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +82,9 @@ class ViewRecord:
     """Seed of the view's samples."""
     camera_attempt: int
     """How many cameras were rejected before this one."""
+    parts: Mapping[str, PartFloor] | None = None
+    """Floors of the parts that are stored, by name (storage.records.parts); a record that has none
+    is written without this field."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,6 +114,42 @@ class Sample:
     lights_rgb: NDArray[np.float32] | None = None
     """[C, L, R, R, 3] radiance of each emitter object alone, in the order of `scene.objects`; their
     sum is the picture (storage.records.lights). None where the build keeps lights together."""
+    parts_rgb: Parts | None = None
+    """[C, R, R, 3] radiance of each part by its name, or [C, L, R, R, 3] where lights are apart;
+    their sum is the picture, or that of the light (storage.records.parts). None where the build
+    keeps all light together."""
+    passes_exr: tuple[bytes, ...] | None = None
+    """OpenEXR files of the passes that the build stores, one per camera; `view_passes` reads them.
+    None where the build stores none."""
+
+    def view_passes(self, names: Sequence[str], *, view: int = 0) -> dict[str, NDArray]:
+        """Return passes of one view by name, at the resolution of its picture, one ray a pixel.
+
+        Those that are stored are read, others are computed; the numbers are the same.
+
+        Args:
+            names: of passes (storage.records.passes.declared), other than `motion_px`.
+            view: row of the cameras.
+
+        Returns:
+            for each name a picture [R, R], or [R, R, K] where the pass has K channels, row 0 on
+            top: int32 for ids, bool for `hit`, float32 for all others. Where nothing is met, ids
+            are -1, depths infinite, and all others NaN.
+
+        Raises:
+            TrilightError: there is no such pass or view, or what is stored is unreadable.
+        """
+        require_row("view", view, self.scene.num_views)
+        try:
+            return picture_passes(
+                self.scene,
+                names,
+                view=view,
+                resolution=self.radiance_rgb.shape[2],
+                stored=None if self.passes_exr is None else self.passes_exr[view],
+            )
+        except TrilightError as error:
+            raise TrilightError(f"sample {self.key}: view {view}: {error}") from error
 
     def check(self) -> None:
         """Raise TrilightError at the first broken law of what can be learnt from, named by key.
@@ -116,6 +172,9 @@ class Sample:
         apart = () if self.lights_rgb is None else np.moveaxis(self.lights_rgb, 1, 0)
         for light, radiance_rgb in enumerate(apart):
             _check_radiance(self.key, f" light {light}", radiance_rgb)
+        for part, pictures in (self.parts_rgb or {}).items():
+            for radiance_rgb in np.moveaxis(pictures, 1, 0) if pictures.ndim == 5 else [pictures]:
+                _check_radiance(self.key, f" {part} light", radiance_rgb)
 
 
 def sample_key(scene_index: int) -> str:
@@ -127,8 +186,8 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
     """Return the members of a sample by suffix; equal samples give equal bytes.
 
     A sample that was read from the profile `compact` and is packed so again loses once more: copy
-    members where they are to stay. Where lights are apart, pictures stay exact in every profile:
-    they are the sum of their lights.
+    members where they are to stay. Where lights or parts are apart, pictures stay exact in every
+    profile: they are the sum of these.
 
     Raises:
         TrilightError: a picture holds what half floats cannot (storage.records.exr).
@@ -137,15 +196,22 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
     record = {
         "schema_version": SCHEMA_VERSION,
         **scene_record(sample.scene),
-        "views": [dataclasses.asdict(view) for view in sample.views],
+        "views": [_view_record(view) for view in sample.views],
     }
     members = pack_arrays(encode_arrays(sample.scene), profile) | {"json": canonical_json(record)}
-    of_pictures = profile if sample.lights_rgb is None else "lossless"
+    together = sample.lights_rgb is None and sample.parts_rgb is None
+    of_pictures = profile if together else "lossless"
     for view, (picture, made) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
         members[f"{view}.exr"] = pack_picture(picture, made.noise_floor_db, of_pictures)
     if sample.lights_rgb is not None:
         for view, lights in enumerate(sample.lights_rgb):
             members[f"{view}.lights.exr"] = encode_lights_exr(lights)
+    if sample.parts_rgb is not None:
+        for view in range(len(sample.views)):
+            of_view = {name: pictures[view] for name, pictures in sample.parts_rgb.items()}
+            members[f"{view}.parts.exr"] = encode_parts_exr(of_view)
+    for view, packed in enumerate(sample.passes_exr or ()):
+        members[f"{view}.passes.exr"] = packed
     return members
 
 
@@ -161,6 +227,8 @@ def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
         pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(record.views))]
         radiance_rgb = np.stack(pictures)
         lights_rgb = _decode_lights(record.scene, radiance_rgb, members)
+        parts_rgb = _decode_parts(record, radiance_rgb, members)
+        passes_exr = _packed_passes(len(record.views), members)
     except KeyError as error:
         raise TrilightError(f"sample {key}: {error} is missing.") from error
     except ValueError as error:
@@ -171,7 +239,15 @@ def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
         radiance_rgb=radiance_rgb,
         views=record.views,
         lights_rgb=lights_rgb,
+        parts_rgb=parts_rgb,
+        passes_exr=passes_exr,
     )
+
+
+def _packed_passes(num_views: int, members: Mapping[str, bytes]) -> tuple[bytes, ...] | None:
+    if not any(suffix.endswith(".passes.exr") for suffix in members):
+        return None
+    return tuple(members[f"{view}.passes.exr"] for view in range(num_views))
 
 
 def _decode_lights(
@@ -184,6 +260,22 @@ def _decode_lights(
     return np.stack(
         [decode_lights_exr(members[f"{view}.lights.exr"], shape) for view in range(views)]
     )
+
+
+def _decode_parts(
+    record: SceneRecord, radiance_rgb: NDArray[np.float32], members: Mapping[str, bytes]
+) -> dict[str, NDArray[np.float32]] | None:
+    if not any(suffix.endswith(".parts.exr") for suffix in members):
+        return None
+    lights_apart = any(suffix.endswith(".lights.exr") for suffix in members)
+    num = num_lights(record.scene) if lights_apart else None
+    names = list(record.views[0].parts or ())
+    size = radiance_rgb.shape[1], radiance_rgb.shape[2]
+    found = [
+        decode_parts_exr(members[f"{view}.parts.exr"], names, size, num)
+        for view in range(len(radiance_rgb))
+    ]
+    return {name: np.stack([of_view[name] for of_view in found]) for name in names}
 
 
 def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
@@ -218,18 +310,43 @@ def _decode_record(key: str, data: bytes) -> dict[str, Any]:
     return record
 
 
-def _view(value: Mapping[str, Any], row: int) -> ViewRecord:
+def _view_record(view: ViewRecord) -> dict[str, Any]:
+    record = dataclasses.asdict(view)
+    return {name: value for name, value in record.items() if value is not None}
+
+
+def _view(value: Any, row: int) -> ViewRecord:
     """Return the record of a view; raises ValueError for a field that is no usable number."""
-    record = ViewRecord(**value)
-    for field in dataclasses.fields(ViewRecord):
+    if not isinstance(value, Mapping):
+        raise ValueError(f"views[{row}] is {value!r:.40}; expected a JSON object.")
+    numbers = {name: entry for name, entry in value.items() if name != "parts"}
+    record = ViewRecord(**numbers, parts=_part_floors(value, row))
+    _check_numbers(record, f"views[{row}]")
+    return record
+
+
+def _part_floors(value: Mapping[str, Any], row: int) -> dict[str, PartFloor] | None:
+    if "parts" not in value:
+        return None
+    parts = value["parts"]
+    if not isinstance(parts, Mapping) or tuple(sorted(parts)) not in KNOWN_PARTS:
+        known = "; ".join(", ".join(names) for names in KNOWN_PARTS)
+        raise ValueError(f"views[{row}].parts is {parts!r:.60}; expected floors of {known}.")
+    floors = {name: PartFloor(**parts[name]) for name in sorted(parts)}
+    for name, floor in floors.items():
+        _check_numbers(floor, f"views[{row}].parts.{name}")
+    return floors
+
+
+def _check_numbers(record: ViewRecord | PartFloor, where: str) -> None:
+    for field in dataclasses.fields(record):
         number = getattr(record, field.name)
-        if type(number) is field.type and field.type is not float:
+        if field.name == "parts" or (type(number) is field.type and field.type is not float):
             continue
         if field.type is not float or type(number) not in (int, float) or not -_FAR < number < _FAR:
             raise ValueError(
-                f"views[{row}].{field.name} is {number!r:.40}; expected {_EXPECTED[field.type]}."
+                f"{where}.{field.name} is {number!r:.40}; expected {_EXPECTED[field.type]}."
             )
-    return record
 
 
 def _check_radiance(key: str, which: str, radiance_rgb: NDArray[np.float32]) -> None:

@@ -9,6 +9,7 @@ preset: model=large with model.window_bundles=0.
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -18,16 +19,22 @@ from storage.settings.described import field_value, settings_record
 Settings = TypeVar("Settings")
 
 
+_LIST_OF_WORDS = re.compile(r"\[(\s*[A-Za-z]\w*\s*(?:,\s*[A-Za-z]\w*\s*)*)\]")
+
 Change = tuple[Sequence[str], Any, str]
 """The way that is left to a value, the value, and the whole name."""
 
 
 def json_or_word(text: str) -> Any:
-    """Return the JSON value that a text is, or the text: what a person writes as a value."""
+    """Return the JSON value that a text is, or the text: what a person writes as a value.
+
+    Words in a list need no quotes either: [depth,normal].
+    """
     try:
         return json.loads(text)
     except json.JSONDecodeError:
-        return text
+        listed = _LIST_OF_WORDS.fullmatch(text)
+        return text if listed is None else [word.strip() for word in listed[1].split(",")]
 
 
 def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:

@@ -1,7 +1,7 @@
 """Nothing is stored that nobody reads: whatever a sample holds changes what a consumer makes of it.
 
-Consumers are the training, the report's numbers and the page of a scene. Conversions copy a scene
-whole and therefore do not count.
+Consumers are the training, the report's numbers, the page of a scene, and who asks for passes.
+Conversions copy a scene whole and therefore do not count.
 """
 
 import dataclasses
@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 from safetensors.numpy import load, save
 
-from pipeline.documents.scene_facts import scene_values
 from pipeline.documents.scene_page import Neighbours, encode_scene_page
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.records.exr import decode_exr, encode_exr
+from storage.records.exr import decode_exr, encode_channels, encode_exr
 from storage.records.lights import decode_lights_exr, encode_lights_exr, num_lights
-from storage.records.sample import Sample, decode_sample, decode_scene, encode_sample
+from storage.records.parts import decode_parts_exr, encode_parts_exr
+from storage.records.passes.stored import passes_exr
+from storage.records.sample import PartFloor, Sample, decode_sample, decode_scene, encode_sample
+from storage.records.scene_facts import scene_values
 from tests.scenes_by_hand import tiny_sample
 from train.data.scenes import TrainingScene, training_scene
 
@@ -28,12 +30,24 @@ Change = Callable[[Members], None]
 
 ARRAYS, RECORD = "scene.safetensors", "json"
 _PIXELS = 16
+_PARTS = ("direct", "indirect")
 
 
 def _sample() -> Sample:
-    """Return a sample that keeps its only light apart, so that every kind of member is there."""
+    """Return a sample with its only light, parts and a pass apart: every kind of member exists."""
     sample = tiny_sample(resolution=_PIXELS)
-    return dataclasses.replace(sample, lights_rgb=sample.radiance_rgb[:, None])
+    packed = [passes_exr(sample.scene, ["object"], view=v, resolution=_PIXELS) for v in range(2)]
+    lights = sample.radiance_rgb[:, None]
+    floor = PartFloor(noise_floor_db=40.0, noise_floor_linear_db=30.0, object_noise_floor_db=39.0)
+    views = [dataclasses.replace(view, parts=dict.fromkeys(_PARTS, floor)) for view in sample.views]
+    parts = dict(zip(_PARTS, (lights, np.zeros_like(lights)), strict=True))
+    return dataclasses.replace(
+        sample,
+        lights_rgb=lights,
+        parts_rgb=parts,
+        passes_exr=tuple(packed),
+        views=tuple(views),
+    )
 
 
 def _consumed(members: Members) -> str:
@@ -48,7 +62,8 @@ def _consumed(members: Members) -> str:
     except TrilightError as error:
         return str(error)
     page = encode_scene_page(sample, "train", [], Neighbours(report="", before=None, after=None))
-    return sha256_hex(b"".join([*_tensors(scene), json.dumps(values).encode(), page]))
+    objects = [sample.view_passes(["object"], view=view)["object"].tobytes() for view in range(2)]
+    return sha256_hex(b"".join([*_tensors(scene), *objects, json.dumps(values).encode(), page]))
 
 
 def _tensors(scene: TrainingScene) -> Iterator[bytes]:
@@ -114,6 +129,18 @@ def _brighter_light(members: Members) -> None:
     members["1.lights.exr"] = encode_lights_exr(lights * np.float32(2))
 
 
+def _brighter_part(members: Members) -> None:
+    num = num_lights(_sample().scene)
+    parts = decode_parts_exr(members["1.parts.exr"], _PARTS, (_PIXELS, _PIXELS), num)
+    members["1.parts.exr"] = encode_parts_exr({name: 2 * part for name, part in parts.items()})
+
+
+def _other_objects(members: Members) -> None:
+    members["1.passes.exr"] = encode_channels(
+        {name: np.ones((_PIXELS, _PIXELS), np.float32) for name in ("A", "object.V")}
+    )
+
+
 def _changes() -> dict[str, Change]:
     members = encode_sample(_sample())
     changes: dict[str, Change] = {
@@ -121,7 +148,12 @@ def _changes() -> dict[str, Change]:
         for path in _leaves(json.loads(members[RECORD]))
     }
     changes |= {f"{ARRAYS} {name}": _change_array(name) for name in sorted(load(members[ARRAYS]))}
-    return changes | {"1.exr": _brighter_picture, "1.lights.exr": _brighter_light}
+    return changes | {
+        "1.exr": _brighter_picture,
+        "1.lights.exr": _brighter_light,
+        "1.parts.exr": _brighter_part,
+        "1.passes.exr": _other_objects,
+    }
 
 
 CHANGES = _changes()

@@ -160,7 +160,7 @@ def test_an_executor_is_a_runner(copied: Callable[[str], Path]) -> None:
 
 
 TINY = (
-    "--resolution", "32", "--noise-floor", "20", "--set", "renders.max_spp=32",
+    "--resolution", "32", "--noise-floor", "20", "--set", "renders.max_spp=64",
     "--set", "scenes.num_views=1", "--set", "splits.scenes_per_shard=1",
 )  # fmt: skip
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +18,13 @@ from pathlib import Path
 import numpy as np
 
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.progress import read_scene_logs
+from storage.dataset.progress import SceneLog, read_scene_logs
 
 PARTS = 10
 """Of the run, in the order in which scenes were finished."""
 _EVERY_S, _GRACE_S = 0.5, 10.0
+_LASTING_LOOKS = 10
+"""Processes that are seen less often have made too few scenes to say anything."""
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -29,8 +32,6 @@ _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 class Part:
     """A tenth of the scenes."""
 
-    megabytes: float
-    """Most resident memory of all processes together while they were made."""
     open_files: int
     """Most, of all processes together."""
     processes: int
@@ -43,6 +44,9 @@ class Soak:
 
     parts: tuple[Part, ...]
     """In order."""
+    growth_mb: tuple[float, ...]
+    """Of each process, from a fifth of its life to its end or that of the last scene. Life begins
+    with what is loaded and made once."""
     processes_left: int
     """Of the run, ten seconds after its end."""
     files_left: int
@@ -54,7 +58,8 @@ class _Look:
     """One look at the run's processes."""
 
     unix_s: float
-    megabytes: float
+    resident_mb: dict[int, float]
+    """Of each process, by its number."""
     open_files: int
     processes: int
 
@@ -84,8 +89,10 @@ def soaked(objects: str, num_scenes: int) -> Soak:
             _end(process)
         if process.returncode:
             raise RuntimeError(f"generate ended with {process.returncode}")
+        scenes = sorted(read_scene_logs(DatasetFolder(out)), key=lambda one: one.finished_unix_s)
         return Soak(
-            parts=_parts(DatasetFolder(out), looks),
+            parts=_parts(scenes, looks),
+            growth_mb=_growth_mb(scenes, looks),
             processes_left=_left(process.pid),
             files_left=sum(path.is_file() for path in temporary.rglob("*")),
         )
@@ -114,9 +121,18 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def _parts(folder: DatasetFolder, looks: Sequence[_Look]) -> tuple[Part, ...]:
+def _growth_mb(scenes: Sequence[SceneLog], looks: Sequence[_Look]) -> tuple[float, ...]:
+    lives = defaultdict[int, list[float]](list)
+    for look in looks:
+        if look.unix_s <= scenes[-1].finished_unix_s:
+            for process, megabytes in look.resident_mb.items():
+                lives[process].append(megabytes)
+    lasting = [life for life in lives.values() if len(life) >= _LASTING_LOOKS]
+    return tuple(life[-1] - life[len(life) // 5] for life in lasting)
+
+
+def _parts(scenes: Sequence[SceneLog], looks: Sequence[_Look]) -> tuple[Part, ...]:
     """Cut the run into tenths by the moments at which scenes were finished."""
-    scenes = sorted(read_scene_logs(folder), key=lambda scene: scene.finished_unix_s)
     # what was prepared before the first scene would hide growth in the first tenth
     parts, since = [], scenes[0].finished_unix_s - scenes[0].seconds if scenes else 0.0
     for tenth in np.array_split(np.arange(len(scenes)), PARTS):
@@ -125,7 +141,6 @@ def _parts(folder: DatasetFolder, looks: Sequence[_Look]) -> tuple[Part, ...]:
         seen = [look for look in looks if since < look.unix_s <= until + 2 * _EVERY_S]
         parts.append(
             Part(
-                megabytes=max(look.megabytes for look in seen),
                 open_files=max(look.open_files for look in seen),
                 processes=max(look.processes for look in seen),
             )
@@ -143,17 +158,18 @@ def _left(session: int) -> int:
 
 
 def _look(session: int) -> _Look:
-    pages, files, processes = 0, 0, 0
+    resident_mb, files, processes = dict[int, float](), 0, 0
     for folder in _of_session(session):
         try:
-            pages += int((folder / "statm").read_text().split()[1])
+            pages = int((folder / "statm").read_text().split()[1])
+            resident_mb[int(folder.name)] = pages * _PAGE_BYTES / 1e6
             files += len(os.listdir(folder / "fd"))
         except OSError:  # it has just ended
             continue
         processes += 1
     return _Look(
         unix_s=time.time(),
-        megabytes=pages * _PAGE_BYTES / 1e6,
+        resident_mb=resident_mb,
         open_files=files,
         processes=processes,
     )

@@ -12,6 +12,7 @@ from pipeline.renders.settings import RenderSettings
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected
 from storage.records.exr import decode_exr, encode_exr
+from storage.records.parts import sum_of_parts
 from storage.records.scene import Scene
 from tests.pipeline.renders.scene_kit import (
     Part,
@@ -40,9 +41,9 @@ def _lamp(radiance: float = 100.0, scale: float = 1.0, diffuse: float = 0.0) -> 
     return light(np.array(LAMP) * scale, radiance, diffuse)
 
 
-def _render(scene: Scene) -> RenderedView:
+def _render(scene: Scene, settings: RenderSettings = SETTINGS) -> RenderedView:
     scene.check()
-    renderer = SceneRenderer(scene, SETTINGS)
+    renderer = SceneRenderer(scene, settings)
     return renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed=0)
 
 
@@ -95,6 +96,20 @@ def test_extreme_materials(surface: NDArray[np.float64]) -> None:
     picture = _render(join([ball, _floor(surface), _lamp()])).radiance_rgb
     assert np.isfinite(picture).all()
     assert (picture >= 0).all()
+
+
+@pytest.mark.parametrize("surface", SURFACES.values(), ids=SURFACES.keys())
+def test_extreme_materials_by_part(surface: NDArray[np.float64]) -> None:
+    """A share is a quotient of what may be 0 or large; what a lobe lacks is exactly black."""
+    ball = sphere([0, 0, 0.5], 0.5, surface)
+    scene = join([ball, _floor(surface), _mirror(), _lamp()])
+    view = _render(scene, dataclasses.replace(SETTINGS, split=True, split_lobes=True))
+    assert view.parts_rgb is not None
+    np.testing.assert_array_equal(sum_of_parts(view.parts_rgb), view.radiance_rgb)
+    for name, part in view.parts_rgb.items():
+        assert np.isfinite(part).all() and (part >= 0).all()
+        if "diffuse" in name and not surface[:3].any():
+            assert not part.any()
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.01, 1.0])

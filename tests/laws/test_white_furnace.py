@@ -41,7 +41,7 @@ def mean_radiance(scene: Scene, tracer: Tracer, passes: int = 8, resolution: int
     """Return the mean over what the surface, whose albedo is 1, covers of the picture."""
     camera = camera_of(scene, resolution)
     pictures = [tracer.radiance(camera, seed=k, spp=64) for k in range(passes)]
-    covered = tracer.features(camera, seed=0, spp=64).albedo.mean()
+    covered = tracer.features(camera, spp=64).albedo.mean()
     return float(np.mean(pictures) / covered)
 
 

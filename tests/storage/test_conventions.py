@@ -7,8 +7,10 @@ from hypothesis import strategies as st
 from storage.conventions import (
     camera_rays,
     focal_px,
+    in_camera,
     log10_radiance,
     look_at_c2w,
+    pixel_places,
     preview_srgb8,
     radiance_from_log10,
     srgb8,
@@ -41,6 +43,28 @@ def test_rays_are_unit_and_turn_with_the_picture(fov_deg: float) -> None:
     assert (np.diff(directions @ right, axis=1) > 0).all()
     middle = directions[3:5, 3:5].mean(axis=(0, 1))
     assert np.allclose(middle / np.linalg.norm(middle), -c2w[:3, 2])
+
+
+def test_rows_of_rays_are_those_of_the_picture() -> None:
+    c2w = look_at_c2w(eye=[1, 2, 3], target=[0, 0, 0], up=[0, 0, 1])
+    _, whole = camera_rays(c2w, 50, 9)
+    _, rows = camera_rays(c2w, 50, 9, slice(2, 5))
+    assert np.allclose(rows, whole[2:5], rtol=0, atol=1e-15)
+
+
+@given(angles)
+def test_places_in_the_picture_invert_the_rays(fov_deg: float) -> None:
+    c2w = look_at_c2w(eye=[1, 2, 3], target=[0, 0.5, 0], up=[0, 0, 1])
+    c2w[:3, :3] *= 1 + 1e-5  # as far from a rotation as float32 poses that passed through files
+    origin, rays = camera_rays(c2w, fov_deg, 7)
+    row, column = np.indices((7, 7))
+    centres = np.stack([column, row], axis=-1) + 0.5
+    for distance in (0.1, 30):
+        points = origin + distance * rays
+        assert np.allclose(pixel_places(points, c2w, fov_deg, 7), centres, atol=1e-9)
+        assert (in_camera(points, c2w)[..., 2] < 0).all()
+    assert np.isnan(pixel_places(origin - rays, c2w, fov_deg, 7)).all()
+    assert np.isnan(pixel_places(origin, c2w, fov_deg, 7)).all()
 
 
 @given(st.floats(0, 6e4))

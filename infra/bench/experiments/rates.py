@@ -1,9 +1,8 @@
-"""Rates of rendering: views per core-hour, how often a stated floor is wrong, cost of a path."""
+"""Rates of rendering: views per core-hour, and what a path costs."""
 
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from infra.bench.experiment import (
     Column,
@@ -14,24 +13,18 @@ from infra.bench.experiment import (
     percent,
     repeats,
 )
-from infra.bench.experiments.beside import BROKEN_DB, TARGETS_DB, adaptive
+from infra.bench.experiments.beside import TARGETS_DB, adaptive
 from infra.bench.experiments.sampling import CORE_S
 from infra.bench.sides.sampled_pictures import first_camera
 from infra.bench.sides.shots import SEED, shots
 from infra.bench.subjects.cost_scene import cost_scene
-from infra.bench.subjects.named_scenes import NUM_SAMPLED, sampled, sampled_names
+from infra.bench.subjects.named_scenes import sampled, sampled_names
 from infra.bench.workshop import Workshop
 from pipeline.making.price import USD_PER_CORE_HOUR
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import PASS_SPP, RenderSettings
-from storage.metrics import psnr_log_db
-from storage.records.scene import Scene
 
 MANY_VIEWS = 8_000_000
-_FIRM_DB = 6.0
-"""A reference whose own floor is this much above the stated one adds 1 dB to the error at most."""
-_REFERENCE_SEED = 1_000_003
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,41 +60,6 @@ def traced(settings: PathCost) -> dict[str, float]:
     core_s = time.process_time() - loaded
     megapaths = settings.resolution**2 * PASS_SPP[0] / 1e6
     return {"core_s": core_s / megapaths, "load_s": loaded - started}
-
-
-def promises(scene: Scene, targets: dict[str, RenderSettings], reference: RenderSettings) -> Any:
-    """Return the figures of each target beside a reference of other samples; in a render child."""
-    camera = (scene.c2w[0], float(scene.fov_deg[0]))
-    truth = SceneRenderer(scene, reference).render_view(*camera, _REFERENCE_SEED)
-    found = {}
-    for name, shot in shots(scene, targets).items():
-        true_db = psnr_log_db(shot.view.radiance_rgb, truth.radiance_rgb)
-        stated_db = shot.view.noise_floor_db
-        wrong = float(stated_db - true_db > BROKEN_DB)
-        found[name] = {
-            "core_s": shot.core_s,
-            "wrong": wrong,
-            "ahead_db": true_db - stated_db,
-            "spp": float(shot.view.spp),
-            "at_cap": float(shot.view.at_cap),
-        }
-        if truth.noise_floor_db - stated_db >= _FIRM_DB:
-            found[name]["wrong_firm"] = wrong
-    return found
-
-
-def _measure_promises(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
-    scene = sampled(int(turn.split()[-1])).make(workshop.child)
-    targets = {point.name: point.settings for point in points}
-    most = 4 * workshop.effort.max_spp
-    reference = RenderSettings(
-        resolution=points[0].settings.resolution,
-        noise_floor_db=max(TARGETS_DB) + 8,
-        min_spp=most // 2,
-        max_spp=most,
-        min_mean_radiance=0.0,
-    )
-    yield from workshop.call(promises, scene, targets, reference).items()
 
 
 def _measure_throughput(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
@@ -152,41 +110,6 @@ EXPERIMENTS = (
         ],
         turns=lambda effort: sampled_names(effort.scenes),
         measure=_measure_throughput,
-    ),
-    Experiment(
-        name="calibration",
-        title="How often a stated floor is wrong",
-        about=(
-            "Views of scenes that no constant was tuned on, against references with other samples."
-        ),
-        cost=CORE_S,
-        error=Column(
-            name="stated floors wrong by over 1 dB, %", figure="wrong", over="mean", then=percent
-        ),
-        against="the true error; at most one view in ten may be wrong",
-        columns=(
-            Column(
-                name="wrong where the reference is 6 dB better, %",
-                figure="wrong_firm",
-                over="mean",
-                then=percent,
-            ),
-            Column(name="truth less stated, dB", figure="ahead_db"),
-            Column(name="samples", figure="spp"),
-            Column(name="at the cap, %", figure="at_cap", over="mean", then=percent),
-        ),
-        points=lambda effort: [
-            Point(
-                name=f"{target_db:.0f} dB",
-                settings=adaptive(target_db, effort.resolution * 3 // 4, effort.max_spp),
-            )
-            for target_db in TARGETS_DB
-        ],
-        turns=lambda effort: [
-            f"sampled {NUM_SAMPLED + index}"
-            for index in range(40 if effort.name == "careful" else effort.scenes)
-        ],
-        measure=_measure_promises,
     ),
     Experiment(
         name="path-cost",

@@ -194,7 +194,7 @@ EXPERIMENTS = (
             "render.noise_floor_objects_db",
         ),
         because="Default: 46 dB in the training builds, since an error in a target stays for every "
-        "epoch; 40 dB in `smoke`, whose 24 scenes are to take minutes. Hard views end at the cap "
+        "epoch; 38 dB in `smoke`, whose 24 scenes are to take minutes. Hard views end at the cap "
         "and say so: rejecting them (`reject_at_cap`) would change what the set shows. The linear "
         "PSNR is for figures that are compared with published ones: its target is 5 to 10 dB lower "
         "for the same samples.",
@@ -205,8 +205,8 @@ EXPERIMENTS = (
         title="Samples before the floor is measured first",
         about="Views to the floor of `smoke`, by the samples after which it is looked at first.",
         covers=("build.renders.min_spp",),
-        because="Default: 32. With fewer the two halves may agree by luck, and small passes are "
-        "stratified coarser, so that they save nothing; more only costs where a view is easy.",
+        because="Default: 64. With fewer both halves may miss the same glints, and small passes "
+        "are stratified coarser; more only costs where a view is easy.",
         points=_first,
     ),
     _of_views(
@@ -214,8 +214,9 @@ EXPERIMENTS = (
         title="Samples of the denoiser's guide pictures",
         about="Views at a fixed number of samples, by those of albedo and normals.",
         covers=("build.renders.aux_spp",),
-        because="Default: 64. The filter takes the guides to be without noise, and they are traced "
-        "without light, at a fraction of the price of a sample.",
+        because="Default: 16, on a regular grid. The filter takes the guides to be without "
+        "noise, and they are traced without light, at a fraction of the price of a sample; the "
+        "dear pictures of the training builds have 64.",
         points=_varied("aux_spp", (4, 16, 64)),
     ),
     _of_views(

@@ -100,7 +100,7 @@ def _load(scene: Scene) -> Tracer:
 def _warm_up(tracer: Tracer, camera: Camera) -> None:
     for spp in _PASSES:
         tracer.radiance(camera, seed=0, spp=spp)
-        tracer.features(camera, seed=0, spp=spp)
+        tracer.features(camera, spp=spp)
     warm_up_denoiser(camera.resolution)
 
 
@@ -122,8 +122,7 @@ def _sum_of_samples(tracer: Tracer, camera: Camera, done: int, spp: int) -> NDAr
 def _denoised(
     tracer: Tracer, camera: Camera, picture: NDArray[np.float32], spp: int
 ) -> NDArray[np.float32]:
-    seed = seed_for(SEED, "features")
-    features = tracer.features(camera, seed=seed, spp=_largest_pass(spp))
+    features = tracer.features(camera, spp=_largest_pass(spp))
     return denoise(picture, features, "high")
 
 
@@ -151,7 +150,7 @@ def render_levels(
     started = time.process_time()
     plain = _Plain(scene)
     load_core_s = time.process_time() - started
-    features, core_s = _features(scene, camera, seed)
+    features, core_s = _features(scene, camera)
     total, before, levels = np.zeros((resolution, resolution, 3)), 0, []
     for spp in levels_spp:
         started = time.process_time()
@@ -165,12 +164,12 @@ def render_levels(
     return SampledPictures(load_core_s=load_core_s, levels=tuple(levels))
 
 
-def _features(scene: Scene, camera: Camera, seed: int) -> tuple[Features, float]:
+def _features(scene: Scene, camera: Camera) -> tuple[Features, float]:
     tracer = load_tracer(scene, max_depth=RenderSettings.max_depth, rr_depth=_RR_DEPTH)
     aux_spp = RenderSettings.aux_spp
-    tracer.features(camera, seed=seed, spp=aux_spp)  # compiles
+    tracer.features(camera, spp=aux_spp)  # compiles
     started = time.process_time()
-    features = tracer.features(camera, seed=seed, spp=aux_spp)
+    features = tracer.features(camera, spp=aux_spp)
     return features, time.process_time() - started
 
 

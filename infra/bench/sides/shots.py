@@ -22,7 +22,7 @@ from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import Quality, denoise
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
-from pipeline.renders.tracer import Features, HostSum, Tracer
+from pipeline.renders.tracer import Chosen, Features, HostSum, Tracer
 from storage.metrics import MAX_DB
 from storage.records.lights import encode_lights_exr
 from storage.records.profiles import pack_picture
@@ -44,18 +44,23 @@ class RememberingTracer:
     def only_light(self, row: int) -> "RememberingTracer":
         return RememberingTracer(self._tracer.only_light(row))
 
-    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+    def apart(self, *, bounces: bool, lobes: bool) -> "RememberingTracer":
+        """Raise NotImplementedError: what is remembered are passes of all light together."""
+        raise NotImplementedError
+
+    def radiance(
+        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+    ) -> NDArray[np.float32]:
         return self._remembered(
-            ("radiance", seed, spp), lambda: self._tracer.radiance(camera, seed=seed, spp=spp)
+            ("radiance", seed, spp, None if chosen is None else chosen.tobytes()),
+            lambda: self._tracer.radiance(camera, seed=seed, spp=spp, chosen=chosen),
         )
 
     def pass_sum(self, camera: Camera) -> HostSum:
         return HostSum(self, camera)
 
-    def features(self, camera: Camera, *, seed: int, spp: int) -> Features:
-        return self._remembered(
-            ("features", seed, spp), lambda: self._tracer.features(camera, seed=seed, spp=spp)
-        )
+    def features(self, camera: Camera, *, spp: int) -> Features:
+        return self._remembered(("features", spp), lambda: self._tracer.features(camera, spp=spp))
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
         return self._remembered(("hits",), lambda: self._tracer.hits(camera))
@@ -156,7 +161,7 @@ class RememberingRenderer(SceneRenderer):
         super().__init__(scene, settings)
         self._camera = (scene.c2w[0], float(scene.fov_deg[0]))
         self._remembering = RememberingTracer(self._tracer)
-        self._tracer, self._parts = self._remembering, [self._remembering]
+        self._tracer, self._tracers = self._remembering, [self._remembering]
 
     def timed_view(self, seed: int, settings: RenderSettings) -> tuple[RenderedView, float]:
         """Return the first view under other settings, and the core-seconds it would take alone.

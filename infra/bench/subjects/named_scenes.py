@@ -93,12 +93,16 @@ def sampled_scene(scene_index: int) -> Scene:
     return scene
 
 
-def first_composed(settings: SceneSettings, scene_index: int) -> tuple[Scene | None, int]:
+def first_composed(
+    settings: SceneSettings, scene_index: int, *, seed: int = 0
+) -> tuple[Scene | None, int]:
     """Return a training scene's first attempt that passes, and the number of rejected attempts."""
     pool = assets_of("train")
     for attempt in range(MAX_ATTEMPTS):
         with contextlib.suppress(Rejected):
-            scene = compose_scene(settings, pool, seed=0, scene_index=scene_index, attempt=attempt)
+            scene = compose_scene(
+                settings, pool, seed=seed, scene_index=scene_index, attempt=attempt
+            )
             return scene, attempt
     return None, MAX_ATTEMPTS
 

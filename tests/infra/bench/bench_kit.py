@@ -22,6 +22,8 @@ TINY = Effort(
     network_triangles=64,
     network_px=32,
     repeats=2,
+    judged_scenes=1,
+    reference_spp=128,
     growth=1,
 )
 

@@ -93,7 +93,7 @@ def test_the_block_of_a_page_is_that_of_the_result(tmp_path: Path) -> None:
     """Written anew from the results that are kept, it is what the page holds."""
     of_today = read_block(ROOT / "docs" / "tradeoffs.md", "bench guides")
     found = newest_run(RESULTS, "guides")
-    assert found is not None and "| **64** |" in of_today
+    assert found is not None and "| **16** |" in of_today
     (tmp_path / found[1].path.name).write_bytes(found[1].path.read_bytes())
     page = tmp_path / "page.md"
     page.write_text("<!-- bench guides:begin -->\nold\n<!-- bench guides:end -->\nafter\n")

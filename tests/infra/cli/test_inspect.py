@@ -1,14 +1,22 @@
 """`trilight inspect` writes where it may, and prints what it found."""
 
+import dataclasses
 import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from storage.errors import TrilightError
+from storage.records.sample import PartFloor
 from tests.command_line import trilight
-from tests.pipeline.documents.dataset_by_hand import five_scenes, write_dataset
+from tests.pipeline.documents.dataset_by_hand import (
+    five_scenes,
+    furnished,
+    sample,
+    write_dataset,
+)
 
 
 def inspect(*arguments: str | Path) -> str:
@@ -55,6 +63,24 @@ def test_json_holds_the_distributions(tmp_path: Path) -> None:
     assert read["licences"] == {"CC-BY-4.0": 1, "CC0-1.0": 3}
     assert read["rejections"][0] == ["scenes", "no_room", 2]
     assert (tmp_path / "report.html").exists()
+
+
+@pytest.mark.usefixtures("bare_reports")
+def test_parts_show_with_their_floors(tmp_path: Path) -> None:
+    made = sample(0, furnished(["a"]))
+    floors = {
+        name: PartFloor(noise_floor_db=db, noise_floor_linear_db=30.0, object_noise_floor_db=39.0)
+        for name, db in (("direct", 47.5), ("indirect", 38.25))
+    }
+    parts = {"direct": made.radiance_rgb, "indirect": np.zeros_like(made.radiance_rgb)}
+    views = tuple(dataclasses.replace(view, parts=floors) for view in made.views)
+    whole = dataclasses.replace(made, parts_rgb=parts, views=views)
+    write_dataset(tmp_path, {"train-000000.tar": [whole]})
+    assert "noise floor, indirect median 38.2 dB" in " ".join(inspect(tmp_path).split())
+    read = json.loads(inspect(tmp_path, "--json"))
+    assert read["part_noise_floor_db"] == {"direct": [47.5] * 2, "indirect": [38.25] * 2}
+    (page,) = (tmp_path / "report").glob("*.html")
+    assert "view 1, indirect" in page.read_text() and "38.25" in page.read_text()
 
 
 def _refused(dataset: Path) -> str:

@@ -22,6 +22,7 @@ from storage.conventions import preview_srgb8
 from storage.dataset.shard import write_shard
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
+from storage.records.parts import sum_of_parts
 from storage.records.profiles import Profile
 from storage.records.sample import Sample, encode_sample
 from storage.records.scene import Scene
@@ -107,6 +108,7 @@ def test_one_scene_gives_one_picture_whatever_it_is_read_from(
         np.testing.assert_array_equal(picture, pictures[0])
         assert outcome["scene_sha256"] == scene_digest(scene)
         assert (outcome["spp"], outcome["view"], outcome["at_cap"]) == (8, 1, True)
+        assert outcome["mean_radiance"] == pytest.approx(picture.mean(dtype=np.float64), rel=1e-3)
         assert (outcome["triangles"], outcome["lights"]) == (3, 1)
     assert found[0]["notes"][0] == "two.json: unknown field objects.floor.colour"
     assert "may flatter" in found[1]["notes"][0]
@@ -217,6 +219,29 @@ def test_a_picture_made_before_there_were_other_targets_is_kept(tmp_path: Path) 
         "resolution", "noise_floor_db", "min_spp", "max_spp", "reject_at_cap", "max_depth",
         "rr_depth", "aux_spp", "denoiser", "min_mean_radiance", "per_light",
     }  # fmt: skip
+
+
+def test_parts_stand_as_layers_in_the_file_of_the_picture(tmp_path: Path) -> None:
+    """With their floors in its header; a film's files with layers are kept like others."""
+    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
+    source.write_bytes(encode_scene(tiny_scene()))
+    words = ["render", str(source), "--out", str(out), "--split", *SMALL]
+    assert "layer indirect" in unwrapped(trilight(words, env=WIDE).output)
+    file = OpenEXR.File(io.BytesIO(out.read_bytes()))
+    assert set(file.channels()) == {"RGB", "direct", "indirect"}
+    layers = {name: file.channels()[name].pixels.astype(np.float32) for name in file.channels()}
+    picture = layers.pop("RGB")
+    assert picture.mean() > 0.01
+    np.testing.assert_array_equal(sum_of_parts(layers), picture)
+    assert file.header()["trilight.indirect.noise_floor_db"] == 100.0  # a lone floor
+    film = ("--orbit", "1", "--out", tmp_path / "film", "--split", "--split-lobes")
+    for kept in (False, True):
+        (shot,) = render(source, *film)["pictures"]
+        assert shot["kept"] is kept
+        assert shot["diffuse_indirect.noise_floor_db"] == 100.0
+    assert "a network makes all light together" in mistake(
+        source, "--out", out, "--split", "--engine", "neural"
+    )
 
 
 def _nothing(folder: Path) -> None:

@@ -1,6 +1,7 @@
 """`trilight shards`: what the commands take and print."""
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,15 @@ def test_merge_select_and_reshard(tmp_path: Path) -> None:
     assert [key for s in open_dataset(str(tmp_path / "c")).manifest.shards for key in s.index] == [
         "000000003", "000000009",
     ]  # fmt: skip
+    where = 'template == "plane" and min(noise_floor_db) >= 36.5 and split == "train"'
+    listed = shards("list", tmp_path / "ab", "--where", where)
+    assert "2 of 12 scenes" in listed and "000000009 train" in listed
+    words = shlex.split(listed.partition("Next: trilight shards ")[2])
+    shards(*words)  # as it is printed
+    assert open_dataset(f"{tmp_path / 'ab'}-selected").manifest.num_samples == 2
+    rows = json.loads(shards("list", tmp_path / "ab", "--where", where, "--json"))
+    assert [row["key"] for row in rows["scenes"]] == ["000000003", "000000009"]
+    assert "0 of 12 scenes" in shards("list", tmp_path / "ab", "--where", "max(coverage) > 2")
     size = ("--scenes-per-shard", "5", "--json")
     outcome = json.loads(shards("reshard", tmp_path / "ab", "--out", tmp_path / "d", *size))
     assert outcome["scenes_by_split"] == {"test": 4, "train": 8}
@@ -40,7 +50,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     a, out = finished(tmp_path / "a", scenes(0)), tmp_path / "c"
     with pytest.raises(TrilightError, match="1 dataset; expected at least 2"):
         shards("merge", a, "--out", out)
-    with pytest.raises(TrilightError, match="expected --split, --template or --min-noise-floor"):
+    with pytest.raises(TrilightError, match="expected --where, --split, --template or --min-noise"):
         shards("select", a, "--out", out)
     assert not out.exists()
 

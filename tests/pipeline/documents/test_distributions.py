@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.documents.distributions import Distributions, dataset_distributions
-from pipeline.documents.quantities import QUANTITIES, STATISTICS, summary
 from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
+from storage.records.quantities import QUANTITIES, STATISTICS, summary
 from storage.records.sample import Sample
 from tests.pipeline.documents.dataset_by_hand import five_scenes, furnished, sample, write_dataset
 

@@ -37,7 +37,7 @@ def refused(out: Path, derive: Derive, *places: Path | str) -> str:
 
 def changed_settings(root: Path, group: str, **values: Any) -> Path:
     manifest = open_dataset(str(root)).manifest
-    settings = {**manifest.settings, group: {**manifest.settings[group], **values}}
+    settings = {**manifest.settings, group: {**manifest.settings.get(group, {}), **values}}
     write_manifest(root / "manifest.json", dataclasses.replace(manifest, settings=settings))
     return root
 
@@ -84,6 +84,7 @@ def test_the_same_scene_twice_is_refused(tmp_path: Path) -> None:
     [
         ("renders", {"resolution": 32}, "renders.resolution is 32; expected 16"),
         ("renders", {"per_light": True}, "renders.per_light is True; expected False"),
+        ("storage", {"passes": ["object"]}, "storage.passes is ['object']; expected False"),
     ],
 )
 def test_what_does_not_fit_together_is_named(

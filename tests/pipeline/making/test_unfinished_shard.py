@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from PIL import Image
 
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
@@ -93,6 +94,15 @@ def test_whoever_makes_the_last_piece_packs(tmp_path: Path) -> None:
     assert shard.num_samples == 4
     assert _make(tmp_path, 0, 4, made) is None  # there is nothing left to do
     assert made.total() == 4
+
+
+def test_the_first_scene_can_be_looked_at_at_once(tmp_path: Path) -> None:
+    sheet, made = DatasetFolder(tmp_path).contact_sheet, Counter[int]()
+    _make(tmp_path, 2, 3, made)
+    first = sheet.read_bytes()
+    assert Image.open(sheet).size[0] > 2 * 192, "both views side by side"
+    _make(tmp_path, 3, 4, made)
+    assert sheet.read_bytes() == first, "later scenes leave it"
 
 
 def test_what_somebody_else_is_making_is_left_to_them(tmp_path: Path) -> None:

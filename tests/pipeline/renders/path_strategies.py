@@ -2,6 +2,9 @@
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from pipeline.renders.camera import Camera
 from pipeline.renders.vector_tracer import VectorTracer
 from storage.records.scene import Scene
@@ -13,15 +16,15 @@ _ALMOST_ALL = 2.0**40
 class CameraPathsOnly(VectorTracer):
     """The path tracer as it is without light paths."""
 
-    def _one_pass(self, camera: Camera, *, seed: int, spp: int) -> Any:
-        return self._traced(camera, 0.0, seed=seed, spp=spp)
+    def _one_pass(self, camera: Camera, pixels: Any, *, seed: int, spp: int) -> list[Any]:
+        return self._traced(camera, pixels, 0.0, seed=seed, spp=spp)
 
 
 class CameraPathsLeft(VectorTracer):
     """What weights leave to camera paths beside light paths without number."""
 
-    def _one_pass(self, camera: Camera, *, seed: int, spp: int) -> Any:
-        return self._traced(camera, _ALMOST_ALL, seed=seed, spp=spp)
+    def _one_pass(self, camera: Camera, pixels: Any, *, seed: int, spp: int) -> list[Any]:
+        return self._traced(camera, pixels, _ALMOST_ALL, seed=seed, spp=spp)
 
 
 class LightPathsOnly(VectorTracer):
@@ -31,6 +34,7 @@ class LightPathsOnly(VectorTracer):
         super().__init__(scene, max_depth=max_depth, rr_depth=rr_depth)
         self._unit /= 2.0**32  # each of so many paths counts for so much less
 
-    def _one_pass(self, camera: Camera, *, seed: int, spp: int) -> Any:
+    def _one_pass(self, camera: Camera, pixels: Any, *, seed: int, spp: int) -> list[Any]:
         count = camera.resolution**2 * spp
-        return self._landed(camera, _ALMOST_ALL, seed=seed, count=count)
+        landed = self._landed(camera, _ALMOST_ALL, seed=seed, count=count)
+        return [dr.gather(mi.Color3f, part, pixels) for part in landed]

@@ -5,11 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from infra.bench.sides.judged_pictures import raw_reference, shrunk
 from infra.bench.sides.sampled_pictures import bare_pictures, render_levels
 from infra.bench.sides.shots import SEED, fixed_samples, shots
+from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import SceneRenderer
 from storage.metrics import psnr_log_db
 from storage.seeds import rng_for
+from tests.pipeline.renders.sampling import camera_of
 from tests.pipeline.renders.scene_kit import sampled_like_scene
 from tests.scenes_by_hand import tiny_scene
 
@@ -17,7 +20,7 @@ from tests.scenes_by_hand import tiny_scene
 def test_shared_passes_are_the_pictures_that_each_setting_gives_alone() -> None:
     scene, base = tiny_scene(), fixed_samples(16, 512)
     variants = {
-        "easy": dataclasses.replace(base, min_spp=32, noise_floor_db=40.0),
+        "easy": dataclasses.replace(base, min_spp=16, noise_floor_db=20.0),
         "hard": base,
     }
     together = shots(scene, variants)
@@ -28,6 +31,22 @@ def test_shared_passes_are_the_pictures_that_each_setting_gives_alone() -> None:
         assert together[name].view.spp == alone.spp
         assert together[name].core_s > 0 and together[name].packed_bytes > 0
     assert together["easy"].view.spp < together["hard"].view.spp == 512
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_small_reference_is_that_of_its_own_width() -> None:
+    """A box of pixels is a pixel of a smaller picture: block means of one are samples of it."""
+    scene = sampled_like_scene(np.random.default_rng(5), num_views=1)
+    large = raw_reference(scene, camera_of(scene, 64), 128, 1)
+    assert not np.array_equal(large.a_rgb, large.b_rgb)
+    small = shrunk(large, 32)
+    tracer = load_tracer(scene, max_depth=10, rr_depth=2)
+    direct = tracer.radiance(camera_of(scene, 32), seed=4, spp=256)
+    # Both have 256 samples a pixel, of which single ones are bright: compare calm pixels.
+    mean = 0.5 * (small.a_rgb + small.b_rgb)
+    ratio = mean[direct > 0.1] / direct[direct > 0.1]
+    assert np.median(np.abs(ratio - 1)) < 0.15
+    assert np.median(ratio) == pytest.approx(1, abs=0.03)
 
 
 @pytest.mark.slow

@@ -11,9 +11,13 @@ from pipeline.builds.named import named_build
 from pipeline.making.render_sample import render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders import vector_tracer
+from pipeline.renders.camera import Camera
 from pipeline.renders.renderer import SceneRenderer
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.vector_tracer import VectorTracer
 from storage.records.scene import Scene
+from tests.pipeline.renders.guided_scenes import lit_by_a_mirror, mirrors
+from tests.pipeline.renders.sampling import camera_of
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
 
 SETTINGS = RenderSettings(
@@ -93,6 +97,24 @@ def test_lights_apart_need_no_kernel_of_their_own() -> None:
 
 
 @pytest.mark.usefixtures("history")
+def test_guided_passes_have_one_more_set_of_kernels_for_every_scene() -> None:
+    """That of a scene's table, of guided camera paths, and of the light paths that know of them."""
+    tracer, seen = _guided(mirrors(), max_depth=10)
+    tracer.radiance(seen, seed=0, spp=16)
+    first = _launched()
+    for depth, scene in enumerate((mirrors(0.05), lit_by_a_mirror(0.1), lit_by_a_mirror(0.3))):
+        tracer, seen = _guided(scene, max_depth=10 + depth)
+        tracer.radiance(seen, seed=0, spp=16)
+    assert _launched() <= first
+
+
+def _guided(scene: Scene, *, max_depth: int) -> tuple[VectorTracer, Camera]:
+    tracer = VectorTracer(scene, max_depth=max_depth, rr_depth=2).guided()
+    assert tracer._scene.guide is not None
+    return tracer, camera_of(scene, 32)
+
+
+@pytest.mark.usefixtures("history")
 def test_the_count_of_kernels_can_tell() -> None:
     """A number that is part of the kernel, instead of data for it, makes another kernel."""
     import drjit as dr
@@ -133,8 +155,9 @@ def test_pictures_come_back_only_where_something_is_decided(
     for way in ("__array__", "__dlpack__", "numpy"):
         monkeypatch.setattr(dr.ArrayBase, way, _counted(way, getattr(dr.ArrayBase, way), reads))
     _render(_smallest(), dataclasses.replace(SETTINGS, min_spp=spp, max_spp=spp))
-    # Both halves at the first look for black and at the floor; albedo, normals and hits once.
-    assert reads == ["__array__"] * (2 + 2 + 3)
+    # Both halves at the first look for black and at the floor, there with their squares; albedo,
+    # normals and hits once.
+    assert reads == ["__array__"] * (2 + 2 + 3 + 2)
 
 
 def _counted(way: str, read: Callable[..., object], reads: list[str]) -> Callable[..., object]:

@@ -10,6 +10,7 @@ from pipeline.builds.named import named_build
 from pipeline.making.render_sample import render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.denoiser import denoise
+from pipeline.renders.kept_light import with_mean_of
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.samples import HalfSamples
@@ -22,7 +23,6 @@ from storage.records.exr import decode_exr, encode_exr
 from storage.records.lights import MAX_LIGHTS, light_rows, rounded_to_half, sum_of_lights
 from storage.records.sample import decode_sample, encode_sample
 from storage.records.scene import Scene, SceneObject
-from storage.seeds import seed_for
 from tests.pipeline.renders.sampling import SIGMAS, Estimate, camera_of
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sphere
 from tests.scenes_by_hand import tiny_scene
@@ -93,9 +93,9 @@ def test_lights_apart_add_up_to_one_denoised_picture() -> None:
     parts = [tracer.only_light(row) for row in light_rows(scene)]
     samples = HalfSamples(parts, camera_of(scene, 32), 0, first_spp=32, max_spp=32)
     assert len(list(samples.passes_to(SETTINGS.max_spp))) == 2
-    seed = seed_for(0, "features")
-    features = tracer.features(camera_of(scene, 32), seed=seed, spp=SETTINGS.aux_spp)
-    expected = denoise(samples.mean().sum(axis=0), features, "high")
+    features = tracer.features(camera_of(scene, 32), spp=SETTINGS.aux_spp)
+    raw = samples.mean().sum(axis=0)
+    expected = with_mean_of(denoise(raw, features, "high"), raw)
     # rounded to half floats four times, each light and their sum: 2^-11 of each
     np.testing.assert_allclose(_render(scene).radiance_rgb, expected, rtol=2 * 2**-11, atol=1e-6)
 

@@ -56,7 +56,7 @@ def test_a_lit_square_covers_the_pixels_that_it_should() -> None:
     expected = np.zeros((resolution, resolution), bool)
     expected[top:bottom, left:right] = True
     picture = tracer.radiance(camera, seed=0, spp=64)
-    features = tracer.features(camera, seed=0, spp=64)
+    features = tracer.features(camera, spp=64)
     np.testing.assert_array_equal(tracer.hits(camera), expected)
     # A sample within a float32 rounding of a border may fall on its other side.
     np.testing.assert_allclose(features.albedo[..., 0], expected, atol=0.02)
@@ -74,7 +74,7 @@ def test_emitters_are_invisible_to_the_auxiliary_pictures() -> None:
         for parts in ([floor, lamp], [floor, lamp, in_front])
     ]
     camera = camera_of(join([floor, lamp], eye=(0, -0.1, 2)), 16)
-    without, with_emitter = (tracer.features(camera, seed=1, spp=16) for tracer in pictures)
+    without, with_emitter = (tracer.features(camera, spp=16) for tracer in pictures)
     np.testing.assert_array_equal(without.albedo, with_emitter.albedo)
     np.testing.assert_array_equal(without.normal, with_emitter.normal)
     np.testing.assert_array_equal(pictures[0].hits(camera), pictures[1].hits(camera))

@@ -5,12 +5,17 @@ import hashlib
 import os
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from pipeline.renders import renderer as renderer_module
+from pipeline.renders.denoiser import Quality
 from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
 from pipeline.renders.settings import RenderSettings
+from pipeline.renders.tracer import Features
 from storage.conventions import look_at_c2w
 from storage.errors import Rejected
 from storage.metrics import psnr_log_db
@@ -19,7 +24,9 @@ from storage.settings.changes import changed
 from tests.conftest import ROOT
 from tests.pipeline.renders.scene_kit import join, light, material, quad, sampled_like_scene, sphere
 
-CHEAP = RenderSettings(resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32, aux_spp=16)
+CHEAP = RenderSettings(resolution=32, noise_floor_db=60.0, min_spp=32, max_spp=32)
+GROWING = dataclasses.replace(CHEAP, min_spp=16, max_spp=256)
+"""Its first look is at 64 samples: the picture is narrow."""
 
 
 def simple_scene(radiance: float = 20.0) -> Scene:
@@ -92,14 +99,14 @@ def test_views_do_not_depend_on_the_views_before_them() -> None:
 
 def test_sampling_stops_at_the_target_or_at_the_cap() -> None:
     scene = simple_scene()
-    easy = _render(scene, dataclasses.replace(CHEAP, noise_floor_db=10.0, max_spp=256))
-    assert easy.spp == 32 and not easy.at_cap
-    hard = _render(scene, dataclasses.replace(CHEAP, noise_floor_db=95.0, max_spp=256))
+    easy = _render(scene, dataclasses.replace(GROWING, noise_floor_db=10.0))
+    assert easy.spp == 64 and not easy.at_cap
+    hard = _render(scene, dataclasses.replace(GROWING, noise_floor_db=95.0))
     assert hard.spp == 256 and hard.at_cap
     between = easy.noise_floor_db + 2
-    wanted = _render(scene, dataclasses.replace(CHEAP, noise_floor_db=between, max_spp=4096))
+    wanted = _render(scene, dataclasses.replace(GROWING, noise_floor_db=between, max_spp=4096))
     assert wanted.noise_floor_db >= between and not wanted.at_cap
-    assert 32 < wanted.spp < 4096 and wanted.spp % 32 == 0
+    assert 64 < wanted.spp < 4096 and wanted.spp % 32 == 0
 
 
 def test_a_build_may_refuse_what_stays_noisy() -> None:
@@ -113,7 +120,7 @@ def test_a_build_may_refuse_what_stays_noisy() -> None:
 
 def test_a_view_says_how_far_it_is() -> None:
     scene = simple_scene()
-    settings = dataclasses.replace(CHEAP, noise_floor_db=95.0, max_spp=256)
+    settings = dataclasses.replace(GROWING, noise_floor_db=95.0)
     steps = SceneRenderer(scene, settings).view_steps(scene.c2w[0], float(scene.fov_deg[0]), 0)
     seen = []
     while True:
@@ -125,17 +132,35 @@ def test_a_view_says_how_far_it_is() -> None:
     # passes of 16 to 64 samples a half, then one of 64 of each half
     assert [step.spp for step in seen] == [*range(16, 129, 16), 192, 256]
     assert all(step.spp <= step.expected_spp <= 256 for step in seen)
-    assert [step.missing_db is None for step in seen] == [True] * 2 + [False] * 8
-    assert all(0 < (step.missing_db or 0) < 95 for step in seen[2:])
+    assert [step.missing_db is None for step in seen] == [True] * 4 + [False] * 6
+    assert all(0 < (step.missing_db or 0) < 95 for step in seen[4:])
     assert digest(view) == digest(_render(scene, settings))
 
 
+def test_halves_of_many_samples_have_the_best_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    filtered: list[str] = []
+    denoise = renderer_module.denoise
+
+    def noted(raw: NDArray[np.float32], features: Features, quality: Quality) -> Any:
+        filtered.append(quality)
+        return denoise(raw, features, quality)
+
+    monkeypatch.setattr(renderer_module, "denoise", noted)
+    settings = dataclasses.replace(GROWING, noise_floor_db=95.0, min_spp=64, max_spp=512)
+    _render(simple_scene(), settings)
+    # Two halves at 256 and at 512 samples, and the picture.
+    assert filtered == ["fast"] * 2 + ["high"] * 2 + ["high"]
+    filtered.clear()
+    _render(simple_scene(), dataclasses.replace(settings, denoiser="fast"))
+    assert filtered == ["fast"] * 5
+
+
 def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
-    easy = dataclasses.replace(CHEAP, noise_floor_db=10.0, max_spp=4096)
+    easy = dataclasses.replace(GROWING, noise_floor_db=10.0, max_spp=4096)
     first = _render(simple_scene(), easy)
     wanted = first.noise_floor_linear_db + 2
     both = _render(simple_scene(), dataclasses.replace(easy, noise_floor_linear_db=wanted))
-    assert both.spp > first.spp == 32
+    assert both.spp > first.spp == 64
     assert both.noise_floor_linear_db >= wanted and not both.at_cap
     alone = dataclasses.replace(easy, noise_floor_db=None, noise_floor_linear_db=wanted)
     assert digest(_render(simple_scene(), alone)) == digest(both)
@@ -144,16 +169,16 @@ def test_a_linear_target_goes_on_where_the_log_one_is_reached() -> None:
 def test_a_target_over_objects_goes_on_where_most_is_background() -> None:
     scene = simple_scene()
     far = dataclasses.replace(scene, fov_deg=np.array([110.0], np.float32))
-    easy = dataclasses.replace(CHEAP, max_spp=4096)
+    easy = dataclasses.replace(GROWING, max_spp=4096)
     first = _render(far, dataclasses.replace(easy, noise_floor_db=10.0))
     assert first.hits.mean() < 0.25
     assert first.object_noise_floor_db < first.noise_floor_db - 6
-    reached = first.noise_floor_db - 0.1
+    reached = first.object_noise_floor_db + 1
     whole = _render(far, dataclasses.replace(easy, noise_floor_db=reached))
     objects = _render(
         far, dataclasses.replace(easy, noise_floor_db=reached, noise_floor_objects_db=reached)
     )
-    assert whole.spp == 32 < objects.spp
+    assert whole.spp == 64 < objects.spp
     assert objects.object_noise_floor_db >= reached
 
 

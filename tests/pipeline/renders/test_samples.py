@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.samples import HalfSamples
-from pipeline.renders.tracer import HostSum
+from pipeline.renders.tracer import Chosen, HostSum
 
 CAMERA = Camera(c2w=np.eye(4), fov_deg=40.0, resolution=8)
 
@@ -20,9 +20,12 @@ class Recorder:
     def pass_sum(self, camera: Camera) -> HostSum:
         return HostSum(self, camera)  # type: ignore[arg-type]
 
-    def radiance(self, camera: Camera, *, seed: int, spp: int) -> NDArray[np.float32]:
+    def radiance(
+        self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
+    ) -> NDArray[np.float32]:
         self.asked.append((spp, seed))
-        return np.full((camera.resolution, camera.resolution, 3), spp, np.float32)
+        picture = np.full((camera.resolution, camera.resolution, 3), spp, np.float32)
+        return picture if chosen is None else picture * chosen[..., None]
 
 
 def _passes(first_spp: int, spp: int, max_spp: int) -> tuple[HalfSamples, list[tuple[int, int]]]:

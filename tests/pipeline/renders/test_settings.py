@@ -38,6 +38,24 @@ def test_bad_settings_name_themselves(name: str, value: Any) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("resolution", "max_spp", "first"),
+    [
+        (512, 4096, 64),
+        (256, 4096, 64),
+        (128, 4096, 64),
+        (64, 4096, 128),
+        (96, 4096, 128),
+        (8, 64, 64),
+    ],
+)
+def test_a_narrow_picture_has_more_samples_before_the_first_look(
+    resolution: int, max_spp: int, first: int
+) -> None:
+    settings = {**GOOD, "resolution": resolution, "min_spp": 64, "max_spp": max_spp}
+    assert RenderSettings(**settings).first_spp == first
+
+
 def test_one_target_is_enough_and_one_is_needed() -> None:
     alone = RenderSettings(**{**GOOD, "noise_floor_db": None, "noise_floor_linear_db": 30.0})
     assert alone.targets_db == {"psnr_linear_db": 30.0}
@@ -60,7 +78,7 @@ def test_a_record_holds_later_targets_only_where_they_are_set() -> None:
 
 
 def test_a_picture_that_is_asked_for_has_the_targets_that_are_asked_for() -> None:
-    common = {"resolution": 64, "max_spp": 512}
+    common: dict[str, Any] = {"resolution": 64, "max_spp": 512}
     assert one_picture(**common).targets_db == {"psnr_log_db": 40.0}
     linear = one_picture(**common, noise_floor_linear_db=35.0)
     assert linear.targets_db == {"psnr_linear_db": 35.0}

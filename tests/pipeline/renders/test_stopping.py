@@ -22,7 +22,7 @@ def test_samples_grow_in_whole_steps_up_to_the_cap(
     chosen = next_spp(logs((spp, 0.0)), log_goal(gap_db, step, cap))
     assert chosen % step == 0
     assert spp < chosen <= cap
-    assert chosen <= max(4 * spp, spp + step)
+    assert chosen <= max(2 * spp, spp + step)
     if wider_gap_db >= gap_db:
         assert chosen <= next_spp(logs((spp, 0.0)), log_goal(wider_gap_db, step, cap))
 
@@ -30,8 +30,8 @@ def test_samples_grow_in_whole_steps_up_to_the_cap(
 def test_a_gap_of_one_slope_doubles_the_samples() -> None:
     first = logs((128, 0.0))
     assert next_spp(first, log_goal(1.2, 128, 4096)) == 256
-    assert next_spp(first, log_goal(2.4, 128, 4096)) == 512
-    assert next_spp(first, log_goal(99.0, 128, 4096)) == 512
+    assert next_spp(first, log_goal(2.4, 128, 4096)) == 256
+    assert next_spp(first, log_goal(99.0, 128, 4096)) == 256
     assert next_spp(logs((512, 0.0)), log_goal(99.0, 128, 640)) == 640
 
 
@@ -54,7 +54,7 @@ def test_the_expected_number_of_samples_looks_past_the_next_step() -> None:
     first = logs((128, 0.0))
     assert expected_spp(first, log_goal(1.2, 128, 4096)) == 256
     assert expected_spp(first, log_goal(4.8, 128, 4096)) == 2048
-    assert next_spp(first, log_goal(4.8, 128, 4096)) == 512
+    assert next_spp(first, log_goal(4.8, 128, 4096)) == 256
     assert expected_spp(first, log_goal(1e9, 128, 4096)) == 4096
 
 

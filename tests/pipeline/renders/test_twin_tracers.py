@@ -73,8 +73,8 @@ def test_the_fallback_agrees_within_noise_where_lobes_are_not_rough() -> None:
     assert len(score) > 90 and abs(score.mean()) < 0.35
     camera = camera_of(scene, 32)
     tracer = load_tracer(scene, max_depth=10, rr_depth=5)
-    features = tracer.features(camera, seed=3, spp=16), plugins.features(camera, seed=3, spp=16)
-    # Equal sampler seeds give equal camera rays up to float32, in the same pixels but for edges.
+    features = tracer.features(camera, spp=16), plugins.features(camera, spp=16)
+    # Both trace the same regular grid up to float32, and meet the same triangles but at edges.
     assert np.mean(np.abs(features[0].albedo - features[1].albedo) > 1e-4) < 0.01
     assert np.mean(np.abs(features[0].normal - features[1].normal) > 1e-4) < 0.01
     assert (tracer.hits(camera) != plugins.hits(camera)).sum() <= 1

@@ -6,8 +6,9 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays, look_at_c2w
 from storage.errors import TrilightError
-from storage.records.first_hits import MISS, first_hits
+from storage.records.first_hits import FirstHits, SeenFrom, first_hits
 from storage.records.scene import Scene
+from storage.records.surfaces import MISS
 from tests.scenes_by_hand import tiny_scene
 
 RESOLUTION = 24
@@ -105,6 +106,64 @@ def test_emitters_are_hidden_and_normals_interpolated() -> None:
     expected = shares.sum(axis=-2) / np.linalg.norm(shares.sum(axis=-2))
     np.testing.assert_allclose(corner.shading_normal, expected, rtol=1e-6)
     assert corner.shading_normal[0] > 0.05
+
+
+def test_a_small_triangle_far_away_keeps_its_digits() -> None:
+    """1 cm at 900 m, beside Moeller and Trumbore in the longer floats of numpy."""
+    small = np.array([[-0.006, -0.004, 0.002], [0.007, -0.005, -0.003], [0.001, 0.008, 0]])
+    positions = np.concatenate([tiny_scene().vertex_positions + np.array([[0, 0, 9]]), small])
+    pose = look_at_c2w(eye=[500, 420, 620], target=[0, 0, 0], up=[0, 0, 1])
+    scene = tiny_scene(
+        vertex_positions=positions.astype(np.float32),
+        vertex_normals=np.full((10, 3), [0, 0, 1], np.float32),
+        faces=np.array([[7, 8, 9], [0, 2, 3], [4, 5, 6]], np.uint32),
+        c2w=pose[None].astype(np.float32),
+        fov_deg=np.array([0.01], np.float32),
+    )
+    hit = first_hits(scene, resolution=101, pixel=(50, 50))
+    assert hit.triangle == 0
+    origin, rays = camera_rays(scene.c2w[0], float(scene.fov_deg[0]), 101)
+    a, b, c = scene.vertex_positions[7:].astype(np.longdouble)
+    ray, start = rays[50, 50].astype(np.longdouble), origin - a
+    p = np.cross(ray, c - a)
+    q = np.cross(start, b - a)
+    u, v = np.array([start @ p, ray @ q]) / ((b - a) @ p)
+    # one rounding of a coordinate over the edge: 900 * 1e-16 / 0.01
+    np.testing.assert_allclose(
+        hit.barycentric, np.array([1 - u - v, u, v], float), rtol=0, atol=1e-10
+    )
+
+
+def test_slivers_give_finite_numbers_and_segments_none() -> None:
+    """Corners on a line, to the rounding of float32: Embree does meet some of them."""
+    rng = np.random.default_rng(0)
+    starts, lines = rng.uniform(-1, 1, (200, 1, 3)), rng.normal(size=(200, 1, 3))
+    corners = (starts + lines * rng.uniform(-1, 1, (200, 3, 1))).astype(np.float32)
+    corners[:50] = corners[:50, :1]  # points
+    corners[50:100, 2] = corners[50:100, 1]  # segments
+    scene = tiny_scene(
+        vertex_positions=corners.reshape(-1, 3),
+        vertex_normals=np.tile(np.array([0, 0, 1], np.float32), (600, 1)),
+        faces=np.arange(600, dtype=np.uint32).reshape(-1, 3),
+        material_index=np.zeros(200, np.uint16),
+        object_index=np.zeros(200, np.uint16),
+    )
+    origin = np.array([3.0, 2.0, 1.0])
+    shares = rng.dirichlet([1, 1, 1], (200, 100))
+    rays = np.einsum("nkc,nci->nki", shares, corners.astype(np.float64)) - origin
+    hits = SeenFrom(scene, origin).hits(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    assert hits.met.sum() > 1000 and hits.triangle[hits.met].min() >= 100
+    for name in ("barycentric", "depth_m", "position", "geometric_normal", "shading_normal"):
+        assert np.isfinite(getattr(hits, name)[hits.met]).all(), name
+
+
+def test_a_ray_in_the_plane_of_its_triangle_stands_for_its_middle() -> None:
+    """Float32 may see it a little above the plane in which float64 has it."""
+    scene = tiny_scene()
+    seen = SeenFrom(scene, np.array([-3.0, 0.5, 0.0]))
+    hit = FirstHits(seen=seen, directions=np.array([[1.0, 0, 0]]), triangle=np.array([0]))
+    np.testing.assert_allclose(hit.barycentric, [[1 / 3, 1 / 3, 1 / 3]])
+    np.testing.assert_allclose(hit.position, [[1 / 3, -1 / 3, 0]])
 
 
 def test_one_pixel_is_that_of_the_picture() -> None:

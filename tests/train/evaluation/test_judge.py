@@ -12,7 +12,7 @@ from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.train.toy import toy_sample, toy_scene
 from train.data.scenes import training_scene
-from train.evaluation.judge import CHUNK, hit_masks
+from train.evaluation.judge import hit_masks
 from train.evaluation.rivals import median_picture
 from train.evaluation.scores import ViewScore, lead, score_view, share_better, summarise
 from train.evaluation.sheet import (
@@ -65,13 +65,6 @@ def test_geometry_behind_the_camera_and_emitters_are_not_hit() -> None:
     looking_up[:3, 3] = emitter - [0, 0, 0.05]
     at_light = scene.with_cameras(looking_up[None], np.array([20.0], np.float32))
     assert not hit_masks(at_light, 8).any()
-
-
-def test_many_triangles_go_through_in_chunks() -> None:
-    scene = toy_scene(2, boxes=1 + CHUNK // 12)
-    assert (~scene.triangle_emits).sum() > CHUNK
-    masks = hit_masks(scene, 8)
-    assert np.array_equal(masks[0], hits_one_by_one(scene, 0, 8))
 
 
 def view_score(log_l1: float) -> ViewScore:

@@ -58,12 +58,12 @@ def test_one_dead_link_costs_one_object(
     for name in "abc":
         site.put(f"{name}.obj", f"content of {name}")
     breaks(site)
-    found = find(f"{site.url.replace('//', '//ada:s3cret@')}/?key=s3cret")
+    found = find(f"{site.url.replace('//', '//lovelace:s3cret@')}/?key=s3cret")
     assert [record.uid for record in found.records] == ["a", "c"]
     assert reasons(found) == {"b": reason}
     text = found.failures[0].message
     assert message in text
-    assert "s3cret" not in text and "ada" not in text and "Traceback" not in text
+    assert "s3cret" not in text and "lovelace" not in text and "Traceback" not in text
     assert not list(Path(found.records[0].path).parent.glob("b.obj*"))
     assert breaks is not grow or not site.gets()["/b.obj"]
 
@@ -114,10 +114,10 @@ def test_folders_that_give_nothing(
 ) -> None:
     prepare(site)
     with pytest.raises(TrilightError, match=message) as caught:
-        find(f"{site.url.replace('//', '//ada:s3cret@')}?s3cret")
+        find(f"{site.url.replace('//', '//lovelace:s3cret@')}?s3cret")
     text = str(caught.value)
     assert "expected" in text and "\n" not in text
-    assert "s3cret" not in text and "ada" not in text
+    assert "s3cret" not in text and "lovelace" not in text
 
 
 def test_a_catalogue_that_is_kept_from_us_still_rules(site: Site) -> None:

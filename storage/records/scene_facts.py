@@ -137,7 +137,7 @@ def cameras(scene: Scene) -> list[CameraFacts]:
 
 
 def scene_values(record: SceneRecord) -> Mapping[str, Values]:
-    """Return the values that one scene adds to each distribution (pipeline.documents.quantities).
+    """Return the values that one scene adds to each distribution (storage.records.quantities).
 
     Raises:
         TypeError, ValueError: a view's record holds something that is not a number.

@@ -1,0 +1,47 @@
+"""The samples of a dataset that a user chooses, by split and by key."""
+
+import os
+from collections.abc import Iterator
+
+from storage.conventions import SPLITS
+from storage.dataset.dataset import Dataset
+from storage.errors import TrilightError
+from storage.records.sample import Sample, sample_key
+
+
+def is_dataset(source: str) -> bool:
+    """Return whether what a user names is a dataset, rather than the file of a scene."""
+    return "://" in source or os.path.isdir(source)
+
+
+def chosen_samples(
+    dataset: Dataset, *, split: str | None = None, scene: str | None = None
+) -> Iterator[tuple[str, Sample]]:
+    """Yield (split, sample) of a dataset in its order, with pictures.
+
+    Args:
+        dataset: where they are.
+        split: the only split; None for all.
+        scene: key of the only scene, with or without the zeros before it; None for all.
+
+    Raises:
+        TrilightError: there is no such split or scene, the dataset is empty, or as `read_samples`.
+    """
+    if split is not None and split not in SPLITS:
+        raise TrilightError(f"split is {split!r}; expected one of {', '.join(SPLITS)}.")
+    wanted = sample_key(int(scene)) if scene is not None and scene.isdecimal() else scene
+    found = False
+    for shard in dataset.manifest.shards:
+        if split not in (None, shard.split):
+            continue
+        keys = [key for key in shard.index if wanted in (None, key)]
+        found = found or bool(keys)
+        for sample in dataset.read_samples(shard, keys):
+            yield shard.split, sample
+    if not found:
+        which = f"scene {wanted}" if wanted else "scene"
+        where = "" if split is None else f" in split {split}"
+        raise TrilightError(
+            f"{dataset.shown}: no {which}{where}; expected one of its "
+            f"{dataset.manifest.num_samples}. List them with `trilight inspect`."
+        )

@@ -1,0 +1,1 @@
+"""Exports: the samples of a dataset as files that other libraries open."""

@@ -1,0 +1,51 @@
+"""Hugging Face `datasets`: an image folder, which `load_dataset(FOLDER)` reads without any code.
+
+    SPLIT/metadata.jsonl, SPLIT/KEY.VIEW.{png,depth.tiff,object.tiff,triangle.tiff}
+
+Columns: `image` (8-bit sRGB), `depth` (float32, metres along the axis of the camera, infinite where
+nothing is met), `object` and `triangle` (int32 rows of the scene's objects and triangles, -1 where
+nothing is met), all as pictures; the camera, the picture's noise floor, and the objects' names.
+https://huggingface.co/docs/datasets/image_dataset
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pipeline.exchange.exports.pictures import write_png, write_tiff
+from storage.atomic import write_atomically
+from storage.records.sample import Sample
+
+_PASSES = {"depth": "depth_axis_m", "object": "object", "triangle": "triangle"}
+"""Columns and the passes that they hold."""
+
+
+def write_huggingface(samples: Iterator[tuple[str, Sample]], out: Path) -> None:
+    """Write the pictures, and one table for each split; see the top of this file."""
+    lines: dict[str, list[str]] = {}
+    for split, sample in samples:
+        for view in range(sample.scene.num_views):
+            row = _row(out / split, sample, view)
+            lines.setdefault(split, []).append(json.dumps(row, allow_nan=False))
+    for split, found in lines.items():
+        write_atomically(out / split / "metadata.jsonl", "".join(f"{x}\n" for x in found).encode())
+
+
+def _row(folder: Path, sample: Sample, view: int) -> dict[str, Any]:
+    scene, name = sample.scene, f"{sample.key}.{view}"
+    write_png(folder / f"{name}.png", sample, view)
+    found = sample.view_passes(list(_PASSES.values()), view=view)
+    for column, wanted in _PASSES.items():
+        write_tiff(folder / f"{name}.{column}.tiff", found[wanted])
+    return {
+        "file_name": f"{name}.png",
+        **{f"{column}_file_name": f"{name}.{column}.tiff" for column in _PASSES},
+        "scene": sample.key,
+        "view": view,
+        "c2w": scene.c2w[view].tolist(),
+        "fov_deg": float(scene.fov_deg[view]),
+        "noise_floor_db": sample.views[view].noise_floor_db,
+        "objects": [entry.name for entry in scene.objects],
+        "licences": [entry.licence for entry in scene.objects],
+    }

@@ -1,0 +1,94 @@
+"""Passes of stored scenes as OpenEXR files, one a view, as datasets that store them hold them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.exchange.chosen import chosen_samples, is_dataset
+from pipeline.exchange.open_scene import scene_source
+from pipeline.exchange.reader import SceneReader
+from storage.atomic import write_atomically
+from storage.dataset.dataset import open_dataset
+from storage.records.first_hits import require_row
+from storage.records.passes.stored import passes_exr
+from storage.records.scene import Scene
+
+_RESOLUTION = 256
+"""Of scenes that have no pictures."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WantedPasses:
+    """Which pictures to write."""
+
+    names: Sequence[str]
+    """Passes by name."""
+    scene: str | None
+    """Key of the only scene, with or without zeros before it; None for all."""
+    view: int | None
+    """The only view; None for all."""
+    resolution: int | None
+    """Width and height in pixels; None for that of the dataset's pictures, or 256."""
+    rays_a_side: int
+    """As `view_passes`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Found:
+    """One scene of a source."""
+
+    name: str
+    scene: Scene
+    resolution: int
+    notes: tuple[str, ...] = ()
+
+
+def write_passes(
+    source: str, out: Path, wanted: WantedPasses, *, done: Callable[[Path], None]
+) -> tuple[str, ...]:
+    """Write `SCENE.VIEW.passes.exr` into a folder for each wanted view; return notes for people.
+
+    With the resolution and the single ray of a dataset that stores the same passes, the files are
+    the same to the last byte.
+
+    Args:
+        source: a dataset (folder or URL), or a scene in any form that `trilight convert` reads.
+        out: the folder; it is made.
+        wanted: which.
+        done: called with each file.
+
+    Raises:
+        TrilightError: the source is unusable, there is no such scene, view or pass, or the folder
+            cannot be written.
+    """
+    notes: list[str] = []
+    for found in _scenes(source, wanted.scene):
+        notes += found.notes
+        views = range(found.scene.num_views) if wanted.view is None else [wanted.view]
+        for view in views:
+            require_row("view", view, found.scene.num_views)
+            path = out / f"{found.name}.{view}.passes.exr"
+            data = passes_exr(
+                found.scene,
+                wanted.names,
+                view=view,
+                resolution=wanted.resolution or found.resolution,
+                rays_a_side=wanted.rays_a_side,
+            )
+            write_atomically(path, data)
+            done(path)
+    return tuple(dict.fromkeys(notes))
+
+
+def _scenes(source: str, key: str | None) -> Iterator[_Found]:
+    if is_dataset(source):
+        for _, sample in chosen_samples(open_dataset(source), scene=key):
+            resolution = sample.radiance_rgb.shape[2]
+            yield _Found(name=sample.key, scene=sample.scene, resolution=resolution)
+        return
+    with SceneReader() as reader:
+        wanted = scene_source(source if key is None else f"{source}::{key}", many=True)
+        for each in reader.scenes_of(wanted):
+            loaded = reader.load(each)
+            name = each.path.stem if each.key is None else each.key
+            yield _Found(name=name, scene=loaded.scene, resolution=_RESOLUTION, notes=loaded.notes)

@@ -1,0 +1,158 @@
+"""The passes of a view, as pictures.
+
+The rays of a pixel stand on a regular grid over its area, the same for every pixel, so that equal
+arguments give equal numbers. Ids and barycentrics are those of one more ray, through the centre.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.conventions import camera_rays
+from storage.errors import TrilightError
+from storage.records.first_hits import SeenFrom, require_row
+from storage.records.passes.declared import MOTION, Pass, declared_passes
+from storage.records.passes.motion import require_same_triangles
+from storage.records.passes.rays import Later, PassRays
+from storage.records.scene import Scene
+
+BLOCK_RAYS = 2**14
+"""Rays that are computed at a time: their numbers stay in the processor's cache."""
+
+MOST_A_SIDE = 64
+"""Maximum rays along a side of a pixel."""
+
+
+def view_passes(
+    scene: Scene,
+    names: Sequence[str] | None = None,
+    *,
+    view: int = 0,
+    resolution: int = 256,
+    rays_a_side: int = 1,
+    then: Scene | None = None,
+    then_view: int | None = None,
+) -> dict[str, NDArray]:
+    """Return passes of one camera of a scene: pictures of what its pixels see.
+
+    Emitters are hidden from cameras, as in the path traced pictures: rays pass through them.
+    `declared_passes` says of each pass what it means, its channels, unit, frame and averaging.
+
+    Args:
+        scene: passes `Scene.check`.
+        names: of the passes; all by default, `motion_px` only where it has a meaning.
+        view: row of `scene.c2w`.
+        resolution: width and height of the pictures in pixels.
+        rays_a_side: passes that are averaged take this number of rays along each side of a pixel,
+            1 to 64, its square in all. With 1, everything is exactly what the centre's ray meets.
+        then: for `motion_px`: the same triangles at another moment; by default this scene.
+        then_view: for `motion_px`: row of the cameras of `then`; by default `view`.
+
+    Returns:
+        for each name a picture [R, R], or [R, R, K] where the pass has K channels, row 0 on top:
+        int32 for ids, bool for `hit`, float64 for all others. Where nothing is met, ids are -1,
+        depths infinite, and all others NaN. Means of normals are shorter than 1 where a pixel sees
+        several; means of depths and positions may lie between surfaces.
+
+    Raises:
+        TrilightError: there is no such pass or view; a number is out of its range; or `then` has
+            other triangles.
+    """
+    require_row("view", view, scene.num_views)
+    _require_whole("resolution", resolution, 2**16)
+    _require_whole("rays_a_side", rays_a_side, MOST_A_SIDE)
+    later = _later(scene, view, then, then_view)
+    chosen = _chosen(names, has_motion=later is not None)
+    if all(each.averaging == "centre ray" for each in chosen):
+        rays_a_side = 1
+    origin = scene.c2w[view, :3, 3].astype(np.float64)
+    blocks = [
+        _block(chosen, centre, spread, rays_a_side)
+        for centre, spread in _blocks(SeenFrom(scene, origin), view, resolution, rays_a_side, later)
+    ]
+    return {each.name: np.concatenate([block[each.name] for block in blocks]) for each in chosen}
+
+
+def _blocks(
+    seen: SeenFrom, view: int, resolution: int, a_side: int, later: Later | None
+) -> Iterator[tuple[PassRays, PassRays]]:
+    """Yield the rays of some rows of pixels at a time: those of the centres, and all."""
+    c2w, fov_deg = seen.scene.c2w[view].astype(np.float64), float(seen.scene.fov_deg[view])
+
+    def rays(first: int, last: int, a_side: int) -> PassRays:
+        rows = slice(first * a_side, last * a_side)
+        _, directions = camera_rays(c2w, fov_deg, resolution * a_side, rows)
+        return PassRays(
+            hits=seen.hits(directions),
+            c2w=c2w,
+            fov_deg=fov_deg,
+            resolution=resolution,
+            later=later,
+        )
+
+    rows = max(1, BLOCK_RAYS // (resolution * a_side**2))
+    for first in range(0, resolution, rows):
+        last = min(first + rows, resolution)
+        centre = rays(first, last, 1)
+        yield centre, centre if a_side == 1 else rays(first, last, a_side)
+
+
+def _block(
+    passes: Sequence[Pass], centre: PassRays, spread: PassRays, a_side: int
+) -> dict[str, NDArray]:
+    """Return the pixels of some rows, [rows, R] or [rows, R, channels]."""
+    found: dict[str, NDArray] = {}
+    for each in passes:
+        if each.averaging == "centre ray":
+            found[each.name] = each.of(centre).astype(each.dtype)
+            continue
+        values: NDArray = each.of(spread).astype(each.dtype)
+        found[each.name] = _means(values, a_side, each.nothing)
+    return found
+
+
+def _means(values: NDArray, a_side: int, nothing: float) -> NDArray:
+    """Return the means over squares of rays that have finite values; `nothing` where none has."""
+    has_value = np.isfinite(values if values.ndim == 2 else values[..., 0])
+    if a_side == 1:
+        return np.where(_beside(has_value, values), values, nothing)
+    total = _sums(np.where(_beside(has_value, values), values, 0), a_side)
+    count = _beside(_sums(has_value.astype(np.float64), a_side), total)
+    return np.where(count > 0, total / np.maximum(count, 1), nothing)
+
+
+def _sums(values: NDArray, a_side: int) -> NDArray:
+    """Return the sums over squares of a_side x a_side of the first two axes."""
+    rows, columns, *channels = values.shape
+    blocks = values.reshape(rows // a_side, a_side, columns // a_side, a_side, *channels)
+    return blocks.sum(axis=3).sum(axis=1)
+
+
+def _beside(pixels: NDArray, values: NDArray) -> NDArray:
+    """Return [rows, R] with a last axis where `values` have one."""
+    return pixels if values.ndim == 2 else pixels[..., None]
+
+
+def _chosen(names: Sequence[str] | None, *, has_motion: bool) -> list[Pass]:
+    known = {each.name: each for each in declared_passes()}
+    if names is None:
+        return [each for each in known.values() if has_motion or each.name != MOTION]
+    for name in names:
+        if name not in known:
+            raise TrilightError(f"there is no pass {name!r:.60}; expected of {', '.join(known)}.")
+    return [known[name] for name in names]
+
+
+def _later(scene: Scene, view: int, then: Scene | None, then_view: int | None) -> Later | None:
+    if then is None and then_view is None:
+        return None
+    later = Later(scene if then is None else then, view if then_view is None else then_view)
+    require_row("then_view", later.view, later.scene.num_views)
+    require_same_triangles(scene, later.scene)
+    return later
+
+
+def _require_whole(name: str, value: int, most: int) -> None:
+    if not isinstance(value, int | np.integer) or not 1 <= value <= most:
+        raise TrilightError(f"{name} is {value}; expected a whole number from 1 to {most}.")

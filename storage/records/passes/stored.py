@@ -1,0 +1,133 @@
+"""Passes as OpenEXR: what a sample may hold beside its pictures, and `trilight passes` writes.
+
+All channels are float32, packed without loss: ids below 2^24 are exact in it, and Nuke and Blender
+turn every channel into it anyway. Names of channels are `Pass.exr_channels`. The channel A, which
+is the pass `coverage`, is always there. Where it is 0 nothing is met, and the file holds 0 instead
+of NaN, since filters of other programs would spread NaN over its neighbours; readers restore it.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import TrilightError
+from storage.records.exr import (
+    Header,
+    channel_names,
+    decode_channels,
+    encode_channels,
+    window_size,
+)
+from storage.records.passes.declared import Pass, declared_passes
+from storage.records.passes.pictures import view_passes
+from storage.records.scene import Scene
+
+COVERAGE = "coverage"
+"""The pass that every file has."""
+
+MOST_IDS = 2**24
+"""Float32 holds every whole number up to this one."""
+
+
+def passes_exr(
+    scene: Scene, names: Sequence[str], *, view: int, resolution: int, rays_a_side: int = 1
+) -> bytes:
+    """Return the OpenEXR file of passes of one camera; equal arguments give equal bytes.
+
+    Args:
+        scene: passes `Scene.check`.
+        names: of the passes; `coverage` is added.
+        view, resolution, rays_a_side: as `view_passes`.
+
+    Raises:
+        TrilightError: as `view_passes`, or the scene has more than 2^24 triangles.
+    """
+    if scene.num_triangles > MOST_IDS:
+        raise TrilightError(
+            f"passes: the scene has {scene.num_triangles} triangles; expected at most {MOST_IDS}, "
+            "so that ids are exact in a file."
+        )
+    found = view_passes(
+        scene, _with_coverage(names), view=view, resolution=resolution, rays_a_side=rays_a_side
+    )
+    met = found[COVERAGE] > 0
+    channels: dict[str, NDArray[np.float32]] = {}
+    for each in _passes(found):
+        values = np.atleast_3d(found[each.name]).astype(np.float32)
+        unmet = np.isnan(values) & ~met[..., None]
+        planes = np.where(unmet, np.float32(0), values)
+        for number, channel in enumerate(each.exr_channels):
+            channels[channel] = np.ascontiguousarray(planes[..., number])
+    return encode_channels(channels)
+
+
+def decode_passes_exr(data: bytes, resolution: int) -> dict[str, NDArray]:
+    """Return the passes in a file by name, as `picture_passes`; `coverage` is among them.
+
+    Raises:
+        TrilightError: not an EXR file, truncated, of another size, or with channels that are no
+            whole passes.
+    """
+    there = set(channel_names(data))
+    passes = [each for each in declared_passes() if there >= set(each.exr_channels)]
+    names = [channel for each in passes for channel in each.exr_channels]
+
+    def check(header: Header) -> None:
+        if window_size(header) != (resolution, resolution):
+            raise TrilightError(
+                f"passes: {list(window_size(header))} pixels; expected {[resolution] * 2}."
+            )
+
+    if COVERAGE not in {each.name for each in passes}:
+        raise TrilightError("passes: channel A (coverage) is missing.")
+    channels = decode_channels(data, names, check, separate=True)
+    if any(channel.shape != (resolution, resolution) for channel in channels.values()):
+        raise TrilightError(f"passes: a channel has other pixels than {[resolution] * 2}.")
+    nowhere = channels["A"] == 0
+    return {each.name: _restored(each, channels, nowhere) for each in passes}
+
+
+def picture_passes(
+    scene: Scene, names: Sequence[str], *, view: int, resolution: int, stored: bytes | None = None
+) -> dict[str, NDArray]:
+    """Return passes of one view by name, one ray a pixel: the same numbers, stored or computed.
+
+    Args:
+        scene, names, view, resolution: as `view_passes`.
+        stored: an OpenEXR file of passes of this view; what it lacks is computed.
+
+    Returns:
+        as `view_passes`, with float32 in place of float64.
+
+    Raises:
+        TrilightError: as `view_passes` and `decode_passes_exr`.
+    """
+    found = {} if stored is None else decode_passes_exr(stored, resolution)
+    lacking = [name for name in names if name not in found]
+    if lacking:
+        asked = view_passes(scene, lacking, view=view, resolution=resolution)
+        found |= {each.name: asked[each.name].astype(_kept(each)) for each in _passes(asked)}
+    return {name: found[name] for name in names}
+
+
+def _with_coverage(names: Sequence[str]) -> list[str]:
+    return [*names, *({COVERAGE} - set(names))]
+
+
+def _passes(found: Mapping[str, NDArray]) -> list[Pass]:
+    return [each for each in declared_passes() if each.name in found]
+
+
+def _kept(each: Pass) -> type:
+    """Return the type of a pass that went through a file."""
+    return np.float32 if each.dtype is np.float64 else each.dtype
+
+
+def _restored(each: Pass, channels: Mapping[str, NDArray], nowhere: NDArray[np.bool_]) -> NDArray:
+    planes = [np.asarray(channels[channel], np.float32) for channel in each.exr_channels]
+    if np.isnan(each.nothing):
+        unmet = nowhere & np.all([plane == 0 for plane in planes], axis=0)
+        planes = [np.where(unmet, np.float32(np.nan), plane) for plane in planes]
+    picture = np.stack(planes, axis=-1) if each.channels else planes[0]
+    return picture.astype(_kept(each))

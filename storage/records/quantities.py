@@ -1,0 +1,63 @@
+"""The quantities of a scene that a report shows and a selection asks for, and their statistics."""
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+class Quantity(NamedTuple):
+    """Something that is measured once or more in every scene."""
+
+    label: str
+    """For people, with the unit."""
+    digits: int
+    """Decimals that are shown."""
+    per: Literal["scene", "object", "surface", "light", "view"]
+    """Of what a scene has a value each; `surface` is an object, a floor or a wall."""
+
+
+QUANTITIES: Mapping[str, Quantity] = {
+    "objects_per_scene": Quantity("objects in a scene", 0, "scene"),
+    "triangles_per_scene": Quantity("triangles of a scene", 0, "scene"),
+    "triangles_per_object": Quantity("triangles of an object", 0, "object"),
+    "diffuse": Quantity("diffuse albedo", 3, "surface"),
+    "specular": Quantity("specular albedo", 3, "surface"),
+    "albedo_sum": Quantity("diffuse + specular", 3, "surface"),
+    "roughness": Quantity("roughness", 3, "surface"),
+    "lights_per_scene": Quantity("lights in a scene", 0, "scene"),
+    "total_emission": Quantity("radiance, sum over the lights", 0, "scene"),
+    "light_distance": Quantity("distance from the origin, m", 3, "light"),
+    "light_size": Quantity("size (root of the area), m", 3, "light"),
+    "camera_distance": Quantity("distance from the origin, m", 3, "view"),
+    "elevation_deg": Quantity("elevation, degrees", 1, "view"),
+    "azimuth_deg": Quantity("azimuth, degrees", 1, "view"),
+    "fov_deg": Quantity("field of view, degrees", 1, "view"),
+    "coverage": Quantity("share of the view on objects", 3, "view"),
+    "noise_floor_db": Quantity("noise floor, dB", 1, "view"),
+    "noise_floor_linear_db": Quantity("noise floor as linear PSNR, dB", 1, "view"),
+    "object_noise_floor_db": Quantity("noise floor over geometry, dB", 1, "view"),
+    "spp": Quantity("samples per pixel", 0, "view"),
+    "camera_attempt": Quantity("cameras rejected before", 0, "view"),
+}
+
+STATISTICS = ("count", "min", "p5", "median", "mean", "p95", "max")
+
+
+def summary(values: ArrayLike) -> dict[str, float]:
+    """Return STATISTICS of the finite values; without any, only the count 0."""
+    array = np.asarray(values, np.float64).ravel()
+    finite = array[np.isfinite(array)]
+    if not finite.size:
+        return {"count": 0}
+    low, median, high = (float(value) for value in np.percentile(finite, [5, 50, 95]))
+    return {
+        "count": int(finite.size),
+        "min": float(finite.min()),
+        "p5": low,
+        "median": median,
+        "mean": float(finite.mean()),
+        "p95": high,
+        "max": float(finite.max()),
+    }

@@ -1,0 +1,217 @@
+"""Exports: each opens in the library that it is for, with the pictures and ids of the dataset."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.exchange.exports.export import FORMS
+from storage.conventions import in_camera, preview_srgb8
+from storage.dataset.dataset import open_dataset
+from storage.errors import TrilightError
+from storage.records.sample import PartFloor, Sample
+from tests.command_line import trilight
+from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
+
+SIZE = 16
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    scenes = {"train-000000.tar": [0, 1], "test-000001.tar": [2]}
+    shards = {
+        name: [_by_lobe(sample(i, furnished(["a"]))) for i in rows] for name, rows in scenes.items()
+    }
+    write_dataset(tmp_path / "data", shards, objects=[locked("a", "CC-BY-4.0")])
+    (tmp_path / "data/attribution.csv").write_text("uid\na\n")
+    return tmp_path / "data"
+
+
+def _by_lobe(whole: Sample) -> Sample:
+    """Return a sample whose light is three quarters diffuse and a quarter specular."""
+    light = (np.round(whole.radiance_rgb * 4) * 4).astype(np.float32)  # quarters are half floats
+    floor = PartFloor(noise_floor_db=40.0, noise_floor_linear_db=30.0, object_noise_floor_db=39.0)
+    views = [
+        dataclasses.replace(v, parts={"diffuse": floor, "specular": floor}) for v in whole.views
+    ]
+    parts = {"diffuse": light * np.float32(0.75), "specular": light * np.float32(0.25)}
+    return dataclasses.replace(whole, radiance_rgb=light, parts_rgb=parts, views=tuple(views))
+
+
+def exported(dataset: Path, form: str, *words: str) -> Path:
+    out = dataset.parent / form
+    result = trilight(["export", str(dataset), "--form", form, "--out", str(out), *words, "--json"])
+    assert result.exit_code == 0, result.exception
+    assert (out / "attribution.csv").read_text() == "uid\na\n"
+    return out
+
+
+def samples(dataset: Path, split: str) -> list[Sample]:
+    return list(open_dataset(str(dataset)).samples(split))
+
+
+def test_nerfstudio(dataset: Path) -> None:
+    """The form that its documentation states: nerfstudio itself is not installed here."""
+    out = exported(dataset, "nerfstudio", "--scene", "1")
+    assert [path.name for path in out.iterdir() if path.is_dir()] == ["000000001"]
+    folder = out / "000000001"
+    _, made = samples(dataset, "train")
+    transforms: dict[str, Any] = json.loads((folder / "transforms.json").read_text())
+    assert transforms["camera_model"] == "OPENCV"
+    seen = made.view_passes(["position_m", "hit"], view=1)
+    frame = transforms["frames"][1]
+    pose, depth = np.array(frame["transform_matrix"]), np.load(folder / frame["depth_file_path"])
+    assert depth.dtype == np.float32 and (depth[~seen["hit"]] == 0).all()
+    # the point of a pixel, as nerfstudio finds it: focal lengths, centre, and depth in 0.001 m
+    row, column = np.indices((SIZE, SIZE)) + 0.5
+    local = np.stack(
+        [
+            (column - frame["cx"]) / frame["fl_x"],
+            -(row - frame["cy"]) / frame["fl_y"],
+            np.full((SIZE, SIZE), -1),
+        ],
+        axis=-1,
+    )
+    points = (0.001 * depth[..., None] * local) @ pose[:3, :3].T + pose[:3, 3]
+    hit = seen["hit"]
+    assert 0 < hit.mean() <= 1
+    np.testing.assert_allclose(points[hit], seen["position_m"][hit], atol=1e-5)
+    assert (in_camera(points[hit], pose)[:, 2] < 0).all()
+    assert frame["w"] == frame["h"] == SIZE
+    picture = np.asarray(Image.open(folder / frame["file_path"]))
+    np.testing.assert_array_equal(picture, preview_srgb8(made.radiance_rgb[1]))
+
+
+def test_coco(dataset: Path) -> None:
+    from pycocotools.coco import COCO
+
+    out = exported(dataset, "coco")
+    assert sorted(path.name for path in (out / "annotations").iterdir()) == [
+        *("instances_test.json", "instances_train.json")
+    ]
+    coco = COCO(str(out / "annotations/instances_train.json"))
+    assert [each["name"] for each in coco.loadCats(coco.getCatIds())] == ["object", "shell"]
+    assert len(coco.getImgIds()) == 4
+    found = 0
+    for image in coco.loadImgs(coco.getImgIds()):
+        key, view, _ = image["file_name"].split(".")
+        (made,) = (each for each in samples(dataset, "train") if each.key == key)
+        picture = np.asarray(Image.open(out / "train" / image["file_name"]))
+        np.testing.assert_array_equal(picture, preview_srgb8(made.radiance_rgb[int(view)]))
+        ids = made.view_passes(["object"], view=int(view))["object"]
+        annotations = coco.loadAnns(coco.getAnnIds(imgIds=image["id"]))
+        rows = [entry.name for entry in made.scene.objects]
+        shown = {rows.index(each["object_name"]) for each in annotations}
+        assert shown == set(np.unique(ids[ids >= 0]).tolist())
+        for each in annotations:
+            row = rows.index(each["object_name"])
+            mask = coco.annToMask(each).astype(bool)
+            np.testing.assert_array_equal(mask, ids == row)
+            x, y, width, height = each["bbox"]
+            assert mask[y : y + height, x : x + width].sum() == each["area"] == mask.sum()
+            assert mask[y].any() and mask[y + height - 1].any() and mask[:, x].any()
+            assert mask[:, x + width - 1].any()
+            assert coco.loadCats(each["category_id"])[0]["name"] == made.scene.objects[row].kind
+            found += 1
+    assert found >= 4
+
+
+def test_huggingface(dataset: Path, tmp_path: Path) -> None:
+    from datasets import load_dataset
+
+    out = exported(dataset, "huggingface")
+    loaded = load_dataset(str(out), cache_dir=str(tmp_path / "cache"))
+    assert {split: rows.num_rows for split, rows in loaded.items()} == {"train": 4, "test": 2}
+    made = {each.key: each for each in samples(dataset, "train")}
+    for row in loaded["train"]:
+        one, view = made[row["scene"]], row["view"]
+        np.testing.assert_array_equal(
+            np.asarray(row["image"]), preview_srgb8(one.radiance_rgb[view])
+        )
+        seen = one.view_passes(["depth_axis_m", "object", "triangle"], view=view)
+        for column, name in (("depth", "depth_axis_m"), ("object", "object")):
+            values = np.asarray(row[column])
+            assert values.dtype == seen[name].dtype
+            np.testing.assert_array_equal(values, seen[name])
+        np.testing.assert_array_equal(np.asarray(row["triangle"]), seen["triangle"])
+        np.testing.assert_array_equal(np.array(row["c2w"], np.float32), one.scene.c2w[view])
+        assert row["objects"] == [entry.name for entry in one.scene.objects]
+
+
+def test_hypersim(dataset: Path) -> None:
+    """As its README states it: https://github.com/apple/ml-hypersim."""
+    out = exported(dataset, "hypersim", "--scene", "1") / "000000001"
+    _, made = samples(dataset, "train")
+    assert made.parts_rgb is not None
+
+    def read(name: str) -> Any:
+        with h5py.File(out / name) as file:
+            return file["dataset"][...]
+
+    final = {
+        name: read(f"images/scene_cam_00_final_hdf5/frame.0001.{name}.hdf5")
+        for name in ("color", "diffuse_illumination", "diffuse_reflectance", "residual")
+    }
+    np.testing.assert_array_equal(final["color"], made.radiance_rgb[1])
+    product = final["diffuse_reflectance"] * final["diffuse_illumination"]
+    np.testing.assert_allclose(product + final["residual"], final["color"], rtol=1e-6, atol=1e-6)
+    reflects = final["diffuse_reflectance"] > 0
+    assert reflects.any()
+    np.testing.assert_allclose(product[reflects], made.parts_rgb["diffuse"][1][reflects], rtol=1e-6)
+    geometry = "images/scene_cam_00_geometry_hdf5/frame.0001"
+    position, depth = read(f"{geometry}.position.hdf5"), read(f"{geometry}.depth_meters.hdf5")
+    eyes = read("_detail/cam_00/camera_keyframe_positions.hdf5")
+    hit = np.isfinite(depth)
+    distance = np.linalg.norm(position - eyes[1], axis=-1)
+    np.testing.assert_allclose(distance[hit], depth[hit], rtol=1e-5)
+    assert hit.any() and ((read(f"{geometry}.render_entity_id.hdf5") >= 0) == hit).all()
+    turn = read("_detail/cam_00/camera_keyframe_orientations.hdf5")[1]
+    world = read(f"{geometry}.normal_cam.hdf5") @ turn.T
+    np.testing.assert_allclose(world[hit], read(f"{geometry}.normal_world.hdf5")[hit], atol=1e-6)
+
+
+def test_hypersim_needs_the_lobes_apart(tmp_path: Path) -> None:
+    shards = {"train-000000.tar": [sample(0, furnished(["a"]))]}
+    write_dataset(tmp_path / "data", shards, objects=[locked("a", "CC-BY-4.0")])
+    words = ["export", str(tmp_path / "data"), "--form", "hypersim", "--out", str(tmp_path / "x")]
+    refused = str(trilight(words).exception)
+    assert "keeps all light together; expected diffuse and specular light apart" in refused
+    assert "--set renders.split_lobes=true" in refused
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_same_dataset_gives_the_same_bytes(form: str, dataset: Path) -> None:
+    first = _files(exported(dataset, form, "--split", "test"))
+    (dataset.parent / form).rename(dataset.parent / "first")
+    assert _files(exported(dataset, form, "--split", "test")) == first
+    assert not any("000000000" in name for name in first)
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def test_mistakes(dataset: Path, tmp_path: Path) -> None:
+    def refused(*words: str) -> str:
+        result = trilight(["export", str(dataset), *words])
+        assert result.exit_code != 0 and "\n" not in str(result.exception)
+        return str(result.exception)
+
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/x").touch()
+    full = ("--out", str(tmp_path / "full"))
+    assert "is not empty; expected a new folder" in refused("--form", "coco", *full)
+    new = ("--out", str(tmp_path / "new"))
+    assert "no scene in split validation" in refused(
+        "--form", "coco", "--split", "validation", *new
+    )
+    with pytest.raises(TrilightError, match="no manifest.json"):
+        raise trilight(
+            ["export", str(tmp_path / "full"), "--form", "coco", *new]
+        ).exception or AssertionError("not refused")

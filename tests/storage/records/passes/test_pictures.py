@@ -1,0 +1,294 @@
+"""Passes: in closed form, by laws, beside a slow twin, and their averages beside plain loops."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from storage.conventions import in_camera, pixel_places
+from storage.errors import TrilightError
+from storage.records.material import default_rows
+from storage.records.passes import pictures
+from storage.records.passes.declared import PASSES, declared_passes
+from storage.records.passes.pictures import view_passes
+from storage.records.scene import Scene
+from tests.columns_kit import COAT, WAVES, declared
+from tests.pipeline.renders.scene_kit import join, light, material, quad
+from tests.pipeline.scenes.slow_rays import first_hits as slow_first_hits
+from tests.scenes_by_hand import tiny_scene
+from tests.storage.records.passes.view_kit import from_above, rays_of, room
+
+EXACT = 1e-9
+"""Double precision on corners within some metres, with grazing triangles costing some digits."""
+
+
+@pytest.mark.parametrize("view", [0, 1])
+def test_laws_of_the_centre_rays(view: int) -> None:
+    scene, resolution = room(0), 48
+    seen = view_passes(scene, view=view, resolution=resolution)
+    hit, c2w = seen["hit"], scene.c2w[view]
+    assert 0.2 < hit.mean() < 1
+    origin, rays = rays_of(scene, resolution, view)
+    along = origin + seen["depth_ray_m"][..., None] * rays
+    np.testing.assert_allclose(seen["position_m"][hit], along[hit], atol=EXACT)
+    corners = scene.vertex_positions[scene.faces[seen["triangle"]]].astype(np.float64)
+    rebuilt = np.einsum("ijc,ijck->ijk", seen["barycentric"], corners)
+    np.testing.assert_allclose(seen["position_m"][hit], rebuilt[hit], atol=EXACT)
+    row, column = np.indices(hit.shape)
+    centres = np.stack([column, row], axis=-1) + 0.5
+    places = pixel_places(seen["position_m"], c2w, float(scene.fov_deg[view]), resolution)
+    np.testing.assert_allclose(places[hit], centres[hit], atol=1e-7)
+    axis = -in_camera(seen["position_m"], c2w)[..., 2]
+    np.testing.assert_allclose(seen["depth_axis_m"][hit], axis[hit], rtol=1e-12)
+    for name in ("geometric_normal", "shading_normal"):
+        normal, local = seen[name][hit], seen[f"{name}_camera"][hit]
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1, atol=1e-12)
+        # the axes of a float32 pose are unit vectors to 1e-7
+        np.testing.assert_allclose(local @ c2w[:3, :3].T, normal, atol=1e-6)
+    np.testing.assert_array_equal(seen["object"][hit], scene.object_index[seen["triangle"][hit]])
+    materials = scene.materials[scene.material_index[seen["triangle"][hit]]]
+    np.testing.assert_array_equal(seen["material_specular"][hit], materials[:, 3:6])
+    np.testing.assert_array_equal(seen["material_roughness"][hit], materials[:, 6])
+
+
+def test_the_floor_in_closed_form() -> None:
+    seen = view_passes(from_above(height=1, fov_deg=90), resolution=4, rays_a_side=3)
+    assert seen["coverage"].min() == 1
+    np.testing.assert_allclose(seen["depth_axis_m"], 1, rtol=1e-12)
+    # pixels are half a metre wide; the mean of a linear quantity is that of the centre
+    np.testing.assert_allclose(seen["position_m"][0, 0], [-0.75, 0.75, 0], atol=1e-12)
+    np.testing.assert_allclose(seen["geometric_normal"][2, 1], [0, 0, 1], atol=1e-12)
+    # the camera looks down, so that the floor's normal points at it: along its own +Z
+    np.testing.assert_allclose(seen["geometric_normal_camera"][2, 1], [0, 0, 1], atol=1e-7)
+    assert set(np.unique(seen["triangle"])) == {0, 1}
+    np.testing.assert_array_equal(seen["object"], 0)
+
+
+def test_the_axes_of_the_camera() -> None:
+    """A wall, seen squarely by a camera on its side: its +X is -Z of the world."""
+    wall = quad([[-1, 2, -1], [1, 2, -1], [1, 2, 1], [-1, 2, 1]], material(diffuse=0.5))
+    slanted = dataclasses.replace(wall, normals=np.full((2, 3, 3), [0, -0.8, -0.6]))
+    scene = join([slanted, light([[-1, -9, 3], [1, -9, 3], [0, -9, 4]], 1.0)])
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3] = np.transpose([[0, 0, -1], [1, 0, 0], [0, -1, 0]])
+    seen = view_passes(scene.with_cameras(pose[None], scene.fov_deg), resolution=3)
+    np.testing.assert_allclose(seen["shading_normal"][1, 1], [0, -0.8, -0.6], atol=1e-6)
+    np.testing.assert_allclose(seen["shading_normal_camera"][1, 1], [0.6, 0, 0.8], atol=1e-6)
+    np.testing.assert_allclose(seen["geometric_normal_camera"][1, 1], [0, 0, 1], atol=1e-6)
+    assert seen["depth_axis_m"][0, 0] == pytest.approx(2, abs=1e-12)
+
+
+def test_a_search_through_all_triangles_sees_the_same() -> None:
+    scene, resolution = room(1), 20
+    seen = view_passes(scene, resolution=resolution)
+    origin, rays = rays_of(scene, resolution)
+    solid = np.flatnonzero(~scene.triangle_emits)
+    corners = scene.vertex_positions[scene.faces[solid]].astype(np.float64)
+    face, distance = slow_first_hits(origin, rays.reshape(-1, 3), corners)
+    triangle = np.where(face >= 0, solid[face], -1).reshape(resolution, resolution)
+    same = seen["triangle"] == triangle
+    # a float32 ray may pass a shared edge on its other side; the depth there is the same
+    assert same.mean() > 0.99
+    depth = distance.reshape(resolution, resolution)
+    np.testing.assert_allclose(seen["depth_ray_m"][same], depth[same], rtol=EXACT)
+
+
+def test_a_mirrored_scene_has_mirrored_passes() -> None:
+    scene, resolution = room(0), 40
+    before, after = (view_passes(each, resolution=resolution) for each in (scene, _mirrored(scene)))
+    back = {name: picture[:, ::-1] for name, picture in after.items()}
+    # rays along a rim may fall to either triangle
+    same = (before["triangle"] == back["triangle"]) & (before["hit"] == back["hit"])
+    assert same.mean() > 0.99
+    turned = {"position_m": [-1, 1, 1], "shading_normal": [-1, 1, 1], "barycentric": [1, 1, 1]}
+    # corners run the other way round in the mirror, and (a, b, c) became (a, c, b)
+    back["barycentric"] = back["barycentric"][..., [0, 2, 1]]
+    turned |= {"geometric_normal": [-1, 1, 1], "shading_normal_camera": [-1, 1, 1]}
+    for name in ("depth_axis_m", "depth_ray_m", "material_diffuse", "material_roughness"):
+        np.testing.assert_allclose(before[name][same], back[name][same], rtol=1e-6, err_msg=name)
+    for name, signs in turned.items():
+        np.testing.assert_allclose(
+            before[name][same], (back[name] * signs)[same], atol=1e-4, err_msg=name
+        )
+
+
+def _mirrored(scene: Scene) -> Scene:
+    """Return the scene with x negated, its triangles' second and third corners exchanged."""
+    flip = np.array([-1, 1, 1], np.float32)
+    poses = scene.c2w.copy()
+    poses[:, :3] *= flip[:, None]
+    poses[:, :3, 0] *= -1  # a camera stays right-handed: its own x points to the other side
+    return dataclasses.replace(
+        scene,
+        vertex_positions=scene.vertex_positions * flip,
+        vertex_normals=scene.vertex_normals * flip,
+        faces=scene.faces[:, [0, 2, 1]],
+        c2w=poses,
+    )
+
+
+@pytest.mark.parametrize("a_side", [2, 3])
+def test_averages_are_those_of_a_plain_loop(a_side: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A finer picture has the rays of the grid; blocks of rows join to the same picture."""
+    scene, resolution = room(0), 12
+    whole = view_passes(scene, resolution=resolution, rays_a_side=a_side)
+    monkeypatch.setattr(pictures, "BLOCK_RAYS", 5 * resolution * a_side**2)
+    joined = view_passes(scene, resolution=resolution, rays_a_side=a_side)
+    fine = view_passes(scene, resolution=resolution * a_side)
+    centre = view_passes(scene, resolution=resolution)
+    assert 0 < ((whole["coverage"] > 0) & (whole["coverage"] < 1)).sum()
+    for each in declared_passes():
+        if each.name == "motion_px":
+            continue
+        np.testing.assert_allclose(joined[each.name], whole[each.name], rtol=1e-12)
+        if each.averaging == "centre ray":
+            np.testing.assert_array_equal(whole[each.name], centre[each.name])
+        else:
+            by_loop = _averaged(fine[each.name], fine["hit"], a_side, each.averaging, each.nothing)
+            np.testing.assert_allclose(whole[each.name], by_loop, atol=1e-12, err_msg=each.name)
+
+
+def _averaged(
+    fine: NDArray, hit: NDArray[np.bool_], a_side: int, averaging: str, nothing: float
+) -> NDArray:
+    size = len(fine) // a_side
+    result = np.full((size, size, *fine.shape[2:]), float(nothing))
+    for row, column in np.ndindex(size, size):
+        place = (slice(row * a_side, (row + 1) * a_side), slice(column * a_side, (column + 1) * a_side))  # fmt: skip  # noqa: E501
+        values, counted = fine[place], hit[place]
+        if averaging == "pixel":
+            result[row, column] = values.mean()
+        elif counted.any():
+            result[row, column] = values[counted].mean(axis=0)
+    return result
+
+
+def test_what_is_asked_for_comes_as_it_is_declared() -> None:
+    seen = view_passes(room(0), resolution=6, then_view=1)
+    assert list(seen) == [each.name for each in declared_passes()]
+    for each in declared_passes():
+        tail = (len(each.channels),) if each.channels else ()
+        assert seen[each.name].shape == (6, 6, *tail), each.name
+        assert seen[each.name].dtype == each.dtype, each.name
+        assert each.means.endswith(".")
+    assert "motion_px" not in view_passes(room(0), resolution=6)
+    assert list(view_passes(room(0), ["hit", "object"], resolution=6)) == ["hit", "object"]
+    assert len({each.name for each in PASSES}) == len(PASSES)
+
+
+def test_nothing_is_seen() -> None:
+    away = tiny_scene()
+    poses = away.c2w.copy()
+    poses[:, :3, [0, 2]] *= -1  # turned about
+    for a_side in (1, 2):
+        seen = view_passes(
+            away.with_cameras(poses, away.fov_deg), resolution=5, rays_a_side=a_side, then_view=1
+        )
+        for each in declared_passes():
+            filled = np.full(seen[each.name].shape, each.nothing)
+            np.testing.assert_array_equal(seen[each.name], filled, err_msg=each.name)
+        assert np.isinf(seen["depth_ray_m"]).all() and (seen["triangle"] == -1).all()
+
+
+def test_a_scene_of_lights_alone_shows_nothing() -> None:
+    scene = join([light([[-1, 0, -1], [1, 0, -1], [0, 0, 1]], 1.0)])
+    seen = view_passes(scene, resolution=4)
+    assert not seen["hit"].any() and seen["coverage"].max() == 0
+
+
+def test_emitters_are_hidden() -> None:
+    """The lamp of the tiny scene hangs between this camera and the floor."""
+    seen = view_passes(from_above(height=4, fov_deg=20), resolution=9)
+    assert seen["hit"].all() and seen["material_emission"].max() == 0
+    np.testing.assert_allclose(seen["depth_axis_m"], 4, rtol=1e-12)
+
+
+def test_a_camera_inside_an_object_sees_its_back() -> None:
+    walls = [
+        quad(
+            np.roll([[s, -1, -1], [s, 1, -1], [s, 1, 1], [s, -1, 1]], axis, 1), material(diffuse=1)
+        )
+        for axis in range(3)
+        for s in (-1.0, 1.0)
+    ]
+    lamp = light([[0.1, 0, 0.5], [0, 0.1, 0.5], [0, 0, 0.5]], 1.0)
+    scene = join([*walls, lamp], eye=(0.1, -0.2, 0.3), target=(1, 0.1, 0.2), fov_deg=100)
+    seen = view_passes(scene, resolution=16, rays_a_side=2)
+    assert seen["coverage"].min() == 1
+    assert seen["depth_ray_m"].min() > 0.5
+    behind = np.sum(seen["geometric_normal"] * rays_of(scene, 16)[1], axis=-1) > 0
+    assert 0 < behind.sum() < behind.size, "normals are those of the triangles, not turned"
+
+
+def test_degenerate_triangles_are_never_seen() -> None:
+    scene = from_above()
+    flat = np.array([[0, 0, 0], [0, 0, 1], [1, 1, 1], [0, 2, 0]], np.uint32)
+    more = dataclasses.replace(
+        scene,
+        faces=np.concatenate([flat, scene.faces]),
+        material_index=np.append(np.zeros(4, np.uint16), scene.material_index),
+        object_index=np.append(np.zeros(4, np.uint16), scene.object_index),
+    )
+    # the fourth is the half of the floor turned over, in its place; it may win
+    seen, plain = (view_passes(each, resolution=8) for each in (more, scene))
+    assert not np.isin(seen["triangle"], [0, 1, 2]).any()
+    for name in ("depth_ray_m", "position_m", "material_diffuse", "hit"):
+        np.testing.assert_allclose(seen[name], plain[name], atol=1e-12)
+
+
+def test_a_camera_in_the_plane_of_the_floor_sees_finite_numbers() -> None:
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3] = np.transpose([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    pose[:3, 3] = [0.05, -3, 0]
+    scene = tiny_scene()
+    seen = view_passes(scene.with_cameras(pose[None], scene.fov_deg[:1]), resolution=9)
+    for name in ("barycentric", "position_m", "depth_ray_m", "shading_normal"):
+        assert np.isfinite(seen[name][seen["hit"]]).all(), name
+    assert not seen["hit"][[0, 1, 7, 8]].any()
+
+
+def test_a_single_pixel_and_a_place_far_away() -> None:
+    near = view_passes(from_above(), resolution=1)
+    assert near["depth_ray_m"].shape == (1, 1) and near["position_m"].shape == (1, 1, 3)
+    assert near["depth_ray_m"][0, 0] == pytest.approx(1)
+    scene, away = from_above(), np.array([960, -960, 960], np.float32)
+    poses = scene.c2w.copy()
+    poses[:, :3, 3] += away
+    there = dataclasses.replace(scene, vertex_positions=scene.vertex_positions + away, c2w=poses)
+    here, far = (view_passes(each, resolution=8, rays_a_side=2) for each in (scene, there))
+    np.testing.assert_array_equal(here["coverage"], far["coverage"])
+    # the lattice of float32 is 6e-5 m wide there
+    np.testing.assert_allclose(here["depth_ray_m"], far["depth_ray_m"], atol=1e-4)
+    np.testing.assert_allclose(here["position_m"] + away, far["position_m"], atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ({"view": 2}, "view is 2; expected 0 to 1"),
+        ({"resolution": 0}, "resolution is 0; expected a whole number from 1 to 65536"),
+        ({"resolution": 2.5}, "resolution is 2.5; expected a whole number"),
+        ({"rays_a_side": 65}, "rays_a_side is 65; expected a whole number from 1 to 64"),
+        ({"names": ["depth"]}, "there is no pass 'depth'; expected of triangle, object"),
+        ({"names": ["motion_px"]}, "motion_px: no other moment is given; expected `then`"),
+        ({"then_view": 2}, "then_view is 2; expected 0 to 1"),
+    ],
+)
+def test_mistakes_are_named(arguments: dict, complaint: str) -> None:
+    with pytest.raises(TrilightError, match=complaint):
+        view_passes(tiny_scene(), **{"resolution": 4, **arguments})
+
+
+def test_a_column_of_ones_own_is_a_pass() -> None:
+    with declared(COAT, WAVES):
+        scene = from_above()
+        rows = default_rows(2)
+        rows[:, 10] = [0.25, 0.75]
+        seen = view_passes(
+            dataclasses.replace(scene, materials=rows), ["material_coat", "material_waves"],
+            resolution=4, rays_a_side=2,
+        )  # fmt: skip
+        assert next(each for each in declared_passes() if each.name == "material_waves").channels
+    np.testing.assert_array_equal(seen["material_coat"], np.full((4, 4), 0.25))
+    np.testing.assert_array_equal(seen["material_waves"], np.full((4, 4, 5), 0.5))

@@ -1,0 +1,172 @@
+"""Stored passes: a file gives the numbers that are computed, under names that other tools know."""
+
+import dataclasses
+import io
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from storage.dataset.manifest import Manifest
+from storage.dataset.settings import StorageSettings
+from storage.dataset.verify import check_sample
+from storage.errors import TrilightError
+from storage.records.exr import encode_channels
+from storage.records.passes import stored
+from storage.records.passes.declared import MOTION, declared_passes, pass_names
+from storage.records.passes.pictures import view_passes
+from storage.records.passes.stored import decode_passes_exr, passes_exr, picture_passes
+from storage.records.sample import Sample, decode_sample, encode_sample
+from tests.scenes_by_hand import tiny_sample
+from tests.storage.records.passes.view_kit import room
+
+ALL = tuple(each.name for each in declared_passes() if each.name != MOTION)
+
+
+def with_passes(names: tuple[str, ...]) -> Sample:
+    sample = tiny_sample()
+    packed = tuple(passes_exr(sample.scene, names, view=view, resolution=16) for view in range(2))
+    return dataclasses.replace(sample, passes_exr=packed)
+
+
+@pytest.mark.parametrize("rays_a_side", [1, 2])
+def test_every_pass_comes_back_from_a_file(rays_a_side: int) -> None:
+    scene = room(0)
+    data = passes_exr(scene, ALL, view=1, resolution=32, rays_a_side=rays_a_side)
+    found = decode_passes_exr(data, 32)
+    asked = view_passes(scene, ALL, view=1, resolution=32, rays_a_side=rays_a_side)
+    assert 0 < asked["hit"].mean() < 1
+    assert list(found) == list(asked)
+    for name, picture in asked.items():
+        kept = picture.astype(np.float32) if picture.dtype == np.float64 else picture
+        assert found[name].dtype == kept.dtype, name
+        np.testing.assert_array_equal(found[name], kept, err_msg=name)
+
+
+def test_a_sample_gives_the_same_numbers_stored_or_not() -> None:
+    names = ("object", "depth_axis_m", "shading_normal")
+    sample = with_passes(names[:2])
+    read = decode_sample(sample.key, encode_sample(sample, "compact"))
+    assert read.passes_exr == sample.passes_exr
+    plain = decode_sample(sample.key, encode_sample(tiny_sample(), "compact"))
+    for view in range(2):
+        there, computed = read.view_passes(names, view=view), plain.view_passes(names, view=view)
+        assert list(there) == list(computed) == list(names)
+        for name in names:
+            assert there[name].dtype == computed[name].dtype
+            np.testing.assert_array_equal(there[name], computed[name])
+
+
+def test_stored_passes_are_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    sample = with_passes(("triangle",))
+    monkeypatch.setattr(stored, "view_passes", None)
+    assert sample.view_passes(["triangle"])["triangle"].shape == (16, 16)
+
+
+def test_the_names_and_values_that_other_programs_read() -> None:
+    """The declared names, and 0 in place of NaN; A tells where nothing is met."""
+    names = ("triangle", "depth_axis_m", "shading_normal", "material_diffuse")
+    data = passes_exr(room(0), names, view=1, resolution=32)
+    file = OpenEXR.File(io.BytesIO(data), separate_channels=True)
+    channels = {name: channel.pixels for name, channel in file.channels().items()}
+    letters = ["diffuse.B", "diffuse.G", "diffuse.R"]
+    assert sorted(channels) == [
+        *["A", "N.X", "N.Y", "N.Z", "Z"],
+        *(f"material_{letter}" for letter in letters),
+        "triangle.V",
+    ]
+    assert {channel.dtype for channel in channels.values()} == {np.dtype(np.float32)}
+    missed = channels["A"] == 0
+    assert missed.any()
+    assert (channels["triangle.V"][missed] == -1).all()
+    assert np.isinf(channels["Z"][missed]).all()
+    for name in ("N.X", "N.Y", "N.Z", "material_diffuse.R"):
+        assert (channels[name][missed] == 0).all()
+
+
+def test_no_two_passes_share_a_channel() -> None:
+    channels = [channel for each in declared_passes() for channel in each.exr_channels]
+    assert len(channels) == len(set(channels))
+    for channel in channels:  # Blender and Nuke skip channels with longer names
+        assert len(channel.rpartition(".")[2]) == 1, channel
+
+
+def test_words_mean_passes() -> None:
+    assert pass_names(["normal", "depth", "depth_axis_m"]) == ("depth_axis_m", "shading_normal")
+    assert pass_names(["roughness"]) == ("material_roughness",)
+    assert StorageSettings(passes=("normal", "object")).passes == ("object", "shading_normal")
+    with pytest.raises(TrilightError, match=r"no pass 'dept'; did you mean depth\?"):
+        StorageSettings(passes=("dept",))
+    with pytest.raises(TrilightError, match="motion_px needs another moment"):
+        pass_names([MOTION])
+
+
+def test_more_triangles_than_float32_counts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stored, "MOST_IDS", 2)
+    with pytest.raises(TrilightError, match="3 triangles; expected at most 2"):
+        with_passes(("triangle",))
+
+
+@pytest.mark.parametrize(
+    ("channels", "resolution", "message"),
+    [
+        ({"A": 16, "Q.V": 16}, 16, "channels are A, Q.V; expected A"),
+        ({"A": 16, "N.X": 16}, 16, "channels are A, N.X; expected A"),
+        ({"Z": 16}, 16, r"channel A \(coverage\) is missing"),
+        ({"A": 8}, 16, r"\[8, 8\] pixels; expected \[16, 16\]"),
+    ],
+)
+def test_other_files_are_refused(channels: dict[str, int], resolution: int, message: str) -> None:
+    planes = {name: np.zeros((side, side), np.float32) for name, side in channels.items()}
+    with pytest.raises(TrilightError, match=message):
+        decode_passes_exr(encode_channels(planes), resolution)
+    with pytest.raises(TrilightError):
+        decode_passes_exr(encode_channels(planes)[:100], resolution)
+
+
+def faults(sample: Sample, *names: str) -> list[str]:
+    manifest = Manifest(
+        build="x",
+        settings={"renders": {"resolution": 16}, "storage": {"passes": list(names)}},
+        environment={},
+        num_scenes=1,
+        num_views=2,
+        objects_lock_sha256="",
+        shards=(),
+    )
+    return list(check_sample(sample, "train", manifest, {}))
+
+
+def test_verify_compares_with_the_scene() -> None:
+    sample = with_passes(("object", "depth_axis_m"))
+    assert faults(sample, "object", "depth_axis_m") == []
+    assert "has passes" in faults(sample)[0]
+    assert "lacks passes" in faults(tiny_sample(), "object")[0]
+    assert "expected coverage, object" in faults(sample, "object")[0]
+    assert sample.passes_exr is not None
+    first, second = sample.passes_exr
+    swapped = dataclasses.replace(sample, passes_exr=(second, first))
+    assert "pass depth_axis_m is not what the scene says" in " ".join(
+        faults(swapped, "object", "depth_axis_m")
+    )
+    cut = dataclasses.replace(sample, passes_exr=(first[:-200], second))
+    assert "not a readable OpenEXR" in faults(cut, "object", "depth_axis_m")[0]
+
+
+def test_a_lacking_member_is_named() -> None:
+    members = encode_sample(with_passes(("object",)))
+    del members["1.passes.exr"]
+    with pytest.raises(TrilightError, match="1.passes.exr.*missing"):
+        decode_sample("000000000", members)
+
+
+def test_wrong_views_and_names_are_named() -> None:
+    with pytest.raises(TrilightError, match="view is 2; expected 0 to 1"):
+        tiny_sample().view_passes(["object"], view=2)
+    with pytest.raises(TrilightError, match="sample 000000000: view 0: there is no pass 'x'"):
+        tiny_sample().view_passes(["x"])
+
+
+def test_computed_passes_need_no_file() -> None:
+    found = picture_passes(room(0), ["hit"], view=0, resolution=8)
+    assert found["hit"].dtype == np.bool_
