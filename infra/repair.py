@@ -58,13 +58,15 @@ def repair(
     require_same_extensions(str(root), manifest.extensions, recorded("data"))
     changes, licence = _changes(manifest), _stated_licence(opened)
     asked = read_asked(opened) or ()
+    revisits = _revisited(opened, asked)
     order = DatasetOrder(
         build=manifest.build,
-        objects=None if scenes_from else objects,
+        objects=None if scenes_from or revisits else objects,
         out=str(root),
-        scenes=None if scenes_from else manifest.num_scenes,
+        scenes=None if scenes_from or revisits else manifest.num_scenes,
         licence=licence,
         scenes_from=scenes_from,
+        revisits=revisits,
         views=manifest.num_views if scenes_from else None,
         albedo_over_one=cast(AlbedoOverOne, value_of(asked, "--albedo-over-one") or "scale"),
         changes=changes,
@@ -89,7 +91,7 @@ def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:
             f"the dataset was made by `trilight shards {derivation.operation}`; expected one of "
             "`trilight generate`. Make it again from its sources: the bytes will be the same."
         )
-    of_files = manifest.settings["splits"].get("listed_scenes") is not None
+    of_files = _is_of_files(manifest)
     if of_files and scenes_from is None:
         raise TrilightError(
             f"build {manifest.build!r} was made from scene files; expected --scenes-from FOLDER, "
@@ -102,11 +104,30 @@ def _require_generated(manifest: Manifest, scenes_from: str | None) -> None:
         )
 
 
+def _is_of_files(manifest: Manifest) -> bool:
+    settings = manifest.settings
+    return settings["splits"].get("listed_scenes") is not None and "revisit" not in settings
+
+
+def _revisited(dataset: Dataset, asked: Sequence[str]) -> str | None:
+    """Return the folder of the dataset whose scenes these are, as `logs/asked.json` has it."""
+    settings = dataset.manifest.settings
+    if "revisit" not in settings:
+        return None
+    if (place := value_of(asked, "--revisits")) is None:
+        raise TrilightError(
+            f"{dataset.shown}: its scenes are those of the dataset "
+            f"{settings['revisit']['source_digest']}, and logs/asked.json does not say where that "
+            "is. Delete the bad shards, and run the same `trilight revisit` again."
+        )
+    return place
+
+
 def _changes(manifest: Manifest) -> dict[str, object]:
     """Return in what the settings of a dataset differ from those of its build's name."""
     build = named_build(manifest.build).as_json()
     changed = {name: now for name, _, now in differences(build, manifest.settings)}
-    if manifest.settings["splits"].get("listed_scenes") is not None:
+    if _is_of_files(manifest):
         return {name: now for name, now in changed.items() if name not in _OF_SCENE_FILES}
     return changed
 

@@ -9,6 +9,9 @@ from storage.errors import TrilightError
 from storage.settings.changes import changed, json_or_word
 from storage.settings.described import checked, settings_record
 
+_OF_SOURCES = ("build", "derived", "revisit")
+"""What the settings of a dataset say of its name and of the datasets that it was made of."""
+
 if TYPE_CHECKING:
     from infra.cli.settings_file import Stated
 
@@ -103,7 +106,11 @@ def dataset_record(shared: Shared) -> dict[str, Any]:
     from storage.dataset.dataset import open_dataset
 
     settings = {} if shared.like is None else open_dataset(shared.like).manifest.settings
-    return {name: value for name, value in settings.items() if name not in ("build", "derived")}
+    found = {name: value for name, value in settings.items() if name not in _OF_SOURCES}
+    if "listed_shards" in found.get("splits", {}):  # those of yet another dataset
+        splits = found["splits"].items()
+        found["splits"] = {name: value for name, value in splits if name != "listed_shards"}
+    return found
 
 
 def run_record(shared: Shared) -> dict[str, Any]:

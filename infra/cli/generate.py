@@ -30,7 +30,11 @@ class ExecutorChoice:
 
 @command("build")
 def generate(order: DatasetOrder, shared: Shared, runner: ExecutorChoice, shown: Shown) -> None:
-    order = with_shared(order, shared)
+    make(with_shared(order, shared), runner, shown)
+
+
+def make(order: DatasetOrder, runner: ExecutorChoice, shown: Shown) -> None:
+    """Make a dataset and say what came of it; raises TrilightError."""
     folder, started = dataset_folder(order.place), time.monotonic()
     first_words(f"Making {folder.shown} with the build {order.build}", silent=shown.json)
     executor = find_executor(runner.runner, runner.address, order.workers)

@@ -41,10 +41,10 @@ def plan(
     core: CorePrice,
     shown: Shown,
 ) -> None:
-    if order.scenes_from is not None or order.shards is not None:
+    if (order.scenes_from, order.revisits, order.shards) != (None,) * 3:
         raise TrilightError(
-            "plan: --scenes-from or --shards was given; expected neither, since a whole dataset of "
-            "new scenes is predicted."
+            "plan: --scenes-from, --revisits or --shards was given; expected none of them, since a "
+            "whole dataset of new scenes is predicted."
         )
     order = with_shared(order, shared)
     build, samples, cores = order.build, prognosis.samples, prognosis.cores

@@ -5,7 +5,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import pydantic
+
 from pipeline.assets.settings import AssetSettings
+from pipeline.builds.revisit import RevisitSettings
 from pipeline.renders.settings import RenderSettings
 from scene_templates.settings import SceneSettings
 from storage.dataset.settings import SplitSettings, StorageSettings
@@ -37,6 +40,14 @@ class BuildSettings:
     """How objects and scenes are divided into splits and shards."""
     storage: StorageSettings = dataclasses.field(default_factory=StorageSettings)
     """How arrays and pictures are packed."""
+    revisit: RevisitSettings | None = None
+    """What is new, if the scenes are those of a finished dataset; by default they are composed."""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `revisit` out where there is none: digests of earlier builds stay."""
+        record: dict[str, Any] = as_usual(self)
+        return {name: value for name, value in record.items() if name != "revisit" or value}
 
     def __post_init__(self) -> None:
         if not self.allowed_licences:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
-from pipeline.making.render_sample import render_sample
+from pipeline.making.render_sample import BegunScene, render_sample
+from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.renderer import set_threads
 from pipeline.renders.variant import Variant, activate
@@ -18,7 +19,6 @@ from storage.errors import Rejected
 from storage.records.asset import decode_asset
 from storage.records.objects import Failure, LockedObject
 from storage.records.sample import Sample, sample_key
-from storage.records.scene import Scene
 
 MAX_ATTEMPTS = 16
 """Attempts at a scene before it is given up."""
@@ -40,6 +40,8 @@ class SceneRecipe:
     """Every locked object with its asset file."""
     files: SceneFiles | None = None
     """Where scenes are read from files; otherwise they are composed of the objects."""
+    revisited: RevisitedScenes | None = None
+    """Where scenes are those of a finished dataset."""
     folder: DatasetFolder | None = None
     """Where it is told how far a scene is; None where nobody looks."""
 
@@ -82,10 +84,9 @@ def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
     told = ViewProgress(_state.source.folder, scene_index)
     stage = "scenes"
     try:
-        scene = _scene(split, scene_index, attempt)
+        begun = _scene(split, scene_index, attempt)
         stage = "renders"
-        from_file = _state.source.files is not None
-        sample = render_sample(key, scene, settings, failures, told, keeps_cameras=from_file)
+        sample = render_sample(key, begun, settings, failures, told)
     except Rejected as rejection:
         failures.append(
             Failure(
@@ -102,20 +103,22 @@ def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
     return SceneAttempt(sample=sample, failures=failures)
 
 
-def _scene(split: str, scene_index: int, attempt: int) -> Scene:
-    source = _state.source
+def _scene(split: str, scene_index: int, attempt: int) -> BegunScene:
+    source, settings = _state.source, _state.source.settings
+    if source.revisited is not None:
+        return source.revisited.scene(scene_index, attempt, settings)
     if source.files is not None:
-        settings = source.settings
-        return source.files.scene(
-            scene_index, settings.assets, num_views=settings.scenes.num_views, seed=settings.seed
-        )
-    return compose_scene(
-        source.settings.scenes,
+        num_views, seed = settings.scenes.num_views, settings.seed
+        scene = source.files.scene(scene_index, settings.assets, num_views=num_views, seed=seed)
+        return BegunScene(scene=scene, kept_cameras=num_views)
+    scene = compose_scene(
+        settings.scenes,
         assets_of(split),
-        seed=source.settings.seed,
+        seed=settings.seed,
         scene_index=scene_index,
         attempt=attempt,
     )
+    return BegunScene(scene=scene)
 
 
 def assets_of(split: str) -> Sequence[PooledAsset]:

@@ -73,6 +73,9 @@ class DatasetOrder:
     albedo_over_one: AlbedoOverOne = "scale"
     """How to treat a material of a scene file whose diffuse and specular albedos add up to more
     than 1: scale multiplies both by one factor, refuse leaves the file out."""
+    revisits: str | None = None
+    """Folder of a finished dataset whose scenes to render again, with what the settings `revisit`
+    say is new (`trilight revisit` writes them); by default scenes are composed of objects."""
     shards: str | None = None
     """Range A:B of the shards to make, from A up to but not including B; by default all. The run
     that makes the last missing shard finishes the dataset."""
@@ -86,6 +89,14 @@ class DatasetOrder:
             raise TrilightError(
                 f"--scenes-from {self.scenes_from} was given with --objects or --scenes; expected "
                 "neither: the files say both."
+            )
+        if (
+            self.revisits is not None
+            and (self.objects, self.scenes, self.scenes_from) != (None,) * 3
+        ):
+            raise TrilightError(
+                f"--revisits {self.revisits} was given with --objects, --scenes or --scenes-from; "
+                "expected none of them: the dataset says all."
             )
         if self.scenes_from is None and self.views is not None:
             raise TrilightError(f"--views is {self.views}; expected it only with --scenes-from.")

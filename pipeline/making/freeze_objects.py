@@ -9,6 +9,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.isolation import is_passing
 from pipeline.making.publication import Publication
+from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.objects.sources import FoundObjects
 from storage.conventions import SPLITS
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
@@ -29,6 +30,8 @@ class AcceptedObjects:
     """Objects in the source, refused ones included."""
     files: SceneFiles | None = None
     """Where scenes come from files: those, and `objects` are the files themselves."""
+    revisited: RevisitedScenes | None = None
+    """Where scenes are those of a finished dataset: that, whose objects these are."""
 
 
 def freeze_objects(

@@ -9,11 +9,12 @@
     shards     tars of finished scenes, the same bytes everywhere    pipeline.shards.pack
     documents  card, report, contact sheet: what people look at      pipeline.documents
 
-The objects are frozen after the mesh stage (where scenes come from files, the files are). From then
-on scene k is a function of the settings, the frozen objects and k, and so it does not matter who
-makes it. A `Runner` makes many scenes at the same time (`make_shards`): on threads, in a Slurm
-array, with Prefect, on a Dask cluster (pipeline.executors.registry lists them). Native code runs in
-child processes, so that a crash costs one attempt.
+The objects are frozen after the mesh stage (where scenes come from files, the files are; where
+they are those of a finished dataset, its objects are). From then on scene k is a function of the
+settings, the frozen objects and k, and so it does not matter who makes it. A `Runner` makes many
+scenes at the same time (`make_shards`): on threads, in a Slurm array, with Prefect, on a Dask
+cluster (pipeline.executors.registry lists them). Native code runs in child processes, so that a
+crash costs one attempt.
 
 Files are the truth, and every step may be killed at any moment. A mesh is kept in the asset store,
 a scene in the staging folder, a shard in the dataset; the next run looks at what is there and makes
@@ -31,6 +32,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
+from pipeline.making.accept_revisited import accept_revisited
 from pipeline.making.accept_scene_files import accept_scene_files
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.making.bucket_publication import joined
@@ -104,6 +106,8 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
             publication.refresh()
             if listed:
                 accepted = accept_scene_files(listed, order.licence, settings, publication)
+            elif order.revisits:
+                accepted = accept_revisited(order.revisits, settings, publication)
             else:
                 source = object_source(settings, order.objects)
                 accepted = accept_objects(
@@ -195,7 +199,8 @@ def make_piece(job: ShardJob, piece: Piece, child: IsolatedChild) -> tuple[int, 
     """
     splits, profile = job.settings.splits, job.settings.storage.profile
     shard, scenes = UnfinishedShard(job.folder, splits, piece.shard_index), 0
-    attempts = MAX_ATTEMPTS if splits.listed_scenes is None else 1  # a file is always the same
+    from_files = job.accepted.files is not None
+    attempts = 1 if from_files else MAX_ATTEMPTS  # a file is always the same
     for scene_index in range(piece.first, piece.last):
         with shard.claim(scene_index) as ours:
             if not ours:

@@ -78,6 +78,7 @@ def _new_pool(job: ShardJob) -> ChildPool:
             gpu=cards[number % len(cards)] if cards else None,
             objects=job.accepted.objects,
             files=job.accepted.files,
+            revisited=job.accepted.revisited,
             folder=job.folder,
         )
         limits = _CARD_LIMITS if on_card else _RENDER_LIMITS

@@ -7,6 +7,7 @@ from typing import Any
 from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_folder import SceneFolder, find_scene_files
+from pipeline.making.accept_revisited import settings_for_revisit
 from pipeline.making.accept_scene_files import settings_for_files
 from pipeline.making.bucket_publication import begin_dataset
 from pipeline.making.dataset_order import DatasetOrder
@@ -67,7 +68,7 @@ class Run:
         notes: tuple[str, ...] = ()
         if listed and self.accepted.files:
             notes = (*self.accepted.files.notes, *listed.notes(self.settings.scenes.num_views))
-        elif statistics:
+        elif statistics and self.order.revisits is None:
             notes = frozen_note(self.order.build, statistics)
         return Outcome(
             digest=publication.manifest.dataset_digest,
@@ -175,6 +176,8 @@ def settings_of(
         allow_licences=order.allow_licences,
         changes=order.changes,
     )
+    if order.revisits is not None or settings.revisit is not None:
+        return settings_for_revisit(settings, order.revisits), None
     source = object_source(settings, order.objects)
     files = order.scenes_from
     listed = None if files is None else find_scene_files(files, order.albedo_over_one)

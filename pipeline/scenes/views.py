@@ -35,13 +35,17 @@ class ViewCamera:
     """Number of the proposal."""
 
 
-def with_first_cameras(scene: Scene, settings: SceneSettings) -> Scene:
-    """Return the scene with `settings.num_views` cameras; raises Rejected("no_camera")."""
-    sight = Sight(scene)
-    return with_cameras(
-        scene,
-        [next(_that_see(scene, sight, settings, view, 0)) for view in range(settings.num_views)],
-    )
+def with_first_cameras(
+    scene: Scene, settings: SceneSettings, given: Sequence[ViewCamera] = ()
+) -> Scene:
+    """Return the scene with `settings.num_views` cameras, of which the first may be given.
+
+    Raises:
+        Rejected: "no_camera", or "no_layout" where its template draws none.
+    """
+    sight, views = Sight(scene), range(len(given), settings.num_views)
+    drawn = [next(_that_see(scene, sight, settings, view, 0)) for view in views]
+    return with_cameras(scene, [*given, *drawn])
 
 
 def cameras_of_view(
@@ -62,6 +66,13 @@ def cameras_of_view(
     yield ViewCamera(c2w=scene.c2w[view], fov_deg=scene.fov_deg[view], attempt=attempt)
     of_scene = settings.of_scene(scene.provenance["scene_index"])
     yield from _that_see(scene, sight, of_scene, view, attempt + 1)
+
+
+def cameras_of(scene: Scene) -> list[ViewCamera]:
+    """Return the cameras that a scene has."""
+    attempts = scene.provenance.get("camera_attempts", [0] * scene.num_views)
+    rows = zip(scene.c2w, scene.fov_deg, attempts, strict=True)
+    return [ViewCamera(c2w=c2w, fov_deg=fov, attempt=attempt) for c2w, fov, attempt in rows]
 
 
 def with_cameras(scene: Scene, cameras: Sequence[ViewCamera]) -> Scene:
@@ -111,8 +122,16 @@ def _that_see(
 
 def _proposal(scene: Scene, settings: SceneSettings, view: int, attempt: int) -> ViewCamera:
     origin = scene.provenance
-    rng = rng_for(origin["seed"], "camera", origin["scene_index"], origin["attempt"], view, attempt)
-    pose = TEMPLATES[origin["template"]].camera_rand(rng, settings.cameras)
+    template, names = origin["template"], (origin["scene_index"], origin["attempt"], view, attempt)
+    if (new := origin.get("new_cameras")) is None:
+        rng = rng_for(origin["seed"], "camera", *names)
+    else:
+        template, rng = new["layout"], rng_for(new["seed"], "new camera", *names)
+    if template not in TEMPLATES:
+        raise Rejected(
+            "no_layout", f"{template!r} is no layout that draws cameras; name one, or give cameras"
+        )
+    pose = TEMPLATES[template].camera_rand(rng, settings.cameras)
     return ViewCamera(
         c2w=pose.c2w.astype(np.float32), fov_deg=np.float32(pose.fov_deg), attempt=attempt
     )

@@ -25,6 +25,7 @@ from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason, decode_failures
 from storage.records.sample import sample_key
+from storage.settings.described import from_record
 
 _AT_WORK_S = 600.0
 """Older notes on unfinished views were left by a kill: a pass of samples takes less time."""
@@ -141,8 +142,8 @@ def planned_shards(manifest: Manifest) -> dict[str, int]:
     if derivation_of(manifest.settings):  # it only ever appears whole
         return {entry.name: entry.num_samples for entry in manifest.shards}
     try:
-        splits = SplitSettings(**manifest.settings["splits"])
-    except (KeyError, TypeError) as error:
+        splits = from_record(SplitSettings, manifest.settings["splits"])
+    except (KeyError, TrilightError) as error:
         raise TrilightError(f"manifest: settings.splits is not readable ({error!r}).") from error
     return {
         shard_name(index, splits): len(scenes_of_shard(index, splits))

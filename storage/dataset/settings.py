@@ -3,11 +3,16 @@
 They are apart from the code that reads shards, which does not import pydantic.
 """
 
+import functools
+import itertools
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import pydantic
 
+from storage.conventions import SPLITS
 from storage.dataset.splits import TEST_SLOT
+from storage.errors import TrilightError, expected_one_of
 from storage.records.passes.declared import pass_names
 from storage.records.profiles import Profile
 from storage.settings.described import checked
@@ -15,6 +20,20 @@ from storage.settings.ranges import Within
 
 MOST_SCENES = 1_000_000_000
 """Maximum number of scenes in a dataset: a sample's name has nine digits."""
+
+
+@checked()
+class ListedShard:
+    """One shard of a dataset whose shards are those of another."""
+
+    split: str
+    """Its split: train, validation or test."""
+    scenes: Annotated[int, Within(1, MOST_SCENES, unit="scenes")]
+    """Number of its scenes."""
+
+    def __post_init__(self) -> None:
+        if self.split not in SPLITS:
+            raise TrilightError(f"split is {self.split!r}; {expected_one_of(self.split, SPLITS)}.")
 
 
 @checked()
@@ -34,6 +53,18 @@ class SplitSettings:
     listed_scenes: Annotated[int | None, Within(1, MOST_SCENES, unit="scenes")] = None
     """Number of scenes, if they come from scene files: the last shard may then hold fewer, and the
     dataset cannot grow."""
+    listed_shards: tuple[ListedShard, ...] = ()
+    """The shards, if the scenes are those of a finished dataset; by default there are none listed.
+    The dataset cannot grow then."""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return _without_empty(as_usual(self), "listed_shards")
+
+    @functools.cached_property
+    def first_scenes(self) -> tuple[int, ...]:
+        """Index of the first scene of each listed shard, and of one beyond the last."""
+        return (0, *itertools.accumulate(shard.scenes for shard in self.listed_shards))
 
 
 @checked()
@@ -52,6 +83,9 @@ class StorageSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `passes` out where there are none: digests of earlier builds stay."""
-        record: dict[str, Any] = as_usual(self)
-        return {name: value for name, value in record.items() if name != "passes" or value}
+        return _without_empty(as_usual(self), "passes")
+
+
+def _without_empty(record: Mapping[str, Any], field: str) -> dict[str, Any]:
+    """Leave a later field out where it holds nothing: digests of earlier builds stay."""
+    return {name: value for name, value in record.items() if name != field or value}

@@ -2,7 +2,8 @@
 
 An object's split is a hash of its cleaned geometry: copies under other names stay together, and
 adding objects moves none. A scene's split is that of its shard, by the shard's number, so a longer
-dataset begins with exactly the scenes of a shorter one.
+dataset begins with exactly the scenes of a shorter one. Where the shards are listed, since they are
+those of another dataset, the list says both.
 """
 
 from collections.abc import Mapping
@@ -34,6 +35,8 @@ def split_of_object(geometry_sha256: str, settings: "SplitSettings") -> str:
 
 def split_of_shard(shard_index: int, settings: "SplitSettings") -> str:
     """Return the split of a shard from its number."""
+    if settings.listed_shards:
+        return settings.listed_shards[shard_index].split
     if settings.one_split:
         return JUDGED_SPLIT
     slot = shard_index % settings.shards_per_cycle
@@ -52,6 +55,8 @@ def named_shard(shard_index: int, split: str) -> str:
 
 def scenes_of_shard(shard_index: int, settings: "SplitSettings") -> range:
     """Return the indices of the scenes of a shard."""
+    if settings.listed_shards:
+        return range(*settings.first_scenes[shard_index : shard_index + 2])
     first = shard_index * settings.scenes_per_shard
     last = first + settings.scenes_per_shard
     if settings.listed_scenes is not None:
@@ -61,6 +66,8 @@ def scenes_of_shard(shard_index: int, settings: "SplitSettings") -> range:
 
 def planned_scenes(num_scenes: int, settings: "SplitSettings") -> int:
     """Return how many scenes are made when `num_scenes` are wanted: those of whole shards."""
+    if settings.listed_shards:
+        return settings.first_scenes[-1]
     if settings.listed_scenes is not None:
         return settings.listed_scenes
     return shards_for(num_scenes, settings) * settings.scenes_per_shard
@@ -68,6 +75,8 @@ def planned_scenes(num_scenes: int, settings: "SplitSettings") -> int:
 
 def shards_for(num_scenes: int, settings: "SplitSettings") -> int:
     """Return how many shards hold at least `num_scenes` scenes."""
+    if settings.listed_shards:
+        return len(settings.listed_shards)
     return -(-num_scenes // settings.scenes_per_shard)
 
 

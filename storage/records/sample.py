@@ -121,6 +121,8 @@ class Sample:
     passes_exr: tuple[bytes, ...] | None = None
     """OpenEXR files of the passes that the build stores, one per camera; `view_passes` reads them.
     None where the build stores none."""
+    kept_members: Mapping[str, bytes] = dataclasses.field(default_factory=dict)
+    """Packed pictures by suffix that stay as another dataset has them, byte for byte."""
 
     def view_passes(self, names: Sequence[str], *, view: int = 0) -> dict[str, NDArray]:
         """Return passes of one view by name, at the resolution of its picture, one ray a pixel.
@@ -185,9 +187,9 @@ def sample_key(scene_index: int) -> str:
 def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, bytes]:
     """Return the members of a sample by suffix; equal samples give equal bytes.
 
-    A sample that was read from the profile `compact` and is packed so again loses once more: copy
-    members where they are to stay. Where lights or parts are apart, pictures stay exact in every
-    profile: they are the sum of these.
+    A sample that was read from the profile `compact` and is packed so again loses once more: what
+    is to stay goes into `kept_members`. Where lights or parts are apart, pictures stay exact in
+    every profile: they are the sum of these.
 
     Raises:
         TrilightError: a picture holds what half floats cannot (storage.records.exr).
@@ -212,7 +214,7 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
             members[f"{view}.parts.exr"] = encode_parts_exr(of_view)
     for view, packed in enumerate(sample.passes_exr or ()):
         members[f"{view}.passes.exr"] = packed
-    return members
+    return {**members, **sample.kept_members}
 
 
 def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
 from pipeline.making import render_sample as module
-from pipeline.making.render_sample import render_sample
+from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.renderer import RenderedView, Sampling
 from pipeline.renders.variant import activate, choose_variant
@@ -68,7 +68,7 @@ def test_a_record_says_all_three_floors_and_the_target_that_was_missed(scene: Sc
     records = []
     for each in (missed, reached):
         build = named_build("smoke", resolution=16, changes=each)
-        sample = render_sample(KEY, scene, build, [], ViewProgress(None, 0))
+        sample = render_sample(KEY, BegunScene(scene=scene), build, [], ViewProgress(None, 0))
         records.append(decode_sample(KEY, encode_sample(sample)).views)
     assert [view.at_cap for view in records[0]] == [True] * scene.num_views
     assert [view.at_cap for view in records[1]] == [False] * scene.num_views
@@ -82,7 +82,7 @@ def test_a_refused_camera_is_replaced_and_told(
 ) -> None:
     monkeypatch.setattr(module, "SceneRenderer", _Renderer)
     failures: list[Failure] = []
-    sample = render_sample(KEY, scene, BUILD, failures, ViewProgress(None, 0))
+    sample = render_sample(KEY, BegunScene(scene=scene), BUILD, failures, ViewProgress(None, 0))
     before = scene.provenance["camera_attempts"]
     after = sample.scene.provenance["camera_attempts"]
     assert [row.item for row in failures] == [f"{KEY}.1"] * 2
@@ -104,5 +104,7 @@ def test_a_refused_camera_of_a_file_ends_the_scene(
     monkeypatch.setattr(module, "SceneRenderer", _Renderer)
     failures: list[Failure] = []
     with pytest.raises(Rejected, match="black_view: view 1: seed "):
-        render_sample(KEY, scene, BUILD, failures, ViewProgress(None, 0), keeps_cameras=True)
+        render_sample(
+            KEY, BegunScene(scene=scene, kept_cameras=2), BUILD, failures, ViewProgress(None, 0)
+        )
     assert failures == []

@@ -9,7 +9,7 @@ import pytest
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.publication import Publication, begin
-from pipeline.making.render_sample import render_sample
+from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.variant import activate, choose_variant
 from pipeline.shards.pack import pack_shard
@@ -79,10 +79,12 @@ def test_what_stores_some_says_so_in_the_order_of_the_table() -> None:
 def test_a_rendered_sample_holds_what_is_asked() -> None:
     activate(choose_variant())
     scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
-    sample = render_sample("000000007", scene, build(**ASKED), [], ViewProgress(None, 7))
+    sample = render_sample(
+        "000000007", BegunScene(scene=scene), build(**ASKED), [], ViewProgress(None, 7)
+    )
     expected = tuple(passes_exr(scene, NAMES, view=view, resolution=16) for view in range(2))
     assert sample.passes_exr == expected
-    plain = render_sample("000000007", scene, build(), [], ViewProgress(None, 7))
+    plain = render_sample("000000007", BegunScene(scene=scene), build(), [], ViewProgress(None, 7))
     assert plain.passes_exr is None
     np.testing.assert_array_equal(plain.radiance_rgb, sample.radiance_rgb)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.builds.named import named_build
-from pipeline.making.render_sample import render_sample
+from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders import vector_tracer
 from pipeline.renders.camera import Camera
@@ -139,7 +139,9 @@ def test_all_views_and_lights_share_one_load(
     scene = scene.with_provenance({"camera_attempts": [0] * 4})
     changes = {"renders.min_spp": 8, "renders.max_spp": 8, "renders.per_light": per_light}
     settings = named_build("smoke", resolution=16, changes=changes)
-    sample = render_sample("000000000", scene, settings, [], ViewProgress(None, 0))
+    sample = render_sample(
+        "000000000", BegunScene(scene=scene), settings, [], ViewProgress(None, 0)
+    )
     assert len(sample.views) == 4
     assert len(loads) == 2  # what camera rays meet, and what all other rays meet
 

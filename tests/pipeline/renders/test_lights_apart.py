@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.builds.named import named_build
-from pipeline.making.render_sample import render_sample
+from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.kept_light import with_mean_of
@@ -232,7 +232,9 @@ def test_a_build_with_the_setting_stores_what_verify_accepts() -> None:
     }
     settings = named_build("smoke", resolution=16, changes=changes)
     scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
-    sample = render_sample("000000007", scene, settings, [], ViewProgress(None, 7))
+    sample = render_sample(
+        "000000007", BegunScene(scene=scene), settings, [], ViewProgress(None, 7)
+    )
     manifest = Manifest(
         build="smoke",
         settings=settings.as_json(),

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.builds.named import named_build
 from pipeline.making.path_tracer import PathTracer
-from pipeline.making.render_sample import render_sample
+from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
@@ -187,7 +187,9 @@ def test_a_build_with_the_setting_stores_what_verify_accepts(
     changes = {f"renders.{name}": value for name, value in asked.items()}
     settings = named_build("smoke", resolution=16, changes={**changes, "scenes.num_views": 2})
     scene = tiny_scene(provenance={"camera_attempts": [0, 0]})
-    sample = render_sample("000000007", scene, settings, [], ViewProgress(None, 7))
+    sample = render_sample(
+        "000000007", BegunScene(scene=scene), settings, [], ViewProgress(None, 7)
+    )
     manifest = Manifest(
         build="smoke",
         settings=settings.as_json(),

@@ -1,0 +1,62 @@
+"""What is new in a dataset whose scenes are those of a finished one."""
+
+from typing import Annotated, Literal
+
+from scene_templates.templates import TEMPLATES
+from storage.errors import TrilightError
+from storage.settings.described import checked
+from storage.settings.ranges import Within
+
+MOST_CAMERAS = 1000
+"""Cameras of a scene; given ones stand in the manifest."""
+
+NUMBERS_OF_CAMERA = 17
+"""16 of camera to world, row by row, and the field of view in degrees."""
+
+
+@checked("revisit settings")
+class RevisitSettings:
+    """What is new in the scenes of a finished dataset."""
+
+    source_digest: str
+    """Dataset digest of the finished dataset."""
+    kept_cameras: Annotated[int, Within(0, MOST_CAMERAS, unit="cameras")]
+    """Number of cameras that each scene keeps, from its first."""
+    new_cameras: Annotated[int, Within(0, MOST_CAMERAS, unit="cameras")] = 0
+    """Number of cameras that are drawn for each scene after those: where it keeps some and no
+    layout is named, the ones that a dataset with more views would have had; else new ones, by the
+    dataset's seed."""
+    camera_layout: str | None = None
+    """Layout that draws the new cameras; by default each scene's own."""
+    given_cameras: tuple[tuple[float, ...], ...] = ()
+    """Cameras that each scene gets after those: each 16 numbers of camera to world, row by row, and
+    the field of view in degrees."""
+    lights: Literal["keep", "new"] = "keep"
+    """Whether lights stay, or are drawn anew by `scenes.lights`, as each scene's layout is lit."""
+    num_lights: Annotated[int | None, Within(1, 64, unit="emitters")] = None
+    """Number of the new lights of each scene; by default as many as it has."""
+    materials: Literal["keep", "new"] = "keep"
+    """Whether materials stay, or are drawn anew by `scenes.materials`; faces that share a colour
+    still do."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.num_views <= MOST_CAMERAS:
+            raise TrilightError(
+                f"cameras: {self.num_views} for each scene; expected 1 to {MOST_CAMERAS}."
+            )
+        if self.camera_layout is not None:
+            TEMPLATES.find(self.camera_layout)
+        if any(len(camera) != NUMBERS_OF_CAMERA for camera in self.given_cameras):
+            raise TrilightError(f"given_cameras: expected {NUMBERS_OF_CAMERA} numbers of each.")
+        if self.num_lights is not None and self.lights == "keep":
+            raise TrilightError("num_lights: expected it only where lights are new.")
+
+    @property
+    def num_views(self) -> int:
+        """Views of each scene."""
+        return self.kept_cameras + self.new_cameras + len(self.given_cameras)
+
+    @property
+    def keeps_light(self) -> bool:
+        """Whether all but the cameras stays, so that a kept camera sees the same picture."""
+        return self.lights == "keep" and self.materials == "keep"

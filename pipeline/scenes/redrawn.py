@@ -1,0 +1,138 @@
+"""Finished scenes with new materials or lights, drawn as composition would draw them.
+
+Geometry stays: the triangles of surfaces keep their order, their normals, and which of them share a
+colour. All lights are the scene's emitters; new ones take their place at the end.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.scenes.drawn_columns import with_drawn_columns
+from pipeline.scenes.pieces import emitter_piece, joined
+from scene_templates.lights import LightSettings, emitters_rand
+from scene_templates.materials import MaterialSettings, surface_rand
+from scene_templates.templates import TEMPLATES
+from storage.errors import Rejected
+from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR
+from storage.records.scene import Scene
+from storage.records.scene_facts import surfaces
+from storage.seeds import rng_for
+
+
+def with_new_materials(
+    scene: Scene, settings: MaterialSettings, *, seed: int, index: int, attempt: int
+) -> Scene:
+    """Return the scene with materials drawn anew for each object, floor and wall; emitters stay.
+
+    Faces that shared a row of materials within an object share one still, and where there were many
+    rows there are as many colours.
+
+    Args:
+        scene: lawful.
+        settings: the ranges to draw from.
+        seed, index, attempt: a random stream belongs to each of these.
+    """
+    rng = rng_for(seed, "new materials", index, attempt)
+    rows, material_index = [scene.materials[:0]], scene.material_index.astype(np.int64)
+    lit = {row for row, entry in enumerate(scene.objects) if entry.kind == "emitter"}
+    facts = {surface.row: surface for surface in surfaces(scene)}
+    for row in range(len(scene.objects)):
+        mine = scene.object_index == row
+        used, within = np.unique(scene.material_index[mine], return_inverse=True)
+        start = sum(map(len, rows))
+        new = scene.materials[used].copy()
+        if row not in lit and row in facts:
+            surface = facts[row]
+            look = surface_rand(
+                rng,
+                settings,
+                smooth_share=float(surface.smooth),
+                kind="shell" if surface.kind == "shell" else "object",
+            )
+            many = look.diffuse_scale * rng.random((len(used), 3))
+            new[:, DIFFUSE] = [look.diffuse_rgb] if len(used) == 1 else many
+            new[:, SPECULAR] = look.specular_rgb
+            new[:, ROUGHNESS] = look.roughness
+        rows.append(new)
+        material_index[mine] = start + within.ravel()
+    materials = with_drawn_columns(
+        np.concatenate(rows), seed=seed, scene_index=index, attempt=attempt
+    )
+    return dataclasses.replace(
+        scene, materials=materials, material_index=material_index.astype(np.uint16)
+    )
+
+
+def with_new_lights(
+    scene: Scene,
+    settings: LightSettings,
+    num_lights: int | None,
+    *,
+    seed: int,
+    index: int,
+    attempt: int,
+) -> Scene:
+    """Return the scene with its emitters replaced by ones drawn as its layout is lit.
+
+    Args:
+        scene: lawful.
+        settings: the ranges to draw from; its count is not used.
+        num_lights: how many; None for as many as there are.
+        seed, index, attempt: a random stream belongs to each of these.
+
+    Raises:
+        Rejected: "no_layout" where the template of the scene is no layout of ours.
+    """
+    name = scene.provenance["template"]
+    if name not in TEMPLATES:
+        raise Rejected("no_layout", f"{name!r} is no layout that draws lights; keep its lights")
+    kinds = np.array([entry.kind for entry in scene.objects])
+    count = int((kinds == "emitter").sum()) if num_lights is None else num_lights
+    rng = rng_for(seed, "new lights", index, attempt)
+    emitters = emitters_rand(rng, settings, TEMPLATES[name].lights, count, _centres(scene, kinds))
+    lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
+    dark, new = _without(scene, kinds == "emitter"), joined(lamps)
+    vertices, rows = len(dark.vertex_positions), len(dark.materials)
+    return dataclasses.replace(
+        dark,
+        vertex_positions=np.concatenate([dark.vertex_positions, new["vertex_positions"]]),
+        vertex_normals=np.concatenate([dark.vertex_normals, new["vertex_normals"]]),
+        faces=np.concatenate([dark.faces, new["faces"] + np.uint32(vertices)]),
+        material_index=np.concatenate(
+            [dark.material_index, new["material_index"] + np.uint16(rows)]
+        ),
+        materials=np.concatenate([dark.materials, new["materials"]]),
+        object_index=np.concatenate(
+            [dark.object_index, new["object_index"] + np.uint16(len(dark.objects))]
+        ),
+        objects=(*dark.objects, *(lamp.entry for lamp in lamps)),
+    )
+
+
+def _centres(scene: Scene, kinds: NDArray[np.str_]) -> list[NDArray[np.float64]]:
+    """Return the middle of each object's bounding box."""
+    centres = []
+    for row in np.flatnonzero(kinds == "object"):
+        points = scene.vertex_positions[scene.faces[scene.object_index == row].ravel()]
+        centres.append((points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2)
+    return centres
+
+
+def _without(scene: Scene, gone: NDArray[np.bool_]) -> Scene:
+    """Return the scene without some objects, and without vertices and materials of theirs alone."""
+    stays = ~gone[scene.object_index]
+    faces = scene.faces[stays]
+    vertices, faces_of = np.unique(faces, return_inverse=True)
+    materials, rows_of = np.unique(scene.material_index[stays], return_inverse=True)
+    return dataclasses.replace(
+        scene,
+        vertex_positions=scene.vertex_positions[vertices],
+        vertex_normals=scene.vertex_normals[vertices],
+        faces=faces_of.reshape(faces.shape).astype(np.uint32),
+        material_index=rows_of.ravel().astype(np.uint16),
+        materials=scene.materials[materials],
+        object_index=(np.cumsum(~gone) - 1)[scene.object_index[stays]].astype(np.uint16),
+        objects=tuple(entry for entry, out in zip(scene.objects, gone, strict=True) if not out),
+    )

@@ -1,0 +1,197 @@
+"""`trilight revisit`, from a finished dataset to a new one, with real children and pictures."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from infra.cli.changes import Shared
+from infra.cli.dataset_changes import with_shared
+from infra.repair import repair
+from pipeline.executors.threads import ThreadRunner
+from pipeline.making.dataset_order import DatasetOrder
+from pipeline.making.pipeline import make_dataset
+from pipeline.making.revisit_order import Revisit, revisit_order
+from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.shard import iterate_samples
+from storage.dataset.verify import verify_dataset
+from storage.errors import TrilightError
+from storage.records.sample import Sample
+from storage.records.scene_facts import lights
+from tests.pipeline.making.tiny_scenes_kit import Undocumented
+
+TINY = {
+    "renders.max_spp": 16,
+    "renders.min_spp": 16,
+    "splits.scenes_per_shard": 2,
+    "storage.profile": "compact",
+}
+
+
+def generated(out: Path, num_views: int) -> Dataset:
+    changes = {**TINY, "scenes.num_views": num_views}
+    order = DatasetOrder(
+        build="smoke", objects="builtin:", out=str(out), scenes=3, resolution=16, changes=changes
+    )
+    make_dataset(order, Undocumented())
+    return open_dataset(str(out))
+
+
+def order_of(source: Path, out: Path, **asked: Any) -> DatasetOrder:
+    order = revisit_order(Revisit(dataset=str(source), out=str(out), **asked))
+    return with_shared(order, Shared(like=str(source)))
+
+
+def revisited(source: Path, out: Path, **asked: Any) -> Dataset:
+    make_dataset(order_of(source, out, **asked), Undocumented())
+    dataset = open_dataset(str(out))
+    assert not verify_dataset(dataset).problems
+    return dataset
+
+
+def members(dataset: Dataset) -> dict[str, bytes]:
+    return {
+        f"{shard.name}/{key}.{suffix}": data
+        for shard in dataset.manifest.shards
+        for key, of_key in iterate_samples(dataset.folder.shard(shard.name))
+        for suffix, data in of_key.items()
+    }
+
+
+def samples(dataset: Dataset) -> list[Sample]:
+    return [each for shard in dataset.manifest.shards for each in dataset.read_shard(shard)]
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return generated(tmp_path_factory.mktemp("source") / "one", 1)
+
+
+def test_another_view_is_that_of_a_dataset_with_more_views(source: Dataset, tmp_path: Path) -> None:
+    """Copied pictures and new ones are those of `generate` with two views, byte for byte."""
+    more = revisited(source.folder.root, tmp_path / "more", cameras="2")
+    fresh = generated(tmp_path / "fresh", 2)
+    found, expected = members(more), members(fresh)
+    assert found.keys() == expected.keys()
+    for name in expected:
+        if name.endswith(".json"):
+            now, then = json.loads(found[name]), json.loads(expected[name])
+            step = {"dataset_digest": source.digest, "key": name[-14:-5], "attempt": 0, "seed": 0}
+            assert now["provenance"].pop("revisited") == [step]
+            for record in (now, then):
+                record["provenance"].pop("settings_sha256")
+            assert now == then
+        else:
+            assert found[name] == expected[name], name
+    assert more.objects_lock() == source.objects_lock()
+    assert [(entry.name, entry.split) for entry in more.manifest.shards] == [
+        (entry.name, entry.split) for entry in source.manifest.shards
+    ]
+
+
+def test_a_kept_picture_is_copied_and_not_rendered(source: Dataset, tmp_path: Path) -> None:
+    """With passes stored beside it, each picture stays the file that it was."""
+    changes = {"storage.passes": ["depth"]}
+    kept = revisited(source.folder.root, tmp_path / "kept", changes=changes)
+    before, now = members(source), members(kept)
+    pictures = {name: data for name, data in before.items() if name.endswith(".exr")}
+    assert pictures
+    assert {name: now[name] for name in pictures} == pictures
+    added = {name for name in now if name not in before}
+    assert added == {name.replace(".0.exr", ".0.passes.exr") for name in pictures}
+
+
+def test_lights_materials_and_resolution_change_on_request(source: Dataset, tmp_path: Path) -> None:
+    new = revisited(
+        source.folder.root,
+        tmp_path / "new",
+        cameras="plane:2",
+        lights="2",
+        materials="new",
+        resolution=24,
+        seed=5,
+    )
+    assert new.manifest.num_views == 2
+    for then, now in zip(samples(source), samples(new), strict=True):
+        assert now.radiance_rgb.shape == (2, 24, 24, 3)
+        assert len(lights(now.scene)) == 2
+        assert not np.array_equal(now.scene.materials[:1], then.scene.materials[:1])
+        assert not any(np.array_equal(pose, then.scene.c2w[0]) for pose in now.scene.c2w)
+        assert now.scene.provenance["new_cameras"] == {"layout": "plane", "seed": 5}
+        step = now.scene.provenance["revisited"][-1]
+        assert (step["dataset_digest"], step["key"]) == (source.digest, then.key)
+
+
+def test_given_cameras_are_those_of_every_scene(source: Dataset, tmp_path: Path) -> None:
+    look = {"position": [0, -2, 1], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps({"cameras": [look]}))
+    given = revisited(source.folder.root, tmp_path / "given", cameras=str(path), shards="0:1")
+    for sample in samples(given):
+        assert np.allclose(sample.scene.c2w[0, :3, 3], [0, -2, 1], atol=1e-6)  # float32
+        assert sample.scene.fov_deg.tolist() == [40]
+
+
+def test_a_run_goes_on_after_a_kill_and_a_bad_shard_is_repaired(
+    source: Dataset, tmp_path: Path
+) -> None:
+    asked = {"cameras": "new:1", "seed": 9}
+    first = order_of(source.folder.root, tmp_path / "set", shards="0:1", **asked)
+    make_dataset(first, ThreadRunner())
+    order = order_of(source.folder.root, tmp_path / "set", **asked)
+    digest = make_dataset(order, ThreadRunner()).digest
+    shard = open_dataset(str(tmp_path / "set")).manifest.shards[0].name
+    (tmp_path / "set" / shard).write_bytes(b"not a shard")
+    repair(str(tmp_path / "set"), [shard], objects=None, scenes_from=None)
+    again = open_dataset(str(tmp_path / "set"))
+    assert again.digest == digest
+    assert not verify_dataset(again).problems
+    whole = revisited(source.folder.root, tmp_path / "whole", **asked)
+    assert whole.digest == digest
+
+
+def test_another_source_is_refused(source: Dataset, tmp_path: Path) -> None:
+    order = order_of(source.folder.root, tmp_path / "set")
+    other = dict(order.changes["revisit"], source_digest="0" * 64)
+    changed = dataclasses.replace(order, changes={**order.changes, "revisit": other})
+    with pytest.raises(TrilightError, match="its dataset digest is .*; expected 0000"):
+        make_dataset(changed, Undocumented())
+    assert not (tmp_path / "set" / "manifest.json").exists()
+
+
+def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for path in source.folder.root.iterdir():
+        if path.is_file():
+            (copy / path.name).write_bytes(path.read_bytes())
+    shard = copy / source.manifest.shards[0].name
+    data = bytearray(shard.read_bytes())
+    data[len(data) // 2] ^= 1
+    shard.write_bytes(bytes(data))
+    with pytest.raises(TrilightError, match=r"sha256 differs\). Run `trilight verify"):
+        make_dataset(order_of(copy, tmp_path / "set", cameras="2"), Undocumented())
+    assert not (tmp_path / "set" / shard.name).exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"cameras": "bogus"}, "--cameras is 'bogus'; expected keep; a number"),
+        ({"cameras": "0"}, "cameras: 0 for each scene; expected 1 to 1000"),
+        ({"cameras": "new:0"}, "cameras: 0 for each scene; expected 1 to 1000"),
+        ({"cameras": "1001"}, "cameras: 1001 for each scene; expected 1 to 1000"),
+        ({"lights": "none"}, "--lights is 'none'; expected keep, new, or a number"),
+        ({"lights": "65"}, "num_lights is 65; expected a whole number from 1 to 64"),
+        ({"materials": "old"}, "materials is 'old'; expected keep or new"),
+    ],
+)
+def test_words_that_mean_nothing_are_one_line(
+    source: Dataset, tmp_path: Path, asked: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(TrilightError, match=message):
+        order_of(source.folder.root, tmp_path / "set", **asked)
+    assert not (tmp_path / "set").exists()
