@@ -125,6 +125,18 @@ def test_lights_materials_and_resolution_change_on_request(source: Dataset, tmp_
         assert (step["dataset_digest"], step["key"]) == (source.digest, then.key)
 
 
+@pytest.mark.parametrize("asked", [{"lights": "new"}, {"materials": "new"}, {"seed": 1}])
+def test_a_kept_camera_is_rendered_again_where_it_would_see_something_else(
+    source: Dataset, tmp_path: Path, asked: dict[str, Any]
+) -> None:
+    new = revisited(source.folder.root, tmp_path / "new", shards="0:1", **asked)
+    for then, now in zip(samples(source), samples(new), strict=False):
+        assert np.array_equal(now.scene.c2w, then.scene.c2w)
+        assert not np.array_equal(now.radiance_rgb, then.radiance_rgb)
+        changed = not np.array_equal(now.scene.materials, then.scene.materials)
+        assert changed == ("seed" not in asked)
+
+
 def test_given_cameras_are_those_of_every_scene(source: Dataset, tmp_path: Path) -> None:
     look = {"position": [0, -2, 1], "look_at": [0, 0, 0], "up": [0, 0, 1], "fov": 40}
     path = tmp_path / "cameras.json"

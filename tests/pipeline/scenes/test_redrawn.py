@@ -51,6 +51,8 @@ def test_new_materials_leave_shape_light_and_the_pattern_of_colours(scene: Scene
         same = scene.material_index[mine][:, None] == scene.material_index[mine]
         assert np.array_equal(new.material_index[mine][:, None] == new.material_index[mine], same)
         assert not np.any(np.all(before[:, DIFFUSE] == after[:, DIFFUSE], axis=1))
+        num_colours = len(np.unique(scene.material_index[mine]))
+        assert len(np.unique(after[:, DIFFUSE], axis=0)) == num_colours
         sums = (after[:, DIFFUSE] + after[:, SPECULAR]).max(axis=1)
         assert sums.max() <= SETTINGS.materials.albedo_sum[1] + 1e-6  # rounding of float32
 
