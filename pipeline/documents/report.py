@@ -23,7 +23,8 @@ _STYLE = """
 .figure { flex: 0 0 590px; width: 590px } .numbers { flex: 1 1 0; min-width: 0; font-size: .87rem }
 .numbers table { margin-bottom: 1rem }
 @media (max-width: 60rem) { .pair { display: block } .figure { width: auto } }
-.toc a { margin-right: 1rem } .bar { display: inline-block; height: .7em; background: #3b6ea5 }
+.toc { display: flex; flex-wrap: wrap; gap: 0 1rem }
+.bar { display: inline-block; height: .7em; background: #3b6ea5 }
 .cards { display: flex; flex-wrap: wrap; gap: 1rem }
 .card { width: 176px; overflow-wrap: anywhere; font-size: .85rem; line-height: 1.35 }
 .card img { display: block; width: 176px; background: #111; margin-bottom: .25rem }
