@@ -42,7 +42,8 @@ dataset or of any scene that `trilight convert` reads. `--set storage.passes=[de
 makes `trilight generate` store the same bytes in the shards, as `000000123.0.passes.exr`; by
 default nothing is stored. `sample.view_passes(["depth_axis_m"])` of a sample of a dataset returns
 the same numbers, whether they are stored or not: ids as int32, others as float32. `motion_px` needs
-a second moment or camera and is not stored.
+a second moment or camera and is not stored. The pages of a dataset's report show small pictures of
+depth, normals, object ids, diffuse albedo and roughness, computed when they are written.
 
 - All channels are 32-bit floats, compressed without loss (ZIP). Ids below 2^24 are exact in them;
   scenes with more triangles are refused.

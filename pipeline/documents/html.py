@@ -35,6 +35,8 @@ td, th { text-align: left; padding: .2rem .7rem .2rem 0; border-bottom: 1px soli
 th { font-weight: 600; overflow-wrap: normal }
 td.n, th.n { text-align: right; overflow-wrap: normal }
 .faint { color: #777 } img.wide { max-width: 100% }
+@media (max-width: 40rem) { table:not(.narrow) { display: block; overflow-x: auto }
+  table:not(.narrow) td { overflow-wrap: normal } }
 table.narrow { width: auto } table.narrow td, table.narrow th { padding-right: 1.6rem }
 """
 """What all pages look like."""

@@ -12,6 +12,7 @@ from pipeline.documents import report_sections
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.gallery import write_gallery
 from pipeline.documents.html import Markup, element, joined, page, table
+from pipeline.documents.scene_passes import passes_command
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
@@ -22,7 +23,8 @@ _STYLE = """
 .figure { flex: 0 0 590px; width: 590px } .numbers { flex: 1 1 0; min-width: 0; font-size: .87rem }
 .numbers table { margin-bottom: 1rem }
 @media (max-width: 60rem) { .pair { display: block } .figure { width: auto } }
-.toc a { margin-right: 1rem } .bar { display: inline-block; height: .7em; background: #3b6ea5 }
+.toc { display: flex; flex-wrap: wrap; gap: 0 1rem }
+.bar { display: inline-block; height: .7em; background: #3b6ea5 }
 .cards { display: flex; flex-wrap: wrap; gap: 1rem }
 .card { width: 176px; overflow-wrap: anywhere; font-size: .85rem; line-height: 1.35 }
 .card img { display: block; width: 176px; background: #111; margin-bottom: .25rem }
@@ -98,10 +100,21 @@ def _overview(dataset: Dataset, found: Distributions) -> Markup:
     rows += [
         ("objects", f"{len(found.objects)}, {len(found.placements)} of them in scenes"),
         ("rejections", f"{len(found.failures)}"),
+        ("passes", _passes(manifest.settings)),
         ("size", f"{manifest.num_bytes / 1e6:.1f} MB in {len(manifest.shards)} shards"),
         ("dataset digest", manifest.dataset_digest),
     ]
     return table((), rows, class_="narrow")
+
+
+def _passes(settings: Mapping[str, object]) -> Markup:
+    """Return which passes the shards hold; where they hold none, the command that writes some."""
+    storage = settings.get("storage")
+    names = storage.get("passes") if isinstance(storage, Mapping) else None
+    if names:
+        return joined([", ".join(map(str, names)), "beside each picture"], " ")
+    command = element("code", passes_command())
+    return joined(["none stored;", command, "in the dataset's folder writes them"], " ")
 
 
 def _settings(dataset: Dataset) -> Markup:

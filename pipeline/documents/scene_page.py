@@ -19,6 +19,8 @@ from pipeline.documents.html import (
     png_uri,
     table,
 )
+from pipeline.documents.pass_colours import id_colours
+from pipeline.documents.scene_passes import PASSES_STYLE, passes_section
 from storage.conventions import preview_srgb8, srgb8
 from storage.records.material import DIFFUSE
 from storage.records.objects import Failure
@@ -33,7 +35,7 @@ _STYLE = """
 figure { margin: 0 } figure img { display: block; width: 272px; background: #111 }
 figcaption { font-size: .85rem; color: #555; margin-top: .2rem }
 .swatches { font-size: 0; line-height: 0 }
-.swatches i { display: inline-block; width: 13px; height: 13px; margin: 1px }
+.swatches i, .id { display: inline-block; width: 13px; height: 13px; margin: 1px }
 nav { display: flex; gap: 1.5rem } td:first-child { min-width: 9rem }
 .objects td:nth-child(2) { white-space: nowrap }
 """
@@ -74,6 +76,7 @@ def encode_scene_page(
         element("h2", "Views"),
         _views(sample),
         *_parts(sample),
+        passes_section(sample),
         element("h2", "Objects"),
         _objects(scene),
         element("h2", "Materials"),
@@ -84,7 +87,7 @@ def encode_scene_page(
         element("h2", "Provenance"),
         _provenance(scene.provenance),
     ]
-    return page(title, joined(body), style=_STYLE)
+    return page(title, joined(body), style=_STYLE + PASSES_STYLE)
 
 
 def preview(radiance_rgb: NDArray[np.float32], width: int) -> NDArray[np.uint8]:
@@ -174,7 +177,7 @@ def _objects(scene: Scene) -> Markup:
     shading = {s.row: "smooth" if s.smooth else "flat" for s in surfaces(scene)}
     rows: list[list[Cell]] = [
         [
-            entry.name,
+            joined([_square(id_colours(row), class_="id"), entry.name], " "),
             entry.kind,
             entry.uid,
             entry.licence,
@@ -209,11 +212,12 @@ def _materials(scene: Scene) -> Markup:
 def _swatches(scene: Scene, row: int) -> Markup:
     used = np.unique(scene.material_index[scene.object_index == row])
     colours = srgb8(scene.materials[used[:_MOST_SWATCHES], DIFFUSE])
-    shown = [
-        element("i", style=f"background: #{red:02x}{green:02x}{blue:02x}")
-        for red, green, blue in colours.tolist()
-    ]
-    return element("div", *shown, class_="swatches")
+    return element("div", *map(_square, colours), class_="swatches")
+
+
+def _square(colour: NDArray[np.uint8], **attributes: str) -> Markup:
+    red, green, blue = colour.tolist()
+    return element("i", **attributes, style=f"background: #{red:02x}{green:02x}{blue:02x}")
 
 
 def _lights(scene: Scene) -> Markup:

@@ -144,8 +144,8 @@ def test_a_scene_has_its_facts(five: dict[str, Tags]) -> None:
     assert "0 a object a CC0-1.0 flat 2 1 b object b CC0-1.0 flat 2" in text
     assert "light 0.000, -0.033, 2.000 2.000 100.0, 100.0, 100.0 0.02000" in text
     assert text.count("no_room") == 2  # both rejected attempts at it
-    assert tags.tags.count("figure") == 2
-    assert tags.tags.count("i") == 1 + 2 + 2  # swatches
+    assert tags.tags.count("figure") == 2 + 2 * 5  # pictures, and passes of both views
+    assert tags.tags.count("i") == 4 + 1 + 2 + 2  # colours of ids, then of materials
     assert "no_room" not in text_of(five["000000000"])
 
 

@@ -1,0 +1,62 @@
+"""Colours of passes, for people to look at: never for measuring.
+
+Black stands for nothing: pixels that meet no surface. Every other grey and every id is brighter.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from storage.conventions import srgb8
+from storage.records.surfaces import MISS
+
+_DARKEST = 40
+"""Grey of the farthest point and of roughness 0, which is told from black."""
+
+
+def depth_greys(depth_m: NDArray) -> NDArray[np.uint8]:
+    """Return depths [R, R] in metres as greys: the nearest is white, the farthest dark.
+
+    The greys fall in proportion to the depth. Infinite depths are black.
+    """
+    near, far = finite_range(depth_m) or (0.0, 0.0)
+    span = far - near
+    return share_greys(
+        np.where(np.isfinite(depth_m), (far - depth_m) / span if span else 1, np.nan)
+    )
+
+
+def share_greys(share: NDArray) -> NDArray[np.uint8]:
+    """Return numbers from 0 to 1 [R, R] as greys from dark to white; NaN is black."""
+    met = np.isfinite(share)
+    greys = _DARKEST + (255 - _DARKEST) * np.clip(np.where(met, share, 0), 0, 1)
+    return np.where(met, np.round(greys), 0).astype(np.uint8)
+
+
+def normal_colours(normal: NDArray) -> NDArray[np.uint8]:
+    """Return unit vectors [R, R, 3] as RGB: -1 to 1 become 0 to 255; NaN is black."""
+    return np.round(np.where(np.isnan(normal), 0, (normal + 1) * 127.5)).astype(np.uint8)
+
+
+def albedo_colours(albedo: NDArray) -> NDArray[np.uint8]:
+    """Return linear colours [R, R, 3] from 0 to 1 as sRGB; NaN is black."""
+    return srgb8(np.nan_to_num(albedo))
+
+
+def id_colours(ids: ArrayLike) -> NDArray[np.uint8]:
+    """Return the colours of ids [...], as [..., 3] RGB: the palette of PASCAL VOC's label pictures.
+
+    An id has the same colour in every scene, and no two ids below 2^24 - 1 share one: from its
+    lowest bit on, the bits of id + 1 are dealt to red, green and blue in turn, the strongest
+    first. -1, which stands for nothing, is black.
+    """
+    code = np.asarray(ids, np.int64) - MISS
+    colours = np.zeros((*code.shape, 3), np.uint8)
+    for bit in range(24):
+        colours[..., bit % 3] |= ((code >> bit & 1) << 7 - bit // 3).astype(np.uint8)
+    return colours
+
+
+def finite_range(values: NDArray) -> tuple[float, float] | None:
+    """Return the least and the greatest finite number; None where there is none."""
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if finite.size else None

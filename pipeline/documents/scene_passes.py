@@ -1,0 +1,126 @@
+"""What the pixels of a scene's views see, as small pictures for its page.
+
+They are computed from the scene when the page is written, so that a dataset stores nothing for
+them. At 96 pixels a side, all views of a scene cost about half of what its page costs without them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.documents.html import Markup, element, image, png_uri
+from pipeline.documents.pass_colours import (
+    albedo_colours,
+    depth_greys,
+    finite_range,
+    id_colours,
+    normal_colours,
+    share_greys,
+)
+from storage.records.passes.declared import pass_names
+from storage.records.passes.pictures import view_passes
+from storage.records.sample import Sample
+from storage.records.surfaces import MISS
+
+PASSES_STYLE = """
+.passes { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fill, 192px);
+  margin-bottom: 1.2rem } .passes img { width: 100%; image-rendering: pixelated }
+@media (max-width: 32rem) { .passes { grid-template-columns: 1fr 1fr } }
+section code { display: block; overflow-x: auto; white-space: nowrap; margin-bottom: 1rem }
+"""
+"""What `passes_section` needs of the page's style."""
+
+_PREVIEW_PX = 96
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Shown:
+    """How one pass is shown."""
+
+    word: str
+    """The pass, as `trilight passes` takes it."""
+    title: str
+    pixels: Callable[[NDArray], NDArray[np.uint8]]
+    """Returns the picture."""
+    caption: Callable[[NDArray], str]
+    """Returns what the picture's colours mean; it is asked only where something is met."""
+
+
+def _ranged(form: str) -> Callable[[NDArray], str]:
+    return lambda values: form.format(*finite_range(values) or ())
+
+
+def _ids_seen(ids: NDArray) -> str:
+    seen = len(np.unique(ids[ids != MISS]))
+    return f"{seen} seen, in the colours of the table Objects"
+
+
+_SHOWN = (
+    _Shown(
+        word="depth",
+        title="depth",
+        pixels=depth_greys,
+        caption=_ranged("{:.2f} to {:.2f} m, near is bright"),
+    ),
+    _Shown(
+        word="normal",
+        title="shading normal",
+        pixels=normal_colours,
+        caption=lambda _: "x, y, z of the world from -1 to 1 as red, green, blue",
+    ),
+    _Shown(word="object", title="object ids", pixels=id_colours, caption=_ids_seen),
+    _Shown(
+        word="diffuse",
+        title="diffuse albedo",
+        pixels=albedo_colours,
+        caption=_ranged("{:.2f} to {:.2f} (no unit)"),
+    ),
+    _Shown(
+        word="roughness",
+        title="roughness",
+        pixels=share_greys,
+        caption=_ranged("{:.2f} to {:.2f} (no unit), rough is bright"),
+    ),
+)
+
+
+def passes_section(sample: Sample) -> Markup:
+    """Return small pictures of what each view of a sample sees, and the command for the numbers."""
+    words = [shown.word for shown in _SHOWN]
+    intro = element(
+        "p",
+        f"What each view sees through the centres of {_PREVIEW_PX} x {_PREVIEW_PX} pixels, "
+        "computed from the scene for this page. Lights are hidden from cameras; where no surface "
+        "is met, the pictures are black. In the dataset's folder, this command writes the numbers:",
+    )
+    command = element("code", passes_command(words, scene=sample.key))
+    views = [_view(sample, view, words) for view in range(sample.scene.num_views)]
+    return element("section", element("h2", "Passes"), intro, command, *views)
+
+
+def passes_command(words: Sequence[str] = (), *, scene: str | None = None) -> str:
+    """Return the command that writes passes beside the dataset in whose folder it runs.
+
+    Args:
+        words: passes, as `trilight passes` takes them; none for those it writes by default.
+        scene: key of the only scene; None for all.
+    """
+    one = "" if scene is None else f" --scene {scene}"
+    chosen = f" --passes {','.join(words)}" if words else ""
+    return f"trilight passes .{one}{chosen} --out ../passes"
+
+
+def _view(sample: Sample, view: int, words: Sequence[str]) -> Markup:
+    names = [pass_names([word])[0] for word in words]
+    found = view_passes(sample.scene, names, view=view, resolution=_PREVIEW_PX)
+    figures = []
+    for shown, name in zip(_SHOWN, names, strict=True):
+        values = found[name]
+        met = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
+        means = shown.caption(values) if met else "nothing is met"
+        title = f"view {view}, {shown.title}"
+        picture = image(png_uri(shown.pixels(values)), title)
+        figures.append(element("figure", picture, element("figcaption", f"{title}: {means}")))
+    return element("div", *figures, class_="passes")
