@@ -75,8 +75,10 @@ BUILD_V1 = BuildSettings(
         held_out_objects=0.02,
         one_split=False,
         listed_scenes=None,
+        listed_shards=(),
     ),
     storage=StorageSettings(profile="compact", passes=()),
+    revisit=None,
 )
 """What the published sets have in common; each says what it changes of it."""
 
@@ -86,5 +88,6 @@ JUDGING_SPLITS = SplitSettings(
     held_out_objects=0.125,
     one_split=True,
     listed_scenes=None,
+    listed_shards=(),
 )
 """Of sets whose scenes are all of the split `test`."""

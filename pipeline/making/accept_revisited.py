@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from pipeline.builds.revisit import RevisitSettings
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.freeze_objects import AcceptedObjects, frozen_objects
 from pipeline.making.publication import Publication
@@ -36,6 +37,7 @@ def settings_for_revisit(settings: BuildSettings, place: str | None) -> BuildSet
             f"kept_cameras is {asked.kept_cameras}; expected at most "
             f"{source.manifest.num_views}, the views of each scene of {place}."
         )
+    _require_layouts(settings, asked, place)
     scenes = dataclasses.replace(settings.scenes, num_views=asked.num_views)
     listed = tuple(
         ListedShard(split=shard.split, scenes=shard.num_samples)
@@ -43,6 +45,22 @@ def settings_for_revisit(settings: BuildSettings, place: str | None) -> BuildSet
     )
     splits = dataclasses.replace(settings.splits, listed_shards=listed)
     return dataclasses.replace(settings, scenes=scenes, splits=splits)
+
+
+def _require_layouts(settings: BuildSettings, asked: RevisitSettings, place: str) -> None:
+    """Refuse to draw, in scenes of files, what only a layout of ours can say."""
+    if settings.splits.listed_scenes is None:
+        return
+    if asked.new_cameras and asked.camera_layout is None:
+        raise TrilightError(
+            f"{place}: its scenes are of files, whose own layout draws no cameras; expected a "
+            "layout and a number, such as --cameras plane:4, or a file with cameras."
+        )
+    if asked.lights == "new":
+        raise TrilightError(
+            f"{place}: its scenes are of files, whose own layout draws no lights; expected "
+            "--lights keep."
+        )
 
 
 def accept_revisited(

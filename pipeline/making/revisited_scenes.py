@@ -60,7 +60,8 @@ class RevisitedScenes:
             given=[*cameras, *_given(asked)],
         )
         if not asked.keeps_light:
-            require_laws(scene, settings.scenes)
+            # its triangles are those of before, but for the lamps that were asked for
+            require_laws(scene, settings.scenes, in_budget=False)
         return BegunScene(
             scene=scene,
             kept_cameras=asked.kept_cameras + len(asked.given_cameras),

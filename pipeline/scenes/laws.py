@@ -11,8 +11,13 @@ from storage.errors import Rejected, TrilightError
 from storage.records.scene import Scene
 
 
-def require_laws(scene: Scene, settings: SceneSettings) -> None:
+def require_laws(scene: Scene, settings: SceneSettings, *, in_budget: bool = True) -> None:
     """Raise Rejected where a scene breaks the laws of the record, of its budget, or of its lights.
+
+    Args:
+        scene: any.
+        settings: the limits.
+        in_budget: whether the number of triangles is limited too.
 
     Raises:
         Rejected: "law_broken" with what `Scene.check` says, "over_budget", or "emitter_inside"
@@ -22,7 +27,7 @@ def require_laws(scene: Scene, settings: SceneSettings) -> None:
         scene.check()
     except TrilightError as error:
         raise Rejected("law_broken", str(error)) from error
-    if scene.num_triangles > settings.max_triangles:
+    if in_budget and scene.num_triangles > settings.max_triangles:
         found = f"{scene.num_triangles} triangles; at most {settings.max_triangles} were allowed"
         raise Rejected("over_budget", found)
     _require_emitters_outside(scene, settings.lights.num_inside)

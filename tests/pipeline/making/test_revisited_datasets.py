@@ -174,6 +174,20 @@ def test_another_source_is_refused(source: Dataset, tmp_path: Path) -> None:
     assert not (tmp_path / "set" / "manifest.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [({"cameras": "new:2"}, "draws no cameras"), ({"lights": "new"}, "draws no lights")],
+)
+def test_scenes_of_files_have_no_layout_to_draw_from(
+    source: Dataset, tmp_path: Path, asked: dict[str, Any], message: str
+) -> None:
+    of_files = {"splits.listed_scenes": 4}
+    order = order_of(source.folder.root, tmp_path / "set", changes=of_files, **asked)
+    with pytest.raises(TrilightError, match=f"its scenes are of files, .* {message}; expected"):
+        make_dataset(order, Undocumented())
+    assert not (tmp_path / "set" / "manifest.json").exists()
+
+
 def test_a_damaged_source_is_named(source: Dataset, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     copy.mkdir()
