@@ -17,7 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.bench.effort import Asked, Effort
-from infra.bench.subjects.named_scenes import described, first_sample, make_reference, sampled
+from infra.bench.subjects.named_scenes import (
+    NamedScene,
+    described,
+    first_sample,
+    make_reference,
+    sampled,
+)
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
@@ -175,17 +181,24 @@ class Workshop:
             raise Rejected("no_object", f"only {len(large)} objects have {least} triangles")
         return large[number - 1]
 
-    def subject(self, name: str) -> Subject:
+    def scene(self, name: str) -> Scene:
         """Return a scene of the named set, `sampled N` or one of the user's folder."""
+        return self._named(name).make(self.child)
+
+    def subject(self, name: str) -> Subject:
+        """Return such a scene with its reference, which a denoiser has seen."""
         return self.kept(("subject", name), lambda: self._subject(name))
+
+    def _named(self, name: str) -> NamedScene:
+        named = next((one for one in described(self.asked.scenes) if one.name == name), None)
+        if named is None and not name.startswith("sampled "):
+            raise TrilightError(f"scene {name!r} is not in --scenes {self.asked.scenes}.")
+        return named or sampled(int(name.split()[-1]))
 
     def _subject(self, name: str) -> Subject:
         from train.data.resolution import block_mean
 
-        named = next((one for one in described(self.asked.scenes) if one.name == name), None)
-        if named is None and not name.startswith("sampled "):
-            raise TrilightError(f"scene {name!r} is not in --scenes {self.asked.scenes}.")
-        named = named or sampled(int(name.split()[-1]))
+        named = self._named(name)
         reference = make_reference(named, self.child)
         return Subject(
             scene=named.make(self.child),

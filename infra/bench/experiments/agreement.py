@@ -20,7 +20,7 @@ from infra.bench.sides.judged_pictures import (
 )
 from infra.bench.sides.sampled_pictures import first_camera
 from infra.bench.sides.shots import Shot, shots
-from infra.bench.subjects.named_scenes import described, sampled, sampled_names
+from infra.bench.subjects.named_scenes import sampled_names
 from infra.bench.workshop import Workshop
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import RenderSettings
@@ -66,8 +66,7 @@ def _their_side(scene: Scene, resolution: int, spp: int) -> Reference:
 
 def _measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     effort = workshop.effort
-    named = next((one for one in described(workshop.asked.scenes) if one.name == turn), None)
-    scene = (named or sampled(int(turn.split()[-1]))).make(workshop.child)
+    scene = workshop.scene(turn)
     variants = {point.name: point.settings for point in points}
     spp, px = 2 * effort.max_spp, effort.resolution
     taken, ours = workshop.call(our_side, scene, variants, px, spp)

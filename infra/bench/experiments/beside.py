@@ -1,8 +1,8 @@
 """Our renderer beside plain Mitsuba and Blender's Cycles: cost at equal true error.
 
-Errors are true ones, to converged references of our own renderer: where another renderer
-transports light differently it cannot come nearer than that difference, as its error at many
-samples shows. The sides take turns on every scene.
+Errors are true ones, to raw samples of our own tracer in two halves, which no denoiser has seen:
+their noise cancels. Where another renderer transports light differently it cannot come nearer than
+that difference, as its error at many samples shows. The sides take turns on every scene.
 """
 
 import dataclasses
@@ -17,13 +17,15 @@ from infra.bench.curve import PricedLevel, at_error
 from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Point, TurnFigures, percent
 from infra.bench.experiments.sampling import CORE_S, DB, WORST
-from infra.bench.sides.sampled_pictures import render_levels
+from infra.bench.sides.judged_pictures import Reference, raw_reference, true_error_db
+from infra.bench.sides.sampled_pictures import first_camera, render_levels
 from infra.bench.sides.shots import SEED, shots
 from infra.bench.subjects.named_scenes import NUM_SAMPLED, sampled_names
-from infra.bench.workshop import Subject, Workshop
+from infra.bench.workshop import Workshop
 from pipeline.builds.training import pretrain_256
+from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.settings import RenderSettings
-from storage.metrics import psnr_linear_db, psnr_log_db
+from storage.conventions import log10_radiance
 from storage.records.scene import Scene
 
 TARGETS_DB = (38.0, 42.0, 46.0, 50.0)
@@ -99,19 +101,21 @@ def beside(theirs: Theirs) -> Any:
     """Return the measuring of our targets beside another renderer's fixed numbers of samples."""
 
     def measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
-        subject = workshop.subject(turn)
+        scene, px = workshop.scene(turn), workshop.effort.resolution
+        camera, spp = first_camera(scene, px), 4 * workshop.effort.max_spp
+        reference = workshop.call(raw_reference, scene, camera, spp)
         ours = {p.name: p.settings for p in points if isinstance(p.settings, RenderSettings)}
-        taken = workshop.call(shots, subject.scene, ours)
+        taken = workshop.call(shots, scene, ours)
         others = [point for point in points if point.name not in ours]
         found: dict[str, dict[str, float]] = {}
         levels = []
-        for point, made in zip(others, theirs(workshop, subject.scene, others), strict=True):
+        for point, made in zip(others, theirs(workshop, scene, others), strict=True):
             name, picture, core_s, load_s = made
             found[name] = {"core_s": core_s, "load_s": load_s, "spp": float(point.settings)}
-            found[name] |= _errors(picture, subject)
+            found[name] |= _errors(picture, reference)
             levels.append(PricedLevel(spp=point.settings, core_s=core_s, db=found[name]["db"]))
         for name, shot in taken.items():
-            figures = _errors(shot.view.radiance_rgb, subject)
+            figures = _errors(shot.view.radiance_rgb, reference)
             stated = shot.view.noise_floor_db
             equal, has_it = at_error(levels, figures["db"])
             yield (
@@ -132,11 +136,11 @@ def beside(theirs: Theirs) -> Any:
     return measure
 
 
-def _errors(picture: Picture, subject: Subject) -> dict[str, float]:
-    return {
-        "db": psnr_log_db(picture, subject.reference_rgb),
-        "linear_db": psnr_linear_db(picture, subject.reference_rgb),
-    }
+def _errors(picture: Picture, reference: Reference) -> dict[str, float]:
+    everywhere = np.ones(picture.shape[:2], np.bool_)
+    db, open_db = true_error_db(picture, reference, log10_radiance, everywhere)
+    linear_db, _ = true_error_db(picture, reference, clamped_radiance, everywhere)
+    return {"db": db, "linear_db": linear_db, "open_db": open_db}
 
 
 _BESIDE = (
@@ -148,6 +152,7 @@ _BESIDE = (
     Column(name="other side at equal error, times", figure="times"),
     Column(name="least times", figure="times", over="least"),
     Column(name="of them bounds, %", figure="bound", over="mean", then=percent),
+    Column(name="what the reference leaves open, median dB", figure="open_db"),
 )
 
 EXPERIMENTS = (
@@ -159,7 +164,7 @@ EXPERIMENTS = (
         cost=CORE_S,
         error=DB,
         better="higher",
-        against="converged references of our renderer; median over the scenes",
+        against="raw samples of our tracer in two halves; median over the scenes",
         columns=_BESIDE,
         because="`other side at equal error` is the median over the scenes of Mitsuba's "
         "core-seconds, interpolated between its numbers of samples, divided by ours; where it "
@@ -179,7 +184,7 @@ EXPERIMENTS = (
         cost=CORE_S,
         error=DB,
         better="higher",
-        against="converged references of our renderer, which favours ours",
+        against="raw samples of our tracer in two halves, which favours ours",
         columns=_BESIDE,
         points=lambda effort: [*_ours(effort), *_cycles(effort)],
         turns=lambda effort: sampled_names(min(6, effort.scenes)),

@@ -34,12 +34,11 @@ Answer = TypeVar("Answer")
 class RememberingTracer:
     """A `Tracer` around another one that traces nothing twice; use a new one for every view."""
 
-    def __init__(self, tracer: Tracer) -> None:
+    def __init__(self, tracer: Tracer, ledger: "Ledger | None" = None, *, guided: bool = False):
         self._tracer = tracer
-        self._answers: dict[tuple[Any, ...], tuple[Any, float]] = {}
-        self.owed_core_s = 0.0
-        """Core-seconds of remembered answers since this was last set to 0: what the caller would
-        have spent besides its own."""
+        self._guided = guided
+        self.ledger = Ledger() if ledger is None else ledger
+        """What was traced, shared with the tracer that is guided."""
 
     def only_light(self, row: int) -> "RememberingTracer":
         return RememberingTracer(self._tracer.only_light(row))
@@ -48,24 +47,64 @@ class RememberingTracer:
         """Raise NotImplementedError: what is remembered are passes of all light together."""
         raise NotImplementedError
 
+    def guided(self) -> "RememberingTracer":
+        """Return the guided tracer, where the renderer can be guided; the view pays for learning.
+
+        Both halves ask, and learn once.
+        """
+        make = getattr(self._tracer, "guided", None)
+        if self._guided or make is None:
+            return self
+        tracer = self.ledger.once(("guided",), make)
+        return RememberingTracer(tracer, self.ledger, guided=True)
+
     def radiance(
         self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
-        return self._remembered(
-            ("radiance", seed, spp, None if chosen is None else chosen.tobytes()),
+        pixels = None if chosen is None else chosen.tobytes()
+        return self.ledger.remembered(
+            ("radiance", self._guided, seed, spp, pixels),
             lambda: self._tracer.radiance(camera, seed=seed, spp=spp, chosen=chosen),
         )
 
-    def pass_sum(self, camera: Camera) -> HostSum:
-        return HostSum(self, camera)
+    def pass_sum(self, camera: Camera) -> "RememberingSum":
+        return RememberingSum(self, camera)
 
     def features(self, camera: Camera, *, spp: int) -> Features:
-        return self._remembered(("features", spp), lambda: self._tracer.features(camera, spp=spp))
+        return self.ledger.remembered(
+            ("features", spp), lambda: self._tracer.features(camera, spp=spp)
+        )
 
     def hits(self, camera: Camera) -> NDArray[np.bool_]:
-        return self._remembered(("hits",), lambda: self._tracer.hits(camera))
+        return self.ledger.remembered(("hits",), lambda: self._tracer.hits(camera))
 
-    def _remembered(self, key: tuple[Any, ...], trace: Callable[[], Answer]) -> Answer:
+
+class RememberingSum(HostSum):
+    """The sum of remembered passes, guided where the renderer asks for it."""
+
+    _tracer: RememberingTracer
+
+    def guide(self) -> None:
+        self._tracer = self._tracer.guided()
+
+
+class Ledger:
+    """Answers with what they cost, and what a view owes for those that it did not pay itself."""
+
+    def __init__(self) -> None:
+        self._answers: dict[tuple[Any, ...], tuple[Any, float]] = {}
+        self._paid: set[tuple[Any, ...]] = set()
+        self.owed_core_s = 0.0
+        """Core-seconds of remembered answers since the view began: what it would have spent besides
+        its own."""
+
+    def begin_view(self) -> None:
+        """Owe nothing."""
+        self.owed_core_s = 0.0
+        self._paid.clear()
+
+    def remembered(self, key: tuple[Any, ...], trace: Callable[[], Answer]) -> Answer:
+        """Return an answer that the renderer would compute each time that it asks."""
         if key in self._answers:
             answer, core_s = self._answers[key]
             self.owed_core_s += core_s
@@ -74,6 +113,14 @@ class RememberingTracer:
             answer = trace()
             self._answers[key] = (answer, time.process_time() - started)
         return answer
+
+    def once(self, key: tuple[Any, ...], learn: Callable[[], Answer]) -> Answer:
+        """Return an answer that the renderer keeps for the view."""
+        if key in self._paid:
+            answer: Answer = self._answers[key][0]
+            return answer
+        self._paid.add(key)
+        return self.remembered(key, learn)
 
 
 SEED = 20_261_122
@@ -172,10 +219,10 @@ class RememberingRenderer(SceneRenderer):
         """
         other = copy.copy(self)
         other._settings = settings
-        self._remembering.owed_core_s = 0.0
+        self._remembering.ledger.begin_view()
         started = time.process_time()
         view = other.render_view(*self._camera, seed)
-        return view, time.process_time() - started + self._remembering.owed_core_s
+        return view, time.process_time() - started + self._remembering.ledger.owed_core_s
 
 
 def _alone(scene: Scene, settings: RenderSettings) -> Shot:
