@@ -33,7 +33,10 @@ tree adds 0.2 core-seconds for 100,000 triangles. Passes were compared with
 Mitsuba's `aov` integrator: positions differ by 0.7 micrometres at most and normals by 5e-6, which
 is its single precision. Two of its passes mean something else. Its depth begins at the near plane
 of the camera. Its albedo leaves out the specular lobe where that is narrow: it is wrong on glossy
-surfaces (`tests/pipeline/renders/test_passes.py`).
+surfaces (`tests/pipeline/renders/test_passes.py`). Beside Blender's Cycles (four RenderFormer
+scenes, 128 x 128, one ray a pixel) positions differ by 7 micrometres at most, normals by 0.02
+degrees in 99 of 100 pixels, and diffuse colours not at all; Cycles turns normals at rims by up to
+26 degrees, and counts what is scattered more than once into its glossy colour.
 
 ## Asked for, or stored
 
@@ -49,8 +52,8 @@ depth, normals, object ids, diffuse albedo and roughness, computed when they are
   scenes with more triangles are refused.
 - `Z`, `A`, `N`, `P` and `Ng` are the names that compositors and viewers of OpenEXR use for depth,
   alpha and layers of normals and positions. Other layers have the name of the pass, and channels
-  have one letter. The files were read back with the OpenEXR library; nobody has opened them in Nuke
-  or Blender for this page.
+  have one letter. Blender 4.5 opens the files as layers and takes `Depth` and `Alpha` from them
+  (`tests/pipeline/renders/test_passes_beside_cycles.py`); nobody has opened them in Nuke yet.
 - `A` is `coverage`, and is in every file. Numbers are not multiplied by it. Where it is 0, nothing
   is met: ids are -1, depths infinite, and other channels 0 instead of NaN.
 
