@@ -56,6 +56,7 @@ def test_what_generate_names_runs_for_eight_scenes(trilight: Trilight, tmp_path:
     _ran(trilight, *train, "--steps", "4")
 
 
+@pytest.mark.slow
 def test_an_unfinished_set_names_the_command_that_finishes_it(
     trilight: Trilight, tmp_path: Path
 ) -> None:

@@ -94,6 +94,7 @@ def test_bad_scenes_are_one_clear_line(
         assert message in refused("generate", "smoke", "--out", "set", *arguments)
 
 
+@pytest.mark.slow
 def test_a_bad_file_and_a_dark_scene_cost_themselves(
     trilight: Trilight, refused: Callable[..., str], scenes: Path, tmp_path: Path
 ) -> None:

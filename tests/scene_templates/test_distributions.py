@@ -102,7 +102,7 @@ def _surface_tables(scenes: list[Drawn], stated: Stated) -> Table:
 @pytest.mark.parametrize(
     "build",
     [
-        "pretrain-256",
+        pytest.param("pretrain-256", marks=pytest.mark.slow),
         "renderformer-v1-256",
         pytest.param("renderformer-v1-512", marks=pytest.mark.slow),
     ],

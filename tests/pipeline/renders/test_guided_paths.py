@@ -100,6 +100,7 @@ _ADAPTIVE = RenderSettings(
 )
 
 
+@pytest.mark.slow
 def test_adaptive_guided_views_keep_the_light() -> None:
     """Guided where first samples were noisy, more samples where they were: and no light is lost.
 

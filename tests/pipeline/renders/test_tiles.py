@@ -72,6 +72,7 @@ def _adapted(
     return samples
 
 
+@pytest.mark.slow
 def test_the_mean_stays_unbiased_where_tiles_are_chosen_by_rare_light() -> None:
     """Where a half chose for itself, tiles that found a flash would be diluted: 8 % were missing.
 

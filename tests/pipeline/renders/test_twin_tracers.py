@@ -60,6 +60,7 @@ def test_both_integrators_agree_within_their_noise(
     assert len(score) > 90 and abs(score.mean()) < 0.35
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("llvm")
 def test_the_fallback_agrees_within_noise_where_lobes_are_not_rough() -> None:
     """`roughconductor` has the separable Smith term; it differs from ours in rough lobes only."""
