@@ -14,6 +14,8 @@ from infra.rendering.engines import EnginePlan, Facts, MitsubaPlan, NeuralPlan
 from infra.rendering.look import enlargement
 from infra.rendering.plan import RenderPlan
 from infra.rendering.run import FinishedShot, RenderOutcome
+from pipeline.renders.preview import PreviewSettings
+from pipeline.renders.settings import RenderSettings
 
 Rows = list[tuple[str, str]]
 
@@ -23,6 +25,12 @@ _FLOORS = {
     "object_noise_floor_db": "object_psnr_log_db",
 }
 """The metric of each floor that a path traced picture states."""
+
+_FILTERS = {
+    "fast": "one fast denoise",
+    "high": "one denoise",
+    "off": "not denoised",
+}
 
 _MEANING = {
     "psnr_linear_db": ": linear, clamped to [0, 1]",
@@ -106,28 +114,32 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
 
 def _engine(engine: EnginePlan, facts: Facts) -> Rows:
     match engine:
-        case MitsubaPlan():
-            floors = [_floor(engine, facts, name, metric) for name, metric in _FLOORS.items()]
+        case MitsubaPlan(settings=PreviewSettings() as preview):
+            unknown = "unknown: a preview measures none"
+            samples = f"{facts['spp']}, {_FILTERS[preview.denoiser]}"
+            return [("samples per pixel", samples), ("noise floor", unknown)]
+        case MitsubaPlan(settings=RenderSettings() as settings):
+            floors = [_floor(settings, facts, name, metric) for name, metric in _FLOORS.items()]
             rows = [("noise floor", floors[0]), *(("", floor) for floor in floors[1:])]
             mean = f"{facts['mean_radiance']:.4g} (radiance), that of its samples"
             rows = [("samples per pixel", f"{facts['spp']}"), *rows, ("mean brightness", mean)]
-            return [*rows, *_layers(engine, facts)]
+            return [*rows, *_layers(settings, facts)]
         case NeuralPlan():
             return [("network", f"{engine.checkpoint}; passes: {facts['passes']}")]
     raise TypeError(f"{engine.name} is an engine without a description")
 
 
-def _layers(engine: MitsubaPlan, facts: Facts) -> Rows:
+def _layers(settings: RenderSettings, facts: Facts) -> Rows:
     """Return the layers of the file with their floors."""
     return [
         (f"layer {part}", f"{float(facts[f'{part}.noise_floor_db']):.1f} dB (psnr_log_db)")
-        for part in engine.settings.part_names
+        for part in settings.part_names
     ]
 
 
-def _floor(engine: MitsubaPlan, facts: Facts, name: str, metric: str) -> str:
+def _floor(settings: RenderSettings, facts: Facts, name: str, metric: str) -> str:
     """Return one floor of a picture, and what came of its target if there is one."""
-    floor_db, target_db = float(facts[name]), engine.settings.targets_db.get(metric)
+    floor_db, target_db = float(facts[name]), settings.targets_db.get(metric)
     text = f"{floor_db:.1f} dB ({metric}{_MEANING.get(metric, '')}"
     if target_db is None:
         return f"{text})"
@@ -137,7 +149,8 @@ def _floor(engine: MitsubaPlan, facts: Facts, name: str, metric: str) -> str:
 
 def _floors(shots: Sequence[FinishedShot]) -> dict[str, list[float]]:
     """Return the floors of all pictures by metric; empty where none is path traced."""
-    traced = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
+    every = [shot.pictures["mitsuba"].facts for shot in shots if "mitsuba" in shot.pictures]
+    traced = [facts for facts in every if "noise_floor_db" in facts]
     names = _FLOORS.items() if traced else ()
     return {metric: [float(facts[name]) for facts in traced] for name, metric in names}
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from infra.rendering.cameras import ShotCamera
+from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.settings import FIRST_SPP, RenderSettings
 from pipeline.renders.variant import Variant
 from storage.conventions import HALF_FLOAT_MAX
@@ -83,9 +84,9 @@ class EnginePlan(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class MitsubaPlan:
-    """Path tracing to a measured noise floor."""
+    """Path tracing to a measured noise floor, or of a fixed number of samples."""
 
-    settings: RenderSettings
+    settings: RenderSettings | PreviewSettings
     seed: int
     """Of the samples."""
     threads: int
@@ -103,11 +104,16 @@ class MitsubaPlan:
             threads=self.threads,
             sampled=sampled,
         )
-        return MitsubaEngine(tracer)
+        return MitsubaEngine(tracer, is_preview=isinstance(self.settings, PreviewSettings))
 
     def caveats(self, pictures: Sequence[Facts]) -> list[str]:
         found = []
-        if any(int(facts["spp"]) < FIRST_SPP for facts in pictures):
+        if isinstance(self.settings, PreviewSettings):
+            found.append(
+                "the error of a preview is not measured: leave --spp out for a picture with a "
+                "noise floor"
+            )
+        elif any(int(facts["spp"]) < FIRST_SPP for facts in pictures):
             found.append(f"below {FIRST_SPP} samples the measured noise floor may flatter")
         if self.variant.note:
             found.append(f"{self.variant.note}; see trilight doctor")
@@ -117,8 +123,8 @@ class MitsubaPlan:
 class MitsubaEngine:
     """A path tracer in a child process."""
 
-    def __init__(self, tracer: "PathTracer") -> None:
-        self._tracer = tracer
+    def __init__(self, tracer: "PathTracer", *, is_preview: bool = False) -> None:
+        self._tracer, self._is_preview = tracer, is_preview
         self.identity = tracer.identity
 
     def open(self, scene: Scene, name: str) -> OpenedScene:
@@ -128,6 +134,9 @@ class MitsubaEngine:
         return OpenedScene(notes=notes, render=self._render)
 
     def _render(self, camera: ShotCamera, name: str) -> Rendered:
+        if self._is_preview:
+            preview = self._tracer.preview(camera.c2w, camera.fov_deg, name)
+            return Rendered(radiance_rgb=preview.radiance_rgb, facts={"spp": preview.spp})
         view = self._tracer.render(camera.c2w, camera.fov_deg, name)
         facts: dict[str, Fact] = {
             "spp": view.spp,

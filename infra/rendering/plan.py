@@ -14,7 +14,8 @@ from infra.rendering.sources import scene_sources
 from infra.torch_library import require_torch
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.renders.settings import RenderSettings, one_picture
+from pipeline.renders.preview import FAST_SPP, PreviewSettings
+from pipeline.renders.settings import Filtered, RenderSettings, one_picture
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
 
@@ -76,15 +77,7 @@ def plan_render(asked: Asked, reader: SceneReader) -> RenderPlan:
             unusable, or a place that cannot be written.
     """
     checkpoint, resolution = _network_and_width(asked)
-    settings = one_picture(
-        resolution=resolution,
-        max_spp=asked.max_spp,
-        noise_floor_db=asked.noise_floor_db,
-        noise_floor_linear_db=asked.noise_floor_linear_db,
-        noise_floor_objects_db=asked.noise_floor_objects_db,
-        split=asked.split,
-        split_lobes=asked.split_lobes,
-    )
+    settings = _settings(asked, resolution)
     look = Look(tone_map=asked.tone_map, exposure_ev=asked.exposure_ev)
     if asked.out.suffix.lower() == ".exr":
         scene_source(asked.source)  # a wrong name is said before any library is loaded
@@ -136,7 +129,26 @@ def _network_and_width(asked: Asked) -> tuple[str | None, int]:
     return checkpoint, find_network(checkpoint, network_of_run).trained.resolution or _RESOLUTION
 
 
-def _engines(asked: Asked, settings: RenderSettings, checkpoint: str | None) -> list[EnginePlan]:
+def _settings(asked: Asked, resolution: int) -> RenderSettings | PreviewSettings:
+    if asked.spp is not None:
+        usual: Filtered = "fast" if asked.spp <= FAST_SPP else "high"
+        return PreviewSettings(
+            resolution=resolution, spp=asked.spp, denoiser=asked.denoiser or usual
+        )
+    return one_picture(
+        resolution=resolution,
+        max_spp=asked.max_spp,
+        noise_floor_db=asked.noise_floor_db,
+        noise_floor_linear_db=asked.noise_floor_linear_db,
+        noise_floor_objects_db=asked.noise_floor_objects_db,
+        split=asked.split,
+        split_lobes=asked.split_lobes,
+    )
+
+
+def _engines(
+    asked: Asked, settings: RenderSettings | PreviewSettings, checkpoint: str | None
+) -> list[EnginePlan]:
     engines = list[EnginePlan]()
     if asked.engine != "neural":
         mitsuba = MitsubaPlan(

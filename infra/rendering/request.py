@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 from infra.rendering.look import ToneMap
 from pipeline.exchange.from_description import AlbedoOverOne
-from pipeline.renders.settings import NoiseFloor, Resolution, Samples
+from pipeline.renders.preview import MOST_SPP
+from pipeline.renders.settings import Filtered, NoiseFloor, Resolution, Samples
 from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Seed, Within
@@ -42,6 +43,12 @@ class Asked:
     not count. It governs only if given; by default it does not."""
     max_spp: Samples = 4096
     """mitsuba: maximum number of samples per pixel."""
+    spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
+    """mitsuba: a preview of exactly so many samples per pixel and one denoise, whose error is not
+    measured; by default sampling goes on to the noise floor."""
+    denoiser: Filtered | None = None
+    """mitsuba with --spp: Open Image Denoise with its fast or its high filter, or off; by default
+    fast up to 16 samples and high beyond."""
     split: bool = False
     """mitsuba: write direct and indirect light into the EXR as layers as well, whose sum is the
     picture."""
@@ -81,6 +88,7 @@ class Asked:
     """Number of CPU threads; by default one for each core."""
 
     def __post_init__(self) -> None:
+        self._require_one_kind()
         if self.orbit is not None and self.cameras is not None:
             raise TrilightError(f"--cameras is {self.cameras}; expected no --orbit beside it.")
         if self.checkpoint is not None and self.engine == "mitsuba":
@@ -91,4 +99,27 @@ class Asked:
             raise TrilightError(
                 "--split or --split-lobes is given; expected --engine mitsuba or both beside it, "
                 "since a network makes all light together."
+            )
+
+    def _require_one_kind(self) -> None:
+        """Raise TrilightError where a preview and a measured picture are both asked for."""
+        floors = {
+            "--noise-floor": self.noise_floor_db,
+            "--noise-floor-linear": self.noise_floor_linear_db,
+            "--noise-floor-objects": self.noise_floor_objects_db,
+            "--split": self.split or None,
+            "--split-lobes": self.split_lobes or None,
+        }
+        asked = [name for name, value in floors.items() if value is not None]
+        if self.spp is not None and asked:
+            raise TrilightError(
+                f"--spp is {self.spp} beside {asked[0]}; expected one of them: a preview measures "
+                "nothing and keeps nothing apart."
+            )
+        if self.spp is None and self.denoiser is not None:
+            raise TrilightError(f"--denoiser is {self.denoiser}; expected --spp beside it.")
+        if self.spp is not None and self.engine == "neural":
+            raise TrilightError(
+                f"--spp is {self.spp}; expected --engine mitsuba or both beside it, since a "
+                "network takes no samples."
             )

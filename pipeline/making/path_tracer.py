@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.making.environment import environment
+from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
 from pipeline.renders.renderer import RenderedView, Sampling, SceneRenderer, set_threads
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate
@@ -29,7 +30,7 @@ class PathTracer:
 
     def __init__(
         self,
-        settings: RenderSettings,
+        settings: RenderSettings | PreviewSettings,
         *,
         seed: int,
         variant: Variant,
@@ -39,7 +40,7 @@ class PathTracer:
         """Remember how to render.
 
         Args:
-            settings: how well.
+            settings: how well, or with how many samples.
             seed: of the samples of every picture, from 0.
             variant: what Mitsuba runs on.
             threads: how many of them.
@@ -75,7 +76,7 @@ class PathTracer:
         self._call(name, self._open)
 
     def render(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> RenderedView:
-        """Return the picture of one camera.
+        """Return the picture of one camera, where the settings say how good it is to be.
 
         Args:
             c2w: [4, 4] camera to world.
@@ -85,7 +86,15 @@ class PathTracer:
         Raises:
             TrilightError: there is none.
         """
-        return self._call(name, lambda: self._picture(c2w, fov_deg))
+        view = self._call(name, lambda: self._picture(c2w, fov_deg))
+        assert isinstance(view, RenderedView)
+        return view
+
+    def preview(self, c2w: NDArray[np.float32], fov_deg: float, name: str) -> Preview:
+        """Return the preview of one camera, where the settings are a preview's; as `render`."""
+        view = self._call(name, lambda: self._picture(c2w, fov_deg))
+        assert isinstance(view, Preview)
+        return view
 
     def close(self) -> None:
         """End the child."""
@@ -96,7 +105,7 @@ class PathTracer:
         self._child.call(_open_scene, self._scene, self._settings)
         self._is_open = True
 
-    def _picture(self, c2w: NDArray[np.float32], fov_deg: float) -> RenderedView:
+    def _picture(self, c2w: NDArray[np.float32], fov_deg: float) -> RenderedView | Preview:
         if not self._is_open:  # a child that died took the scene and the samples with it
             self._open()
         try:
@@ -106,7 +115,7 @@ class PathTracer:
         except ChildFailed:
             self._is_open = False
             raise
-        rendered: RenderedView = step
+        rendered: RenderedView | Preview = step
         return rendered
 
     def _call(self, name: str, step: Callable[[], Result]) -> Result:
@@ -127,8 +136,8 @@ class PathTracer:
 class _ChildState:
     """What the child holds between two calls."""
 
-    renderer: SceneRenderer
-    steps: Generator[Sampling, None, RenderedView]
+    renderer: SceneRenderer | PreviewRenderer
+    steps: Generator[Sampling, None, RenderedView | Preview]
 
 
 _state = _ChildState()
@@ -139,17 +148,20 @@ def _set_up_child(variant: Variant, threads: int) -> None:
     set_threads(threads)
 
 
-def _open_scene(scene: Scene, settings: RenderSettings) -> None:
-    _state.renderer = SceneRenderer(scene, settings)
+def _open_scene(scene: Scene, settings: RenderSettings | PreviewSettings) -> None:
+    if isinstance(settings, PreviewSettings):
+        _state.renderer = PreviewRenderer(scene, settings)
+    else:
+        _state.renderer = SceneRenderer(scene, settings)
 
 
 def _begin_view(c2w: NDArray[np.float32], fov_deg: float, seed: int) -> None:
     _state.steps = _state.renderer.view_steps(c2w, fov_deg, seed)
 
 
-def _advance() -> Sampling | RenderedView:
+def _advance() -> Sampling | RenderedView | Preview:
     try:
         return next(_state.steps)
     except StopIteration as end:
-        rendered: RenderedView = end.value
+        rendered: RenderedView | Preview = end.value
         return rendered

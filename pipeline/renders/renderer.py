@@ -184,12 +184,12 @@ class SceneRenderer:
         """Return the pictures of a view by their fields: the sum of what is apart, as stored."""
         per_light, names = self._settings.per_light, self._settings.part_names
         if not (per_light or names):
-            return {"radiance_rgb": _representable(pictures[0])}
-        parts = _by_part(rounded_to_half(_representable(pictures)), max(1, len(names)))
+            return {"radiance_rgb": representable(pictures[0])}
+        parts = _by_part(rounded_to_half(representable(pictures)), max(1, len(names)))
         lights = sum_of_lights(parts)
         named = zip(names, parts if per_light else parts[:, 0], strict=False)
         return {
-            "radiance_rgb": _representable(sum_of_lights(lights)),
+            "radiance_rgb": representable(sum_of_lights(lights)),
             "lights_rgb": lights if per_light else None,
             "parts_rgb": dict(named) or None,
         }
@@ -351,7 +351,7 @@ def _shares_of(parts_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.divide(parts_rgb, total, out=equal, where=total > 0).astype(np.float32)
 
 
-def _representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return radiance that half floats can hold; raises Rejected("radiance_overflow") else."""
     if radiance_rgb.max() >= HALF_FLOAT_MAX:
         raise Rejected("radiance_overflow", f"a pixel of radiance {radiance_rgb.max():.3g}")

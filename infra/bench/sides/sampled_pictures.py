@@ -22,6 +22,7 @@ from infra.bench.sides.shots import SEED, warm_up_denoiser
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
+from pipeline.renders.preview import denoised, samples_sum
 from pipeline.renders.settings import PASS_SPP, RenderSettings
 from pipeline.renders.tracer import Features, Tracer
 from storage.records.scene import Scene
@@ -75,20 +76,22 @@ def bare_pictures(
     tracer = _load(scene)
     load_core_s = time.process_time() - started
     total, done, spent = np.zeros((resolution, resolution, 3)), 0, 0.0
-    raw, denoised = [], []
+    raw, cleaned = [], []
     for spp in levels_spp:
         started = time.process_time()
-        total += _sum_of_samples(tracer, camera, done, spp)
+        while done < spp:
+            part, done = samples_sum(tracer, camera, SEED, done, spp)
+            total += part
         picture = (total / spp).astype(np.float32)
-        spent, done = spent + time.process_time() - started, spp
+        spent += time.process_time() - started
         raw.append(SampledPicture(spp=spp, radiance_rgb=picture, core_s=spent))
         started = time.process_time()
-        clean = _denoised(tracer, camera, picture, spp)
+        clean = denoised(tracer, camera, picture, spp, "high")
         core_s = spent + time.process_time() - started
-        denoised.append(SampledPicture(spp=spp, radiance_rgb=clean, core_s=core_s))
+        cleaned.append(SampledPicture(spp=spp, radiance_rgb=clean, core_s=core_s))
     return (
         SampledPictures(load_core_s=load_core_s, levels=tuple(raw)),
-        SampledPictures(load_core_s=load_core_s, levels=tuple(denoised)),
+        SampledPictures(load_core_s=load_core_s, levels=tuple(cleaned)),
     )
 
 
@@ -102,28 +105,6 @@ def _warm_up(tracer: Tracer, camera: Camera) -> None:
         tracer.radiance(camera, seed=0, spp=spp)
         tracer.features(camera, spp=spp)
     warm_up_denoiser(camera.resolution)
-
-
-def _largest_pass(spp: int) -> int:
-    return next(size for size in _PASSES if size <= spp)
-
-
-def _sum_of_samples(tracer: Tracer, camera: Camera, done: int, spp: int) -> NDArray[np.float64]:
-    """Return the sum of the samples from number `done` up to `spp`, [R, R, 3]."""
-    total = np.zeros((camera.resolution, camera.resolution, 3))
-    while done < spp:
-        size = _largest_pass(spp - done)
-        seed = seed_for(SEED, "bare", done)
-        total += size * tracer.radiance(camera, seed=seed, spp=size).astype(np.float64)
-        done += size
-    return total
-
-
-def _denoised(
-    tracer: Tracer, camera: Camera, picture: NDArray[np.float32], spp: int
-) -> NDArray[np.float32]:
-    features = tracer.features(camera, spp=_largest_pass(spp))
-    return denoise(picture, features, "high")
 
 
 _RR_DEPTH = 5

@@ -1,0 +1,83 @@
+"""Previews: any number of samples from one, unbiased before the denoiser, and no stated error."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
+from storage.errors import Rejected, TrilightError
+from storage.records.scene import Scene
+from tests.pipeline.renders.sampling import SIGMAS
+from tests.pipeline.renders.scene_kit import sampled_like_scene
+from tests.scenes_by_hand import tiny_scene
+
+
+def made(scene: Scene, spp: int, seed: int = 0, **changes: Any) -> Preview:
+    settings = PreviewSettings(**{"resolution": 32, "spp": spp, "denoiser": "off", **changes})
+    steps = PreviewRenderer(scene, settings).view_steps(scene.c2w[0], float(scene.fov_deg[0]), seed)
+    told = []
+    while True:
+        try:
+            told.append(next(steps))
+        except StopIteration as end:
+            found: Preview = end.value
+            assert told[-1].spp == found.spp == spp
+            assert all(step.missing_db is None for step in told)
+            return found
+
+
+def picture(scene: Scene, spp: int, seed: int = 0, **changes: Any) -> NDArray[np.float32]:
+    return made(scene, spp, seed, **changes).radiance_rgb
+
+
+@pytest.mark.parametrize("spp", [1, 3, 7, 20, 64, 85])
+def test_any_number_of_samples_is_a_picture(spp: int) -> None:
+    scene = tiny_scene()
+    for denoiser in ("off", "fast", "high"):
+        found = picture(scene, spp, denoiser=denoiser)
+        assert found.shape == (32, 32, 3) and found.dtype == np.float32
+        assert np.isfinite(found).all() and (found >= 0).all() and found.max() > 0
+        np.testing.assert_array_equal(found, picture(scene, spp, denoiser=denoiser))
+    assert not np.array_equal(picture(scene, spp), picture(scene, spp, seed=1))
+
+
+@pytest.mark.parametrize("spp", [1, 5])
+def test_few_samples_have_the_light_of_many(spp: int) -> None:
+    """The mean over seeds is that of 2048 samples, in blocks, within five standard errors."""
+    scene = sampled_like_scene(np.random.default_rng(3), num_views=1)
+    blocks: Callable[[NDArray[np.float32]], NDArray[np.float64]] = lambda one: (  # noqa: E731
+        one.reshape(4, 8, 4, 8, 3).mean(axis=(1, 3, 4), dtype=np.float64)
+    )
+    few = np.array([blocks(picture(scene, spp, seed)) for seed in range(64)])
+    many = np.array([blocks(picture(scene, 128, 1000 + seed)) for seed in range(16)])
+    error = np.sqrt(few.var(axis=0, ddof=1) / len(few) + many.var(axis=0, ddof=1) / len(many))
+    off = np.abs(few.mean(axis=0) - many.mean(axis=0))
+    assert (off <= SIGMAS * error + 1e-6).all()  # black blocks have no spread
+
+
+def test_more_samples_and_a_denoiser_come_nearer() -> None:
+    scene = sampled_like_scene(np.random.default_rng(3), num_views=1)
+    truth = picture(scene, 2048, 99)
+
+    def error(spp: int, denoiser: str) -> float:
+        found = picture(scene, spp, denoiser=denoiser)
+        return float(np.square(np.log1p(found) - np.log1p(truth)).mean())
+
+    assert error(64, "off") < error(4, "off") < error(1, "off")
+    # found 2.5 times nearer; half of that is left for luck
+    assert error(1, "fast") < error(1, "off") / 1.25
+
+
+def test_what_cannot_be_a_preview_is_refused() -> None:
+    with pytest.raises(TrilightError, match="spp is 0; expected a whole number from 1 to 4096"):
+        PreviewSettings(resolution=32, spp=0)
+    with pytest.raises(TrilightError, match="resolution is 36; expected a multiple of 8"):
+        PreviewSettings(resolution=36, spp=1)
+    scene = tiny_scene()
+    lamps = scene.materials.copy()
+    lamps[:, 7:10] = 1.0
+    with pytest.raises(Rejected, match="no_surfaces"):
+        made(tiny_scene(materials=lamps), 1)
