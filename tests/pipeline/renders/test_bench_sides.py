@@ -81,5 +81,5 @@ def test_bare_pictures_come_nearer_with_samples() -> None:
     assert raw[2] > raw[0] + 10
     assert psnr_log_db(denoised[0].radiance_rgb, reference) > raw[0]
     assert denoised[0].core_s > sampled[0].core_s > 0
-    # the mean of all samples is the scene's light, up to the noise of 128 of them
-    assert abs(sampled[2].radiance_rgb.mean() / reference.mean() - 1) < 0.02
+    # the mean of all samples is the scene's light: five standard errors of 1 % each
+    assert abs(sampled[2].radiance_rgb.mean() / reference.mean() - 1) < 0.05
