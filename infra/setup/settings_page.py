@@ -14,6 +14,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.documents.markdown import table
 from pipeline.flows.orders import DatasetInRuns
 from pipeline.making.price import CorePrice
+from pipeline.making.revisit_order import Revisit
 from storage.records.scene import Scene
 from storage.settings.described import described, field_sentences
 from storage.settings.ranges import declared_ranges, shown_number
@@ -25,6 +26,7 @@ FILE = Path(__file__).parents[2] / "docs/reference/settings.md"
 ROOTS: dict[str, tuple[type, ...]] = {
     "Scene": (Scene,),
     "Generate": (DatasetInRuns, BuildSettings),
+    "Revisit": (Revisit,),
     "Render": (Asked,),
     "Plan": (CorePrice,),
     "Train": (TrainOrder, TrainSettings),

@@ -5,13 +5,26 @@ from typing import Annotated, Literal
 from scene_templates.templates import TEMPLATES
 from storage.errors import TrilightError
 from storage.settings.described import checked
-from storage.settings.ranges import Within
+from storage.settings.ranges import FLOAT32_MAX, Within
 
 MOST_CAMERAS = 1000
 """Cameras of a scene; given ones stand in the manifest."""
 
-NUMBERS_OF_CAMERA = 17
-"""16 of camera to world, row by row, and the field of view in degrees."""
+_POSE = 16
+
+
+@checked("revisit settings")
+class GivenCamera:
+    """A camera of every scene."""
+
+    c2w: Annotated[tuple[float, ...], Within(-FLOAT32_MAX, FLOAT32_MAX)]
+    """Camera to world, 4 x 4, row by row."""
+    fov_deg: Annotated[float, Within(0, 180, low_open=True, high_open=True, unit="degrees")]
+    """Full field of view."""
+
+    def __post_init__(self) -> None:
+        if len(self.c2w) != _POSE:
+            raise TrilightError(f"c2w is {len(self.c2w)} numbers; expected {_POSE}.")
 
 
 @checked("revisit settings")
@@ -28,9 +41,8 @@ class RevisitSettings:
     dataset's seed."""
     camera_layout: str | None = None
     """Layout that draws the new cameras; by default each scene's own."""
-    given_cameras: tuple[tuple[float, ...], ...] = ()
-    """Cameras that each scene gets after those: each 16 numbers of camera to world, row by row, and
-    the field of view in degrees."""
+    given_cameras: tuple[GivenCamera, ...] = ()
+    """Cameras that each scene gets after those; by default there are none."""
     lights: Literal["keep", "new"] = "keep"
     """Whether lights stay, or are drawn anew by `scenes.lights`, as each scene's layout is lit."""
     num_lights: Annotated[int | None, Within(1, 64, unit="emitters")] = None
@@ -46,8 +58,6 @@ class RevisitSettings:
             )
         if self.camera_layout is not None:
             TEMPLATES.find(self.camera_layout)
-        if any(len(camera) != NUMBERS_OF_CAMERA for camera in self.given_cameras):
-            raise TrilightError(f"given_cameras: expected {NUMBERS_OF_CAMERA} numbers of each.")
         if self.num_lights is not None and self.lights == "keep":
             raise TrilightError("num_lights: expected it only where lights are new.")
 

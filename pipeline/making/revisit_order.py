@@ -6,9 +6,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
-
-from pipeline.builds.revisit import MOST_CAMERAS, RevisitSettings
+from pipeline.builds.revisit import MOST_CAMERAS, GivenCamera, RevisitSettings
 from pipeline.exchange.open_scene import load_cameras, scene_source
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.renders.settings import NoiseFloor, Resolution
@@ -54,9 +52,10 @@ class Revisit:
     """Sampling stops at this measured noise floor in dB (psnr_log_db); by default as the dataset
     was made."""
     noise_floor_linear_db: NoiseFloor | None = None
-    """The same as psnr_linear_db; of several floors, all are reached."""
+    """The same as psnr_linear_db; by default as the dataset was made. Of several floors, all are
+    reached."""
     noise_floor_objects_db: NoiseFloor | None = None
-    """The same as object_psnr_log_db."""
+    """The same as object_psnr_log_db; by default as the dataset was made."""
     build: str | None = None
     """Build that fills in settings which the dataset does not state, since it was merged; by
     default the dataset's own."""
@@ -123,8 +122,11 @@ def _cameras(words: str, num_views: int) -> dict[str, Any]:
         c2w, fov_deg = load_cameras(scene_source(words))
         if len(c2w) > MOST_CAMERAS:
             raise TrilightError(f"--cameras {words}: {len(c2w)}; expected up to {MOST_CAMERAS}.")
-        numbers = np.column_stack([c2w.reshape(-1, 16), fov_deg]).astype(float)
-        return {"kept_cameras": 0, "given_cameras": tuple(map(tuple, numbers.tolist()))}
+        given = tuple(
+            GivenCamera(c2w=tuple(pose.ravel().tolist()), fov_deg=float(angle))
+            for pose, angle in zip(c2w, fov_deg, strict=True)
+        )
+        return {"kept_cameras": 0, "given_cameras": given}
     layouts = ", ".join(TEMPLATES)
     raise TrilightError(f"--cameras is {words!r}; {_CAMERAS} (layouts: {layouts}).")
 

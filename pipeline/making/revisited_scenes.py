@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.builds.revisit import NUMBERS_OF_CAMERA, RevisitSettings
+from pipeline.builds.revisit import RevisitSettings
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.render_sample import BegunScene, KeptPictures
 from pipeline.scenes.laws import require_laws
@@ -142,8 +142,14 @@ def _redrawn(scene: Scene, index: int, attempt: int, settings: BuildSettings) ->
 
 
 def _given(asked: RevisitSettings) -> list[ViewCamera]:
-    numbers = np.asarray(asked.given_cameras, np.float32).reshape(-1, NUMBERS_OF_CAMERA)
-    return [ViewCamera(c2w=row[:16].reshape(4, 4), fov_deg=row[16], attempt=0) for row in numbers]
+    return [
+        ViewCamera(
+            c2w=np.array(camera.c2w, np.float32).reshape(4, 4),
+            fov_deg=np.float32(camera.fov_deg),
+            attempt=0,
+        )
+        for camera in asked.given_cameras
+    ]
 
 
 def _kept(

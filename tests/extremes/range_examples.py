@@ -13,9 +13,11 @@ from infra.setup.settings_page import ROOTS, reachable
 from model.config import ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings
 from pipeline.builds.named import named_build
+from pipeline.builds.revisit import GivenCamera, RevisitSettings
 from pipeline.builds.settings import BuildSettings
 from pipeline.flows.orders import DatasetInRuns
 from pipeline.making.price import CorePrice
+from pipeline.making.revisit_order import Revisit
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from scene_templates.cameras import CameraSettings
 from scene_templates.families import Family
@@ -26,7 +28,7 @@ from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
-from storage.dataset.settings import SplitSettings
+from storage.dataset.settings import ListedShard, SplitSettings
 from storage.records.scene import Scene
 from storage.settings.ranges import Declared, declared_ranges
 from train.evaluation.order import EvaluationOrder
@@ -61,6 +63,10 @@ EXAMPLES: dict[type, Any] = {
     Excursion: Excursion(axis="fov_deg", value=10.0, changes=()),
     RenderSettings: SMOKE.renders,
     SplitSettings: SMOKE.splits,
+    ListedShard: ListedShard(split="train", scenes=4),
+    Revisit: Revisit(dataset="a", out="b"),
+    RevisitSettings: RevisitSettings(source_digest="", kept_cameras=4, lights="new", num_lights=2),
+    GivenCamera: GivenCamera(c2w=(0.0,) * 16, fov_deg=40.0),
     Asked: ASKED,
     CorePrice: CorePrice(),
     TrainOrder: TrainOrder(),
@@ -86,6 +92,10 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
     (SceneSettings, "fill_to", "high"): {"max_triangles": MAX_TRIANGLES},
     (MaterialSettings, "roughness_log", "low"): {"roughness_bias": 0.0},
     (MaterialSettings, "roughness_bias", "high"): {"roughness_log": (1.0, 2.0)},
+    (RevisitSettings, "kept_cameras", "low"): {"new_cameras": 1},
+    (RevisitSettings, "new_cameras", "high"): {"kept_cameras": 0},
+    (Asked, "spp", "low"): {"noise_floor_db": None},
+    (Asked, "spp", "high"): {"noise_floor_db": None},
     (RenderSettings, "min_spp", "high"): {"max_spp": MAX_SPP},
     (RenderSettings, "max_spp", "low"): {"min_spp": 8},
     (TrainSettings, "resolution", "low"): {"model": dataclasses.replace(smoke(), patch_px=1)},

@@ -124,6 +124,7 @@ INTERNAL = {
     "StreamSettings": "made of TrainSettings",
     "OrderSettings": "made of StreamSettings",
     "PublishedConfig": "a ModelConfig, and one number that the published code fixes",
+    "PreviewSettings": "made of Asked",
     "StorageSettings": "has no number",
     "StatusOrder": "has no number",
 }

@@ -193,41 +193,6 @@ def test_a_linear_target_alone_governs_and_is_said_beside_what_came_of_it(tmp_pa
     assert "geometry is seen; the cap came before 95 dB)" in both
 
 
-def test_a_preview_says_that_its_error_is_unknown(tmp_path: Path) -> None:
-    source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
-    source.write_bytes(encode_scene(tiny_scene()))
-    words = ["render", str(source), "--out", str(out), "--resolution", "16", "--spp", "3"]
-    printed = unwrapped(trilight(words, env=WIDE).output)
-    assert "samples per pixel 3, one fast denoise noise floor unknown" in printed
-    assert "leave --spp out for a picture with a noise floor" in printed
-    assert f"Look at {out.with_suffix('.png')}; measure with {out}" in printed
-    header = OpenEXR.File(io.BytesIO(out.read_bytes()), header_only=True).header()
-    assert header["trilight.spp"] == 3
-    assert not [name for name in header if "noise_floor" in name]
-    assert json.loads(header["trilight.settings"])["denoiser"] == "fast"
-    assert json.loads(trilight([*words, "--json"]).output)["spp"] == 3
-    raw = trilight([*words, "--denoiser", "off"], env=WIDE).output
-    assert "3, not denoised" in raw
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--spp", "4", "--noise-floor", "30"), "--spp is 4 beside --noise-floor; expected one"),
-        (("--spp", "4", "--split"), "--spp is 4 beside --split; expected one of them"),
-        (("--denoiser", "fast"), "--denoiser is fast; expected --spp beside it"),
-        (("--spp", "4", "--engine", "neural"), "expected --engine mitsuba or both beside it"),
-        (("--spp", "0"), "--spp is 0; expected a whole number from 1 to 4096 samples"),
-    ],
-)
-def test_a_preview_measures_nothing(tmp_path: Path, words: tuple[str, ...], message: str) -> None:
-    source = tmp_path / "tiny.safetensors"
-    source.write_bytes(encode_scene(tiny_scene()))
-    asked = ["render", str(source), "--out", str(tmp_path / "x.exr"), *words]
-    assert message in unwrapped(trilight(asked, env=WIDE).output)
-    assert not (tmp_path / "x.exr").exists()
-
-
 def test_the_words_of_what_was_asked_give_the_picture_again(tmp_path: Path) -> None:
     source, out = tmp_path / "tiny.safetensors", tmp_path / "x.exr"
     source.write_bytes(encode_scene(tiny_scene()))
