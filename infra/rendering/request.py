@@ -118,8 +118,8 @@ class Asked:
             )
         if self.spp is None and self.denoiser is not None:
             raise TrilightError(f"--denoiser is {self.denoiser}; expected --spp beside it.")
-        if self.spp is not None and self.engine == "neural":
+        if self.spp is not None and self.engine != "mitsuba":
             raise TrilightError(
-                f"--spp is {self.spp}; expected --engine mitsuba or both beside it, since a "
-                "network takes no samples."
+                f"--spp is {self.spp} beside --engine {self.engine}; expected --engine mitsuba: a "
+                "network takes no samples, and a preview is nothing to judge one by."
             )

@@ -41,7 +41,8 @@ def test_a_preview_says_that_its_error_is_unknown(tmp_path: Path) -> None:
         (("--spp", "4", "--noise-floor", "30"), "--spp is 4 beside --noise-floor; expected one"),
         (("--spp", "4", "--split"), "--spp is 4 beside --split; expected one of them"),
         (("--denoiser", "fast"), "--denoiser is fast; expected --spp beside it"),
-        (("--spp", "4", "--engine", "neural"), "expected --engine mitsuba or both beside it"),
+        (("--spp", "4", "--engine", "neural"), "--engine neural; expected --engine mitsuba: a"),
+        (("--spp", "4", "--engine", "both"), "--engine both; expected --engine mitsuba: a"),
         (("--spp", "0"), "--spp is 0; expected a whole number from 1 to 4096 samples"),
     ],
 )
