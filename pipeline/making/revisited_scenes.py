@@ -15,12 +15,11 @@ from pipeline.making.render_sample import BegunScene, KeptPictures
 from pipeline.scenes.laws import require_laws
 from pipeline.scenes.redrawn import with_new_lights, with_new_materials
 from pipeline.scenes.views import ViewCamera, cameras_of, with_first_cameras
-from pipeline.shards.finished import FinishedDataset, SampleReader, open_finished
-from storage.dataset.manifest import ShardEntry, index_shard
+from pipeline.shards.finished import FinishedDataset, SampleReader, open_finished, require_whole
+from storage.dataset.manifest import ShardEntry
 from storage.errors import TrilightError
 from storage.records.sample import Sample, decode_sample
 from storage.records.scene import Scene
-from storage.settings.described import settings_record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,13 +78,8 @@ class RevisitedScenes:
         starts = settings.splits.first_scenes
         row = int(np.searchsorted(starts, index, side="right")) - 1
         shard = shards_with_scenes(self._source)[row]
-        path = self._source.folder.shard(shard.name)
         if shard.name not in self._checked:
-            if not path.exists() or index_shard(path) != shard:
-                raise TrilightError(
-                    f"{path}: missing, or its bytes are not those of the manifest (sha256 "
-                    f"differs). Run `trilight verify {self.root}`, and make the shard anew."
-                )
+            require_whole(self._source, shard)
             self._checked.add(shard.name)
         return shard, shard.keys[index - starts[row]]
 
@@ -102,14 +96,12 @@ class RevisitedScenes:
 
     def _pictures_stay(self, settings: BuildSettings) -> bool:
         """Return whether a picture of the same scene and camera would be made and packed alike."""
-        was, asked = self._source.manifest.settings, settings.revisit
-        now = settings.as_json()
-        profile = settings_record(settings.storage)["profile"]
+        was, now = self._source.manifest.settings, settings.as_json()
         return (
-            asked is not None
-            and asked.keeps_light
+            settings.revisit is not None
+            and settings.revisit.keeps_light
             and (was.get("seed"), was.get("renders")) == (now["seed"], now["renders"])
-            and was.get("storage", {}).get("profile") == profile
+            and was.get("storage", {}).get("profile") == now["storage"]["profile"]
         )
 
 

@@ -14,7 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.renderer import Sampling, representable
+from pipeline.renders.renderer import (
+    Sampling,
+    representable,
+    require_bounded,
+    require_surfaces,
+)
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
 from pipeline.renders.tracer import Tracer
 from storage.errors import Rejected, TrilightError
@@ -77,8 +82,7 @@ class PreviewRenderer:
         Raises:
             Rejected: "unlit_scene" or "no_surfaces", as of `SceneRenderer`.
         """
-        if scene.triangle_emits.all():
-            raise Rejected("no_surfaces", f"all {scene.num_triangles} triangles are emitters")
+        require_surfaces(scene)
         self._settings = settings
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
 
@@ -101,7 +105,9 @@ class PreviewRenderer:
             yield Sampling(spp=done, expected_spp=settings.spp, missing_db=None)
         mean = (total / done).astype(np.float32)
         if not np.isfinite(mean).all():
-            raise Rejected("nonfinite_radiance", "a raw sample is not a number")
+            broken = int((~np.isfinite(mean)).any(axis=-1).sum())
+            raise Rejected("nonfinite_radiance", f"{broken} pixels of raw samples")
+        require_bounded(mean)
         picture = denoised(self._tracer, camera, mean, done, settings.denoiser)
         return Preview(radiance_rgb=representable(picture), spp=done)
 

@@ -114,8 +114,7 @@ class SceneRenderer:
                 kept apart.
             NotImplementedError: RenderSettings.require_variant refuses the variant.
         """
-        if scene.triangle_emits.all():
-            raise Rejected("no_surfaces", f"all {scene.num_triangles} triangles are emitters")
+        require_surfaces(scene)
         self._settings = settings
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
@@ -281,8 +280,7 @@ class SceneRenderer:
         shadows the noise of all other light would hide, was 4 dB better on average than its share
         of one denoised picture, indirect light 0.2 dB worse, and the sum 0.4 dB better (docs/log).
         """
-        if pictures_rgb.max() >= _MAX_RAW:
-            raise Rejected("radiance_overflow", f"a raw pixel of radiance {pictures_rgb.max():.3g}")
+        require_bounded(pictures_rgb)
         if quality == "off":
             return pictures_rgb
         names = self._settings.part_names or ("",)
@@ -349,6 +347,18 @@ def _shares_of(parts_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
     total = parts_rgb.sum(axis=0, dtype=np.float64)
     equal = np.full(parts_rgb.shape, 1 / len(parts_rgb))
     return np.divide(parts_rgb, total, out=equal, where=total > 0).astype(np.float32)
+
+
+def require_surfaces(scene: Scene) -> None:
+    """Raise Rejected("no_surfaces") where all triangles emit: every picture would be black."""
+    if scene.triangle_emits.all():
+        raise Rejected("no_surfaces", f"all {scene.num_triangles} triangles are emitters")
+
+
+def require_bounded(raw_rgb: NDArray[np.float32]) -> None:
+    """Raise Rejected("radiance_overflow") where the denoiser would hide what is too bright."""
+    if raw_rgb.max() >= _MAX_RAW:
+        raise Rejected("radiance_overflow", f"a raw pixel of radiance {raw_rgb.max():.3g}")
 
 
 def representable(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -84,16 +84,21 @@ def read_facts(
             of a scene is incomplete.
     """
     for shard in dataset.manifest.shards:
-        path = dataset.folder.shard(shard.name)
-        if not path.exists() or index_shard(path) != shard:
-            raise TrilightError(
-                f"{path}: missing, or its bytes are not those of the manifest (sha256 differs); "
-                "run `trilight verify`, then make the shard anew."
-            )
+        require_whole(dataset, shard)
         with contextlib.closing(SampleReader(dataset)) as reader:
             for key in shard.index:
                 yield _facts(shard, key, reader.members(shard, key, ("json", PLAIN, PACKED)), asked)
         shard_done()
+
+
+def require_whole(dataset: FinishedDataset, shard: ShardEntry) -> None:
+    """Raise TrilightError where a shard is missing or its bytes are not those of the manifest."""
+    path = dataset.folder.shard(shard.name)
+    if not path.exists() or index_shard(path) != shard:
+        raise TrilightError(
+            f"{path}: missing, or its bytes are not those of the manifest (sha256 differs); "
+            "run `trilight verify`, then make the shard anew."
+        )
 
 
 class SampleReader:

@@ -45,7 +45,7 @@ class RememberingTracer:
 
     def apart(self, *, bounces: bool, lobes: bool) -> "RememberingTracer":
         """Raise NotImplementedError: what is remembered are passes of all light together."""
-        raise NotImplementedError
+        raise NotImplementedError("passes of all light together are remembered")
 
     def guided(self) -> "RememberingTracer":
         """Return the guided tracer, where the renderer can be guided; the view pays for learning.

@@ -81,3 +81,13 @@ def test_what_cannot_be_a_preview_is_refused() -> None:
     lamps[:, 7:10] = 1.0
     with pytest.raises(Rejected, match="no_surfaces"):
         made(tiny_scene(materials=lamps), 1)
+
+
+@pytest.mark.parametrize("emission", [1e6, 1e20, 3e35])
+def test_light_that_no_file_holds_is_refused_and_not_hidden(emission: float) -> None:
+    """From about 5e36 on the denoiser would return black."""
+    bright = tiny_scene()
+    bright.materials[:, 7:10] *= emission
+    for denoiser in ("off", "fast"):
+        with pytest.raises(Rejected, match="radiance_overflow|nonfinite_radiance"):
+            made(bright, 4, denoiser=denoiser)
