@@ -56,7 +56,7 @@ def samples(dataset: Path, split: str) -> list[Sample]:
 
 
 def test_nerfstudio(dataset: Path) -> None:
-    """The form that its documentation states; test_nerfstudio.py opens it there."""
+    """The form that its documentation states; test_opened_in_nerfstudio.py opens it there."""
     out = exported(dataset, "nerfstudio", "--scene", "1")
     assert [path.name for path in out.iterdir() if path.is_dir()] == ["000000001"]
     folder = out / "000000001"
