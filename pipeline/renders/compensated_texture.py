@@ -1,6 +1,6 @@
 """Multiple scattering for Mitsuba's `roughconductor`, as a texture of its specular reflectance.
 
-The scale of pipeline.renders.multiscatter depends on the direction of the viewer, which no stock
+The scale of storage.records.multiscatter depends on the direction of the viewer, which no stock
 texture reads; one of our own may. `roughconductor` has the separable Smith term, so the table is
 that one's: from every direction the surface returns as much light as in the kernel, but the shape
 of a rough lobe differs (0.6 % of direct light at roughness 0.6, 4.5 % at 1, root mean square).
@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pipeline.renders.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
+from storage.records.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
 
 PLUGIN = "compensated_specular"
 """Name in scene dictionaries; it has the textures specular, again (Fms) and alpha."""

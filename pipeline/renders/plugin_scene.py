@@ -12,12 +12,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.blend import lobes_of, scaled_albedos
 from pipeline.renders.compensated_texture import PLUGIN, register_plugin
-from pipeline.renders.multiscatter import scattered_again
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
+from storage.records.lobes import lobes_of, scaled_albedos
 from storage.records.material import EMISSION
+from storage.records.multiscatter import scattered_again
 from storage.records.scene import Scene
 
 _TWIN_OFFSET = 1e-4
@@ -45,7 +45,7 @@ _MATERIAL = {
         },
     },
 }
-"""Diffuse and specular lobe as the blend of pipeline.renders.blend, read from the face."""
+"""Diffuse and specular lobe as the blend of storage.records.lobes, read from the face."""
 
 
 def plugin_scene(scene: Scene, *, only_light: int | None = None) -> Any:

@@ -12,10 +12,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.renders.blend import lobes_of
 from pipeline.renders.device_memory import own_floats
 from pipeline.renders.ggx import KernelLobes
-from pipeline.renders.multiscatter import scattered_again
+from storage.records.lobes import lobes_of
+from storage.records.multiscatter import scattered_again
 from storage.records.scene import Scene
 
 _GROUPS = 8

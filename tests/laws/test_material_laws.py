@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders.blend import MIN_ALPHA, lobes_of, scaled_albedos
-from pipeline.renders.multiscatter import scattered_again
 from storage.conventions import alpha_ggx
+from storage.records.lobes import MIN_ALPHA, lobes_of, scaled_albedos
+from storage.records.multiscatter import scattered_again
 from storage.records.scene import Scene
 from tests.pipeline.renders.closed_forms import lambert_irradiance
 from tests.pipeline.renders.sampling import assert_agree, exact, render_blocks
@@ -22,13 +22,13 @@ from tests.pipeline.renders.scene_kit import (
     quad,
     sphere,
 )
-from tests.pipeline.renders.test_multiscatter import slow_albedo
+from tests.storage.records.test_multiscatter import slow_albedo
 
 PLATE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
 
 
 def _albedo(row: NDArray, cos_in: float) -> NDArray[np.float64]:
-    """Directional albedo [3] by brute force and by the formula of pipeline.renders.multiscatter."""
+    """Directional albedo [3] by brute force and by the formula of storage.records.multiscatter."""
     alpha = max(float(alpha_ggx(row[6])), MIN_ALPHA)
     single = slow_albedo(cos_in, alpha, "correlated")
     again = scattered_again(row[None, 3:6], np.array([alpha]), "correlated")[0]

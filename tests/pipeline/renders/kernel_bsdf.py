@@ -11,9 +11,10 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from pipeline.renders import ggx, multiscatter, plugin_scene
+from pipeline.renders import ggx, plugin_scene
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.plugin_tracer import PluginTracer
+from storage.records import multiscatter
 from storage.records.scene import Scene
 
 _PLUGIN = "kernel_bsdf"

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.renders import ggx
-from pipeline.renders.blend import lobes_of
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
-from pipeline.renders.multiscatter import scattered_again
+from storage.records.lobes import lobes_of
+from storage.records.multiscatter import scattered_again
 from tests.pipeline.renders.scene_kit import material
 
 UP = (0.0, 0.0, 1.0)

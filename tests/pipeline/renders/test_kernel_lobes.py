@@ -5,9 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.renders import ggx
-from pipeline.renders.multiscatter import directional_albedo
+from storage.records.multiscatter import directional_albedo
 from tests.pipeline.renders.kernel_lobes import UP, direction, kernel_lobes, seen_at
-from tests.pipeline.renders.test_multiscatter import stretched
+from tests.storage.records.test_multiscatter import stretched
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

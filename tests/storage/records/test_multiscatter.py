@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.renders import multiscatter
-from pipeline.renders.multiscatter import (
+from storage.records import multiscatter
+from storage.records.multiscatter import (
     ROUGHNESS_STEPS,
     X_STEPS,
     Smith,
