@@ -4,6 +4,7 @@ The architecture is written once; a size is only numbers. `SIZES` names those th
 size cannot change: two stages, QK-norm over the full width, SwiGLU, RMSNorm before each block.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Annotated, ClassVar, Literal
 
@@ -15,11 +16,17 @@ from storage.settings.ranges import Within
 
 Head = Literal["dpt", "linear"]
 
+ViewStage = Literal["bundles", "hits"]
+"""`bundles`: RenderFormer as published; `hits`: what rays find is traced (model.hits.decoder)."""
+
 VERTEX_COORDINATES = 9
 """Three vertices of three coordinates: what a triangle's rotary position is made of."""
 
 NUM_TAPS = 4
 """Decoder layers that a DPT head reads (Ranftl et al. 2021)."""
+
+HITS_PX = 8
+"""Pictures of the view stage `hits` are a multiple of so many pixels wide."""
 
 LAYERS = 256
 """Maximum number of layers of a stage: twenty times the largest published network's."""
@@ -65,6 +72,20 @@ class ModelConfig:
     """Widths of the DPT's four grids, finest first; empty with a linear head."""
     dpt_taps: Annotated[tuple[int, ...], Within(0, LAYERS - 1)] = ()
     """Decoder layers that feed the DPT's four grids, finest first; empty with a linear head."""
+    view_stage: ViewStage = "bundles"
+    """What a view begins with: `bundles` of rays, as published, or traced `hits`, after which the
+    network learns only what is not traced. `hits` needs a linear head."""
+    hit_rays: Annotated[int, Within(0, 8, unit="rays")] = 0
+    """hits: rays along a side of each pixel, its square in all; 0 with bundles."""
+    hit_anchors: Annotated[int, Within(0, 256, unit="anchors")] = 0
+    """hits: anchors along a side of the picture, which ask the scene's tokens; 0 with bundles."""
+    gather_rays: Annotated[int, Within(0, 4096, unit="rays")] = 0
+    """hits: rays with which each anchor gathers the light of other surfaces; with 0, no light but
+    that of lamps is traced. 0 with bundles."""
+    pixel_width: Annotated[int, Within(0, 4096)] = 0
+    """hits: width of the network that each pixel passes; 0 with bundles."""
+    scene_tokens: bool = True
+    """hits: whether anchors ask the scene's tokens; false leaves out the view-independent stage."""
     material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """Material columns that the network reads, in the order of its input."""
 
@@ -77,6 +98,7 @@ class ModelConfig:
         if self.window_bundles % 2:
             _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
         _check_columns(self.material_columns)
+        self._check_hits()
         if self.head == "dpt":
             self._check_dpt()
         elif self.dpt_features or self.dpt_channels or self.dpt_taps:
@@ -91,6 +113,24 @@ class ModelConfig:
             _wrong(f"dpt_features {self.dpt_features}", "an even number from 2")
         if self.patch_px != 8:
             _wrong(f"patch_px {self.patch_px} with a dpt head", "8, which its grids multiply up to")
+
+    def _check_hits(self) -> None:
+        needed = {"hit_rays": self.hit_rays, "hit_anchors": self.hit_anchors}
+        needed["pixel_width"] = self.pixel_width
+        if self.view_stage == "hits":
+            for name, value in needed.items():
+                if value < 1:
+                    _wrong(f"{name} {value} with view_stage hits", "1 or more")
+            if self.hit_anchors % HITS_PX:
+                _wrong(f"hit_anchors {self.hit_anchors}", f"a multiple of {HITS_PX}")
+            if self.head != "linear" or self.window_bundles or self.patch_px != HITS_PX:
+                _wrong(
+                    f"view_stage hits with head {self.head}, window_bundles {self.window_bundles} "
+                    f"and patch_px {self.patch_px}",
+                    f"linear, 0 and {HITS_PX}",
+                )
+        elif any(needed.values()) or self.gather_rays or not self.scene_tokens:
+            _wrong("fields of hits beside view_stage bundles", "0, and scene_tokens true")
 
     @property
     def head_width(self) -> int:
@@ -115,6 +155,43 @@ def smoke() -> ModelConfig:
         rope_num_freqs=3,
         rope_max_freq=5.0,
         head="linear",
+    )
+
+
+def hits_smoke() -> ModelConfig:
+    """Return the size with traced hits that two CPU cores train: what is traced does most."""
+    return ModelConfig(
+        width=128,
+        num_heads=2,
+        encoder_layers=2,
+        decoder_layers=3,
+        hidden_width=384,
+        num_registers=4,
+        rope_num_freqs=3,
+        rope_max_freq=12.0,
+        head="linear",
+        view_stage="hits",
+        hit_rays=2,
+        hit_anchors=16,
+        gather_rays=32,
+        pixel_width=64,
+    )
+
+
+def hits_base() -> ModelConfig:
+    """Return V1-Base with the view stage `hits`: for a graphics card."""
+    return dataclasses.replace(
+        hits_smoke(),
+        width=768,
+        num_heads=6,
+        encoder_layers=12,
+        decoder_layers=6,
+        hidden_width=3072,
+        num_registers=16,
+        rope_num_freqs=6,
+        hit_anchors=32,
+        gather_rays=64,
+        pixel_width=128,
     )
 
 
@@ -194,7 +271,15 @@ def large() -> ModelConfig:
 SIZES: Registry[Callable[[], ModelConfig]] = Registry(
     "size",
     Callable,
-    {"smoke": smoke, "tiny": tiny, "small": small, "base": base, "large": large},
+    {
+        "smoke": smoke,
+        "hits-smoke": hits_smoke,
+        "tiny": tiny,
+        "small": small,
+        "base": base,
+        "hits-base": hits_base,
+        "large": large,
+    },
     decides=("weights",),
 )
 """Every named size, ours first and smallest first. A checkpoint holds all numbers of its network,

@@ -13,10 +13,12 @@ from dataclasses import dataclass
 import torch
 
 from model.config import ModelConfig
+from model.hits.decoder import view_flops
 from model.image_head import LAST_CHANNELS
 from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
 from model.renderformer import RenderFormer, count_parameters
+from model.triangle_encoder import SIDE_LIGHTS
 from model.windows import cut_windows
 from storage.records.material import material_width
 
@@ -68,7 +70,7 @@ def costs(config: ModelConfig, workload: Workload) -> Costs:
     sizes = {name: precision.dtype.itemsize for name, precision in PRECISIONS.items()}
     return Costs(
         parameters={
-            "triangle encoder": count_parameters(model.encoder),
+            "triangle encoder": 0 if model.encoder is None else count_parameters(model.encoder),
             "view decoder": count_parameters(model.decoder) - head,
             f"{config.head} head": head,
         },
@@ -88,16 +90,25 @@ def flops(config: ModelConfig, workload: Workload) -> dict[str, int]:
     token_inputs = material_width(config.material_columns) + encoded_normal_width(
         config.normal_octaves
     )
+    if config.view_stage == "hits":
+        token_inputs += SIDE_LIGHTS
+    stage = {
+        "triangle tokens": 2 * workload.triangles * token_inputs * d,
+        "triangle self-attention": config.encoder_layers * (8 * n * d * d + 4 * n * n * d),
+        "triangle feed-forward": config.encoder_layers * 6 * n * d * f,
+        "keys and values": config.decoder_layers * 4 * n * d * d,
+    }
+    if config.view_stage == "hits":
+        view = view_flops(config, n, workload.resolution)
+        whole = stage if config.scene_tokens else {}
+        return whole | {name: views * count for name, count in view.items()}
     layers = {
         "cross-attention": 4 * q * d * d + 4 * q * n * d,
         "bundle self-attention": 8 * q * d * d + 4 * d * _pairs(config, per_side),
         "view feed-forward": 6 * q * d * f,
     }
     return {
-        "triangle tokens": 2 * workload.triangles * token_inputs * d,
-        "triangle self-attention": config.encoder_layers * (8 * n * d * d + 4 * n * n * d),
-        "triangle feed-forward": config.encoder_layers * 6 * n * d * f,
-        "keys and values": config.decoder_layers * 4 * n * d * d,
+        **stage,
         "bundle tokens": views * 2 * q * 3 * config.patch_px**2 * d,
         **{name: views * config.decoder_layers * count for name, count in layers.items()},
         "head": views * _head(config, per_side),

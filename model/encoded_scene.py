@@ -1,8 +1,12 @@
 """What remains of a scene after the view-independent stage: all that any view of it needs."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from model.hits.tracing import TracedScene
 
 KeysValues = tuple[Tensor, Tensor]
 """Keys, not yet rotated into a camera, and values of one layer; [B, H, N, D] each."""
@@ -34,7 +38,10 @@ class EncodedScene:
     places: TokenPlaces
     """Positions of the tokens."""
     keys_values: tuple[KeysValues, ...]
-    """Keys and values for each layer of the view stage."""
+    """Keys and values for each layer of the view stage; for that of hits, keys are rotated into the
+    world."""
+    traced: "tuple[TracedScene, ...]" = ()
+    """Of the view stage of hits: each scene, ready for rays; none where its views come traced."""
 
     def only(self, index: int) -> "EncodedScene":
         """Return one scene of the batch, without the padding that its company brought."""
@@ -50,4 +57,5 @@ class EncodedScene:
             keys_values=tuple(
                 (k[[index]][:, :, exists], v[[index]][:, :, exists]) for k, v in self.keys_values
             ),
+            traced=self.traced[index : index + 1],
         )

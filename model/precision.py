@@ -50,7 +50,8 @@ float16's numbers make; how fast float16 is, and all of tf32, was not measured."
 
 def rounded_parts(model: "RenderFormer") -> list[nn.Module]:
     """Return the parts of a network that a precision rounds; the others stay float32."""
-    return [model.encoder.layers, model.decoder.layers, *model.decoder.head.rounded_parts()]
+    scene = [] if model.encoder is None else [model.encoder.layers]
+    return [*scene, model.decoder.layers, *model.decoder.head.rounded_parts()]
 
 
 def set_precision(model: "RenderFormer", name: str) -> "RenderFormer":
@@ -64,7 +65,7 @@ def set_precision(model: "RenderFormer", name: str) -> "RenderFormer":
     if name not in PRECISIONS:
         raise TrilightError(f"precision {name!r}: expected one of {', '.join(PRECISIONS)}.")
     precision = PRECISIONS[name]
-    device = model.encoder.registers_NW.device
+    device = next(model.parameters()).device
     if precision.needs_cuda and device.type != "cuda":
         raise TrilightError(
             f"precision {name}: the network is on {device.type}, which has no fast path for it; "

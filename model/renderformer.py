@@ -2,13 +2,16 @@
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from model.config import ModelConfig
-from model.encoded_scene import EncodedScene
+from model.encoded_scene import EncodedScene, KeysValues
+from model.hits.decoder import HitDecoder
+from model.hits.tracing import TracedScene, sides_of, traced_batch, traced_cameras
 from model.image_head import blacken
-from model.positions import TriangleRotary
+from model.positions import TriangleRotary, token_places
 from model.precision import tf32
-from model.scene_tensors import Cameras, SceneBatch
+from model.scene_tensors import Cameras, SceneBatch, in_units
 from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError
@@ -36,8 +39,12 @@ class RenderFormer(nn.Module):
             max_freq=config.rope_max_freq,
             head_width=config.head_width,
         )
-        self.encoder = TriangleEncoder(config, rotary)
-        self.decoder = ViewDecoder(config, rotary)
+        self.encoder = TriangleEncoder(config, rotary) if config.scene_tokens else None
+        self.decoder: ViewDecoder | HitDecoder = (
+            HitDecoder(config, rotary)
+            if config.view_stage == "hits"
+            else ViewDecoder(config, rotary)
+        )
 
     def forward(self, batch: SceneBatch, resolution: int) -> Tensor:
         """Return log10(1 + radiance) [B, V, R, R, 3], before the ELU: what training compares.
@@ -45,14 +52,55 @@ class RenderFormer(nn.Module):
         Raises:
             TrilightError: the resolution is not a multiple of `config.picture_px`.
         """
-        return self.decode(self.encode(batch), batch.cameras, resolution)
+        if self.config.view_stage == "bundles":
+            return self.decode(self.encode(batch), batch.cameras, resolution)
+        self._require(resolution, skip_empty_bundles=False)
+        traced, scenes = batch.traced, ()
+        if traced is None:
+            scenes = traced_batch(batch)
+            traced = traced_cameras(scenes, batch.cameras, resolution, self.config)
+        encoded = self._encoded(batch, scenes, traced.sides_T12, traced.unit_3)
+        with tf32(self.tf32):
+            pictures: Tensor = self.decoder(encoded, traced)
+            return pictures
 
     def encode(self, batch: SceneBatch) -> EncodedScene:
         """Return the scenes of a batch ready to be seen; their cameras are not looked at."""
-        places = self.encoder.places(batch)
-        with tf32(self.tf32):
-            keys_values = self.decoder.keys_values(self.encoder(batch, places))
-        return EncodedScene(places=places, keys_values=keys_values)
+        if self.config.view_stage == "bundles":
+            return self._encoded(batch)
+        scenes = traced_batch(batch)
+        lights = [scene.light for scene in scenes]
+        longest = batch.triangles_BT33.shape[1]
+        sides = [pad(sides_of(light), (0, 0, 0, longest - light.num_triangles)) for light in lights]
+        units = [torch.from_numpy(light.mean_3) for light in lights]
+        device = batch.triangles_BT33.device
+        return self._encoded(
+            batch, scenes, torch.stack(sides).to(device), torch.stack(units).to(device)
+        )
+
+    def _encoded(
+        self,
+        batch: SceneBatch,
+        traced: tuple[TracedScene, ...] = (),
+        sides_BT12: Tensor | None = None,
+        unit_B3: Tensor | None = None,
+    ) -> EncodedScene:
+        """Return the scenes after the view-independent stage, if there is one."""
+        places = token_places(
+            batch.triangles_BT33,
+            batch.is_triangle_BT,
+            num_registers=self.config.num_registers,
+            eps=self.config.register_eps,
+        )
+        keys_values: tuple[KeysValues, ...] = ()
+        if self.encoder is not None:
+            if sides_BT12 is not None and unit_B3 is not None:
+                sides_BT12 = sides_BT12 / unit_B3.repeat(1, 4)[:, None]
+                batch = in_units(batch, unit_B3)
+            with tf32(self.tf32):
+                context_BNW = self.encoder(batch, places, sides_BT12)
+                keys_values = self.decoder.keys_values(context_BNW, places)
+        return EncodedScene(places=places, keys_values=keys_values, traced=traced)
 
     def decode(
         self,
@@ -79,6 +127,9 @@ class RenderFormer(nn.Module):
         """
         self._require(resolution, skip_empty_bundles)
         with tf32(self.tf32):
+            if isinstance(self.decoder, HitDecoder):
+                traced = traced_cameras(scene.traced, cameras, resolution, self.config)
+                return self.decoder(scene, traced)
             if not skip_empty_bundles:
                 return self.decoder(scene, cameras, resolution)
             pictures = [
@@ -95,6 +146,11 @@ class RenderFormer(nn.Module):
                 f"resolution {resolution}: expected a multiple of {picture_px}, the width of "
                 f"{unit}. Choose the next one."
             )
+        if skip_empty_bundles and self.config.view_stage == "hits":
+            raise TrilightError(
+                "skip_empty_bundles: this network's view stage has no ray bundles, it knows what "
+                "each pixel's rays hit. Render without it."
+            )
         if skip_empty_bundles and self.config.window_bundles:
             raise TrilightError(
                 "skip_empty_bundles: this network's view stage attends in windows, which have to "
@@ -103,7 +159,9 @@ class RenderFormer(nn.Module):
 
     def recompute_activations(self, wanted: bool) -> None:
         """Keep only each layer's input for the way back, or all that is in it (the default)."""
-        self.encoder.recompute = self.decoder.recompute = wanted
+        self.decoder.recompute = wanted
+        if self.encoder is not None:
+            self.encoder.recompute = wanted
 
     def initialise(self, generator: torch.Generator) -> None:
         """Draw all weights: Xavier for matrices, small tokens, a black picture."""
@@ -112,7 +170,10 @@ class RenderFormer(nn.Module):
                 nn.init.xavier_uniform_(module.weight, generator=generator)
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
-        for token in (self.encoder.tokens.token_W, self.encoder.registers_NW, self.decoder.token_W):
+        tokens = [] if self.encoder is None else self.encoder.learned_tokens()
+        if isinstance(self.decoder, ViewDecoder):
+            tokens.append(self.decoder.token_W)
+        for token in tokens:
             nn.init.normal_(token, std=TOKEN_STD, generator=generator)
         blacken(self.decoder.head)
 

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from model.hits.traced import Traced, stack_traced
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, chosen_columns, laid_out, material_columns
@@ -42,6 +43,9 @@ class SceneTensors:
     """Full field of view in degrees."""
     columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """Names of the columns of `material_TM`, in order (storage.records.material)."""
+    traced: Traced | None = None
+    """What was traced of these views, for a network with the view stage `hits`; where it is None,
+    such a network traces them itself."""
 
     @property
     def num_triangles(self) -> int:
@@ -84,6 +88,8 @@ class SceneBatch:
     """bool, False in the padding; None where nothing is padded, which spares the mask."""
     columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """As in SceneTensors."""
+    traced: Traced | None = None
+    """As in SceneTensors; None where a scene has None."""
 
     @property
     def cameras(self) -> Cameras:
@@ -151,8 +157,20 @@ def tensors_of(scenes: SceneTensors | SceneBatch) -> dict[str, Tensor]:
 
 def converted(scenes: Scenes, convert: Callable[[Tensor], Tensor]) -> Scenes:
     """Return the same scenes with each tensor converted, such as moved to a device."""
-    tensors: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
-    return dataclasses.replace(scenes, **tensors)
+    fields: dict[str, Any] = {name: convert(each) for name, each in tensors_of(scenes).items()}
+    if scenes.traced is not None:
+        fields["traced"] = scenes.traced.converted(convert)
+    return dataclasses.replace(scenes, **fields)
+
+
+def in_units(batch: SceneBatch, unit_B3: Tensor) -> SceneBatch:
+    """Return the batch with all radiance in units [B, 3] of each scene: log10(1 + x / unit)."""
+    material_BTM = batch.material_BTM.clone()
+    for column, part in laid_out(batch.columns):
+        if column.is_radiance and column.is_colour and column.is_log_encoded:
+            radiance = torch.pow(10.0, material_BTM[..., part]) - 1
+            material_BTM[..., part] = torch.log10(1 + radiance / unit_B3[:, None])
+    return dataclasses.replace(batch, material_BTM=material_BTM)
 
 
 def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
@@ -161,6 +179,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
     lengths = [scene.num_triangles for scene in scenes]
     longest = max(lengths)
     padded = min(lengths) < longest
+    traced = [scene.traced for scene in scenes if scene.traced is not None]
     return SceneBatch(
         triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
         normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
@@ -169,6 +188,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
         fov_deg_BV=torch.stack([scene.fov_deg_V for scene in scenes]),
         is_triangle_BT=torch.arange(longest) < torch.tensor(lengths)[:, None] if padded else None,
         columns=scenes[0].columns,
+        traced=stack_traced(traced, longest) if len(traced) == len(scenes) else None,
     )
 
 

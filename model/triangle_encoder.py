@@ -14,12 +14,14 @@ from model.positions import (
     TriangleRotary,
     encode_normals,
     encoded_normal_width,
-    token_places,
     world_rotation,
 )
 from model.precision import as_given
 from model.scene_tensors import SceneBatch
 from storage.records.material import material_width
+
+SIDE_LIGHTS = 12
+"""Numbers of the light that the two sides of a triangle receive (model.hits.traced)."""
 
 
 class TriangleTokens(nn.Module):
@@ -37,13 +39,23 @@ class TriangleTokens(nn.Module):
         self.material_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
         self.normal = nn.Linear(encoded_normal_width(self.octaves), config.width)
         self.normal_norm = Norm(config.width, eps=TOKEN_NORM_EPS)
+        self.light = nn.Linear(SIDE_LIGHTS, config.width) if config.view_stage == "hits" else None
 
-    def forward(self, material_BTM: Tensor, normals_BT33: Tensor) -> Tensor:
-        """Return tokens [B, T, W], float32 under autocast too."""
+    def forward(
+        self, material_BTM: Tensor, normals_BT33: Tensor, light_BTL: Tensor | None = None
+    ) -> Tensor:
+        """Return tokens [B, T, W], float32 under autocast too.
+
+        `light` is what the triangles' sides receive, in units of the scene's mean light; networks
+        with the view stage `hits` are told so.
+        """
         with as_given(material_BTM.device):
             material_BTW = self.material_norm(self.material(material_BTM))
             normal_BTW = self.normal_norm(self.normal(encode_normals(normals_BT33, self.octaves)))
-            return self.token_W + material_BTW + normal_BTW
+            tokens_BTW = self.token_W + material_BTW + normal_BTW
+            if self.light is None or light_BTL is None:
+                return tokens_BTW
+            return tokens_BTW + self.light(torch.log1p(4 * light_BTL))
 
 
 class TriangleEncoder(nn.Module):
@@ -52,7 +64,6 @@ class TriangleEncoder(nn.Module):
     def __init__(self, config: ModelConfig, rotary: TriangleRotary) -> None:
         super().__init__()
         self.rotary = rotary
-        self.register_eps = config.register_eps
         self.recompute = False
         self.columns = config.material_columns
         self.tokens = TriangleTokens(config)
@@ -62,9 +73,15 @@ class TriangleEncoder(nn.Module):
             for _ in range(config.encoder_layers)
         )
 
-    def forward(self, batch: SceneBatch, places: TokenPlaces) -> Tensor:
-        """Return the context [B, N, W] with N = registers + triangles."""
-        tokens_BTW = self.tokens(batch.material_of(self.columns), batch.normals_BT33)
+    def forward(
+        self, batch: SceneBatch, places: TokenPlaces, light_BTL: Tensor | None = None
+    ) -> Tensor:
+        """Return the context [B, N, W] with N = registers + triangles.
+
+        `light_BTL` is as in TriangleTokens.
+        """
+        materials = batch.material_of(self.columns)
+        tokens_BTW = self.tokens(materials, batch.normals_BT33, light_BTL)
         registers_BNW = self.registers_NW.expand(len(tokens_BTW), -1, -1)
         x_BNW = torch.cat([registers_BNW, tokens_BTW], dim=1).to(dtype_of(self.layers))
         rotation = world_rotation(self.rotary, places)
@@ -72,11 +89,6 @@ class TriangleEncoder(nn.Module):
             x_BNW = run_layer(layer, x_BNW, rotation, places.is_key_BN, recompute=self.recompute)
         return x_BNW
 
-    def places(self, batch: SceneBatch) -> TokenPlaces:
-        """Return where the tokens of a batch stand."""
-        return token_places(
-            batch.triangles_BT33,
-            batch.is_triangle_BT,
-            num_registers=len(self.registers_NW),
-            eps=self.register_eps,
-        )
+    def learned_tokens(self) -> list[nn.Parameter]:
+        """Return the tokens that are learned as they are: drawn small at the start."""
+        return [self.tokens.token_W, self.registers_NW]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from model.config import ModelConfig
 from model.empty_bundles import blacken_absent, bundles_that_see, fill_absent
-from model.encoded_scene import EncodedScene, KeysValues
+from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
 from model.image_head import build_head, stack_taps
 from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
 from model.positions import Rotation, TriangleRotary, camera_rotation
@@ -43,8 +43,11 @@ class ViewDecoder(nn.Module):
         )
         self.head = build_head(config)
 
-    def keys_values(self, context_BNW: Tensor) -> tuple[KeysValues, ...]:
-        """Return what each layer asks of a context: once per scene, for any number of views."""
+    def keys_values(self, context_BNW: Tensor, places: TokenPlaces) -> tuple[KeysValues, ...]:
+        """Return what each layer asks of a context: once per scene, for any number of views.
+
+        Keys are not rotated yet, wherever their tokens stand: that takes a camera.
+        """
         layers = cast(Iterable[DecoderLayer], self.layers)
         return tuple(layer.cross.keys_values(context_BNW) for layer in layers)
 

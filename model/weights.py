@@ -17,7 +17,6 @@ from torch import Tensor
 from model.config import ModelConfig
 from model.renderformer import RenderFormer
 from storage.errors import TrilightError
-from storage.records.material import PUBLISHED_COLUMNS
 from storage.records.safe_read import MAX_HEADER_BYTES, safetensors_header
 
 RANGE_KEY = "trilight_trained_range"
@@ -183,7 +182,7 @@ def network_of(config: ModelConfig, tensors: Mapping[str, Tensor]) -> RenderForm
         model = RenderFormer(config)
     require_tensors(tensors, model.state_dict())
     model.load_state_dict(dict(tensors), assign=True)
-    model.encoder.rotary.reset()
+    model.decoder.rotary.reset()
     # a head of convolutions reads tokens as they lie, channels last; its weights then should too
     model.decoder.head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model.eval()
@@ -213,15 +212,27 @@ def require_tensors(got: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -
         raise TrilightError(f"weights: {'; '.join(wrong[:5])}{more}.")
 
 
+_LATER = (
+    "material_columns",
+    "view_stage",
+    "hit_rays",
+    "hit_anchors",
+    "gather_rays",
+    "pixel_width",
+    "scene_tokens",
+)
+
+
 def encode_config(config: ModelConfig) -> str:
     """Return the JSON of a configuration.
 
-    Material columns stand there where they are not the published ones, so that the bytes and the
-    digest of every other network stay what they were before there was a choice.
+    Settings that came later stand there where they are not at their default, so that the bytes and
+    the digest of every other network stay what they were before there was a choice.
     """
     fields = dataclasses.asdict(config)
-    if config.material_columns == PUBLISHED_COLUMNS:
-        del fields["material_columns"]
+    for each in dataclasses.fields(config):
+        if each.name in _LATER and fields[each.name] == each.default:
+            del fields[each.name]
     return json.dumps(fields, sort_keys=True)
 
 

@@ -132,6 +132,7 @@ def stream_settings(settings: TrainSettings) -> StreamSettings:
         views_per_scene=settings.views_per_scene,
         most_triangles=settings.most_triangles,
         augmentation=settings.augmentation,
+        network=settings.model,
     )
 
 

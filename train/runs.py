@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from model.config import base as base_model
+from model.config import hits_smoke
 from model.config import large as large_model
 from model.config import smoke as smoke_model
 from storage.errors import TrilightError, expected_one_of
@@ -52,6 +53,24 @@ def builtin() -> TrainSettings:
         ema_decay=0.999,
         validate_every=500,
         checkpoint_every=500,
+    )
+
+
+def hits() -> TrainSettings:
+    """Return the run of a small network whose first hits and direct light are traced."""
+    return dataclasses.replace(
+        builtin(),
+        run="hits",
+        model=hits_smoke(),
+        num_steps=6_000,
+        views_per_scene=2,
+        augmentation=AugmentationSettings(
+            rotation="uniform",
+            mirror=True,
+            channels=True,
+            vertex_order=True,
+            withheld_inputs=0.05,
+        ),
     )
 
 
@@ -180,6 +199,7 @@ RUNS: Registry[Callable[[], TrainSettings]] = Registry(
     {
         "smoke": smoke,
         "builtin": builtin,
+        "hits": hits,
         "pretrain": pretrain,
         "finetune": finetune,
         "paper-pretrain": paper_pretrain,

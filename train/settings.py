@@ -36,6 +36,9 @@ class AugmentationSettings:
     light_mix: Annotated[float, Within(1, 1000)] = 1.0
     """Scale each light by a log-uniform factor of its own between 1 / light_mix and light_mix;
     above 1 it needs a dataset with a picture for each light (`per_light`)."""
+    withheld_inputs: Share = 0.0
+    """Chance with which a view has to do without one of the inputs that the view stage `hits` is
+    given, drawn for each input; other networks are given none."""
 
 
 Perceptual = Literal["lpips", "ms_ssim", "none"]

@@ -1,7 +1,6 @@
-"""The triangles that cameras see, prepared for rays: everybody's way to Embree.
+"""Triangles prepared for rays: everybody's way to Embree.
 
-Emitters are left out, since they are hidden from camera rays in the pictures too; rays pass through
-them. Embree works in single precision, here in its robust mode, in which no ray slips between two
+Embree works in single precision, here in its robust mode, in which no ray slips between two
 triangles of one edge. Only `pipeline.assets.outside_rays` asks Embree by itself: it has no scene.
 """
 
@@ -21,7 +20,9 @@ class MetSurfaces:
     """What N rays meet first, in Embree's own precision."""
 
     triangle: NDArray[np.int64]
-    """[N] row of `Scene.faces`, or MISS."""
+    """[N] row of the triangle, or MISS."""
+    uv: NDArray[np.float32]
+    """[2, N] weights of its second and third corner; undefined where nothing is met."""
     distance_m: NDArray[np.float32]
     """[N] along the ray, in lengths of its direction; beyond all measure where nothing is met."""
     normal: NDArray[np.float32]
@@ -29,23 +30,37 @@ class MetSurfaces:
     its corners run counter-clockwise; undefined where nothing is met."""
 
 
-class Surfaces:
-    """The triangles of a scene that do not emit."""
+class Triangles:
+    """Some triangles of many, as rays meet them."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, corners_T33: NDArray[np.float32], rows: NDArray[np.intp]) -> None:
+        """Take the corners of triangles, world space, and the rows of those that are there."""
+        count = 3 * len(rows)
+        vertices = corners_T33[rows].reshape(count, 3)
+        self._build(vertices, np.arange(count, dtype=np.uint32).reshape(-1, 3), rows)
+
+    def _build(
+        self,
+        vertices: NDArray[np.float32],
+        faces: NDArray[np.uint32],
+        rows: NDArray[np.intp],
+    ) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        self._rows = np.flatnonzero(~scene.triangle_emits)
+        self._rows = np.append(rows, MISS)  # the last one, which -1 picks
         self._embree = EmbreeScene(robust=True)
-        TriangleMesh(self._embree, scene.vertex_positions, scene.faces[self._rows])
+        if len(rows):
+            TriangleMesh(self._embree, vertices, faces)
 
     def met(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> MetSurfaces:
         """Return what rays [N, 3] from `origins` [N, 3] meet first, from either side."""
         found = self._embree.run(origins, directions, output=True)
-        rows = np.append(self._rows, MISS)  # the last one, which -1 picks
         return MetSurfaces(
-            triangle=rows[found["primID"]], distance_m=found["tfar"], normal=found["Ng"]
+            triangle=self._rows[found["primID"]],
+            uv=np.stack([found["u"], found["v"]]),
+            distance_m=found["tfar"],
+            normal=found["Ng"],
         )
 
     def is_free(
@@ -58,3 +73,15 @@ class Surfaces:
         found = self._embree.run(origins, directions, dists=distances_m, query="OCCLUDED")
         free: NDArray[np.bool_] = np.asarray(found) < 0
         return free
+
+
+class Surfaces(Triangles):
+    """The triangles of a scene that cameras see.
+
+    Emitters are left out, since they are hidden from camera rays in the pictures too; rays pass
+    through them.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        rows = np.flatnonzero(~scene.triangle_emits)
+        self._build(scene.vertex_positions, scene.faces[rows], rows)

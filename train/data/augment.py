@@ -52,6 +52,21 @@ def augmented(
     return scene
 
 
+def with_inputs_withheld(
+    scene: SceneTensors, share: float, rng: np.random.Generator
+) -> SceneTensors:
+    """Return a traced scene whose views lack each input of model.hits.traced.INPUTS by chance.
+
+    So that a network does not come to rest on one of them. Draws nothing where `share` is 0.
+    """
+    if not share or scene.traced is None:
+        return scene
+    kept_VI = rng.random(scene.traced.given_VI.shape) >= share
+    return dataclasses.replace(
+        scene, traced=scene.traced.without(torch.from_numpy(kept_VI).float())
+    )
+
+
 def rotation_rand(kind: "Rotation", rng: np.random.Generator) -> Tensor:
     """Return a random rotation matrix [3, 3], float64; the unit matrix for `none`."""
     if kind == "recipe":

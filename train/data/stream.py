@@ -4,6 +4,7 @@ Batch i holds the same scenes with the same augmentation wherever the stream was
 number of ranks and threads: a run resumes by the number of its step.
 """
 
+import dataclasses
 import queue
 import threading
 from collections import deque
@@ -15,11 +16,12 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from model.hits.tracing import with_traced
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
 from storage.records.sample import Sample
 from storage.seeds import rng_for
-from train.data.augment import augmented, with_views
+from train.data.augment import augmented, with_inputs_withheld, with_views
 from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
@@ -33,6 +35,7 @@ from train.data.scenes import TrainingScene, training_scene
 from train.data.unusable import Unusable, lost_with
 
 if TYPE_CHECKING:
+    from model.config import ModelConfig
     from train.settings import AugmentationSettings
 
 PREFETCHED_SCENES = 16
@@ -59,6 +62,8 @@ class StreamSettings:
     """Samples with more are unusable; 0: none is."""
     augmentation: "AugmentationSettings | None" = None
     """Symmetries that are drawn at each visit; none by default."""
+    network: "ModelConfig | None" = None
+    """The network that is trained: for one with the view stage `hits`, views are traced here."""
 
     @property
     def order(self) -> OrderSettings:
@@ -166,7 +171,14 @@ class _SceneMaker:
         rng = rng_for(settings.seed, "visit", place.position)
         views = rng.permutation(len(scene.target_VRR3))[: settings.views_per_scene]
         seen = with_views(scene, np.sort(views))
-        return augmented(seen, settings.augmentation, rng) if settings.augmentation else seen
+        if settings.augmentation:
+            seen = augmented(seen, settings.augmentation, rng)
+        if settings.network is None or settings.network.view_stage != "hits":
+            return seen
+        # after the symmetries, which therefore need not know what is traced
+        tensors = with_traced(seen.tensors, settings.resolution, settings.network)
+        withheld = settings.augmentation.withheld_inputs if settings.augmentation else 0.0
+        return dataclasses.replace(seen, tensors=with_inputs_withheld(tensors, withheld, rng))
 
     def _usable(self, place: Place) -> TrainingScene:
         count = len(self._shards.names)

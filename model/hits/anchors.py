@@ -1,0 +1,97 @@
+"""Anchors: a few places of a view at which the light of other surfaces is gathered by many rays.
+
+That light is smooth, so its value between anchors may be mixed from theirs (as irradiance caching:
+Ward et al. 1988), and costs the same for a picture of any width.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.hits.camera import Rays
+from model.hits.lit_scene import LitScene, Points
+from model.hits.radiosity import SceneLight
+from model.hits.second_hits import blocks, brought
+from model.hits.vectors import Floats, cosine_direction, spread
+from storage.seeds import rng_for
+
+
+def anchor_pixels(coverage_RR: NDArray[np.float32], anchors_a_side: int) -> NDArray[np.int64]:
+    """Return the pixel of each part of the picture that meets most; of several, the most central.
+
+    Args:
+        coverage_RR: share of each pixel's rays that meet something.
+        anchors_a_side: parts along a side, a divisor of R.
+
+    Returns:
+        [A] pixels, counted row by row; parts row by row.
+    """
+    width = len(coverage_RR)
+    step = width // anchors_a_side
+    offset = np.arange(step) - (step - 1) / 2
+    # the centre of an even part lies between pixels: the tie is broken, the same way everywhere
+    central = np.hypot(offset[:, None] - 0.1, offset[None] - 0.05)
+    prefers = (central.max() - central) / (1000 * max(central.max(), 1))
+    parts = coverage_RR.reshape(anchors_a_side, step, anchors_a_side, step).swapaxes(1, 2)
+    best = (parts + prefers).reshape(anchors_a_side, anchors_a_side, -1).argmax(axis=-1)
+    first = np.arange(anchors_a_side) * step
+    pixels: NDArray[np.int64] = (first[:, None] + best // step) * width + first + best % step
+    return pixels.ravel()
+
+
+def gathered_at(
+    scene: LitScene, light: SceneLight, rays: Rays, anchor: NDArray[np.int64], gather_rays: int
+) -> Floats:
+    """Return irradiance over pi from other surfaces [A, 3] at the first thing in anchors' pixels.
+
+    Args:
+        scene, light: the scene.
+        rays: of the camera.
+        anchor: [A] pixels.
+        gather_rays: of each anchor; 0 gives 0.
+    """
+    total = np.zeros((3, len(anchor)), np.float32)
+    if not gather_rays:
+        return total.T
+    waiting = np.arange(len(anchor))
+    for turn in range(rays.turns):
+        points, met = scene.first_points(rays.origin, rays.direction(turn, anchor[waiting]))
+        if len(met):
+            total[:, waiting[met]] = _gathered(scene, light, points, waiting[met], gather_rays)
+        waiting = np.delete(waiting, met)
+    return np.ascontiguousarray(total.T)
+
+
+def _gathered(
+    scene: LitScene, light: SceneLight, points: Points, number: NDArray[np.intp], gather_rays: int
+) -> Floats:
+    """Return the means [3, P] over rays; `number` tells anchors' random numbers apart."""
+    shift = rng_for(0, "gather").random((5, int(number.max()) + 1), np.float32)[:, number]
+    count = len(number)
+    owner = np.tile(np.arange(count), gather_rays)
+    u = np.concatenate(
+        [
+            np.stack([spread(shift[pair], turn) for turn in range(gather_rays)], axis=1)
+            for pair in (slice(0, 2), slice(2, 4))
+        ]
+    ).reshape(4, -1)
+    u_lamp = np.tile(shift[4], gather_rays) + np.repeat(_van_der_corput(gather_rays), count)
+    u_lamp -= np.floor(u_lamp)
+    total = np.zeros((3, count * gather_rays), np.float32)
+    for part in blocks(count * gather_rays):
+        here = points.only(owner[part])
+        direction = cosine_direction(u[:2, part], here.normal)
+        beyond, met = scene.meet(scene.everything, here.start(direction), direction)
+        found = brought(scene, light, beyond, u_lamp[part], u[2:, part])
+        # below the triangle's own plane, where a shading normal leans, there is the inside
+        total[:, part] = np.where(met, found, np.float32(0))
+    return total.reshape(3, gather_rays, count).mean(axis=1)
+
+
+def _van_der_corput(count: int) -> Floats:
+    """Return the first `count` numbers of the sequence of base 2 (van der Corput 1935)."""
+    number = np.arange(count)
+    total, share = np.zeros(count), 0.5
+    while number.any():
+        total += share * (number & 1)
+        number, share = number >> 1, share / 2
+    return total.astype(np.float32)

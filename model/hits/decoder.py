@@ -1,0 +1,386 @@
+"""The view stage `hits`: each pixel is told what its rays found, and learns the rest.
+
+A grid of anchors asks the scene's tokens, in world space, so that keys are rotated once a scene.
+Each pixel mixes what the nine nearest anchors know, by what it is like them, and a small network
+says how much of each light that was traced counts, and what is missing:
+
+    radiance = diffuse albedo * (gain * mixed gathered light + irradiance)
+             + specular albedo * radiance + gain * direct light + gain * mirrored light
+
+Nothing of it is negative. All light is in units of the scene's mean light, by colour: the picture
+scales with the lamps exactly. There are no pixels from elsewhere in it, so any width will do.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import silu, softplus
+
+from model.attention import attend
+from model.config import ModelConfig
+from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
+from model.hits.traced import CHANNELS, INPUTS, Traced
+from model.hits.view_inputs import Channel
+from model.layers import (
+    LAYER_NORM_EPS,
+    CrossAttention,
+    Norm,
+    SwiGLU,
+    dtype_of,
+    merge_heads,
+    run_layer,
+    split_heads,
+)
+from model.positions import Rotation, TriangleRotary, rotate, world_rotation
+from model.precision import as_given
+
+NEIGHBOURS = 9
+"""Anchors that a pixel reads: that of its own part of the picture and those around it."""
+
+_SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1
+"""Numbers that say what surface a pixel sees (`_told`)."""
+
+_LIGHTS = tuple(channel for channels in CHANNELS.values() for channel in channels)
+
+TOLD = _SURFACE + 3 * len(_LIGHTS) + len(INPUTS)
+"""Numbers that a pixel is told; an anchor is told three more, its gathered light."""
+
+_PLACE = 6
+"""Numbers that say how a pixel lies to an anchor."""
+
+_NEAREST_M = 1e-3
+"""Added to distances, so that a pixel that meets nothing divides by more than 0."""
+
+_FARTHEST = 30.0
+"""What counts as far away: an anchor there has no share but where all are."""
+
+_START = -3.0
+"""Of the light that is learned, before softplus: a twentieth of the scene's mean at the start, so
+that the first picture is what was traced, with dim shadows."""
+
+_GAINED = 3
+"""Lights that are multiplied by a learned gain: gathered, direct, mirrored."""
+
+BLOCK_PIXELS = 2**14
+"""Pixels that are computed at a time while rendering."""
+
+
+def view_flops(config: ModelConfig, tokens: int, resolution: int) -> dict[str, int]:
+    """Return the FLOPs of the parts of this stage for one view of a scene of so many tokens."""
+    d, p = config.width, config.pixel_width
+    a = math.gcd(config.hit_anchors, resolution) ** 2
+    asks = 4 * a * d * d + 4 * a * tokens * d if config.scene_tokens else 0
+    pixel = TOLD * p + p * p + NEIGHBOURS * (2 * p + 3) + _PLACE * p + NEIGHBOURS * 4 * 3
+    pixel += (2 * p + 3) * 2 * p + 2 * p * p + p * 3 * (_GAINED + 2)
+    return {
+        "anchors": 2 * a * ((TOLD + 3) * d + d * d),
+        "cross-attention": config.decoder_layers * asks,
+        "view feed-forward": config.decoder_layers * 6 * a * d * config.hidden_width,
+        "head": 4 * a * d * p + 2 * resolution**2 * pixel,
+    }
+
+
+class AnchorLayer(nn.Module):
+    """Anchors read the scene, then SwiGLU, each added to the residual stream."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.cross_norm = Norm(config.width, eps=LAYER_NORM_EPS) if config.scene_tokens else None
+        self.cross = CrossAttention(config.width, config.num_heads) if config.scene_tokens else None
+        self.ffn_norm = Norm(config.width, eps=LAYER_NORM_EPS)
+        self.ffn = SwiGLU(config.width, config.hidden_width)
+
+    def forward(
+        self,
+        x_BVAW: Tensor,
+        keys_values: KeysValues | None,
+        rotation_BVAD: Rotation,
+        is_key_BN: Tensor | None,
+        reads_BV11: Tensor,
+    ) -> Tensor:
+        """[B, V, A, W] -> [B, V, A, W].
+
+        Keys are rotated; `reads` is 0 where tokens are withheld.
+        """
+        cross = self.cross
+        if cross is None or self.cross_norm is None or keys_values is None:
+            return x_BVAW + self.ffn(self.ffn_norm(x_BVAW))
+        q_BVHAD = split_heads(cross.q_norm(cross.q(self.cross_norm(x_BVAW))), cross.num_heads)
+        q_BVHAD = rotate(q_BVHAD, *rotation_BVAD)
+        views, anchors = q_BVHAD.shape[1], q_BVHAD.shape[3]
+        # the views of a scene ask the same keys: together they are one longer row of questions
+        q_BHQD = q_BVHAD.movedim(1, 2).flatten(2, 3)
+        attended = attend(q_BHQD, *keys_values, is_key_BN).unflatten(2, (views, anchors))
+        read = cross.out(merge_heads(attended.movedim(2, 1)))
+        x_BVAW = x_BVAW + read * reads_BV11.to(read.dtype)
+        return x_BVAW + self.ffn(self.ffn_norm(x_BVAW))
+
+
+class PixelHead(nn.Module):
+    """Pixels and the anchors around them -> what is learned of each pixel's light."""
+
+    taps: tuple[int, ...] = ()
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        width = config.pixel_width
+        self.told = nn.Linear(TOLD, width)
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(config.width, width)
+        self.value = nn.Linear(config.width, width)
+        self.place = nn.Linear(_PLACE, width)
+        self.nearness = nn.Parameter(torch.full((3,), 2.0))
+        self.first = nn.Linear(2 * width + 3, 2 * width)
+        self.second = nn.Linear(2 * width, width)
+        self.last = nn.Linear(width, 3 * (_GAINED + 2))
+
+    def rounded_parts(self) -> list[nn.Module]:
+        """Return what a precision rounds: nothing, as it is a hundredth of the work of anchors."""
+        return []
+
+    def forward(
+        self,
+        told_MPF: Tensor,
+        key_M9W: Tensor,
+        value_M9W: Tensor,
+        lies: "Lie",
+        met_M9: Tensor,
+        gathered_M93: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the learned numbers [M, P, 15], and gathered light mixed for the pixels [M, P, 3].
+
+        M parts of the picture have P pixels and nine anchors each; F numbers a pixel.
+        """
+        pixel_MPW = silu(self.told(told_MPF))
+        alike_MP9 = self.query(pixel_MPW) @ key_M9W.mT / math.sqrt(key_M9W.shape[-1])
+        for weight, unlike_MP9 in zip(softplus(self.nearness), lies.unlike, strict=True):
+            alike_MP9 = alike_MP9 - weight * unlike_MP9
+        nothing_M19 = torch.where(met_M9, 0.0, -2 * _FARTHEST)[:, None]
+        share_MP9 = (alike_MP9 + nothing_M19).softmax(dim=-1)
+        known_MPW = share_MP9 @ value_M9W + self.place(lies.mixed(share_MP9))
+        gathered_MP3 = share_MP9 @ gathered_M93
+        both = torch.cat([pixel_MPW, known_MPW, torch.log1p(4 * gathered_MP3)], dim=-1)
+        return self.last(silu(self.second(silu(self.first(both))))), gathered_MP3
+
+
+class HitDecoder(nn.Module):
+    """Encoded scenes and what was traced of their views -> pictures."""
+
+    def __init__(self, config: ModelConfig, rotary: TriangleRotary) -> None:
+        super().__init__()
+        self.config = config
+        self.rotary = rotary
+        self.recompute = False
+        self.told = nn.Linear(TOLD + 3, config.width)
+        self.anchors = nn.Linear(config.width, config.width)
+        self.layers = nn.ModuleList(AnchorLayer(config) for _ in range(config.decoder_layers))
+        self.norm = Norm(config.width, eps=LAYER_NORM_EPS)
+        self.head = PixelHead(config)
+
+    def keys_values(self, context_BNW: Tensor, places: TokenPlaces) -> tuple[KeysValues, ...]:
+        """Return what each layer asks of a context, keys rotated in the world: once a scene."""
+        rotation_BND = world_rotation(self.rotary, places)
+        found = []
+        for layer in self.layers:
+            k_BHND, v_BHND = layer.cross.keys_values(context_BNW)  # type: ignore[union-attr]
+            found.append((rotate(k_BHND, *rotation_BND), v_BHND))
+        return tuple(found)
+
+    def forward(self, scene: EncodedScene, traced: Traced) -> Tensor:
+        """Return log10(1 + radiance) [B, V, R, R, 3]; each number is at least 0.
+
+        Args:
+            scene: B scenes.
+            traced: V views of each, as `model.hits.traced.stacked` makes them.
+        """
+        with as_given(traced.pixels_VRRC.device):
+            unit_B1113 = traced.unit_3[:, None, None, None, :]
+            surface, light = _told(traced.pixels_VRRC, unit_B1113)
+            given = traced.given_VI[:, :, None, None, :].expand(*surface.shape[:-1], -1)
+            told = torch.cat([surface, torch.log1p(4 * light), given], dim=-1)
+            at = _at_anchors(traced)
+            anchor = torch.cat(
+                [at(told), torch.log1p(4 * traced.gathered_VA3 / unit_B1113[..., 0, :])], dim=-1
+            )
+            place = at(traced.pixels_VRRC)
+        x_BVAW = self._asked(scene, traced, anchor, place[..., Channel.POSITION])
+        with as_given(traced.pixels_VRRC.device):
+            return self._pictures(traced, told, x_BVAW.float(), place, unit_B1113)
+
+    def _asked(
+        self, scene: EncodedScene, traced: Traced, anchor_BVAF: Tensor, position_BVA3: Tensor
+    ) -> Tensor:
+        """Return the anchors [B, V, A, W] after they have read the scene."""
+        x_BVAW = self.anchors(silu(self.told(anchor_BVAF))).to(dtype_of(self.layers))
+        rotation = self.rotary(position_BVA3[..., None, :].expand(-1, -1, -1, 3, 3))
+        reads_BV11 = traced.given_VI[..., INPUTS.index("tokens"), None, None]
+        known = scene.keys_values or [None] * len(self.layers)
+        for layer, keys_values in zip(self.layers, known, strict=True):
+            x_BVAW = run_layer(
+                layer,
+                x_BVAW,
+                keys_values,
+                rotation,
+                scene.places.is_key_BN,
+                reads_BV11,
+                recompute=self.recompute,
+            )
+        return self.norm(x_BVAW)
+
+    def _pictures(
+        self,
+        traced: Traced,
+        told: Tensor,
+        x_BVAW: Tensor,
+        place_BVAC: Tensor,
+        unit_B1113: Tensor,
+    ) -> Tensor:
+        resolution = told.shape[2]
+        side = round(x_BVAW.shape[2] ** 0.5)
+        views = told.shape[:2]
+        unit = unit_B1113.expand(*views, 1, 1, 3).flatten(0, 1)[:, 0]  # [V, 1, 3]
+        head = self.head
+        gathered = (traced.gathered_VA3 / unit_B1113[..., 0, :]).flatten(0, 1)
+        around = [
+            _around(each, side)
+            for each in (
+                head.key(x_BVAW).flatten(0, 1),
+                head.value(x_BVAW).flatten(0, 1),
+                gathered,
+                place_BVAC.flatten(0, 1),
+            )
+        ]
+        told_VMPF = _in_parts(told.flatten(0, 1), side)
+        pixels_VMPC = _in_parts(traced.pixels_VRRC.flatten(0, 1), side)
+        size = told_VMPF.shape[2]
+        pictures = []
+        for view in range(len(told_VMPF)):
+            rows = []
+            step = len(told_VMPF[view]) if torch.is_grad_enabled() else max(1, BLOCK_PIXELS // size)
+            for first in range(0, side * side, step):
+                some = slice(first, first + step)
+                pixels_MPC = pixels_VMPC[view, some]
+                key, value, light, place = (each[view, some] for each in around)
+                learned, mixed = head(
+                    told_VMPF[view, some],
+                    key,
+                    value,
+                    _lies(pixels_MPC, place),
+                    place[..., 0] > 0,
+                    light,
+                )
+                rows.append(_composed(learned, mixed, pixels_MPC, unit[view]))
+            pictures.append(_whole(torch.cat(rows), side))
+        log10 = torch.log1p(torch.stack(pictures)) / math.log(10)
+        return log10.reshape(*views, resolution, resolution, 3)
+
+
+def _told(pixels: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what is said of surfaces [..., 18], and their light in units of the scene's."""
+    normal = nn.functional.normalize(pixels[..., Channel.NORMAL], dim=-1)
+    toward = nn.functional.normalize(pixels[..., Channel.TOWARD], dim=-1)
+    cosine = (normal * toward).sum(dim=-1, keepdim=True)
+    surface = [
+        normal,
+        toward,
+        2 * cosine * normal - toward,
+        cosine,
+        pixels[..., Channel.DIFFUSE],
+        pixels[..., Channel.SPECULAR],
+        pixels[..., Channel.ROUGHNESS],
+        pixels[..., Channel.COVERAGE],
+    ]
+    light = torch.cat([pixels[..., channel] / unit for channel in _LIGHTS], dim=-1)
+    return torch.cat(surface, dim=-1), light
+
+
+def _at_anchors(traced: Traced):  # type: ignore[no-untyped-def]
+    """Return a function that takes [B, V, R, R, K] and returns the anchors' own [B, V, A, K]."""
+
+    def at(values: Tensor) -> Tensor:
+        index = traced.anchor_VA[..., None].expand(-1, -1, -1, values.shape[-1])
+        return values.flatten(2, 3).gather(2, index)
+
+    return at
+
+
+def _in_parts(values_VRRK: Tensor, side: int) -> Tensor:
+    """[V, R, R, K] -> [V, M, P, K]: the pixels of each part of the picture, row by row."""
+    step = values_VRRK.shape[1] // side
+    parts = values_VRRK.unflatten(2, (side, step)).unflatten(1, (side, step))
+    return parts.transpose(2, 3).flatten(3, 4).flatten(1, 2)
+
+
+def _whole(values_MPK: Tensor, side: int) -> Tensor:
+    """[M, P, K] -> [R, R, K]: the inverse of `_in_parts` for one picture."""
+    step = round(values_MPK.shape[1] ** 0.5)
+    parts = values_MPK.unflatten(1, (step, step)).unflatten(0, (side, side))
+    return parts.transpose(1, 2).flatten(2, 3).flatten(0, 1)
+
+
+def _around(values_VAK: Tensor, side: int) -> Tensor:
+    """[V, A, K] -> [V, A, 9, K]: the anchors of the parts around; at the rim, the nearest ones."""
+    grid = torch.arange(side, device=values_VAK.device)
+    near = (grid[:, None] + torch.tensor([-1, 0, 1], device=grid.device)).clamp(0, side - 1)
+    rows = near[:, None, :, None] * side + near[None, :, None, :]
+    return values_VAK[:, rows.reshape(side * side, NEIGHBOURS)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lie:
+    """How pixels lie to nine anchors, in shares of their distance to the camera."""
+
+    unlike: tuple[Tensor, Tensor, Tensor]
+    """[M, P, 9] how far the anchor is, how far from the pixel's plane, and how the normals differ.
+    """
+    anchors_M93: Tensor
+    """Positions, from that of the part's own anchor."""
+    pixels_MP3: Tensor
+    """Likewise."""
+    distance_MP1: Tensor
+
+    def mixed(self, share_MP9: Tensor) -> Tensor:
+        """Return what lies between a pixel and a mixture of anchors, [M, P, 6]."""
+        unlike = [(share_MP9 * each).sum(dim=-1) for each in self.unlike]
+        way = (share_MP9 @ self.anchors_M93 - self.pixels_MP3) / self.distance_MP1
+        return torch.cat([torch.stack(unlike, dim=-1), 4 * way], dim=-1)
+
+
+def _lies(pixels_MPC: Tensor, anchors_M9C: Tensor) -> Lie:
+    """Return how pixels lie to the anchors around; products of matrices, without [M, P, 9, 3]."""
+    own = anchors_M9C[:, NEIGHBOURS // 2, None, Channel.POSITION]
+    pixels_MP3 = pixels_MPC[..., Channel.POSITION] - own
+    anchors_M93 = anchors_M9C[..., Channel.POSITION] - own
+    distance_MP1 = pixels_MPC[..., Channel.DISTANCE] + _NEAREST_M
+    normal = nn.functional.normalize(pixels_MPC[..., Channel.NORMAL], dim=-1)
+    other = nn.functional.normalize(anchors_M9C[..., Channel.NORMAL], dim=-1)
+    squares = pixels_MP3.square().sum(dim=-1, keepdim=True)
+    squares = squares + anchors_M93.square().sum(dim=-1)[:, None]
+    apart = (squares - 2 * pixels_MP3 @ anchors_M93.mT).clamp(min=0).sqrt()
+    above = normal @ anchors_M93.mT - (normal * pixels_MP3).sum(dim=-1, keepdim=True)
+    return Lie(
+        unlike=(
+            (8 * apart / distance_MP1).clamp(max=_FARTHEST),
+            (30 * above.abs() / distance_MP1).clamp(max=_FARTHEST),
+            2 - 2 * normal @ other.mT,
+        ),
+        anchors_M93=anchors_M93,
+        pixels_MP3=pixels_MP3,
+        distance_MP1=distance_MP1,
+    )
+
+
+def _composed(learned: Tensor, gathered: Tensor, pixels: Tensor, unit: Tensor) -> Tensor:
+    """Return radiance [..., 3] of at least 0."""
+    gain_gathered, gain_direct, gain_mirrored, diffuse, specular = learned.split(3, dim=-1)
+    gains = [2 * torch.sigmoid(gain) for gain in (gain_gathered, gain_direct, gain_mirrored)]
+    coverage = pixels[..., Channel.COVERAGE]
+    learned_light = pixels[..., Channel.DIFFUSE] * softplus(diffuse + _START)
+    learned_light = learned_light + pixels[..., Channel.SPECULAR] * softplus(specular + _START)
+    gathered_light = pixels[..., Channel.DIFFUSE] * gains[0] * gathered
+    direct = pixels[..., Channel.SHOWN_DIFFUSE] + pixels[..., Channel.DIRECT_SPECULAR]
+    mirrored = pixels[..., Channel.MIRRORED]
+    indirect = coverage * unit * (learned_light + gathered_light)
+    return indirect + gains[1] * direct + gains[2] * mirrored

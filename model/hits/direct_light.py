@@ -1,0 +1,174 @@
+"""Direct light at points: one point on every lamp's triangle, with and without its shadow.
+
+Unbiased: the mean over `turn`s and shifts is the integral, but for the specular lobe, whose sharp
+part is left to rays that are drawn by the lobe (`lobe_ray_weight`).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.hits.lit_scene import LitScene, Points, off_surface
+from model.hits.reflectance import Gloss, lobe
+from model.hits.vectors import Floats, as_rows, brightest, dot
+
+_INV_PI = np.float32(1 / np.pi)
+
+_SHORTENING = np.float32(1 - 1e-4)
+"""Share of the way to a lamp that a shadow ray goes, as the renderer's."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DirectLight:
+    """Light of lamps at P points, [3, P] each."""
+
+    open_diffuse: Floats
+    """Irradiance over pi, as if nothing stood between."""
+    open_specular: Floats
+    """Specular radiance towards the viewer, likewise."""
+    diffuse: Floats
+    """Irradiance over pi, shadowed."""
+    specular: Floats
+    """Specular radiance towards the viewer, shadowed."""
+
+
+def direct_light(
+    scene: LitScene,
+    points: Points,
+    gloss: Gloss | None,
+    on_lamps: Floats,
+    *,
+    lobe_rays: int,
+) -> DirectLight:
+    """Return the light of all lamps.
+
+    Args:
+        scene: the scene.
+        points: where.
+        gloss: the lobes there; None where the specular part is not wanted, which is then 0.
+        on_lamps: [2, lamps, P] in the unit square: where on each lamp's triangle.
+        lobe_rays: 1 where a ray is drawn by the lobe at each of these points too: what such rays
+            are better at finding is left to them (the power heuristic, Veach and Guibas 1995).
+    """
+    zeros = [np.zeros_like(points.position) for _ in range(4)]
+    light = DirectLight(
+        open_diffuse=zeros[0], open_specular=zeros[1], diffuse=zeros[2], specular=zeros[3]
+    )
+    for number, lamp in enumerate(scene.lamps):
+        _add(light, scene, points, gloss, int(lamp), on_lamps[:, number], lobe_rays)
+    return light
+
+
+def _add(
+    light: DirectLight,
+    scene: LitScene,
+    points: Points,
+    gloss: Gloss | None,
+    lamp: int,
+    on_lamp: Floats,
+    lobe_rays: int,
+) -> None:
+    place = _on_triangle(scene, lamp, on_lamp)
+    to_lamp = place - points.position
+    square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
+    to_lamp = to_lamp / np.sqrt(square)
+    cosine = dot(points.normal, to_lamp)
+    lamp_plane = scene.plane[:, lamp]
+    facing = np.abs(lamp_plane @ to_lamp)
+    solid = facing * scene.area[lamp] / square
+    diffuse = np.maximum(cosine, 0) * solid * _INV_PI
+    specular = None
+    if gloss is not None:
+        value, density = lobe(gloss, points, to_lamp, cosine)
+        specular = value * solid / (1 + np.square(lobe_rays * density * solid))
+    useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
+    is_free = np.zeros(diffuse.shape, np.float32)
+    is_free[useful] = _is_free(scene, points, place, to_lamp, useful)
+    emission = scene.emission[:, lamp, None]
+    np.add(light.open_diffuse, diffuse * emission, out=light.open_diffuse)
+    np.add(light.diffuse, diffuse * is_free * emission, out=light.diffuse)
+    if specular is not None and gloss is not None:
+        coloured = gloss.colour * specular * emission
+        np.add(light.open_specular, coloured, out=light.open_specular)
+        np.add(light.specular, coloured * is_free, out=light.specular)
+
+
+def lobe_ray_weight(scene: LitScene, met: Points, start: Floats, density: Floats) -> Floats:
+    """Return the share [P] of a lamp's emission that a ray drawn by the lobe has to bring, not `direct_light`.
+
+    Args:
+        scene: the scene.
+        met: what the rays have met, lamps or not.
+        start: [3, P] where they began.
+        density: [P] of the lobe along the rays.
+    """
+    way = met.position - start
+    facing = np.abs(dot(scene.plane[:, met.triangle], met.toward))
+    square = np.maximum(dot(way, way), np.float32(1e-12))
+    solid = facing * scene.area[met.triangle] / square
+    kept = np.square(density * solid)
+    weight: Floats = kept / (1 + kept)
+    return weight
+
+
+def chosen_lamp_light(
+    scene: LitScene, points: Points, gloss: Gloss, u_lamp: Floats, on_lamp: Floats
+) -> Floats:
+    """Return the radiance [3, P] that points send to their viewers of one lamp's light each.
+
+    The chance of a lamp's triangle is in proportion to its power and its estimated solid angle, so
+    that few rays are spent on lamps far away. Unbiased.
+
+    Args:
+        scene: with at least one lamp.
+        points, gloss: where.
+        u_lamp: [P] uniform numbers that choose the lamp.
+        on_lamp: [2, P] where on it.
+    """
+    lamps = scene.lamps
+    middle = scene.corners[:, :, lamps].mean(axis=0)  # [3, L]
+    brightness = scene.emission[:, lamps].mean(axis=0) * scene.area[lamps]
+    away = middle[:, :, None] - points.position[:, None]
+    odds = brightness[:, None] / (dot(away, away) + scene.area[lamps][:, None])
+    total = np.cumsum(odds, axis=0)
+    number = (u_lamp * total[-1] > total).sum(axis=0).clip(0, len(lamps) - 1)
+    chance = np.take_along_axis(odds, number[None], axis=0)[0] / total[-1]
+    lamp = lamps[number]
+    place = _on_triangle(scene, lamp, on_lamp)
+    to_lamp = place - points.position
+    square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
+    to_lamp = to_lamp / np.sqrt(square)
+    cosine = dot(points.normal, to_lamp)
+    value, _ = lobe(gloss, points, to_lamp, cosine)
+    albedo = np.take(scene.diffuse, points.triangle, axis=1)
+    reflected = albedo * (np.maximum(cosine, 0) * _INV_PI) + gloss.colour * value
+    solid = np.abs(dot(scene.plane[:, lamp], to_lamp)) * scene.area[lamp] / square / chance
+    useful = np.flatnonzero(brightest(reflected) > 0)
+    is_free = np.zeros(solid.shape, np.float32)
+    is_free[useful] = _is_free(scene, points, place, to_lamp, useful)
+    return np.take(scene.emission, lamp, axis=1) * reflected * (solid * is_free)
+
+
+def _is_free(
+    scene: LitScene, points: Points, place: Floats, to_lamp: Floats, rows: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """Return whether nothing stands between some of the points and their places on lamps."""
+    if not len(rows):
+        return np.zeros(0, np.bool_)
+    position, plane = points.position[:, rows], points.plane[:, rows]
+    start = off_surface(position, plane, to_lamp[:, rows])
+    way = place[:, rows] - start
+    length = np.sqrt(np.maximum(dot(way, way), np.float32(1e-20)))
+    return scene.everything.is_free(as_rows(start), as_rows(way / length), length * _SHORTENING)
+
+
+def _on_triangle(scene: LitScene, rows: NDArray[np.intp] | int, u: Floats) -> Floats:
+    """Return points [3, P], evenly spread over triangles for u [2, P] in the unit square."""
+    root = np.sqrt(u[0])
+    weights = np.stack([1 - root, root * (1 - u[1]), root * u[1]])
+    corners = scene.corners[:, :, rows]
+    if corners.ndim == 2:
+        corners = corners[:, :, None]
+    place: Floats = (corners * weights[:, None]).sum(axis=0)
+    return place

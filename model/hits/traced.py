@@ -1,0 +1,71 @@
+"""`Traced`: what was traced of scenes and views, as the tensors that a network of hits reads."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from model.hits.view_inputs import Channel
+
+INPUTS = ("open", "direct", "mirrored", "gathered", "tokens")
+"""What a network of hits may be without: light from lamps as if nothing stood between, with its
+shadows, light that one mirrored ray brings, light that anchors gather, and the scene's tokens."""
+
+CHANNELS = {
+    "open": (Channel.OPEN_DIFFUSE, Channel.OPEN_SPECULAR),
+    "direct": (Channel.DIRECT_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.SHOWN_DIFFUSE),
+    "mirrored": (Channel.MIRRORED,),
+}
+"""Where the inputs stand that pixels have."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Traced:
+    """What was traced of a scene and of V of its views; of a batch, B comes first everywhere."""
+
+    sides_T12: Tensor
+    """Direct and indirect irradiance over pi of the front, then of the back, of each triangle."""
+    unit_3: Tensor
+    """Mean light of the scene, by colour (model.hits.radiosity)."""
+    pixels_VRRC: Tensor
+    """model.hits.view_inputs."""
+    anchor_VA: Tensor
+    """int64 pixel of each anchor."""
+    gathered_VA3: Tensor
+    """Irradiance over pi from other surfaces, at the anchors."""
+    given_VI: Tensor
+    """1, or 0 where a view has to do without one of INPUTS."""
+
+    def converted(self, convert: Callable[[Tensor], Tensor]) -> "Traced":
+        """Return the same with each tensor converted, such as moved to a device."""
+        return Traced(**{each.name: convert(getattr(self, each.name)) for each in fields(self)})
+
+    def without(self, kept_VI: Tensor) -> "Traced":
+        """Return the same for views that lack the inputs whose number in `kept_VI` is 0."""
+        pixels = self.pixels_VRRC.clone()
+        for name, channels in CHANNELS.items():
+            for channel in channels:
+                pixels[..., channel] *= kept_VI[..., INPUTS.index(name), None, None, None]
+        gathered = self.gathered_VA3 * kept_VI[..., INPUTS.index("gathered"), None, None]
+        return Traced(
+            sides_T12=self.sides_T12,
+            unit_3=self.unit_3,
+            pixels_VRRC=pixels,
+            anchor_VA=self.anchor_VA,
+            gathered_VA3=gathered,
+            given_VI=self.given_VI * kept_VI,
+        )
+
+
+def stack_traced(scenes: Sequence[Traced], longest: int) -> Traced:
+    """Return the batch of scenes, their triangles padded with zeros."""
+    padded = [
+        torch.nn.functional.pad(each.sides_T12, (0, 0, 0, longest - len(each.sides_T12)))
+        for each in scenes
+    ]
+    others = [each.name for each in fields(Traced) if each.name != "sides_T12"]
+    return Traced(
+        sides_T12=torch.stack(padded),
+        **{name: torch.stack([getattr(each, name) for each in scenes]) for name in others},
+    )

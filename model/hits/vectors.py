@@ -1,0 +1,72 @@
+"""Vectors [3, P] of many points, component by component; float32."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+_TINY = np.float32(1e-20)
+
+
+def dot(a: Floats, b: Floats) -> Floats:
+    """Return [P] products."""
+    product: Floats = a[0] * b[0]
+    product += a[1] * b[1]
+    product += a[2] * b[2]
+    return product
+
+
+def brightest(a: Floats) -> Floats:
+    """Return [P] the largest of the three components."""
+    return np.maximum(np.maximum(a[0], a[1]), a[2])
+
+
+def unit(a: Floats) -> Floats:
+    """Return vectors of length 1; those of length 0 stay 0."""
+    return a / np.sqrt(np.maximum(dot(a, a), _TINY))
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Return [3, P]."""
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def as_rows(a: Floats) -> Floats:
+    """Return [P, 3], as Embree reads rays."""
+    return np.ascontiguousarray(a.T)
+
+
+def tangents(n: Floats) -> tuple[Floats, Floats]:
+    """Return two unit vectors across unit vectors n (Duff et al. 2017)."""
+    sign = np.where(n[2] >= 0, np.float32(1), np.float32(-1))
+    a = -1 / (sign + n[2])
+    b = n[0] * n[1] * a
+    first = np.stack([1 + sign * n[0] ** 2 * a, sign * b, -sign * n[0]])
+    return first, np.stack([b, sign + n[1] ** 2 * a, -n[1]])
+
+
+def from_frame(local: Floats, n: Floats) -> Floats:
+    """Return vectors given in the frame whose third axis is n, in the world."""
+    first, second = tangents(n)
+    return first * local[0] + second * local[1] + n * local[2]
+
+
+def spread(shift: Floats, turn: int | NDArray[np.intp]) -> Floats:
+    """Return point number `turn` ([...]) of a sequence in the unit square, moved by shifts [2, ...].
+
+    The sequence R2 (Roberts 2018): its first points are far from each other for any count, and a
+    random shift of each pixel makes them unbiased.
+    """
+    moved = shift.copy()
+    for axis, step in enumerate((0.7548776662466927, 0.5698402909980532)):
+        moved[axis] += np.asarray((turn + 1) * step % 1, np.float32)
+    return moved - np.floor(moved)
+
+
+def cosine_direction(u: Floats, n: Floats) -> Floats:
+    """Return directions around unit normals n, as often as their cosine is large, from u [2, P]."""
+    radius, angle = np.sqrt(u[0]), np.float32(2 * np.pi) * u[1]
+    height = np.sqrt(np.maximum(1 - u[0], 0))
+    return from_frame(np.stack([radius * np.cos(angle), radius * np.sin(angle), height]), n)

@@ -1,0 +1,270 @@
+"""`ViewInputs`: what the rays of each pixel find, and what anchors gather; numbers for a network.
+
+A pixel has rays_a_side^2 rays, whose findings are averaged after shading, as the film does. Light
+from other surfaces is smooth but where it is mirrored. So it is gathered by many rays at few
+anchors, a grid over the picture, and mirrored by one ray for each pixel.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.hits.anchors import anchor_pixels, gathered_at
+from model.hits.camera import Rays
+from model.hits.direct_light import direct_light, lobe_ray_weight
+from model.hits.lit_scene import LitScene, Points
+from model.hits.radiosity import SceneLight
+from model.hits.reflectance import Gloss, drawn, gloss_at, lobe
+from model.hits.second_hits import DIMMEST, blocks, brought
+from model.hits.vectors import brightest, dot, spread
+from storage.seeds import rng_for
+
+
+class Channel:
+    """Where in `ViewInputs.pixels` each quantity stands."""
+
+    COVERAGE = slice(0, 1)
+    """Share of the pixel's rays that meet something."""
+    POSITION = slice(1, 4)
+    """Mean point of those, metres, world space."""
+    DISTANCE = slice(4, 5)
+    """Mean distance from the camera."""
+    NORMAL = slice(5, 8)
+    """Mean shading normal, towards the camera's side."""
+    TOWARD = slice(8, 11)
+    """Mean unit vector to the camera."""
+    DIFFUSE = slice(11, 14)
+    """Mean diffuse albedo."""
+    SPECULAR = slice(14, 17)
+    """Mean specular albedo, with what multiple scattering adds."""
+    ROUGHNESS = slice(17, 18)
+    """Mean roughness."""
+    OPEN_DIFFUSE = slice(18, 21)
+    """Irradiance over pi from lamps as if nothing stood between."""
+    DIRECT_DIFFUSE = slice(21, 24)
+    """Irradiance over pi from lamps, shadowed."""
+    OPEN_SPECULAR = slice(24, 27)
+    """Specular radiance from lamps as if nothing stood between; over all rays of the pixel."""
+    DIRECT_SPECULAR = slice(27, 30)
+    """Specular radiance from lamps, shadowed; over all rays of the pixel."""
+    SHOWN_DIFFUSE = slice(30, 33)
+    """Diffuse radiance from lamps, shadowed: albedo times irradiance, over all rays."""
+    MIRRORED = slice(33, 36)
+    """Specular radiance from other surfaces, by one ray; over all rays of the pixel."""
+
+
+NUM_CHANNELS = 36
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewInputs:
+    """One view of a scene; R pixels across, A anchors."""
+
+    pixels: NDArray[np.float32]
+    """[R, R, 36], by `Channel`; 0 where nothing is met."""
+    anchor: NDArray[np.int64]
+    """[A] pixel that each anchor stands in, counted row by row: the fullest of its part."""
+    gathered: NDArray[np.float32]
+    """[A, 3] irradiance over pi from other surfaces, at the anchors; 0 where nothing is met."""
+
+
+def view_inputs(
+    scene: LitScene,
+    light: SceneLight,
+    c2w: NDArray[np.float32],
+    fov_deg: float,
+    resolution: int,
+    *,
+    rays_a_side: int,
+    anchors_a_side: int,
+    gather_rays: int,
+) -> ViewInputs:
+    """Return what is traced for a view; equal arguments give equal numbers.
+
+    Args:
+        scene, light: the scene.
+        c2w: [4, 4] of the camera.
+        fov_deg: its full field of view.
+        resolution: pixels across.
+        rays_a_side: rays along a side of each pixel.
+        anchors_a_side: anchors along a side of the picture, a divisor of the resolution.
+        gather_rays: of each anchor; 0: nothing is gathered, and nothing mirrored.
+    """
+    rays = Rays(c2w, fov_deg, resolution, rays_a_side)
+    rng = rng_for(0, "hits", resolution)
+    on_lamps = rng.random((2, len(scene.lamps), resolution**2), np.float32)
+    chance = rng.random((6, resolution**2), np.float32)
+    sums = np.zeros((NUM_CHANNELS, resolution**2), np.float32)
+    directions = [rays.direction(turn) for turn in range(rays.turns)]
+    for part in blocks(resolution**2):
+        along = np.stack([direction[:, part] for direction in directions])
+        shaded = _shaded(scene, rays.origin, along, chance[5, part])
+        if len(shaded.pixel):
+            pixel, turn = shaded.pixel + part.start, shaded.turn
+            block = _Block(
+                points=shaded.points,
+                gloss=gloss_at(scene, shaded.points),
+                sums=sums,
+                pixel=pixel,
+                weight=shaded.weight,
+            )
+            _add_surface(block, scene, rays.origin)
+            lobe_rays = 1 if gather_rays else 0
+            _add_direct(block, scene, spread(on_lamps[:, :, pixel], turn), lobe_rays)
+            if gather_rays:
+                u = chance[:5, pixel]
+                u[:2] = spread(u[:2], turn)
+                _add_lobe_rays(block, scene, light, u, shaded.chosen * np.float32(rays.turns))
+    pixels = _averaged(sums, rays.turns)
+    anchor = anchor_pixels(pixels[0].reshape(resolution, resolution), anchors_a_side)
+    return ViewInputs(
+        pixels=np.ascontiguousarray(pixels.T).reshape(resolution, resolution, NUM_CHANNELS),
+        anchor=anchor,
+        gathered=gathered_at(scene, light, rays, anchor, gather_rays),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Shaded:
+    """Points at which light is computed: one of a pixel whose rays all meet one triangle, for all
+    of them; else each ray's own.
+    """
+
+    points: Points
+    pixel: NDArray[np.intp]
+    """[P] row."""
+    turn: NDArray[np.intp]
+    """[P] which of the pixel's rays it is."""
+    weight: NDArray[np.float32]
+    """[P] how many of the pixel's rays it stands for."""
+    chosen: NDArray[np.float32]
+    """[P] 1 for one point of each pixel, drawn evenly from its rays; 0 for others."""
+
+
+def _shaded(
+    scene: LitScene,
+    origin: NDArray[np.float32],
+    along: NDArray[np.float32],
+    chance: NDArray[np.float32],
+) -> _Shaded:
+    """Return the points of a block of pixels, from rays [turns, 3, pixels]."""
+    turns, _, count = along.shape
+    found = scene.first_hits(origin, along.swapaxes(0, 1).reshape(3, -1))
+    triangle = found.triangle.reshape(turns, count)
+    drawn_turn = np.minimum((chance * turns).astype(np.intp), turns - 1)
+    alone = np.arange(turns)[:, None] == drawn_turn
+    is_one = (triangle == triangle[0]).all(axis=0)
+    turn, pixel = np.nonzero((triangle >= 0) & (alone | ~is_one))
+    ray = turn * count + pixel
+    points = scene.points(
+        found.triangle[ray], found.uv[:, ray], np.ascontiguousarray(along[turn, :, pixel].T)
+    )
+    return _Shaded(
+        points=points,
+        pixel=pixel,
+        turn=turn,
+        weight=np.where(is_one[pixel], np.float32(turns), np.float32(1)),
+        chosen=alone[turn, pixel].astype(np.float32),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Block:
+    """Points that are shaded together, and where their light is added up."""
+
+    points: Points
+    gloss: Gloss
+    sums: NDArray[np.float32]
+    """[36, R R]"""
+    pixel: NDArray[np.intp]
+    """[P] whom the points belong to."""
+    weight: NDArray[np.float32]
+    """[P] how many rays each stands for."""
+
+    def add(
+        self, channel: slice, values: NDArray[np.float32], rows: NDArray[np.intp] | None = None
+    ) -> None:
+        """Add [channels, P], or of some rows of the points."""
+        pixel = self.pixel if rows is None else self.pixel[rows]
+        weighed = values * (self.weight if rows is None else self.weight[rows])
+        for number, row in enumerate(range(channel.start, channel.stop)):
+            self.sums[row] += np.bincount(pixel, weighed[number], self.sums.shape[1])
+
+
+def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) -> None:
+    points = block.points
+    away = points.position - origin[:, None]
+    block.add(Channel.COVERAGE, np.ones_like(points.position[:1]))
+    block.add(Channel.POSITION, points.position)
+    block.add(Channel.DISTANCE, np.sqrt(dot(away, away))[None])
+    block.add(Channel.NORMAL, points.normal)
+    block.add(Channel.TOWARD, points.toward)
+    block.add(Channel.DIFFUSE, np.take(scene.diffuse, points.triangle, axis=1))
+    block.add(Channel.SPECULAR, block.gloss.colour)
+    block.add(Channel.ROUGHNESS, scene.roughness[points.triangle][None])
+
+
+def _add_direct(
+    block: _Block, scene: LitScene, on_lamps: NDArray[np.float32], lobe_rays: int
+) -> None:
+    lit = direct_light(scene, block.points, block.gloss, on_lamps, lobe_rays=lobe_rays)
+    block.add(Channel.OPEN_DIFFUSE, lit.open_diffuse)
+    block.add(Channel.DIRECT_DIFFUSE, lit.diffuse)
+    block.add(Channel.OPEN_SPECULAR, lit.open_specular)
+    block.add(Channel.DIRECT_SPECULAR, lit.specular)
+    albedo = np.take(scene.diffuse, block.points.triangle, axis=1)
+    block.add(Channel.SHOWN_DIFFUSE, albedo * lit.diffuse)
+
+
+def _add_lobe_rays(
+    block: _Block,
+    scene: LitScene,
+    light: SceneLight,
+    u: NDArray[np.float32],
+    shading: NDArray[np.float32],
+) -> None:
+    """Add what rays drawn by the lobe meet: lamps, by their share of what finds them, and surfaces.
+
+    What surfaces send back takes a shadow ray each, so one ray of a pixel stands for all.
+
+    Args:
+        block, scene, light: where.
+        u: [5, P] uniform numbers.
+        shading: [P] rays of the pixel that a ray counts for as to surfaces; 0: none is asked.
+    """
+    some = np.flatnonzero(brightest(block.gloss.colour) > DIMMEST)
+    direction, weight = drawn(block.gloss.only(some), block.points.only(some), u[:2, some])
+    goes = np.flatnonzero(weight > 0)
+    some, direction, weight = some[goes], direction[:, goes], weight[goes]
+    if not len(some):
+        return
+    points, gloss = block.points.only(some), block.gloss.only(some)
+    beyond, met = scene.meet(scene.everything, points.start(direction), direction)
+    arrives = gloss.colour * np.where(met, weight, np.float32(0))
+    lamps = np.flatnonzero(met & scene.emits[beyond.triangle])
+    if len(lamps):
+        here, there = points.only(lamps), beyond.only(lamps)
+        along = direction[:, lamps]
+        _, density = lobe(gloss.only(lamps), here, along, dot(here.normal, along))
+        kept = lobe_ray_weight(scene, there, here.position, density)
+        emitted = arrives[:, lamps] * np.take(scene.emission, there.triangle, axis=1) * kept
+        block.add(Channel.DIRECT_SPECULAR, emitted, some[lamps])
+        block.add(Channel.OPEN_SPECULAR, emitted, some[lamps])
+    asked = np.flatnonzero(met & (shading[some] > 0))
+    if len(asked):
+        rows = some[asked]
+        found = brought(scene, light, beyond.only(asked), u[2, rows], u[3:5, rows])
+        # `add` counts the rays that a point stands for; here one stands for all of its pixel
+        found *= arrives[:, asked] * (shading[rows] / block.weight[rows])
+        block.add(Channel.MIRRORED, found, rows)
+
+
+def _averaged(sums: NDArray[np.float32], turns: int) -> NDArray[np.float32]:
+    """Return means: of surfaces over the rays that met one, of radiance over all."""
+    covered = np.maximum(sums[Channel.COVERAGE], np.float32(1))
+    over_all = np.float32(turns)
+    means = sums / over_all
+    for channel in (slice(1, Channel.OPEN_SPECULAR.start),):
+        means[channel] = sums[channel] / covered
+    return means
