@@ -5,6 +5,7 @@ neighbouring bundles, so that their borders do not show. Both start at a black p
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -130,7 +131,7 @@ def build_head(config: ModelConfig) -> LinearHead | DptHead:
     return DptHead(config) if config.head == "dpt" else LinearHead(config)
 
 
-def blacken(head: LinearHead | DptHead) -> None:
+def blacken(head: Any) -> None:
     """Zero the last layer, so that training starts at a black picture.
 
     Safe only because the loss is taken before the ELU: after it, a start at 0 has a thousandth of

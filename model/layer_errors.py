@@ -6,6 +6,7 @@ type: float16 ends at 65504.
 
 import copy
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -86,13 +87,16 @@ def _outputs(model: RenderFormer, batch: SceneBatch, resolution: int) -> dict[st
     outputs: dict[str, Tensor] = {}
 
     def keep(name: str) -> object:
-        def hook(module: nn.Module, inputs: object, output: Tensor) -> None:
-            outputs[name] = output.double()
+        def hook(module: nn.Module, inputs: object, output: Any) -> None:
+            main = output[0] if isinstance(output, tuple) else output
+            outputs[name] = main.double()
 
         return hook
 
-    layers: list[tuple[str, nn.Module]] = [("encoder.tokens", model.encoder.tokens)]
-    layers += [(f"encoder.layers.{i}", layer) for i, layer in enumerate(model.encoder.layers)]
+    layers: list[tuple[str, nn.Module]] = []
+    if model.encoder is not None:
+        layers.append(("encoder.tokens", model.encoder.tokens))
+        layers += [(f"encoder.layers.{i}", layer) for i, layer in enumerate(model.encoder.layers)]
     layers += [(f"decoder.layers.{i}", layer) for i, layer in enumerate(model.decoder.layers)]
     layers += [("decoder.head", model.decoder.head)]
     handles = [layer.register_forward_hook(keep(name)) for name, layer in layers]  # type: ignore[arg-type]

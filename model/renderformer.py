@@ -1,5 +1,7 @@
 """The whole network (RenderFormer, Zeng et al. 2025): assembles the two stages, nothing else."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -7,7 +9,7 @@ from torch.nn.functional import pad
 from model.config import ModelConfig
 from model.encoded_scene import EncodedScene, KeysValues
 from model.hits.decoder import HitDecoder
-from model.hits.tracing import TracedScene, sides_of, traced_batch, traced_cameras
+from model.hits.tracing import TracedScene, like, sides_of, traced_batch, traced_cameras
 from model.image_head import blacken
 from model.positions import TriangleRotary, token_places
 from model.precision import tf32
@@ -39,12 +41,9 @@ class RenderFormer(nn.Module):
             max_freq=config.rope_max_freq,
             head_width=config.head_width,
         )
-        self.encoder = TriangleEncoder(config, rotary) if config.scene_tokens else None
-        self.decoder: ViewDecoder | HitDecoder = (
-            HitDecoder(config, rotary)
-            if config.view_stage == "hits"
-            else ViewDecoder(config, rotary)
-        )
+        self.encoder: Any = TriangleEncoder(config, rotary) if config.scene_tokens else None
+        stage = HitDecoder if config.view_stage == "hits" else ViewDecoder
+        self.decoder: Any = stage(config, rotary)
 
     def forward(self, batch: SceneBatch, resolution: int) -> Tensor:
         """Return log10(1 + radiance) [B, V, R, R, 3], before the ELU: what training compares.
@@ -55,14 +54,15 @@ class RenderFormer(nn.Module):
         if self.config.view_stage == "bundles":
             return self.decode(self.encode(batch), batch.cameras, resolution)
         self._require(resolution, skip_empty_bundles=False)
-        traced, scenes = batch.traced, ()
+        scenes: tuple[TracedScene, ...] = ()
+        traced = batch.traced
         if traced is None:
             scenes = traced_batch(batch)
             traced = traced_cameras(scenes, batch.cameras, resolution, self.config)
         encoded = self._encoded(batch, scenes, traced.sides_T12, traced.unit_3)
         with tf32(self.tf32):
             pictures: Tensor = self.decoder(encoded, traced)
-            return pictures
+        return pictures
 
     def encode(self, batch: SceneBatch) -> EncodedScene:
         """Return the scenes of a batch ready to be seen; their cameras are not looked at."""
@@ -73,9 +73,9 @@ class RenderFormer(nn.Module):
         longest = batch.triangles_BT33.shape[1]
         sides = [pad(sides_of(light), (0, 0, 0, longest - light.num_triangles)) for light in lights]
         units = [torch.from_numpy(light.mean_3) for light in lights]
-        device = batch.triangles_BT33.device
+        sides_BT12 = like(torch.stack(sides), batch.triangles_BT33)
         return self._encoded(
-            batch, scenes, torch.stack(sides).to(device), torch.stack(units).to(device)
+            batch, scenes, sides_BT12, like(torch.stack(units), batch.triangles_BT33)
         )
 
     def _encoded(

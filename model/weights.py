@@ -184,7 +184,7 @@ def network_of(config: ModelConfig, tensors: Mapping[str, Tensor]) -> RenderForm
     model.load_state_dict(dict(tensors), assign=True)
     model.decoder.rotary.reset()
     # a head of convolutions reads tokens as they lie, channels last; its weights then should too
-    model.decoder.head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    model.decoder.head.to(memory_format=torch.channels_last)
     return model.eval()
 
 

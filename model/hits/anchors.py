@@ -39,7 +39,12 @@ def anchor_pixels(coverage_RR: NDArray[np.float32], anchors_a_side: int) -> NDAr
 
 
 def gathered_at(
-    scene: LitScene, light: SceneLight, rays: Rays, anchor: NDArray[np.int64], gather_rays: int
+    scene: LitScene,
+    light: SceneLight,
+    rays: Rays,
+    anchor: NDArray[np.int64],
+    gather_rays: int,
+    seed: int,
 ) -> Floats:
     """Return irradiance over pi from other surfaces [A, 3] at the first thing in anchors' pixels.
 
@@ -48,25 +53,28 @@ def gathered_at(
         rays: of the camera.
         anchor: [A] pixels.
         gather_rays: of each anchor; 0 gives 0.
+        seed: of the noise.
     """
     total = np.zeros((3, len(anchor)), np.float32)
     if not gather_rays:
         return total.T
+    shift = rng_for(seed, "gather").random((5, len(anchor)), np.float32)
     waiting = np.arange(len(anchor))
     for turn in range(rays.turns):
         points, met = scene.first_points(rays.origin, rays.direction(turn, anchor[waiting]))
         if len(met):
-            total[:, waiting[met]] = _gathered(scene, light, points, waiting[met], gather_rays)
+            total[:, waiting[met]] = _gathered(
+                scene, light, points, shift[:, waiting[met]], gather_rays
+            )
         waiting = np.delete(waiting, met)
     return np.ascontiguousarray(total.T)
 
 
 def _gathered(
-    scene: LitScene, light: SceneLight, points: Points, number: NDArray[np.intp], gather_rays: int
+    scene: LitScene, light: SceneLight, points: Points, shift: Floats, gather_rays: int
 ) -> Floats:
-    """Return the means [3, P] over rays; `number` tells anchors' random numbers apart."""
-    shift = rng_for(0, "gather").random((5, int(number.max()) + 1), np.float32)[:, number]
-    count = len(number)
+    """Return the means [3, P] over rays; `shift` [5, P] are uniform numbers."""
+    count = shift.shape[1]
     owner = np.tile(np.arange(count), gather_rays)
     u = np.concatenate(
         [
@@ -79,10 +87,9 @@ def _gathered(
     total = np.zeros((3, count * gather_rays), np.float32)
     for part in blocks(count * gather_rays):
         here = points.only(owner[part])
-        direction = cosine_direction(u[:2, part], here.normal)
+        direction = cosine_direction(u[:2, part], here.normal, here.edge)
         beyond, met = scene.meet(scene.everything, here.start(direction), direction)
         found = brought(scene, light, beyond, u_lamp[part], u[2:, part])
-        # below the triangle's own plane, where a shading normal leans, there is the inside
         total[:, part] = np.where(met, found, np.float32(0))
     return total.reshape(3, gather_rays, count).mean(axis=1)
 

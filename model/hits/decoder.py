@@ -12,7 +12,9 @@ scales with the lamps exactly. There are no pixels from elsewhere in it, so any 
 """
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -183,8 +185,8 @@ class HitDecoder(nn.Module):
         """Return what each layer asks of a context, keys rotated in the world: once a scene."""
         rotation_BND = world_rotation(self.rotary, places)
         found = []
-        for layer in self.layers:
-            k_BHND, v_BHND = layer.cross.keys_values(context_BNW)  # type: ignore[union-attr]
+        for layer in cast(Iterable[Any], self.layers):
+            k_BHND, v_BHND = layer.cross.keys_values(context_BNW)
             found.append((rotate(k_BHND, *rotation_BND), v_BHND))
         return tuple(found)
 
@@ -296,7 +298,7 @@ def _told(pixels: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat(surface, dim=-1), light
 
 
-def _at_anchors(traced: Traced):  # type: ignore[no-untyped-def]
+def _at_anchors(traced: Traced) -> Callable[[Tensor], Tensor]:
     """Return a function that takes [B, V, R, R, K] and returns the anchors' own [B, V, A, K]."""
 
     def at(values: Tensor) -> Tensor:

@@ -95,7 +95,9 @@ def _add(
 
 
 def lobe_ray_weight(scene: LitScene, met: Points, start: Floats, density: Floats) -> Floats:
-    """Return the share [P] of a lamp's emission that a ray drawn by the lobe has to bring, not `direct_light`.
+    """Return the share [P] of a lamp's emission that a ray drawn by the lobe has to bring.
+
+    The rest is what `direct_light` brings.
 
     Args:
         scene: the scene.

@@ -31,6 +31,9 @@ class Points:
     """[3, P] unit normal of the triangle, on the side of the shading normal."""
     toward: Floats
     """[3, P] unit vector to where the point is seen from."""
+    edge: Floats
+    """[3, P] an edge of the triangle: what frames are built on, so that they turn with the world.
+    """
     back: NDArray[np.bool_]
     """[P] whether the triangle is seen from the side from which its corners run clockwise."""
 
@@ -42,6 +45,7 @@ class Points:
             normal=self.normal[:, rows],
             plane=self.plane[:, rows],
             toward=self.toward[:, rows],
+            edge=self.edge[:, rows],
             back=self.back[rows],
         )
 
@@ -74,6 +78,7 @@ class LitScene:
         self.corners = np.ascontiguousarray(corners_T33.transpose(1, 2, 0))  # [corner, 3, T]
         self.normals = np.ascontiguousarray(normals_T33.transpose(1, 2, 0))
         edges = self.corners[1:] - self.corners[0]
+        self.edge = np.ascontiguousarray(edges[0])
         across = np.cross(edges[0], edges[1], axis=0)
         self.area = 0.5 * np.sqrt(dot(across, across))
         self.plane = unit(across)
@@ -124,6 +129,7 @@ class LitScene:
             normal=normal * turn,
             plane=plane * turn,
             toward=-direction,
+            edge=np.take(self.edge, triangle, axis=1),
             back=back,
         )
 

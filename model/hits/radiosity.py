@@ -86,7 +86,7 @@ def _bounced(scene: LitScene, direct_2T3: Floats, rng: np.random.Generator) -> F
     faced = np.zeros((RAYS, len(rows)), np.int64)
     for turn in range(RAYS):
         points = _points(scene, rows, spread(on_triangle, turn))
-        direction = cosine_direction(spread(towards, turn), points.normal)
+        direction = cosine_direction(spread(towards, turn), points.normal, points.edge)
         met, is_met = scene.meet(scene.everything, points.start(direction), direction)
         side = met.triangle + scene.num_triangles * met.back
         faced[turn] = np.where(is_met, side, len(rows))
@@ -119,6 +119,7 @@ def _points(scene: LitScene, sides: NDArray[np.intp], u: Floats) -> Points:
         normal=-down,
         plane=-down,
         toward=-down,
+        edge=points.edge,
         back=sides >= scene.num_triangles,
     )
 

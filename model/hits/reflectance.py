@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.hits.lit_scene import LitScene, Points
-from model.hits.vectors import Floats, dot, from_frame, tangents, unit
+from model.hits.vectors import Floats, dot, tangents, unit
 from storage.records.multiscatter import ROUGHNESS_STEPS, X_STEPS, albedo_table
 
 _INV_PI = np.float32(1 / np.pi)
@@ -100,7 +100,7 @@ def drawn(gloss: Gloss, points: Points, u: Floats) -> tuple[Floats, Floats]:
     A weight is what the lobe sends along the direction, cosine included, over the density: G2 / G1.
     Spherical caps (Dupuy and Benyoub 2023).
     """
-    first, second = tangents(points.normal)
+    first, second = tangents(points.normal, points.edge)
     seen = np.stack([dot(points.toward, first), dot(points.toward, second), gloss.cos_seen])
     wide = np.stack([gloss.alpha, gloss.alpha, np.ones_like(gloss.alpha)])
     bent = unit(seen * wide)
@@ -114,7 +114,7 @@ def drawn(gloss: Gloss, points: Points, u: Floats) -> tuple[Floats, Floats]:
     above = np.maximum(cosine, _LEAST_COSINE)
     masked_seen = gloss.stretch_seen / gloss.cos_seen
     masked = stretched(above, gloss.alpha) / above
-    direction = from_frame(local, points.normal)
+    direction = first * local[0] + second * local[1] + points.normal * local[2]
     goes = gloss.faces & (cosine > 0) & (dot(direction, points.plane) > 0)
     weight = (1 + masked_seen) / (masked_seen + masked)
     return direction, np.where(goes, weight, np.float32(0))

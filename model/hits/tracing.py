@@ -25,7 +25,7 @@ class TracedScene:
     light: SceneLight
 
     def view(
-        self, c2w_44: Tensor, fov_deg: float, resolution: int, config: ModelConfig
+        self, c2w_44: Tensor, fov_deg: float, resolution: int, config: ModelConfig, seed: int
     ) -> ViewInputs:
         """Return what is traced for one view."""
         return view_inputs(
@@ -37,6 +37,7 @@ class TracedScene:
             rays_a_side=config.hit_rays,
             anchors_a_side=anchors_a_side(config, resolution),
             gather_rays=config.gather_rays,
+            seed=seed,
         )
 
 
@@ -78,19 +79,27 @@ def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
     return tuple(found)
 
 
-def with_traced(scene: SceneTensors, resolution: int, config: ModelConfig) -> SceneTensors:
-    """Return a scene with what is traced of its views: what a trainer's threads do ahead."""
+def with_traced(
+    scene: SceneTensors, resolution: int, config: ModelConfig, seed: int
+) -> SceneTensors:
+    """Return a scene with what is traced of its views: what a trainer's threads do ahead.
+
+    `seed` is that of the noise: a network that saw one noise alone might learn it.
+    """
     columns = {column.name: part for column, part in laid_out(scene.columns)}
     numbers = [scene.material_TM[:, columns[name]] for name in PUBLISHED_COLUMNS]
     lit = traced_scene(scene.triangles_T33, scene.normals_T33, torch.cat(numbers, dim=-1))
-    traced = traced_views(lit, scene.c2w_V44, scene.fov_deg_V, resolution, config)
+    traced = traced_views(lit, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)
     return dataclasses.replace(scene, traced=traced)
 
 
 def traced_cameras(
     scenes: tuple[TracedScene, ...], cameras: Cameras, resolution: int, config: ModelConfig
 ) -> Traced:
-    """Return what is traced of any cameras of the scenes of a batch, on the cameras' device."""
+    """Return what is traced of any cameras of the scenes of a batch.
+
+    It is where the cameras are, and of their type.
+    """
     found = [
         traced_views(scene, c2w_V44, fov_deg_V, resolution, config)
         for scene, c2w_V44, fov_deg_V in zip(
@@ -98,7 +107,12 @@ def traced_cameras(
         )
     ]
     longest = max(scene.lit.num_triangles for scene in scenes)
-    return stack_traced(found, longest).converted(lambda each: each.to(cameras.c2w_BV44.device))
+    return stack_traced(found, longest).converted(lambda each: like(each, cameras.fov_deg_BV))
+
+
+def like(numbers: Tensor, other: Tensor) -> Tensor:
+    """Return numbers where another tensor is, and, but for indices, of its type."""
+    return numbers.to(other.device, other.dtype if numbers.is_floating_point() else None)
 
 
 def traced_views(
@@ -107,10 +121,11 @@ def traced_views(
     fov_deg_V: Tensor,
     resolution: int,
     config: ModelConfig,
+    seed: int = 0,
 ) -> Traced:
     """Return the tensors of some views of a scene, on the CPU."""
     views = [
-        scene.view(c2w_44, float(fov_deg), resolution, config)
+        scene.view(c2w_44, float(fov_deg), resolution, config, seed)
         for c2w_44, fov_deg in zip(c2w_V44, fov_deg_V, strict=True)
     ]
     return Traced(

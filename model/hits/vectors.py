@@ -3,9 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
+Floats = NDArray
+"""float32: numpy's own annotations cannot follow it through arithmetic."""
 
 _TINY = np.float32(1e-20)
+_LEAST_SHARE = np.float32(1e-3)
+"""Of a vector that lies across a normal, for a frame to be built on it."""
 
 
 def dot(a: Floats, b: Floats) -> Floats:
@@ -38,25 +41,36 @@ def as_rows(a: Floats) -> Floats:
     return np.ascontiguousarray(a.T)
 
 
-def tangents(n: Floats) -> tuple[Floats, Floats]:
-    """Return two unit vectors across unit vectors n (Duff et al. 2017)."""
-    sign = np.where(n[2] >= 0, np.float32(1), np.float32(-1))
-    a = -1 / (sign + n[2])
-    b = n[0] * n[1] * a
-    first = np.stack([1 + sign * n[0] ** 2 * a, sign * b, -sign * n[0]])
-    return first, np.stack([b, sign + n[1] ** 2 * a, -n[1]])
+def tangents(n: Floats, along: Floats) -> tuple[Floats, Floats]:
+    """Return two unit vectors across unit vectors n, the first of them towards `along`.
+
+    An edge of the triangle, say: the frame then turns with the world. Where `along` is n or
+    nothing, any frame is returned (Duff et al. 2017).
+    """
+    across = along - n * dot(along, n)
+    length = np.sqrt(dot(across, across))
+    lost = length <= _LEAST_SHARE * np.sqrt(dot(along, along))
+    first = across / np.where(lost, np.float32(1), length)
+    if lost.any():
+        sign = np.where(n[2] >= 0, np.float32(1), np.float32(-1))
+        a = -1 / (sign + n[2])
+        b = n[0] * n[1] * a
+        first = np.where(lost, np.stack([1 + sign * n[0] ** 2 * a, sign * b, -sign * n[0]]), first)
+    return first, cross(n, first)
 
 
-def from_frame(local: Floats, n: Floats) -> Floats:
-    """Return vectors given in the frame whose third axis is n, in the world."""
-    first, second = tangents(n)
+def from_frame(local: Floats, n: Floats, along: Floats) -> Floats:
+    """Return vectors given in the frame of `tangents`, whose third axis is n, in the world."""
+    first, second = tangents(n, along)
     return first * local[0] + second * local[1] + n * local[2]
 
 
 def spread(shift: Floats, turn: int | NDArray[np.intp]) -> Floats:
-    """Return point number `turn` ([...]) of a sequence in the unit square, moved by shifts [2, ...].
+    """Return points of a sequence in the unit square, moved by shifts [2, ...].
 
-    The sequence R2 (Roberts 2018): its first points are far from each other for any count, and a
+    `turn` says which point, or which for each ([...]).
+
+    It is R2 (Roberts 2018): its first points are far from each other for any count, and a
     random shift of each pixel makes them unbiased.
     """
     moved = shift.copy()
@@ -65,8 +79,11 @@ def spread(shift: Floats, turn: int | NDArray[np.intp]) -> Floats:
     return moved - np.floor(moved)
 
 
-def cosine_direction(u: Floats, n: Floats) -> Floats:
-    """Return directions around unit normals n, as often as their cosine is large, from u [2, P]."""
+def cosine_direction(u: Floats, n: Floats, along: Floats) -> Floats:
+    """Return directions around unit normals n, as often as their cosine is large.
+
+    From u [2, P] in the unit square, in the frame of `tangents`.
+    """
     radius, angle = np.sqrt(u[0]), np.float32(2 * np.pi) * u[1]
     height = np.sqrt(np.maximum(1 - u[0], 0))
-    return from_frame(np.stack([radius * np.cos(angle), radius * np.sin(angle), height]), n)
+    return from_frame(np.stack([radius * np.cos(angle), radius * np.sin(angle), height]), n, along)

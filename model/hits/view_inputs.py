@@ -79,6 +79,7 @@ def view_inputs(
     rays_a_side: int,
     anchors_a_side: int,
     gather_rays: int,
+    seed: int = 0,
 ) -> ViewInputs:
     """Return what is traced for a view; equal arguments give equal numbers.
 
@@ -90,9 +91,10 @@ def view_inputs(
         rays_a_side: rays along a side of each pixel.
         anchors_a_side: anchors along a side of the picture, a divisor of the resolution.
         gather_rays: of each anchor; 0: nothing is gathered, and nothing mirrored.
+        seed: of the noise, which stays where it is on the picture from view to view.
     """
     rays = Rays(c2w, fov_deg, resolution, rays_a_side)
-    rng = rng_for(0, "hits", resolution)
+    rng = rng_for(seed, "hits", resolution)
     on_lamps = rng.random((2, len(scene.lamps), resolution**2), np.float32)
     chance = rng.random((6, resolution**2), np.float32)
     sums = np.zeros((NUM_CHANNELS, resolution**2), np.float32)
@@ -121,14 +123,16 @@ def view_inputs(
     return ViewInputs(
         pixels=np.ascontiguousarray(pixels.T).reshape(resolution, resolution, NUM_CHANNELS),
         anchor=anchor,
-        gathered=gathered_at(scene, light, rays, anchor, gather_rays),
+        gathered=gathered_at(scene, light, rays, anchor, gather_rays, seed),
     )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Shaded:
-    """Points at which light is computed: one of a pixel whose rays all meet one triangle, for all
-    of them; else each ray's own.
+    """Points at which light is computed.
+
+    One of a pixel whose rays all meet one triangle stands for all of them; else each ray has its
+    own.
     """
 
     points: Points

@@ -86,7 +86,7 @@ def test_what_is_kept_of_a_scene_depends_on_no_view() -> None:
     batch = batch_scenes([random_scene(5)])
     with torch.no_grad():
         encoded = model.encode(batch)
-        context = model.encoder(batch, model.encoder.places(batch))
+        context = model.encoder(batch, model.encode(batch).places)
         for index, (k, v) in enumerate(encoded.keys_values):
             layer: Any = model.decoder.layers[index]
             normed = layer.cross.context_norm(context)

@@ -81,7 +81,7 @@ def test_translating_the_world_changes_neither_context_nor_picture(
     moved = translated(scene, torch.tensor([distance, -2 * distance, 0.5], dtype=torch.float64))
     with torch.no_grad():
         context, context_moved = (
-            model.encoder(batch, model.encoder.places(batch))
+            model.encoder(batch, model.encode(batch).places)
             for batch in (batch_scenes([scene]), batch_scenes([moved]))
         )
     # Angles grow with the distance, and so does what float64 loses of them.

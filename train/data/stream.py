@@ -176,7 +176,8 @@ class _SceneMaker:
         if settings.network is None or settings.network.view_stage != "hits":
             return seen
         # after the symmetries, which therefore need not know what is traced
-        tensors = with_traced(seen.tensors, settings.resolution, settings.network)
+        noise = int(rng.integers(2**31))
+        tensors = with_traced(seen.tensors, settings.resolution, settings.network, noise)
         withheld = settings.augmentation.withheld_inputs if settings.augmentation else 0.0
         return dataclasses.replace(seen, tensors=with_inputs_withheld(tensors, withheld, rng))
 

@@ -1,0 +1,60 @@
+"""What networks are told of light is what the path tracer finds: direct, and by one bounce."""
+
+import numpy as np
+import pytest
+
+from model.hits.view_inputs import Channel
+from storage.records.scene import Scene
+from tests.model.hits.kit import corner, direct, traced
+from tests.pipeline.renders.sampling import Estimate, assert_agree, render_blocks
+
+PASSES = 12
+
+
+def _traced_blocks(scene: Scene, part: slice | None) -> Estimate:
+    """Return the means of 4 x 4 pixels over several noises, with their standard errors."""
+    pictures = []
+    for seed in range(PASSES):
+        inputs = traced(scene, 32, seed=seed)
+        picture = direct(inputs) if part is None else inputs.pixels[..., part]
+        pictures.append(picture.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3)))
+    cells = np.array(pictures, np.float64)
+    return Estimate(mean=cells.mean(axis=0), error=cells.std(axis=0, ddof=1) / np.sqrt(PASSES))
+
+
+@pytest.mark.parametrize("roughness", [0.15, 0.4, 1.0])
+def test_direct_light_is_that_of_paths_of_two_edges(llvm: None, roughness: float) -> None:
+    """Pixels are sampled on a grid of 2 x 2 and not all over: at rims, 3 % of a block of 16."""
+    scene = corner(roughness=roughness)
+    ours = _traced_blocks(scene, None)
+    theirs = render_blocks(scene, max_depth=2, passes=6)
+    at_rims = 0.03 * theirs.mean.max()
+    assert_agree(Estimate(mean=ours.mean, error=np.hypot(ours.error, at_rims)), theirs)
+    both = np.hypot(ours.error, theirs.error)
+    of_mean = float(np.sqrt(np.square(both).sum()) / both.size)
+    apart = abs(float(ours.mean.mean() - theirs.mean.mean()))
+    assert apart < 5 * of_mean + 0.005 * float(theirs.mean.mean())
+
+
+def test_diffuse_light_of_other_surfaces_is_that_of_longer_paths(llvm: None) -> None:
+    """Without gloss nothing is simplified: gathered light times albedo is all indirect light.
+
+    But for what is mixed between anchors: so there is one for each pixel, and means are compared.
+    """
+    scene = corner()
+    materials = scene.materials.copy()
+    materials[:, 3:6] = 0
+    scene = type(scene)(**{**vars(scene), "materials": materials})
+    found = [traced(scene, 32, anchors_a_side=32, gather_rays=32, seed=k) for k in range(3)]
+    ours = np.mean(
+        [
+            x.pixels[..., Channel.COVERAGE]
+            * x.pixels[..., Channel.DIFFUSE]
+            * x.gathered.reshape(32, 32, 3)
+            for x in found
+        ]
+    )
+    whole = render_blocks(scene, max_depth=10, passes=6).mean
+    short = render_blocks(scene, max_depth=2, passes=6).mean
+    # radiosity of triangles as large as the floor for the light of the third edge on: 4 %
+    assert ours == pytest.approx((whole - short).mean(), rel=0.04)

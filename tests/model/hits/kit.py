@@ -1,0 +1,65 @@
+"""Scenes for the tests of what is traced, as `LitScene` has them."""
+
+import numpy as np
+
+from model.hits.lit_scene import LitScene
+from model.hits.radiosity import scene_light
+from model.hits.view_inputs import ViewInputs, view_inputs
+from storage.records.scene import Scene
+from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
+
+FLOOR = [[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]]
+WALL = [[-2, 1.5, 0], [2, 1.5, 0], [2, 1.5, 3], [-2, 1.5, 3]]
+LAMP = [[-0.3, -0.4, 2.2], [0.4, -0.2, 2.3], [0.0, 0.5, 2.1]]
+
+
+def lit_scene(scene: Scene) -> LitScene:
+    return LitScene(
+        scene.vertex_positions[scene.faces],
+        scene.vertex_normals[scene.faces],
+        scene.materials[scene.material_index],
+    )
+
+
+def corner(*, roughness: float = 0.4, radiance: float = 30.0) -> Scene:
+    """Return a floor and a wall with a box and a glossy ball under one lamp."""
+    parts = [
+        quad(FLOOR, material(diffuse=[0.6, 0.5, 0.4], specular=0.1, roughness=0.5)),
+        quad(WALL, material(diffuse=[0.3, 0.5, 0.7])),
+        box([-0.5, 0.3, 0.3], 0.6, material(diffuse=[0.7, 0.2, 0.2]), turn=0.4),
+        sphere([0.5, -0.2, 0.4], 0.4, material(diffuse=0.1, specular=0.7, roughness=roughness)),
+        light(LAMP, [radiance, 0.8 * radiance, 0.6 * radiance]),
+    ]
+    return join(parts, eye=(1.0, -3.0, 1.4), target=(0, 0, 0.4), fov_deg=38.0)
+
+
+def traced(
+    scene: Scene,
+    resolution: int = 32,
+    *,
+    rays_a_side: int = 2,
+    anchors_a_side: int = 8,
+    gather_rays: int = 16,
+    seed: int = 0,
+) -> ViewInputs:
+    lit = lit_scene(scene)
+    return view_inputs(
+        lit,
+        scene_light(lit),
+        scene.c2w[0],
+        float(scene.fov_deg[0]),
+        resolution,
+        rays_a_side=rays_a_side,
+        anchors_a_side=anchors_a_side,
+        gather_rays=gather_rays,
+        seed=seed,
+    )
+
+
+def direct(inputs: ViewInputs) -> np.ndarray:
+    """Return the direct light of a view [R, R, 3]."""
+    from model.hits.view_inputs import Channel
+
+    shown = inputs.pixels[..., Channel.SHOWN_DIFFUSE]
+    total: np.ndarray = shown + inputs.pixels[..., Channel.DIRECT_SPECULAR]
+    return total

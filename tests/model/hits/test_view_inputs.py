@@ -1,0 +1,161 @@
+"""What is traced of a view: laws that hold for every scene, and the extremes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from model.hits.view_inputs import NUM_CHANNELS, Channel
+from storage.conventions import pixel_places
+from storage.records.first_hits import first_hits
+from storage.records.material import EMISSION
+from storage.records.scene import Scene
+from tests.model.hits.kit import FLOOR, LAMP, corner, direct, traced
+from tests.pipeline.renders.scene_kit import box, join, light, material, quad, sphere
+from tests.rigid_motion import moved
+
+LIGHTS = slice(Channel.OPEN_DIFFUSE.start, NUM_CHANNELS)
+
+
+def _relit(scene: Scene, factor: float | np.ndarray) -> Scene:
+    materials = scene.materials.copy()
+    materials[:, EMISSION] *= factor
+    return dataclasses.replace(scene, materials=materials.astype(np.float32))
+
+
+def test_light_scales_with_the_lamps() -> None:
+    """By powers of two, which round nothing: equal to the last bit."""
+    once, twice = traced(corner()), traced(_relit(corner(), 4.0))
+    assert np.array_equal(4 * once.pixels[..., LIGHTS], twice.pixels[..., LIGHTS])
+    assert np.array_equal(4 * once.gathered, twice.gathered)
+    before = slice(0, LIGHTS.start)
+    assert np.array_equal(once.pixels[..., before], twice.pixels[..., before])
+
+
+def test_channels_change_places_together() -> None:
+    scene = corner()
+    order = np.array([2, 0, 1])
+    columns = np.concatenate([order, 3 + order, [6], 7 + order])
+    other = dataclasses.replace(scene, materials=scene.materials[:, columns])
+    plain, permuted = traced(scene), traced(other)
+    for channel in (Channel.DIFFUSE, Channel.SPECULAR, Channel.SHOWN_DIFFUSE, Channel.MIRRORED):
+        # a lamp is drawn by the mean of its colours, which is summed in another order
+        got, wanted = permuted.pixels[..., channel], plain.pixels[..., channel][..., order]
+        np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(permuted.gathered, plain.gathered[:, order], rtol=1e-4, atol=1e-6)
+
+
+def test_a_turned_world_shows_the_same_light() -> None:
+    """Rays that graze a rim may fall on its other side by a rounding: one pixel in a hundred."""
+    scene = corner()
+    rotation = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()
+    there, here = traced(moved(scene, rotation, [0.3, -0.2, 0.5])), traced(scene)
+    assert np.mean(np.abs(there.gathered - here.gathered) > 1e-3 * here.gathered.max()) < 0.02
+    for channel in (LIGHTS, Channel.DIFFUSE, Channel.DISTANCE):
+        apart = np.abs(there.pixels[..., channel] - here.pixels[..., channel]).max(axis=-1)
+        scale = here.pixels[..., channel].max()
+        assert np.mean(apart > 1e-3 * scale) < 0.01
+    turned = here.pixels[..., Channel.NORMAL] @ rotation.T
+    apart = np.abs(turned - there.pixels[..., Channel.NORMAL]).max(axis=-1)
+    assert np.mean(apart > 1e-3) < 0.01
+
+
+def test_surfaces_are_those_that_the_passes_know() -> None:
+    scene = corner()
+    inputs = traced(scene, rays_a_side=1)
+    hits = first_hits(scene, resolution=32)
+    assert np.array_equal(inputs.pixels[..., 0] > 0, hits.met)
+    there = hits.met
+    # Embree's own place on a triangle, in single precision, 3 m away
+    position = inputs.pixels[..., Channel.POSITION][there]
+    np.testing.assert_allclose(position, hits.position[there], atol=2e-5)
+    distance = inputs.pixels[..., 4][there]
+    np.testing.assert_allclose(distance, hits.depth_m[there], atol=2e-5)
+    np.testing.assert_array_equal(
+        inputs.pixels[..., Channel.DIFFUSE][there], hits.material[there][:, :3]
+    )
+    places = pixel_places(position, scene.c2w[0], float(scene.fov_deg[0]), 32)
+    rows, columns = np.nonzero(there)
+    np.testing.assert_allclose(places, np.stack([columns, rows], axis=1) + 0.5, atol=1e-3)
+
+
+def test_shadows_only_take_light_away() -> None:
+    pixels = traced(corner()).pixels
+    for shadowed, open_light in (
+        (Channel.DIRECT_DIFFUSE, Channel.OPEN_DIFFUSE),
+        (Channel.DIRECT_SPECULAR, Channel.OPEN_SPECULAR),
+    ):
+        assert (pixels[..., shadowed] <= pixels[..., open_light] * (1 + 1e-5)).all()
+    assert (pixels[..., Channel.DIRECT_DIFFUSE] < 0.5 * pixels[..., Channel.OPEN_DIFFUSE]).any()
+
+
+def test_equal_arguments_equal_numbers_and_another_seed_another_noise() -> None:
+    one, again, other = traced(corner()), traced(corner()), traced(corner(), seed=1)
+    assert np.array_equal(one.pixels, again.pixels)
+    assert np.array_equal(one.gathered, again.gathered)
+    assert not np.array_equal(one.pixels, other.pixels)
+
+
+@pytest.mark.parametrize("resolution", [8, 24, 100, 256])
+def test_any_width_shows_the_same_scene(resolution: int) -> None:
+    """Means of a picture and of one with 16 rays a pixel; 64 pixels see a highlight by chance."""
+    tolerance = 0.03 if resolution > 8 else 0.2
+    few = traced(corner(), resolution, anchors_a_side=np.gcd(8, resolution))
+    many = traced(corner(), 64, rays_a_side=4)
+    assert few.pixels.shape == (resolution, resolution, NUM_CHANNELS)
+    assert direct(few).mean() == pytest.approx(direct(many).mean(), rel=tolerance)
+
+
+EXTREMES = {
+    "black metal": [quad(FLOOR, material(roughness=0.01)), light(LAMP, 50.0)],
+    "mirror": [quad(FLOOR, material(specular=1.0, roughness=0.0)), light(LAMP, 50.0)],
+    "rough mirror": [quad(FLOOR, material(specular=1.0, roughness=0.01)), light(LAMP, 50.0)],
+    "a dim lamp": [quad(FLOOR, material(diffuse=0.5, specular=0.5)), light(LAMP, 1e-20)],
+    "lamp in an object": [
+        quad(FLOOR, material(diffuse=0.5)),
+        sphere([0, 0, 0.6], 0.5, material(specular=0.9, roughness=0.05)),
+        light(np.array(LAMP) * 0.1 + [0, 0, 0.35], 5e4),
+    ],
+    "lamp on the floor": [quad(FLOOR, material(diffuse=0.5, specular=0.4, roughness=0.1)),
+                          light([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0]], 10.0)],
+    "bright": [quad(FLOOR, material(diffuse=1.0)), light(LAMP, 1e6)],
+    "a hundred lamps": [
+        quad(FLOOR, material(diffuse=0.5, specular=0.3, roughness=0.2)),
+        *(light(np.array(LAMP) * 0.2 + [0.3 * (k % 10) - 1.5, 0.3 * (k // 10) - 1.5, 1.0], 3.0)
+          for k in range(100)),
+    ],
+    "nothing": [box([0, 50, 0], 0.1, material(diffuse=0.5)), light(LAMP, 5.0)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes_are_finite_and_not_negative(name: str) -> None:
+    scene = join(EXTREMES[name], eye=(1.0, -3.0, 1.4), target=(0, 0, 0.2), fov_deg=40.0)
+    inputs = traced(scene, 16)
+    assert np.isfinite(inputs.pixels).all()
+    assert np.isfinite(inputs.gathered).all()
+    assert (inputs.pixels[..., LIGHTS] >= 0).all()
+    assert (inputs.gathered >= 0).all()
+
+
+def test_no_light_at_all_is_black() -> None:
+    """A scene has an emitter, but a group of its lights may have none (model.light_groups)."""
+    dark = _relit(corner(), 0.0)
+    inputs = traced(dark)
+    assert not inputs.pixels[..., LIGHTS].any()
+    assert not inputs.gathered.any()
+
+
+def test_a_lamp_without_area_gives_nothing() -> None:
+    scene = corner()
+    positions = scene.vertex_positions.copy()
+    positions[-3:] = positions[-1]
+    inputs = traced(dataclasses.replace(scene, vertex_positions=positions))
+    assert np.isfinite(inputs.pixels).all()
+    assert not inputs.pixels[..., LIGHTS].any()
+
+
+def test_a_grazing_mirror_is_finite() -> None:
+    scene = join(EXTREMES["mirror"], eye=(0, -1.9, 1e-4), target=(0, 2, 0), fov_deg=60.0)
+    assert np.isfinite(traced(scene, 16).pixels).all()
