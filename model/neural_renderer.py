@@ -190,7 +190,8 @@ class NeuralRenderer:
     def resolution_notes(self, resolution: int) -> tuple[str, ...]:
         """Return what a person should know of pictures of this width by this network."""
         trained = self.trained.resolution
-        if trained is None or resolution == trained:
+        by_pixel = self._model.config.view_stage == "hits"
+        if trained is None or resolution == trained or by_pixel:
             return ()
         return (
             f"pictures of {resolution} pixels, and the network was trained on {trained}: expect "

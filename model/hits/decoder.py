@@ -209,7 +209,7 @@ class HitDecoder(nn.Module):
             place = at(traced.pixels_VRRC)
         x_BVAW = self._asked(scene, traced, anchor, place[..., Channel.POSITION])
         with as_given(traced.pixels_VRRC.device):
-            return self._pictures(traced, told, x_BVAW.float(), place, unit_B1113)
+            return self._pictures(traced, told, x_BVAW.to(told.dtype), place, unit_B1113)
 
     def _asked(
         self, scene: EncodedScene, traced: Traced, anchor_BVAF: Tensor, position_BVA3: Tensor

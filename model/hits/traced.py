@@ -1,7 +1,7 @@
 """`Traced`: what was traced of scenes and views, as the tensors that a network of hits reads."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -48,14 +48,19 @@ class Traced:
             for channel in channels:
                 pixels[..., channel] *= kept_VI[..., INPUTS.index(name), None, None, None]
         gathered = self.gathered_VA3 * kept_VI[..., INPUTS.index("gathered"), None, None]
-        return Traced(
-            sides_T12=self.sides_T12,
-            unit_3=self.unit_3,
-            pixels_VRRC=pixels,
-            anchor_VA=self.anchor_VA,
-            gathered_VA3=gathered,
-            given_VI=self.given_VI * kept_VI,
-        )
+        given = self.given_VI * kept_VI
+        return replace(self, pixels_VRRC=pixels, gathered_VA3=gathered, given_VI=given)
+
+
+def with_others_tokens(own: Traced, other: Traced | None) -> Traced:
+    """Return the views of a scene with what the triangles of another one receive.
+
+    It is brought to the own scene's unit, so that the other is neither brighter nor darker.
+    """
+    if other is None:
+        return own
+    sides_T12 = other.sides_T12 * (own.unit_3 / other.unit_3).repeat(4)
+    return replace(own, sides_T12=sides_T12)
 
 
 def stack_traced(scenes: Sequence[Traced], longest: int) -> Traced:

@@ -80,7 +80,7 @@ def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
 
 
 def with_traced(
-    scene: SceneTensors, resolution: int, config: ModelConfig, seed: int
+    scene: SceneTensors, resolution: int, config: ModelConfig, seed: int = 0
 ) -> SceneTensors:
     """Return a scene with what is traced of its views: what a trainer's threads do ahead.
 

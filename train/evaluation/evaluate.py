@@ -4,9 +4,13 @@ import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from pydantic import SkipValidation
 
+from model.config import ModelConfig
+from model.hits.traced import INPUTS, with_others_tokens
+from model.hits.tracing import with_traced
 from model.light_groups import light_groups
 from model.neural_renderer import NeuralRenderer
 from model.renderformer import RenderFormer
@@ -82,7 +86,10 @@ def judged_views(contest: Contest, scene_done: Callable[[], None]) -> list[Judge
     before: SceneTensors | None = None
     for sample in contest.samples():
         judged = judged_scene(sample, contest.resolution)
+        if contest.network.config.view_stage == "hits":
+            judged = with_traced_views(judged, contest.network.config, contest.resolution)
         contestants = {NETWORK: predict(contest.network, judged.scene)}
+        contestants |= withheld_pictures(contest.network, judged.scene)
         grouped = grouped_pictures(contest.network, sample.scene, contest.resolution)
         if grouped is not None:
             contestants[GROUPED] = grouped
@@ -201,14 +208,44 @@ def grouped_pictures(
     return np.stack(pictures).astype(np.float64)
 
 
+def with_traced_views(judged: JudgedScene, config: ModelConfig, resolution: int) -> JudgedScene:
+    """Return a scene with what is traced of it, once for all that a network of hits is asked."""
+    tensors = with_traced(judged.scene.tensors, resolution, config)
+    return dataclasses.replace(judged, scene=dataclasses.replace(judged.scene, tensors=tensors))
+
+
+def withheld_pictures(
+    network: RenderFormer, scene: TrainingScene
+) -> dict[str, NDArray[np.float64]]:
+    """Return what a network of hits makes without each of its inputs, by the contestant's name.
+
+    Of a traced scene; of any other, nothing is returned.
+    """
+    traced = scene.tensors.traced
+    if traced is None:
+        return {}
+    found = {}
+    for index, name in enumerate(INPUTS):
+        kept_VI = torch.ones_like(traced.given_VI)
+        kept_VI[:, index] = 0
+        tensors = dataclasses.replace(scene.tensors, traced=traced.without(kept_VI))
+        found[f"{NETWORK} without {name}"] = predict(
+            network, dataclasses.replace(scene, tensors=tensors)
+        )
+    return found
+
+
 def swapped_pictures(
     network: RenderFormer, scene: TrainingScene, other: SceneTensors
 ) -> NDArray[np.float64]:
-    """Return another scene through the cameras of this one, linear radiance [V, R, R, 3].
+    """Return what a network makes with another scene's triangles [V, R, R, 3], linear radiance.
 
     Does the network look at the scene at all? One that has only learned what pictures look like on
-    average is no worse with the triangles of another scene.
+    average is no worse with the triangles of another scene. A network of hits keeps its own hits:
+    the other scene's tokens alone are put in place of its own.
     """
     cameras = scene.tensors
     seen = dataclasses.replace(other, c2w_V44=cameras.c2w_V44, fov_deg_V=cameras.fov_deg_V)
+    if cameras.traced is not None:
+        seen = dataclasses.replace(seen, traced=with_others_tokens(cameras.traced, other.traced))
     return predict(network, dataclasses.replace(scene, tensors=seen))
