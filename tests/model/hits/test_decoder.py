@@ -1,4 +1,4 @@
-"""The network that is told hits: what it passes through, what it cannot do, what it can do without."""
+"""The network that is told hits: what it passes on, what it reads, what it can do without."""
 
 import dataclasses
 from typing import Any
@@ -94,7 +94,7 @@ def test_before_any_training_what_was_traced_is_passed_on() -> None:
 def test_the_picture_scales_with_the_lamps(tokens: bool) -> None:
     scene = corner()
     materials = scene.materials.copy()
-    materials[:, EMISSION] *= np.float32([8.0, 4.0, 2.0])
+    materials[:, EMISSION] *= np.array([8.0, 4.0, 2.0], np.float32)
     brighter = dataclasses.replace(scene, materials=materials)
     model = network(scene_tokens=tokens)
     one, other = (radiance(picture(model, tensors(each))[0, 0]) for each in (scene, brighter))

@@ -15,7 +15,7 @@ def _plate(roughness: float, specular: float = 1.0) -> LitScene:
     corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
     materials = np.zeros((1, 10), np.float32)
     materials[0, 3:6], materials[0, 6] = specular, roughness
-    return LitScene(corners, np.tile(np.float32([0, 0, 1]), (1, 3, 1)), materials)
+    return LitScene(corners, np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1)), materials)
 
 
 def _points(scene: LitScene, toward: np.ndarray) -> Points:

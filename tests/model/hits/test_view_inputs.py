@@ -107,6 +107,10 @@ def test_any_width_shows_the_same_scene(resolution: int) -> None:
     assert direct(few).mean() == pytest.approx(direct(many).mean(), rel=tolerance)
 
 
+def _small_lamp(column: int, row: int, height: float) -> np.ndarray:
+    return 0.1 * np.array(LAMP) + np.array([0.3 * column - 1.5, 0.3 * row - 1.5, height])
+
+
 EXTREMES = {
     "black metal": [quad(FLOOR, material(roughness=0.01)), light(LAMP, 50.0)],
     "mirror": [quad(FLOOR, material(specular=1.0, roughness=0.0)), light(LAMP, 50.0)],
@@ -115,15 +119,14 @@ EXTREMES = {
     "lamp in an object": [
         quad(FLOOR, material(diffuse=0.5)),
         sphere([0, 0, 0.6], 0.5, material(specular=0.9, roughness=0.05)),
-        light(np.array(LAMP) * 0.1 + [0, 0, 0.35], 5e4),
+        light(_small_lamp(5, 5, 0.35), 5e4),
     ],
     "lamp on the floor": [quad(FLOOR, material(diffuse=0.5, specular=0.4, roughness=0.1)),
                           light([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0]], 10.0)],
     "bright": [quad(FLOOR, material(diffuse=1.0)), light(LAMP, 1e6)],
     "a hundred lamps": [
         quad(FLOOR, material(diffuse=0.5, specular=0.3, roughness=0.2)),
-        *(light(np.array(LAMP) * 0.2 + [0.3 * (k % 10) - 1.5, 0.3 * (k // 10) - 1.5, 1.0], 3.0)
-          for k in range(100)),
+        *(light(_small_lamp(k % 10, k // 10, 1.0), 3.0) for k in range(100)),
     ],
     "nothing": [box([0, 50, 0], 0.1, material(diffuse=0.5)), light(LAMP, 5.0)],
 }  # fmt: skip
