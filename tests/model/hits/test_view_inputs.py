@@ -122,7 +122,7 @@ EXTREMES = {
         light(_small_lamp(5, 5, 0.35), 5e4),
     ],
     "lamp on the floor": [quad(FLOOR, material(diffuse=0.5, specular=0.4, roughness=0.1)),
-                          light([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0]], 10.0)],
+                          light(np.eye(3)[[2, 0, 1]] * [0.5, 0.5, 0], 10.0)],
     "bright": [quad(FLOOR, material(diffuse=1.0)), light(LAMP, 1e6)],
     "a hundred lamps": [
         quad(FLOOR, material(diffuse=0.5, specular=0.3, roughness=0.2)),
