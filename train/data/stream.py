@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from model.hits.tracing import with_traced
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
 from storage.records.sample import Sample
@@ -175,6 +174,8 @@ class _SceneMaker:
             seen = augmented(seen, settings.augmentation, rng)
         if settings.network is None or settings.network.view_stage != "hits":
             return seen
+        from model.hits.tracing import with_traced  # brings the checker of settings along
+
         # after the symmetries, which therefore need not know what is traced
         noise = int(rng.integers(2**31))
         tensors = with_traced(seen.tensors, settings.resolution, settings.network, noise)
