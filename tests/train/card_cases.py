@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
@@ -85,10 +86,10 @@ def resume(data: str, lpips: str, out: Path) -> None:
 
     Muon is torch's own there, whatever the processor beside the card has.
     """
-    torch.cpu._is_avx512_bf16_supported = lambda: False
     first = dataclasses.replace(one_step_of("builtin", "smoke"), num_steps=2, warmup_steps=1)
     second = dataclasses.replace(one_step_of("finetune", "smoke"), from_weights=True)
-    with fake_card():
+    with pytest.MonkeyPatch.context() as patch, fake_card():
+        patch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
         crew = Crew(device=CARD)
         train_run(first, data=[data], out=out / "first", crew=crew)
         checkpoint = out / "first" / "checkpoints" / "step-000000002.safetensors"

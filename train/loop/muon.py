@@ -18,7 +18,7 @@ def fitting_precision(crew: Crew) -> Precision:
     bfloat16 on a card and where the processor has AVX512_BF16, as all with AMX do. Elsewhere a
     product in bfloat16 is emulated, or not vectorised at all: without AVX-512 it takes 15 times as
     long as one in float32 (docs/log/2026-11-24-muon.md). torch's own question,
-    `_is_mkldnn_bf16_supported`, asks for AVX-512 alone, and so also says yes to emulation. One
+    `_is_mkldnn_bf16_supported`, also says yes where AVX-512 emulates it. One
     answer for all, since every process moves its copy of the weights itself, and copies must not
     drift apart. All processes must call it.
     """
