@@ -15,12 +15,11 @@ from train.settings import Precision
 def fitting_precision(crew: Crew) -> Precision:
     """Return the precision of Muon's products that all processes of a crew are quick at.
 
-    bfloat16 on a card and where the processor has AVX512_BF16, as all with AMX do. Elsewhere a
-    product in bfloat16 is emulated, or not vectorised at all: without AVX-512 it takes 15 times as
-    long as one in float32 (docs/log/2026-11-24-muon.md). torch's own question,
-    `_is_mkldnn_bf16_supported`, also says yes where AVX-512 emulates it. One
-    answer for all, since every process moves its copy of the weights itself, and copies must not
-    drift apart. All processes must call it.
+    bfloat16 on a card and where the processor has AVX512_BF16, as all with AMX do. Elsewhere such a
+    product is emulated: with AVX2 alone a step takes 12 times as long as in float32
+    (docs/log/2026-11-24-muon.md). torch's own question, `_is_mkldnn_bf16_supported`, also says yes
+    where AVX-512 emulates it. One answer for all, since every process moves its copy of the weights
+    itself, and copies must not drift apart. All processes must call it.
     """
     quick = crew.device.type != "cpu" or torch.cpu._is_avx512_bf16_supported()
     return "float32" if crew.any(not quick) else "bfloat16"
