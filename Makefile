@@ -21,8 +21,8 @@ dataset: setup  ## 24 scenes of built-in objects, verified
 test: setup-all  ## the tests that take minutes, on two cores; a third of that is waiting, hence four workers
 	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python -m pytest -n 4 --dist worksteal
 
-test-slow: setup-all  ## the others
-	python -m pytest -m slow -n 2 --dist worksteal
+test-slow: setup-all  ## the others, which wait for servers and children much of the time
+	python -m pytest -m slow -n 3 --dist worksteal
 
 test-elsewhere: setup-all  ## the most telling ones, as other processors would run them
 	python -m tests.elsewhere

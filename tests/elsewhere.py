@@ -60,6 +60,8 @@ CHOSEN = (
     "tests/train/data/test_augment.py",
     "tests/train/data/test_stream.py",
     "tests/train/evaluation/test_judge.py",
+    "tests/train/loop/test_muon.py",
+    "tests/train/loop/test_optim.py",
     "tests/train/loop/test_step.py",
     "tests/train/loss/test_objective.py",
     "tests/train/loop/test_processes.py",

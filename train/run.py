@@ -32,6 +32,7 @@ from train.loop.checkpoints import (
     saved_steps,
 )
 from train.loop.crew import Crew
+from train.loop.muon import fitting_precision
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState, new_state
 from train.loop.trainer import Trainer
@@ -161,13 +162,15 @@ def _begin(
     progress: TrainProgress,
 ) -> tuple[TrainSettings, TrainState]:
     """Return the state that the run begins or goes on with, and the settings with its network."""
+    precision = fitting_precision(crew)
     if start.resume:
         checkpoint = resumed_checkpoint(folder.checkpoints, crew, progress.noted)
         if settings.from_weights:
             config = decode_config(checkpoint.header["model"])
             settings = dataclasses.replace(settings, model=config)
-        _note_other_crew(checkpoint, crew, progress)
-        return settings, resumed_state(checkpoint, settings, data.digest, crew.device)
+        state = resumed_state(checkpoint, settings, data.digest, crew.device, precision)
+        _note_other_execution(checkpoint, crew, state, progress)
+        return settings, state
     if saved_steps(folder.checkpoints):
         raise TrilightError(
             f"{folder.root}: holds a run already; add --resume to go on with it, or choose "
@@ -177,6 +180,7 @@ def _begin(
     network = None if start.begin_with is None else open_network(start.begin_with, network_of_run)
     if network is not None:
         settings = dataclasses.replace(settings, model=network.config)
+    state = new_state(settings, crew.device, network, precision)
     if crew.is_first:
         record = {
             "settings": settings_record(settings),
@@ -186,17 +190,27 @@ def _begin(
             "versions": {"torch": torch.__version__, "python": platform.python_version()},
             "threads": torch.get_num_threads(),
             "processes": crew.world_size,
+            "muon_precision": state.updater.muon_precision,
         }
         write_atomically(folder.settings, pretty_json(record))
-    return settings, new_state(settings, crew.device, network)
+    return settings, state
 
 
-def _note_other_crew(checkpoint: Checkpoint, crew: Crew, progress: TrainProgress) -> None:
+def _note_other_execution(
+    checkpoint: Checkpoint, crew: Crew, state: TrainState, progress: TrainProgress
+) -> None:
     before = checkpoint.header["world_size"]
     if before != crew.world_size:
         progress.noted(
             f"the run goes on with {crew.world_size} processes instead of {before}: the same to "
             "rounding, not to the bit"
+        )
+    now = state.updater.muon_precision
+    earlier = checkpoint.header.get("muon_precision", "bfloat16")  # the only one that there was
+    if now and now != earlier:
+        progress.noted(
+            f"the run goes on with Muon's products in {now} instead of {earlier}, which suits the "
+            "processors here: the same to the rounding of bfloat16, not to the bit"
         )
 
 

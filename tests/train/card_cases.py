@@ -2,9 +2,11 @@
 
 import dataclasses
 import functools
+import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_forward_pre_hook
@@ -80,10 +82,14 @@ def train_and_judge(run: str, size: str, data: str, lpips: str, out: Path) -> No
 
 
 def resume(data: str, lpips: str, out: Path) -> None:
-    """Go on with a run on the card, and begin a second stage with it."""
+    """Go on with a run on the card, and begin a second stage with it.
+
+    Muon is torch's own there, whatever the processor beside the card has.
+    """
     first = dataclasses.replace(one_step_of("builtin", "smoke"), num_steps=2, warmup_steps=1)
     second = dataclasses.replace(one_step_of("finetune", "smoke"), from_weights=True)
-    with fake_card():
+    with pytest.MonkeyPatch.context() as patch, fake_card():
+        patch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
         crew = Crew(device=CARD)
         train_run(first, data=[data], out=out / "first", crew=crew)
         checkpoint = out / "first" / "checkpoints" / "step-000000002.safetensors"
@@ -91,6 +97,9 @@ def resume(data: str, lpips: str, out: Path) -> None:
         train_run(first, data=[data], out=out / "first", start=Start(resume=True), crew=crew)
         start = Start(begin_with=str(checkpoint), lpips=lpips)
         train_run(second, data=[data], out=out / "second", start=start, crew=crew)
+    for name in ("first", "second"):
+        record = json.loads((out / name / "settings.json").read_text())
+        assert record["muon_precision"] == "bfloat16"
 
 
 def evaluate_command(data: str, lpips: str, out: Path) -> dict[str, set[str]]:

@@ -29,13 +29,14 @@ from train.data.unusable import Unusable
 from train.folder import RunFolder
 from train.loop.crew import Crew
 from train.loop.state import TrainState, new_state
-from train.settings import TrainSettings
+from train.settings import Precision, TrainSettings
 
 PREFIX, SUFFIX = "step-", ".safetensors"
 """Names of the files, around the number of the step."""
 
 HEADER_KEY = "trilight_checkpoint"
-"""Metadata entry with counters, damage met, settings, digest of the data, number of processes."""
+"""Metadata entry with counters, damage met, settings, digest of the data, and how it was executed:
+number of processes, precision of Muon's products."""
 
 UNSEALED = "0" * 64
 """Placeholder for the sha256 while it is computed. Old checkpoints have no sha256."""
@@ -59,6 +60,7 @@ def save_checkpoint(
         "model": encode_config(settings.model),
         "data_digest": data_digest,
         "world_size": world_size,
+        "muon_precision": state.updater.muon_precision,
         **({"extensions": found} if (found := recorded("weights")) else {}),
         "sha256": UNSEALED,
     }
@@ -126,8 +128,9 @@ def resumed_state(
     settings: TrainSettings,
     data_digest: str,
     device: torch.device | None = None,
+    muon_precision: Precision = "bfloat16",
 ) -> TrainState:
-    """Return the state of a run, ready for its next step.
+    """Return the state of a run, ready for its next step; the last two are those of `new_state`.
 
     Raises:
         TrilightError: the checkpoint belongs to other settings or other data; the first field that
@@ -138,7 +141,7 @@ def resumed_state(
     begun = from_record(TrainSettings, header["settings"])  # a field that came later is at default
     _require_same("settings", settings_record(begun), settings_record(settings))
     _require_same("data", {"digest": header["data_digest"]}, {"digest": data_digest})
-    state = new_state(settings, device)
+    state = new_state(settings, device, muon_precision=muon_precision)
     state.step, state.skipped_steps = header["step"], header["skipped_steps"]
     state.unusable = Unusable(settings.most_unusable, header["unusable"])
     load_tensors(state.model, _part(checkpoint.arrays, "model"))

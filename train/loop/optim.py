@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from train.settings import TrainSettings
+from train.loop.muon import muon
+from train.settings import Precision, TrainSettings
 
 ADAMW_KEEPS = ("exp_avg", "exp_avg_sq")
 """AdamW's state for each weight, beside its count of updates."""
@@ -21,23 +22,27 @@ class Updater:
 
     Muon (Jordan et al. 2024) makes the step of a matrix near orthogonal, so that its rare
     directions move as far as the frequent ones. Its steps are scaled to the size of AdamW's (Liu et
-    al. 2025), so one learning rate serves both. Muon is not exactly reproducible: the
-    orthogonal matrix is computed in bfloat16, so where sums in another order cross a rounding, a
-    weight moves differently, by up to a tenth of a typical step.
+    al. 2025), so one learning rate serves both.
+
+    How near two trainings come whose gradients differ by 1e-7 of themselves, as sums in another
+    order do: with Muon's products in float32 a weight moves otherwise by up to 1e-5 of a typical
+    step, with products in bfloat16, where such a difference can cross a rounding, by up to a tenth.
     """
 
-    def __init__(self, model: nn.Module, settings: TrainSettings) -> None:
+    muon_precision: Precision | None
+    """Precision of Muon's products; None where AdamW moves every weight."""
+
+    def __init__(self, model: nn.Module, settings: TrainSettings, precision: Precision) -> None:
+        """Take the network, the run, and the precision of Muon's products (loop.muon)."""
         self._names: dict[Tensor, str] = {weight: name for name, weight in model.named_parameters()}
         muon_rate = settings.muon_rate
         matrices = [weight for weight in self._names if muon_rate and weight.ndim == 2]
         others = [weight for weight in self._names if not (muon_rate and weight.ndim == 2)]
         adamw = torch.optim.AdamW(others, betas=settings.betas, weight_decay=settings.weight_decay)
         self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
+        self.muon_precision = precision if matrices else None
         if matrices:
-            muon = torch.optim.Muon(
-                matrices, weight_decay=settings.weight_decay, adjust_lr_fn="match_rms_adamw"
-            )
-            self._optimizers.append((muon, muon_rate))
+            self._optimizers.append((muon(matrices, settings.weight_decay, precision), muon_rate))
 
     def zero_grad(self) -> None:
         """Forget the gradient."""

@@ -13,7 +13,7 @@ from model.renderformer import RenderFormer
 from storage.seeds import seed_for
 from train.data.unusable import Unusable
 from train.loop.optim import Updater
-from train.settings import TrainSettings
+from train.settings import Precision, TrainSettings
 
 
 @dataclass(kw_only=True, eq=False)
@@ -58,6 +58,7 @@ def new_state(
     settings: TrainSettings,
     device: torch.device | None = None,
     begin_with: RenderFormer | None = None,
+    muon_precision: Precision = "bfloat16",
 ) -> TrainState:
     """Return the state before the first step.
 
@@ -65,6 +66,7 @@ def new_state(
         settings: of the run; they alone decide the random weights.
         device: where it is to be; the CPU unless said.
         begin_with: a network of the same configuration whose weights take their place.
+        muon_precision: of Muon's products, where the run has Muon (loop.muon.fitting_precision).
     """
     model = RenderFormer(settings.model)
     if begin_with is None:
@@ -78,7 +80,7 @@ def new_state(
         mean_model = copy.deepcopy(model).requires_grad_(False)
     return TrainState(
         model=model,
-        updater=Updater(model, settings),
+        updater=Updater(model, settings, muon_precision),
         unusable=Unusable(settings.most_unusable),
         mean_model=mean_model,
     )

@@ -10,8 +10,13 @@ from model.renderformer import RenderFormer
 from tests.train.kit import tiny_run
 from train.loop.optim import Updater
 from train.loop.state import new_state
+from train.settings import Precision, TrainSettings
 
 RATE = 1e-3
+each_kind = pytest.mark.parametrize(
+    ("muon_rate", "precision"), [(0.0, "bfloat16"), (3.0, "bfloat16"), (3.0, "float32")]
+)
+"""AdamW alone, and with Muon on each kind of processor."""
 
 
 def with_gradients(seed: int = 0) -> RenderFormer:
@@ -40,7 +45,8 @@ def test_without_muon_it_is_torchs_adamw() -> None:
     for ours, theirs in zip(model.parameters(), twin.parameters(), strict=True):
         theirs.grad = None if ours.grad is None else ours.grad.clone()
     settings = tiny_run(weight_decay=0.1)
-    updater = Updater(model, settings)
+    updater = Updater(model, settings, "float32")
+    assert updater.muon_precision is None
     adamw = torch.optim.AdamW(twin.parameters(), betas=settings.betas, weight_decay=0.1)
     for rate in (RATE, 3 * RATE):
         updater.step(rate)
@@ -50,11 +56,15 @@ def test_without_muon_it_is_torchs_adamw() -> None:
         assert torch.equal(ours, theirs)
 
 
-def test_muon_moves_every_direction_of_a_matrix_about_as_far() -> None:
+@pytest.mark.parametrize(("precision", "beside"), [("bfloat16", 0.05), ("float32", 1e-4)])
+def test_muon_moves_every_direction_of_a_matrix_about_as_far(
+    precision: Precision, beside: float
+) -> None:
     model = with_gradients()
     gradients = {name: weight.grad for name, weight in model.named_parameters()}
     matrices = 0
-    for name, step in moved(model, Updater(model, tiny_run(muon_rate=3.0, weight_decay=0))).items():
+    updater = Updater(model, tiny_run(muon_rate=3.0, weight_decay=0), precision)
+    for name, step in moved(model, updater).items():
         gradient = gradients[name]
         assert gradient is not None
         if step.ndim != 2 or min(step.shape) == 1:
@@ -64,41 +74,47 @@ def test_muon_moves_every_direction_of_a_matrix_about_as_far() -> None:
         seen = -(u.T @ step @ vt.T) / (3 * RATE * 0.2 * math.sqrt(max(step.shape)))
         lengths = seen.diagonal()
         # five of Muon's iterations take a hundredth of the length to between 0.3 and 1.2 of the
-        # whole (their polynomial, by hand); what they leave beside the diagonal is bfloat16's
+        # whole (their polynomial, by hand); what they leave beside the diagonal is rounding
         assert 0.3 < lengths.min() and lengths.max() < 1.25, name
-        assert (seen - torch.diag(lengths)).abs().max() < 0.05, name
+        assert (seen - torch.diag(lengths)).abs().max() < beside, name
     assert matrices > 10
 
 
-@pytest.mark.parametrize("muon_rate", [0.0, 3.0])
-def test_without_a_gradient_every_weight_shrinks_by_its_rate(muon_rate: float) -> None:
+@each_kind
+def test_without_a_gradient_every_weight_shrinks_by_its_rate(
+    muon_rate: float, precision: Precision
+) -> None:
     model = with_gradients()
     for weight in model.parameters():
         weight.grad = torch.zeros_like(weight)
     before = [weight.detach().clone() for weight in model.parameters()]
-    Updater(model, tiny_run(muon_rate=muon_rate, weight_decay=0.5)).step(RATE)
+    Updater(model, tiny_run(muon_rate=muon_rate, weight_decay=0.5), precision).step(RATE)
     for ours, old in zip(model.parameters(), before, strict=True):
         # float32 rounding of one product
         rate = muon_rate * RATE if muon_rate and old.ndim == 2 else RATE
         torch.testing.assert_close(ours.detach(), (1 - 0.5 * rate) * old, rtol=1e-6, atol=0)
 
 
-def test_with_muon_vectors_are_moved_as_without() -> None:
-    with_muon = moved(model := with_gradients(), Updater(model, tiny_run(muon_rate=3.0)))
-    without = moved(model := with_gradients(), Updater(model, tiny_run()))
+@pytest.mark.parametrize("precision", ["bfloat16", "float32"])
+def test_with_muon_vectors_are_moved_as_without(precision: Precision) -> None:
+    def moved_by(settings: TrainSettings) -> dict[str, torch.Tensor]:
+        model = with_gradients()
+        return moved(model, Updater(model, settings, precision))
+
+    with_muon, without = moved_by(tiny_run(muon_rate=3.0)), moved_by(tiny_run())
     vectors = [name for name, step in without.items() if step.ndim == 1]
     assert vectors and all(torch.equal(with_muon[name], without[name]) for name in vectors)
 
 
-@pytest.mark.parametrize("muon_rate", [0.0, 3.0])
-def test_what_is_remembered_can_be_taken_over(muon_rate: float) -> None:
+@each_kind
+def test_what_is_remembered_can_be_taken_over(muon_rate: float, precision: Precision) -> None:
     settings = tiny_run(muon_rate=muon_rate)
     model = with_gradients()
-    updater = Updater(model, settings)
+    updater = Updater(model, settings, precision)
     assert updater.memories() == {}
     updater.step(RATE)
     twin = copy.deepcopy(model)
-    other = Updater(twin, settings)
+    other = Updater(twin, settings, precision)
     other.remember(updater.memories(), 1)
     kinds = {name.split("/")[0] for name in updater.memories()}
     assert kinds == {"exp_avg", "exp_avg_sq"} | ({"momentum_buffer"} if muon_rate else set())

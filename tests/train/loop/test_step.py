@@ -85,12 +85,14 @@ def ruin_gradient(state: TrainState, batch: TrainingBatch) -> None:
     state.model.decoder.token_W.register_hook(lambda gradient: gradient * math.inf)
 
 
-@pytest.mark.parametrize("muon_rate", [0.0, 3.0])
+@pytest.mark.parametrize(
+    ("muon_rate", "precision"), [(0.0, "bfloat16"), (3.0, "bfloat16"), (3.0, "float32")]
+)
 @pytest.mark.parametrize("ruin", [ruin_target, ruin_weight, ruin_gradient])
 def test_a_step_that_is_not_finite_changes_nothing(
-    ruin: Callable[[TrainState, TrainingBatch], None], muon_rate: float
+    ruin: Callable[[TrainState, TrainingBatch], None], muon_rate: float, precision: Precision
 ) -> None:
-    state = new_state(tiny_run(ema_decay=0.5, muon_rate=muon_rate))
+    state = new_state(tiny_run(ema_decay=0.5, muon_rate=muon_rate), muon_precision=precision)
     batch = make_batch(scenes(2))
     assert step(state, [batch]).applied
     ruin(state, batch)
