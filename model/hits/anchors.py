@@ -89,7 +89,8 @@ def _gathered(
         here = points.only(owner[part])
         direction = cosine_direction(u[:2, part], here.normal, here.edge)
         beyond, met = scene.meet(scene.everything, here.start(direction), direction)
-        found = brought(scene, light, beyond, u_lamp[part], u[2:, part])
+        spreads = np.zeros(met.shape, np.bool_)
+        found = brought(scene, light, beyond, u_lamp[part], u[2:, part], spreads)
         total[:, part] = np.where(met, found, np.float32(0))
     return total.reshape(3, gather_rays, count).mean(axis=1)
 

@@ -19,6 +19,10 @@ _SHORTENING = np.float32(1 - 1e-4)
 """Share of the way to a lamp that a shadow ray goes, as the renderer's."""
 
 
+_EVEN = np.float32(0.05)
+"""Reflectance that every lamp counts for, so that none is left out whose middle is not seen."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DirectLight:
     """Light of lamps at P points, [3, P] each."""
@@ -94,58 +98,86 @@ def _add(
         np.add(light.specular, coloured * is_free, out=light.specular)
 
 
-def lobe_ray_weight(scene: LitScene, met: Points, start: Floats, density: Floats) -> Floats:
+def lobe_ray_weight(
+    scene: LitScene, met: Points, start: Floats, density: Floats, chance: Floats | float = 1.0
+) -> Floats:
     """Return the share [P] of a lamp's emission that a ray drawn by the lobe has to bring.
 
-    The rest is what `direct_light` brings.
+    The rest is what `direct_light` brings, or `chosen_lamp_light`.
 
     Args:
         scene: the scene.
         met: what the rays have met, lamps or not.
         start: [3, P] where they began.
         density: [P] of the lobe along the rays.
+        chance: [P] with which the lamp would have been chosen there; of `direct_light`, 1.
     """
     way = met.position - start
     facing = np.abs(dot(scene.plane[:, met.triangle], met.toward))
     square = np.maximum(dot(way, way), np.float32(1e-12))
-    solid = facing * scene.area[met.triangle] / square
+    solid = facing * scene.area[met.triangle] / square / np.maximum(chance, np.float32(1e-12))
     kept = np.square(density * solid)
     weight: Floats = kept / (1 + kept)
     return weight
 
 
+def lamp_chances(scene: LitScene, points: Points, gloss: Gloss) -> Floats:
+    """Return the chance [lamps, P] of each lamp's triangle to be chosen at points.
+
+    In proportion to what its middle would send on without shadows, with a share for all: so few
+    rays are spent on lamps that are far away or not where a narrow lobe looks.
+    """
+    odds = np.zeros((len(scene.lamps), points.position.shape[1]), np.float32)
+    albedo = scene.diffuse.mean(axis=0)[points.triangle] * _INV_PI
+    colour = gloss.colour.mean(axis=0)
+    for number, lamp in enumerate(scene.lamps):
+        middle = scene.corners[:, :, lamp].mean(axis=0)
+        to_lamp = middle[:, None] - points.position
+        square = np.maximum(dot(to_lamp, to_lamp), scene.area[lamp])
+        to_lamp = to_lamp / np.sqrt(square)
+        cosine = dot(points.normal, to_lamp)
+        value, _ = lobe(gloss, points, to_lamp, cosine)
+        sent = albedo * np.maximum(cosine, 0) + colour * value + _EVEN
+        odds[number] = sent * (scene.emission[:, lamp].mean() * scene.area[lamp]) / square
+    chances: Floats = odds / np.maximum(odds.sum(axis=0), np.float32(1e-30))
+    return chances
+
+
 def chosen_lamp_light(
-    scene: LitScene, points: Points, gloss: Gloss, u_lamp: Floats, on_lamp: Floats
+    scene: LitScene,
+    points: Points,
+    gloss: Gloss,
+    chances: Floats,
+    u_lamp: Floats,
+    on_lamp: Floats,
+    has_lobe_ray: NDArray[np.bool_],
 ) -> Floats:
     """Return the radiance [3, P] that points send to their viewers of one lamp's light each.
 
-    The chance of a lamp's triangle is in proportion to its power and its estimated solid angle, so
-    that few rays are spent on lamps far away. Unbiased.
+    Unbiased.
 
     Args:
         scene: with at least one lamp.
         points, gloss: where.
+        chances: of the lamps there (`lamp_chances`).
         u_lamp: [P] uniform numbers that choose the lamp.
         on_lamp: [2, P] where on it.
+        has_lobe_ray: [P] whether a ray drawn by the lobe brings its share of the specular part.
     """
     lamps = scene.lamps
-    middle = scene.corners[:, :, lamps].mean(axis=0)  # [3, L]
-    brightness = scene.emission[:, lamps].mean(axis=0) * scene.area[lamps]
-    away = middle[:, :, None] - points.position[:, None]
-    odds = brightness[:, None] / (dot(away, away) + scene.area[lamps][:, None])
-    total = np.cumsum(odds, axis=0)
-    number = (u_lamp * total[-1] > total).sum(axis=0).clip(0, len(lamps) - 1)
-    chance = np.take_along_axis(odds, number[None], axis=0)[0] / total[-1]
+    number = (u_lamp > np.cumsum(chances, axis=0)).sum(axis=0).clip(0, len(lamps) - 1)
+    chance = np.maximum(np.take_along_axis(chances, number[None], axis=0)[0], np.float32(1e-12))
     lamp = lamps[number]
     place = _on_triangle(scene, lamp, on_lamp)
     to_lamp = place - points.position
     square = np.maximum(dot(to_lamp, to_lamp), np.float32(1e-12))
     to_lamp = to_lamp / np.sqrt(square)
     cosine = dot(points.normal, to_lamp)
-    value, _ = lobe(gloss, points, to_lamp, cosine)
+    solid = np.abs(dot(scene.plane[:, lamp], to_lamp)) * scene.area[lamp] / square / chance
+    value, density = lobe(gloss, points, to_lamp, cosine)
+    value = value / (1 + np.where(has_lobe_ray, np.square(density * solid), np.float32(0)))
     albedo = np.take(scene.diffuse, points.triangle, axis=1)
     reflected = albedo * (np.maximum(cosine, 0) * _INV_PI) + gloss.colour * value
-    solid = np.abs(dot(scene.plane[:, lamp], to_lamp)) * scene.area[lamp] / square / chance
     useful = np.flatnonzero(brightest(reflected) > 0)
     is_free = np.zeros(solid.shape, np.float32)
     is_free[useful] = _is_free(scene, points, place, to_lamp, useful)

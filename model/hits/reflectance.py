@@ -43,9 +43,11 @@ class Gloss:
         )
 
 
-def gloss_at(scene: LitScene, points: Points, least_alpha: float = 0.0) -> Gloss:
-    """Return the lobes of points, those that are narrower than `least_alpha` widened to it."""
-    alpha = np.maximum(scene.alpha[points.triangle], np.float32(least_alpha))
+def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None) -> Gloss:
+    """Return the lobes of points, those that are narrower than `least_alpha` [P] widened to it."""
+    alpha = scene.alpha[points.triangle]
+    if least_alpha is not None:
+        alpha = np.maximum(alpha, least_alpha)
     cosine = dot(points.normal, points.toward)
     seen = np.maximum(cosine, _LEAST_COSINE)
     stretch = stretched(seen, alpha)

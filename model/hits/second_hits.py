@@ -1,22 +1,24 @@
 """What rays bring from the surfaces that they meet: direct light there, and radiosity for the rest.
 
 So light of any number of diffuse bounces arrives by one ray. A ray that meets a mirror goes on.
-Lamps are small: a ray that a mirror sends on finds one once in thousands, and is then a thousand
+Lamps are small: of rays that spread, one in thousands is mirrored onto one, and is then a thousand
 times too bright. So lamps are asked for at every surface, whose lobe counts as wider than it is
-(Kaplanyan and Dachsbacher 2013): reflected light of lamps is blurred, and does not flicker.
+(Kaplanyan and Dachsbacher 2013): reflected light of lamps is blurred, and does not flicker. Rays
+that hardly spread, since a mirror sent them, show lamps in the next mirror as sharply as it does.
 """
 
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
-from model.hits.direct_light import chosen_lamp_light
+from model.hits.direct_light import chosen_lamp_light, lamp_chances, lobe_ray_weight
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
-from model.hits.reflectance import gloss_at
+from model.hits.reflectance import drawn, gloss_at, lobe
 from model.hits.vectors import Floats, brightest, dot
 
-WIDENED_ALPHA = 0.25
+WIDENED_ALPHA = np.float32(0.25)
 """GGX width that surfaces have at least, where a ray has met them."""
 
 SMOOTH_ALPHA = np.float32(0.1)
@@ -39,6 +41,7 @@ def brought(
     points: Points,
     u_lamp: Floats,
     on_lamp: Floats,
+    is_sharp: NDArray[np.bool_],
     *,
     mirrors: int = MIRRORS,
 ) -> Floats:
@@ -50,6 +53,7 @@ def brought(
         scene, light: the scene.
         points: where the rays have met it.
         u_lamp, on_lamp: [P] and [2, P] uniform numbers.
+        is_sharp: [P] whether only mirrors have sent the rays.
         mirrors: followed at most.
     """
     specular = np.take(scene.specular, points.triangle, axis=1)
@@ -60,21 +64,46 @@ def brought(
     spread_out = spread_out + np.where(is_mirror, np.float32(0), specular)
     sides = points.back.astype(np.intp)
     sent: Floats = spread_out * light.indirect_2T3[sides, points.triangle].T
+    has_lobe_ray = is_sharp & is_mirror
+    keeps_width = has_lobe_ray | (is_sharp & (scene.alpha[points.triangle] >= SMOOTH_ALPHA))
+    gloss = gloss_at(scene, points, np.where(keeps_width, np.float32(0), WIDENED_ALPHA))
+    chances = lamp_chances(scene, points, gloss)
     if len(scene.lamps):
-        gloss = gloss_at(scene, points, WIDENED_ALPHA)
-        sent += chosen_lamp_light(scene, points, gloss, u_lamp, on_lamp)
+        sent += chosen_lamp_light(scene, points, gloss, chances, u_lamp, on_lamp, has_lobe_ray)
     rows = np.flatnonzero(is_mirror)
-    if not len(rows):
-        return sent
-    some = points.only(rows)
-    cosine = dot(some.normal, some.toward)
-    onward = some.normal * (2 * cosine) - some.toward
-    beyond, met = scene.meet(scene.everything, some.start(onward), onward)
-    met &= (cosine > 0) & (dot(onward, some.plane) > 0)
-    u_beyond = u_lamp[rows], on_lamp[:, rows]
-    seen = brought(scene, light, beyond, *u_beyond, mirrors=mirrors - 1)
-    sent[:, rows] += specular[:, rows] * np.where(met, seen, np.float32(0))
+    if len(rows):
+        sent[:, rows] += _mirrored(
+            scene, light, points, rows, chances, (u_lamp, on_lamp), is_sharp[rows], mirrors
+        )
     return sent
+
+
+def _mirrored(
+    scene: LitScene,
+    light: SceneLight,
+    points: Points,
+    rows: NDArray[np.intp],
+    chances: Floats,
+    u: tuple[Floats, Floats],
+    is_sharp: NDArray[np.bool_],
+    mirrors: int,
+) -> Floats:
+    """Return what some points, which are mirrors, send on of what they see [3, rows]."""
+    u_lamp, on_lamp = u[0][rows], u[1][:, rows]
+    here = points.only(rows)
+    gloss = gloss_at(scene, here)
+    onward, weight = drawn(gloss, here, on_lamp)
+    beyond, met = scene.meet(scene.everything, here.start(onward), onward)
+    seen = brought(scene, light, beyond, u_lamp, on_lamp[::-1], is_sharp, mirrors=mirrors - 1)
+    lit = np.flatnonzero(is_sharp & met & scene.emits[beyond.triangle])
+    if len(lit):
+        some, there, along = here.only(lit), beyond.only(lit), onward[:, lit]
+        _, density = lobe(gloss.only(lit), some, along, dot(some.normal, along))
+        number = np.searchsorted(scene.lamps, there.triangle).clip(0, len(scene.lamps) - 1)
+        chance = chances[number, rows[lit]]
+        kept = lobe_ray_weight(scene, there, some.position, density, chance)
+        seen[:, lit] += np.take(scene.emission, there.triangle, axis=1) * kept
+    return gloss.colour * np.where(met, weight * seen, np.float32(0))
 
 
 def blocks(count: int) -> Iterator[slice]:

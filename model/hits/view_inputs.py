@@ -16,7 +16,7 @@ from model.hits.direct_light import direct_light, lobe_ray_weight
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, drawn, gloss_at, lobe
-from model.hits.second_hits import DIMMEST, blocks, brought
+from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, brought
 from model.hits.vectors import brightest, dot, spread
 from storage.seeds import rng_for
 
@@ -258,7 +258,8 @@ def _add_lobe_rays(
     asked = np.flatnonzero(met & (shading[some] > 0))
     if len(asked):
         rows = some[asked]
-        found = brought(scene, light, beyond.only(asked), u[2, rows], u[3:5, rows])
+        is_sharp = gloss.alpha[asked] < SMOOTH_ALPHA
+        found = brought(scene, light, beyond.only(asked), u[2, rows], u[3:5, rows], is_sharp)
         # `add` counts the rays that a point stands for; here one stands for all of its pixel
         found *= arrives[:, asked] * (shading[rows] / block.weight[rows])
         block.add(Channel.MIRRORED, found, rows)

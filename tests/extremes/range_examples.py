@@ -79,6 +79,7 @@ EXAMPLES: dict[type, Any] = {
 """A valid value of every class that declares a range, but for `Scene`."""
 
 _LINEAR = {"head": "linear", "dpt_features": 0, "dpt_channels": (), "dpt_taps": ()}
+_HITS = {"view_stage": "hits", "hit_rays": 1, "hit_anchors": 8, "pixel_width": 8}
 _PLANE = dataclasses.replace(ONE_FAMILY_EACH[0], num_objects=(0, 0), template="plane")
 _EVERY = 10**9
 
@@ -113,6 +114,8 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
     (ModelConfig, "patch_px", "high"): _LINEAR,
     (ModelConfig, "dpt_features", "low"): _LINEAR,
     (ModelConfig, "dpt_taps", "high"): {"decoder_layers": 256},
+    **{(ModelConfig, name, "high"): _LINEAR | _HITS
+       for name in ("hit_rays", "hit_anchors", "gather_rays", "pixel_width")},
 }  # fmt: skip
 """What must stand beside an end."""
 

@@ -90,6 +90,7 @@ def test_three_processes_make_each_object_once(sources: Path) -> None:
     assert len(calls(sources)) == 4
 
 
+@pytest.mark.slow
 def test_after_a_kill_the_next_run_makes_only_what_is_missing(sources: Path) -> None:
     """The second object never ends in the first run; its child dies with its owner."""
     plan = sources / "plan.json"

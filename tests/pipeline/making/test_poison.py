@@ -24,6 +24,9 @@ from tests.pipeline.making import poison
 from tests.pipeline.making.bucket_kit import OUT, empty_bucket
 from tests.s3_server import control, s3_server
 
+pytestmark = pytest.mark.slow
+"""Children that die and are started again take a minute together."""
+
 SHARD_BYTES = 174_000
 SHEET_BYTES = 150_000
 """The contact sheet of the first scene, about."""

@@ -51,6 +51,7 @@ def _means(tracer: VectorTracer, scene: Scene, seeds: range) -> tuple[float, flo
     return float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means)))
 
 
+@pytest.mark.slow
 def test_light_paths_know_how_camera_paths_are_guided() -> None:
     """The mean of a scene that only a mirror lights, guided and not.
 

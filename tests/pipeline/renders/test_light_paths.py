@@ -55,6 +55,7 @@ def _leaning() -> Scene:
     return join([floor, wall, lamp], eye=(0, -0.2, 2), target=(0, 0.3, 0), fov_deg=40)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "max_depth"),
     [(_matt(), 10), (_leaning(), 3), (_ball(0.6), 3),
