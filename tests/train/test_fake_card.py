@@ -22,7 +22,10 @@ from tests.train.toy import write_toy_dataset
 from train.loss.lpips import LINEAR_FILE, VGG16_FILE
 from train.runs import RUNS
 
-QUICK = {"smoke": "smoke", "builtin": "smoke", "paper-pretrain": "smoke", "pretrain": "tiny"}
+QUICK = {
+    "smoke": "smoke", "builtin": "smoke", "paper-pretrain": "smoke", "pretrain": "tiny",
+    "hits": "hits-smoke",
+}  # fmt: skip
 """Every kind of step. Second stages step as the first ones do, and `small` and `base` are a larger
 `tiny`; the windows of `large` take half a minute, and are with the slow tests."""
 
@@ -54,6 +57,7 @@ def lpips(tmp_path_factory: pytest.TempPathFactory) -> str:
     [
         pytest.param(run, size, marks=[] if QUICK.get(run) == size else pytest.mark.slow)
         for run, size in itertools.product(RUNS, SIZES)
+        if run.startswith("hits") == size.startswith("hits")
     ],
 )
 def test_every_run_of_every_size_works_on_a_card(
