@@ -123,8 +123,6 @@ class AnchorLayer(nn.Module):
 class PixelHead(nn.Module):
     """Pixels and the anchors around them -> what is learned of each pixel's light."""
 
-    taps: tuple[int, ...] = ()
-
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         width = config.pixel_width
@@ -139,7 +137,7 @@ class PixelHead(nn.Module):
         self.last = nn.Linear(width, 3 * (_GAINED + 2))
 
     def rounded_parts(self) -> list[nn.Module]:
-        """Return what a precision rounds: nothing, as it is a hundredth of the work of anchors."""
+        """Return what a precision rounds: nothing. Light is added up here, and steps would show."""
         return []
 
     def forward(
