@@ -103,14 +103,14 @@ def view_inputs(
         along = np.stack([direction[:, part] for direction in directions])
         shaded = _shaded(scene, rays.origin, along, chance[5, part])
         if len(shaded.pixel):
-            pixel, turn = shaded.pixel + part.start, shaded.turn
             block = _Block(
                 points=shaded.points,
                 gloss=gloss_at(scene, shaded.points),
-                sums=sums,
-                pixel=pixel,
+                sums=sums[:, part],
+                pixel=shaded.pixel,
                 weight=shaded.weight,
             )
+            pixel, turn = shaded.pixel + part.start, shaded.turn
             _add_surface(block, scene, rays.origin)
             lobe_rays = 1 if gather_rays else 0
             _add_direct(block, scene, spread(on_lamps[:, :, pixel], turn), lobe_rays)
@@ -137,7 +137,7 @@ class _Shaded:
 
     points: Points
     pixel: NDArray[np.intp]
-    """[P] row."""
+    """[P] which pixel of the block."""
     turn: NDArray[np.intp]
     """[P] which of the pixel's rays it is."""
     weight: NDArray[np.float32]
@@ -180,9 +180,9 @@ class _Block:
     points: Points
     gloss: Gloss
     sums: NDArray[np.float32]
-    """[36, R R]"""
+    """[36, pixels of the block]"""
     pixel: NDArray[np.intp]
-    """[P] whom the points belong to."""
+    """[P] which of the block's pixels the points belong to."""
     weight: NDArray[np.float32]
     """[P] how many rays each stands for."""
 
@@ -268,8 +268,7 @@ def _add_lobe_rays(
 def _averaged(sums: NDArray[np.float32], turns: int) -> NDArray[np.float32]:
     """Return means: of surfaces over the rays that met one, of radiance over all."""
     covered = np.maximum(sums[Channel.COVERAGE], np.float32(1))
-    over_all = np.float32(turns)
-    means = sums / over_all
-    for channel in (slice(1, Channel.OPEN_SPECULAR.start),):
-        means[channel] = sums[channel] / covered
+    means = sums / np.float32(turns)
+    of_surfaces = slice(Channel.POSITION.start, Channel.OPEN_SPECULAR.start)
+    means[of_surfaces] = sums[of_surfaces] / covered
     return means
