@@ -45,6 +45,8 @@ LLVM_TARGET = ("haswell", 8)
 
 CHOSEN = (
     "tests/pipeline/builds/test_frozen_builds.py",
+    "tests/model/hits/test_decoder.py",
+    "tests/model/hits/test_view_inputs.py",
     "tests/model/test_builtin.py",
     "tests/model/test_light_groups.py",
     "tests/model/test_neural_renderer.py",
