@@ -160,16 +160,10 @@ def smoke() -> ModelConfig:
 
 def hits_smoke() -> ModelConfig:
     """Return the size with traced hits that two CPU cores train: what is traced does most."""
-    return ModelConfig(
-        width=128,
-        num_heads=2,
-        encoder_layers=2,
+    return dataclasses.replace(
+        smoke(),
         decoder_layers=3,
-        hidden_width=384,
-        num_registers=4,
-        rope_num_freqs=3,
         rope_max_freq=12.0,
-        head="linear",
         view_stage="hits",
         hit_rays=2,
         hit_anchors=16,

@@ -193,7 +193,7 @@ class HitDecoder(nn.Module):
 
         Args:
             scene: B scenes.
-            traced: V views of each, as `model.hits.traced.stacked` makes them.
+            traced: V views of each, as `model.hits.traced.stack_traced` makes them.
         """
         with as_given(traced.pixels_VRRC.device):
             unit_B1113 = traced.unit_3[:, None, None, None, :]

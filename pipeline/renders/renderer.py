@@ -15,7 +15,7 @@ Mitsuba is imported inside functions only: `activate` must come first.
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +40,8 @@ from storage.errors import Rejected
 from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
 from storage.records.parts import MAX_PICTURES, Parts
 from storage.records.scene import Scene
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -138,13 +140,7 @@ class SceneRenderer:
                 it), "radiance_overflow" (a pixel that half floats cannot hold),
                 "floor_not_reached" (at max_spp, with `reject_at_cap`).
         """
-        steps = self.view_steps(c2w, fov_deg, seed)
-        while True:
-            try:
-                next(steps)
-            except StopIteration as end:
-                view: RenderedView = end.value
-                return view
+        return finished(self.view_steps(c2w, fov_deg, seed))
 
     def view_steps(
         self, c2w: ArrayLike, fov_deg: float, seed: int
@@ -347,6 +343,16 @@ def _shares_of(parts_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
     total = parts_rgb.sum(axis=0, dtype=np.float64)
     equal = np.full(parts_rgb.shape, 1 / len(parts_rgb))
     return np.divide(parts_rgb, total, out=equal, where=total > 0).astype(np.float32)
+
+
+def finished(steps: Generator[Any, None, Result]) -> Result:
+    """Run steps to their end, whatever they say of their progress, and return what they return."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: Result = end.value
+            return result
 
 
 def require_surfaces(scene: Scene) -> None:

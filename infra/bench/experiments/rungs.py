@@ -12,12 +12,11 @@ from infra.bench.experiments.engines import build_within
 from infra.bench.experiments.sampling import DB
 from infra.bench.sides.rung_pictures import judged, network_rung, physics_alone, sampled_rungs
 from infra.bench.sides.shots import SEED
+from infra.bench.subjects.named_scenes import first_composed
 from infra.bench.workshop import Workshop
 from pipeline.builds.settings import BuildSettings
-from pipeline.making.attempt_scene import assets_of
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.settings import Filtered
-from pipeline.scenes.compose import compose_scene
 from storage.dataset.splits import JUDGED_SPLIT
 from storage.errors import Rejected
 from storage.records.scene import Scene
@@ -35,8 +34,6 @@ SAMPLES: tuple[tuple[int, Filtered], ...] = (
 
 TRIANGLES = 768
 """Maximum number of triangles of a scene: what the small networks are trained on."""
-
-_ATTEMPTS = 20
 
 
 def _points(effort: Effort) -> list[Point]:
@@ -62,22 +59,14 @@ def _measure(workshop: Workshop, points: Sequence[Point], turn: str, *, px: int)
 def one_view_scene(build: BuildSettings, index: int) -> Scene:
     """Return a scene with one camera, of objects that are judged on; runs in a render child."""
     settings = dataclasses.replace(build.scenes, num_views=1)
-    for attempt in range(_ATTEMPTS):
-        try:
-            return compose_scene(
-                settings,
-                assets_of(JUDGED_SPLIT),
-                seed=SEED,
-                scene_index=index,
-                attempt=attempt,
-            )
-        except Rejected:
-            continue
-    raise Rejected("no_scene", f"scene {index}: every attempt at it was rejected")
+    scene, _ = first_composed(settings, index, seed=SEED, split=JUDGED_SPLIT)
+    if scene is None:
+        raise Rejected("no_scene", f"scene {index}: every attempt at it was rejected")
+    return scene
 
 
 def _set_up(workshop: Workshop) -> Any:
-    """Return the networks, a render child of scenes that none of them learned from, the width."""
+    """Return the networks, a render child of scenes that none of them learned from, its build."""
     import torch
 
     from model.neural_renderer import NeuralRenderer

@@ -1,9 +1,9 @@
 """One view of a scene by each rung, timed and judged: nothing traced, hits, everything."""
 
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from infra.bench.sides.shots import SEED, warm_up_denoiser
 from pipeline.renders.camera import Camera
 from pipeline.renders.noise_floor import clamped_radiance
 from pipeline.renders.preview import PreviewRenderer, PreviewSettings
+from pipeline.renders.renderer import finished
 from pipeline.renders.settings import Filtered
 from storage.conventions import log10_radiance
 from storage.records.first_hits import first_hits
@@ -54,7 +55,7 @@ def sampled_rungs(
             began = time.process_time()
             renderer = PreviewRenderer(scene, settings)
             loaded = time.process_time()
-            radiance = _result(renderer.view_steps(pose, fov_deg, SEED)).radiance_rgb
+            radiance = finished(renderer.view_steps(pose, fov_deg, SEED)).radiance_rgb
             shown.append(_timed(radiance, began, loaded))
         found.append(_median(shown))
     camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=resolution)
@@ -108,15 +109,6 @@ def judged(picture: RungPicture, scene: Scene, reference: Reference) -> Mapping[
         "linear_db": true_error_db(shown, reference, clamped_radiance, everywhere)[0],
         "ssim": float(picture_scores(shown, mean.astype(np.float32), hits, None)["ssim"] or 0.0),
     }
-
-
-def _result(steps: Generator[Any, None, Any]) -> Any:
-    """Return what a generator returns."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as ended:
-            return ended.value
 
 
 def _timed(picture: NDArray[np.float32], began: float, loaded: float) -> RungPicture:

@@ -94,10 +94,10 @@ def sampled_scene(scene_index: int) -> Scene:
 
 
 def first_composed(
-    settings: SceneSettings, scene_index: int, *, seed: int = 0
+    settings: SceneSettings, scene_index: int, *, seed: int = 0, split: str = "train"
 ) -> tuple[Scene | None, int]:
-    """Return a training scene's first attempt that passes, and the number of rejected attempts."""
-    pool = assets_of("train")
+    """Return a scene's first attempt that passes, and the number of rejected attempts."""
+    pool = assets_of(split)
     for attempt in range(MAX_ATTEMPTS):
         with contextlib.suppress(Rejected):
             scene = compose_scene(

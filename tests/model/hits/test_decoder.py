@@ -21,22 +21,14 @@ from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.model.hits.kit import corner, traced
-from tests.model.kit import awake
+from tests.model.kit import awake, tiny_config
 
 PX = 32
 
 
 def hits_config(**changes: Any) -> ModelConfig:
-    config = ModelConfig(
-        width=48,
-        num_heads=2,
+    config = tiny_config(
         encoder_layers=1,
-        decoder_layers=2,
-        hidden_width=32,
-        num_registers=2,
-        rope_num_freqs=1,
-        rope_max_freq=5.0,
-        head="linear",
         view_stage="hits",
         hit_rays=2,
         hit_anchors=8,
