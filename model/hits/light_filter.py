@@ -7,6 +7,8 @@ ray. Light is divided by specular albedo before, and multiplied after, so that p
 weights have no colour, so that the picture stays linear in the light.
 """
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad, silu, softplus
@@ -25,6 +27,10 @@ _AROUND_PX = (3, 7)
 
 _DARKEST = 1e-4
 """Specular albedo that a mixture is divided by at least."""
+
+_ROWS = 16
+"""Rows of a picture that are mixed at a time while rendering: they stay in the processor's cache.
+"""
 
 _LEAST_TRUST = 30.0
 """A ray that is not trusted at all counts e^-30: its pixel, all alone, still shows it."""
@@ -76,23 +82,42 @@ def _seen(both_V6RR: Tensor) -> Tensor:
 
 
 def _mean_around(both_V6RR: Tensor, width: int) -> Tensor:
-    return avg_pool2d(both_V6RR, width, stride=1, padding=width // 2, count_include_pad=False)
+    """Return means over squares, by rows and then by columns: a fifth of the time of both at once.
+
+    At the rim only what is inside counts.
+    """
+    half = width // 2
+    rows = avg_pool2d(both_V6RR, (1, width), 1, (0, half), count_include_pad=False)
+    return avg_pool2d(rows, (width, 1), 1, (half, 0), count_include_pad=False)
 
 
 def _mixed(alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> Tensor:
     """Return light and albedo [V, 6, R, R], mixed with the same weights."""
-    height, width = both_V6RR.shape[2:]
-    alike = alike_VCRR[:, :_ALIKE]
-    doubt = softplus(-alike_VCRR[:, _ALIKE]).clamp(max=_LEAST_TRUST)
+    height = both_V6RR.shape[2]
     frame = (step, step, step, step)
-    alike_around, both_around = pad(alike, frame), pad(both_V6RR, frame)
-    trust_around = pad(torch.exp(-doubt), frame)  # 0 outside the picture
-    total, shares = torch.zeros_like(both_V6RR), torch.zeros_like(doubt)
+    trust = torch.exp(-softplus(-alike_VCRR[:, _ALIKE:]).clamp(max=_LEAST_TRUST))
+    around = pad(torch.cat([alike_VCRR[:, :_ALIKE], trust, both_V6RR], dim=1), frame)
+    rows = height if torch.is_grad_enabled() else _ROWS
+    return torch.cat(
+        [
+            _mixed_rows(around[:, :, first : first + rows + 2 * step], near_9, step)
+            for first in range(0, height, rows)
+        ],
+        dim=2,
+    )
+
+
+def _mixed_rows(around_VCRR: Tensor, near_9: Tensor, step: int) -> Tensor:
+    """Return [V, 6, rows, R] from all numbers of pixels with a frame around, 0 outside."""
+    height, width = (size - 2 * step for size in around_VCRR.shape[2:])
+    own = around_VCRR[:, :_ALIKE, step : step + height, step : step + width]
+    total: Tensor | float = 0.0
+    shares: Tensor | float = 0.0
     for tap, near in enumerate(near_9):
         row, column = tap // 3 * step, tap % 3 * step
-        rows, columns = slice(row, row + height), slice(column, column + width)
-        unlike = (alike - alike_around[..., rows, columns]).square().sum(dim=1)
-        share = torch.exp(near - unlike) * trust_around[:, rows, columns]
-        total = total + share[:, None] * both_around[..., rows, columns]
+        there = around_VCRR[:, :, row : row + height, column : column + width]
+        unlike = (own - there[:, :_ALIKE]).square().sum(dim=1, keepdim=True)
+        share = torch.exp(near - unlike) * there[:, _ALIKE : _ALIKE + 1]
+        total = total + share * there[:, _ALIKE + 1 :]
         shares = shares + share
-    return total / shares[:, None]
+    return cast(Tensor, total / shares)
