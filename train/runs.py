@@ -62,8 +62,11 @@ def hits() -> TrainSettings:
         builtin(),
         run="hits",
         model=hits_smoke(),
-        num_steps=6_000,
+        num_steps=2_400,
         views_per_scene=2,
+        ema_decay=0.998,
+        validate_every=200,
+        checkpoint_every=200,
         augmentation=AugmentationSettings(
             rotation="uniform",
             mirror=True,

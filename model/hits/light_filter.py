@@ -28,7 +28,7 @@ _AROUND_PX = (3, 7)
 _DARKEST = 1e-4
 """Specular albedo that a mixture is divided by at least."""
 
-_ROWS = 16
+_ROWS = 32
 """Rows of a picture that are mixed at a time while rendering: they stay in the processor's cache.
 """
 
