@@ -16,9 +16,6 @@ _OFFSET = np.float32(1500 * 2.0**-24)
 """How far rays start off a surface, as a share of 1 m plus their distance from the origin: the
 renderer's own (pipeline.renders.kernel_scene)."""
 
-_FLAT = 1e-3
-"""By how much the normals of a flat triangle's corners may differ."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Points:
@@ -101,12 +98,6 @@ class LitScene:
         return len(self.area)
 
     @cached_property
-    def is_curved(self) -> NDArray[np.bool_]:
-        """[T] whether shading normals differ between the corners of triangles."""
-        apart: NDArray[np.bool_] = (np.ptp(self.normals, axis=0) > _FLAT).any(axis=0)
-        return apart
-
-    @cached_property
     def seen(self) -> Triangles:
         """What cameras see: all but emitters, which are hidden from them."""
         return Triangles(self._corner_rows, np.flatnonzero(~self.emits))
@@ -124,7 +115,7 @@ class LitScene:
             uv: [2, P] weights of the second and third corner.
             direction: [3, P] of the rays.
         """
-        weights = _weights(uv)
+        weights = np.stack([1 - uv[0] - uv[1], uv[0], uv[1]])
         position = _between(self.corners, triangle, weights)
         normal = unit(_between(self.normals, triangle, weights))
         plane = self.plane[:, triangle]
@@ -141,10 +132,6 @@ class LitScene:
             edge=np.take(self.edge, triangle, axis=1),
             back=back,
         )
-
-    def shading_normals(self, triangle: NDArray[np.intp], uv: Floats) -> Floats:
-        """Return the unit shading normals [3, P] at weights [2, P], as the corners have them."""
-        return unit(_between(self.normals, triangle, _weights(uv)))
 
     def first_hits(self, origin: Floats, direction: Floats) -> MetSurfaces:
         """Return what rays [3, P] from one camera [3] see first."""
@@ -165,10 +152,6 @@ class LitScene:
         found = among.met(as_rows(start), as_rows(direction))
         met = found.triangle >= 0
         return self.points(np.maximum(found.triangle, 0), found.uv, direction), met
-
-
-def _weights(uv: Floats) -> Floats:
-    return np.stack([1 - uv[0] - uv[1], uv[0], uv[1]])
 
 
 def _between(corners: Floats, triangle: NDArray[np.intp], weights: Floats) -> Floats:

