@@ -17,14 +17,16 @@ from infra.bench.experiments.sampling import DB
 from infra.bench.sides.preview_pictures import preview_ladder
 from infra.bench.sides.rung_pictures import RungPicture, judged, network_rung
 from infra.bench.workshop import Workshop
+from infra.rendering.way_table import NETWORK_SCENE, NETWORK_VIEW
 from pipeline.objects.generated import BENCHMARK
 from pipeline.renders.preview_parts import all_parts, timed_parts
 from pipeline.renders.settings import Filtered
 
 NETWORK = "network builtin:"
-NETWORK_SCENE, NETWORK_VIEW = "network scene", "network view"
+PROBES = ("held-out 1", "held-out 2")
+"""Scenes on which other machines time the same parts (infra.bench.sides.machine_costs)."""
 
-WIDTHS = {64: (1024, 2048), 128: (512, 1024), 256: (256, 256), 512: (128, 128)}
+WIDTHS = {64: (1024, 2048), 128: (256, 512), 256: (64, 128), 512: (16, 128)}
 """By width in pixels: most samples of a preview, and samples of the references' halves together."""
 
 
@@ -55,8 +57,12 @@ def _measure(workshop: Workshop, points: Sequence[Point], turn: str, *, px: int)
 
 
 def _parts(effort: Effort) -> list[Point]:
-    names = (*all_parts(), NETWORK_SCENE, NETWORK_VIEW)
-    return [Point(name=part_name(name, px)) for px in WIDTHS for name in names]
+    return [Point(name=part_name(name, px)) for px in WIDTHS for name in timed_names()]
+
+
+def timed_names() -> tuple[str, ...]:
+    """Return the names of all parts, those of the network too."""
+    return (*all_parts(), NETWORK_SCENE, NETWORK_VIEW)
 
 
 def part_name(part: str, px: int) -> str:
