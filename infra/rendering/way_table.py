@@ -1,6 +1,6 @@
 """What ways to a picture cost and how far they are from the truth: the tables that choices read.
 
-Errors are shipped: they do not depend on the machine. Costs are shipped as well, as core-seconds of
+Errors are shipped: they do not depend on the machine. PictureCosts are shipped as well, as core-seconds of
 the machine on which they were measured, until `trilight doctor --measure` has timed the same parts
 on this one and keeps them in the user's cache.
 """
@@ -55,7 +55,7 @@ class PartCost:
 
 
 @checked("costs of previews")
-class Costs:
+class PictureCosts:
     """What the parts of pictures take on a machine."""
 
     machine: str
@@ -90,9 +90,9 @@ class WayTable:
     """Number of scenes, one view each."""
     errors: tuple[WayError, ...]
     """Each way at the widths at which it was measured."""
-    costs: Costs
+    costs: PictureCosts
     """Median core-seconds of the parts, one thread."""
-    probe: Costs
+    probe: PictureCosts
     """The same of the mean of the first scenes alone, which other machines time as well."""
 
 
@@ -100,7 +100,7 @@ class WayTable:
 class KnownCosts:
     """The costs that hold here, and where they are from."""
 
-    costs: Costs
+    costs: PictureCosts
     is_of_here: bool
     """Whether they were measured on this machine."""
     source: str
@@ -128,7 +128,7 @@ def known_costs(variant: Variant) -> KnownCosts:
     shipped, path = shipped_table().costs, machine_costs_path()
     try:
         record: Any = json.loads(path.read_bytes())
-        costs = from_record(Costs, record)
+        costs = from_record(PictureCosts, record)
         _require_whole(costs, shipped)
     except FileNotFoundError:
         why = f"costs as shipped: `{MEASURE}` measures this machine"
@@ -144,14 +144,14 @@ def known_costs(variant: Variant) -> KnownCosts:
     return KnownCosts(costs=shipped, is_of_here=False, source=why)
 
 
-def keep_machine_costs(costs: Costs) -> Path:
+def keep_machine_costs(costs: PictureCosts) -> Path:
     """Keep costs as those of this machine and return their file; TrilightError as of files."""
     path = machine_costs_path()
     write_atomically(path, canonical_json(settings_record(costs)) + b"\n")
     return path
 
 
-def _require_whole(costs: Costs, shipped: Costs) -> None:
+def _require_whole(costs: PictureCosts, shipped: PictureCosts) -> None:
     known = {(row.part, row.width) for row in costs.rows}
     for row in shipped.rows:
         if (row.part, row.width) not in known:

@@ -15,8 +15,8 @@ import numpy as np
 from infra.rendering.way_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
-    Costs,
     KnownCosts,
+    PictureCosts,
     Rung,
     WayError,
     WayTable,
@@ -114,7 +114,13 @@ class Choice:
 
 
 def priced_ways(
-    table: WayTable, costs: Costs, *, width: int, threads: int, per_scene: float, network: bool
+    table: WayTable,
+    costs: PictureCosts,
+    *,
+    width: int,
+    threads: int,
+    per_scene: float,
+    network: bool,
 ) -> list[Priced]:
     """Return every way with its price and error.
 
@@ -189,7 +195,7 @@ def chosen_way(
     return Choice(asked=asked, priced=priced, fits=fits, scenes=table.scenes, costs=known.source)
 
 
-def _part_seconds(costs: Costs, width: int, threads: int) -> dict[str, float]:
+def _part_seconds(costs: PictureCosts, width: int, threads: int) -> dict[str, float]:
     """Return the seconds of every part, interpolated between widths in logarithms.
 
     Below the least width they are those of that width, which is more than they are; above the

@@ -20,7 +20,7 @@ from infra.bench.experiments.previews import (
 )
 from infra.bench.run import RESULTS, store_of
 from infra.bench.store import Run
-from infra.rendering.way_table import SHIPPED, Costs, PartCost, WayError, WayTable
+from infra.rendering.way_table import SHIPPED, PartCost, PictureCosts, WayError, WayTable
 from pipeline.renders.preview_parts import SCENE
 from storage.atomic import write_atomically
 from storage.errors import TrilightError
@@ -80,7 +80,7 @@ def _errors(run: Run, turns: Sequence[str], px: int) -> Iterator[WayError]:
 
 def _costs(
     machine: str, run: Run, turns: Sequence[str], over: Callable[[list[float]], float]
-) -> Costs:
+) -> PictureCosts:
     rows = []
     for px in WIDTHS:
         for part in timed_names():
@@ -88,7 +88,7 @@ def _costs(
             core_s = float(f"{over(found):.4g}")
             serial_s, parallel_s = (core_s, 0.0) if part in _SERIAL else (0.0, core_s)
             rows.append(PartCost(part=part, width=px, serial_s=serial_s, parallel_s=parallel_s))
-    return Costs(machine=machine, rows=tuple(rows))
+    return PictureCosts(machine=machine, rows=tuple(rows))
 
 
 def _newest(results: Path, name: str) -> Run | None:

@@ -22,8 +22,8 @@ from infra.bench.workshop import Workshop
 from infra.rendering.way_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
-    Costs,
     PartCost,
+    PictureCosts,
     WayTable,
     machine_name,
 )
@@ -40,7 +40,7 @@ Timed = dict[tuple[int, int], Mapping[str, float]]
 """Seconds of the parts by width and threads."""
 
 
-def measured_costs(table: WayTable) -> Costs:
+def measured_costs(table: WayTable) -> PictureCosts:
     """Return what the parts take here, in well under a minute on an idle machine."""
     cores = os.cpu_count() or 1
     with contextlib.closing(Workshop(QUICK, Asked())) as workshop:
@@ -55,7 +55,7 @@ def measured_costs(table: WayTable) -> Costs:
     return costs_of(table, mean, cores, machine_name(choose_variant()))
 
 
-def costs_of(table: WayTable, timed: Timed, cores: int, machine: str) -> Costs:
+def costs_of(table: WayTable, timed: Timed, cores: int, machine: str) -> PictureCosts:
     """Return the shipped costs times what the probes take here by what they took there.
 
     Args:
@@ -88,7 +88,7 @@ def costs_of(table: WayTable, timed: Timed, cores: int, machine: str) -> Costs:
                 parallel_s=float(f"{core_s * parallel:.4g}"),
             )
         )
-    return Costs(machine=machine, rows=tuple(rows))
+    return PictureCosts(machine=machine, rows=tuple(rows))
 
 
 def _serial_and_parallel(one_s: float, all_s: float, cores: int) -> Any:

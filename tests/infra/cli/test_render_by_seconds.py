@@ -9,8 +9,8 @@ import OpenEXR
 import pytest
 
 from infra.rendering.way_table import (
-    Costs,
     PartCost,
+    PictureCosts,
     keep_machine_costs,
     machine_name,
     shipped_table,
@@ -85,7 +85,7 @@ def test_the_costs_of_this_machine_choose(
         PartCost(part=row.part, width=row.width, serial_s=1e-7, parallel_s=0)
         for row in shipped_table().costs.rows
     )
-    keep_machine_costs(Costs(machine=machine_name(variant), rows=rows))
+    keep_machine_costs(PictureCosts(machine=machine_name(variant), rows=rows))
     found = json.loads(trilight([*words, "--seconds", "1e-3", "--json"]).output)
     assert found["spp"] >= 256 and "costs as measured here" in found["choice"]
 

@@ -1,4 +1,4 @@
-"""Costs of this machine win where they are whole and its own; else a sentence says why not."""
+"""PictureCosts of this machine win where they are whole and its own; else a sentence says why not."""
 
 import dataclasses
 import json
@@ -9,7 +9,7 @@ import pytest
 
 from infra.rendering.way_table import (
     MEASURE,
-    Costs,
+    PictureCosts,
     keep_machine_costs,
     known_costs,
     machine_costs_path,
@@ -28,10 +28,10 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def costs_of_here() -> Costs:
+def costs_of_here() -> PictureCosts:
     shipped = shipped_table().costs
     slower = [dataclasses.replace(row, serial_s=row.serial_s + 1) for row in shipped.rows]
-    return Costs(machine=machine_name(VARIANT), rows=tuple(slower))
+    return PictureCosts(machine=machine_name(VARIANT), rows=tuple(slower))
 
 
 def test_without_a_file_costs_are_shipped() -> None:

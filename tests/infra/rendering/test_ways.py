@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -10,9 +11,9 @@ from hypothesis import strategies as st
 from infra.rendering.way_table import (
     NETWORK_SCENE,
     NETWORK_VIEW,
-    Costs,
     KnownCosts,
     PartCost,
+    PictureCosts,
     WayError,
     WayTable,
     shipped_table,
@@ -108,15 +109,15 @@ def test_prices_are_sums_of_parts_between_widths_in_logarithms() -> None:
         for at, name in enumerate((*all_parts(), NETWORK_SCENE, NETWORK_VIEW))
         for width in (64, 256)
     ]
-    error = {"spp": 20, "denoiser": "fast", "rung": "traced"}
+    error: dict[str, Any] = {"spp": 20, "denoiser": "fast", "rung": "traced"}
     table = WayTable(
         scenes=3,
         errors=(
             WayError(**error, width=64, median_db=20.0, least_db=10.0),
             WayError(**error, width=256, median_db=30.0, least_db=14.0),
         ),
-        costs=Costs(machine="x", rows=tuple(rows)),
-        probe=Costs(machine="x", rows=()),
+        costs=PictureCosts(machine="x", rows=tuple(rows)),
+        probe=PictureCosts(machine="x", rows=()),
     )
     names = list(all_parts())
     of = {name: names.index(name) + 1 for name in names}
@@ -142,7 +143,7 @@ def test_the_network_is_chosen_by_its_figures_alone() -> None:
         part(row.part, row.width, 1e-6) if row.part.startswith("network") else row
         for row in table.costs.rows
     ]
-    quick = Costs(machine="x", rows=tuple(rows))
+    quick = PictureCosts(machine="x", rows=tuple(rows))
     for network, rung in ((True, "network"), (False, "traced")):
         ways = priced_ways(table, quick, width=64, threads=1, per_scene=1, network=network)
         assert reaching(ways, 0, 64).way.rung == rung

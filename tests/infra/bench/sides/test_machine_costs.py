@@ -1,4 +1,4 @@
-"""Costs of a machine are shipped ones times what its probes take; threads share what they can."""
+"""PictureCosts of a machine are shipped ones times what its probes take; threads share what they can."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_what_threads_seem_to_slow_down_is_serial() -> None:
 
 
 def test_one_core_is_measured_once() -> None:
-    timed = {(px, 1): each for (px, threads), each in timed_as_shipped(2.0, 0.0).items()
+    timed: Timed = {(px, 1): each for (px, threads), each in timed_as_shipped(2.0, 0.0).items()
              if threads == 1}  # fmt: skip
     for row in costs_of(shipped_table(), timed, 1, "here").rows:
         assert row.serial_s == 0 and row.parallel_s > 0
@@ -63,7 +63,7 @@ def test_between_the_probed_widths_machines_differ_by_what_lies_between() -> Non
 
 
 def test_a_part_that_was_not_timed_costs_what_is_shipped() -> None:
-    timed = {
+    timed: Timed = {
         key: {part: s for part, s in each.items() if not part.startswith("network")}
         for key, each in timed_as_shipped(2.0, 0.0).items()
     }
