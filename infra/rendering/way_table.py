@@ -1,6 +1,6 @@
 """What ways to a picture cost and how far they are from the truth: the tables that choices read.
 
-Errors are shipped: they do not depend on the machine. PictureCosts are shipped as well, as core-seconds of
+Errors are shipped: they do not depend on the machine. Costs are shipped as well, as core-seconds of
 the machine on which they were measured, until `trilight doctor --measure` has timed the same parts
 on this one and keeps them in the user's cache.
 """

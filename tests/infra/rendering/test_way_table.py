@@ -1,4 +1,4 @@
-"""PictureCosts of this machine win where they are whole and its own; else a sentence says why not."""
+"""Costs of this machine win where they are whole and its own; else a sentence says why not."""
 
 import dataclasses
 import json

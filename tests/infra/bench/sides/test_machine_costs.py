@@ -1,4 +1,4 @@
-"""PictureCosts of a machine are shipped ones times what its probes take; threads share what they can."""
+"""Costs of a machine are shipped ones times what its probes take; threads share what they can."""
 
 import numpy as np
 import pytest
