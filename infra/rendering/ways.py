@@ -70,6 +70,9 @@ class Priced:
     """Median psnr_log_db over the scenes of the table."""
     least_db: float
     """That of the worst of them."""
+    judged_px: int
+    """Width in pixels of which this error is: that of the pictures asked for, or the nearest of
+    those at which the way was measured where it lies beyond them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,8 +102,8 @@ class Choice:
         lead = "chosen" if self.fits else "nothing is as quick; the quickest is chosen"
         return (
             f"{self.asked}: {lead}: {one.way}; expected {one.db:.1f} dB in the median of "
-            f"{self.scenes} scenes ({one.least_db:.1f} in the worst), in {_shown_s(one.seconds)} s "
-            f"after start-up; {self.costs}"
+            f"{self.scenes} scenes at {one.judged_px} pixels ({one.least_db:.1f} in the worst), in "
+            f"{_shown_s(one.seconds)} s after start-up; {self.costs}"
         )
 
     @property
@@ -138,12 +141,14 @@ def priced_ways(
         way = Way(rung=row.rung, spp=row.spp, denoiser=row.denoiser)
         if network or row.rung != "network":
             rows.setdefault(way, []).append(row)
+            rows[way].sort(key=lambda each: each.width)
     return [
         Priced(
             way=way,
             seconds=part_s[way.scene_part] / per_scene + seconds_of(way.view_parts, part_s),
             db=_at_width(width, {row.width: row.median_db for row in of_way}),
             least_db=_at_width(width, {row.width: row.least_db for row in of_way}),
+            judged_px=min(max(width, of_way[0].width), of_way[-1].width),
         )
         for way, of_way in rows.items()
     ]

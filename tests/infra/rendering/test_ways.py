@@ -35,7 +35,7 @@ FILTERS: tuple[Filtered, ...] = ("fast", "high")
 
 def priced(seconds: float, db: float, spp: int = 1) -> Priced:
     way = Way(rung="traced", spp=spp, denoiser="fast")
-    return Priced(way=way, seconds=seconds, db=db, least_db=db - 5)
+    return Priced(way=way, seconds=seconds, db=db, least_db=db - 5, judged_px=64)
 
 
 def part(name: str, width: int, serial_s: float, parallel_s: float = 0.0) -> PartCost:
@@ -132,7 +132,7 @@ def test_prices_are_sums_of_parts_between_widths_in_logarithms() -> None:
         assert (one.db, one.least_db) == pytest.approx((25.0, 12.0))
     for width, db, growth in ((8, 20.0, 64**1.5), (2048, 30.0, 256**1.5 * 64)):
         (one,) = priced_ways(table, table.costs, width=width, threads=1, per_scene=1, network=False)
-        assert one.db == db
+        assert one.db == db and one.judged_px == (64 if width < 64 else 256)
         assert one.seconds == pytest.approx((units + of["scene"]) * growth, rel=1e-9)
 
 
@@ -159,8 +159,8 @@ def test_a_choice_says_what_it_is_and_whether_it_fits() -> None:
         choice = chosen_way(ways, table, known, seconds=seconds, error_db=None, width=64)
         assert choice.sentence == (
             f"--seconds {seconds:g}: {lead}: 4 samples a pixel, filter fast; expected 30.0 dB in "
-            f"the median of {table.scenes} scenes (25.0 in the worst), in 0.25 s after start-up; "
-            "costs as shipped"
+            f"the median of {table.scenes} scenes at 64 pixels (25.0 in the worst), in 0.25 s "
+            "after start-up; costs as shipped"
         )
         assert choice.facts == {
             "chosen_for": f"--seconds {seconds:g}", "expected_db": 30.0, "expected_seconds": 0.25
