@@ -133,7 +133,8 @@ def priced_ways(
         width: of a picture in pixels.
         threads: that work; no more than there are cores.
         per_scene: pictures that share the loading of a scene, at least 1.
-        network: whether the network can run here.
+        network: whether the network can run here; it is a way only at widths between those at which
+            it was judged.
     """
     part_s = _part_seconds(costs, width, threads)
     rows: dict[Way, list[WayError]] = {}
@@ -151,6 +152,8 @@ def priced_ways(
             judged_px=min(max(width, of_way[0].width), of_way[-1].width),
         )
         for way, of_way in rows.items()
+        # samples come nearer the truth as pictures grow, a network leaves what it was trained on
+        if way.rung == "traced" or of_way[0].width <= width <= of_way[-1].width
     ]
 
 

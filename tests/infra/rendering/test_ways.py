@@ -151,6 +151,15 @@ def test_the_network_is_chosen_by_its_figures_alone() -> None:
         assert within_seconds(ways, 1e9)[0].way.rung == "traced"
 
 
+def test_the_network_is_no_way_at_widths_at_which_it_was_not_judged() -> None:
+    table = shipped_table()
+    judged = [row.width for row in table.errors if row.rung == "network"]
+    for width in (8, 64, 128, 256, 512, 1024):
+        ways = priced_ways(table, table.costs, width=width, threads=1, per_scene=1, network=True)
+        offered = any(one.way.rung == "network" for one in ways)
+        assert offered == (min(judged) <= width <= max(judged))
+
+
 def test_a_choice_says_what_it_is_and_whether_it_fits() -> None:
     table = shipped_table()
     known = KnownCosts(costs=table.costs, is_of_here=False, source="costs as shipped")
