@@ -101,8 +101,6 @@ class KnownCosts:
     """The costs that hold here, and where they are from."""
 
     costs: PictureCosts
-    is_of_here: bool
-    """Whether they were measured on this machine."""
     source: str
     """Where they are from, as the end of a sentence."""
 
@@ -136,12 +134,12 @@ def known_costs(variant: Variant) -> KnownCosts:
         why = f"costs as shipped, since {path} cannot be used ({error}): `{MEASURE}` writes it anew"
     else:
         if costs.machine == machine_name(variant):
-            return KnownCosts(costs=costs, is_of_here=True, source="costs as measured here")
+            return KnownCosts(costs=costs, source="costs as measured here")
         why = (
             f"costs as shipped, since {path} is of another machine ({costs.machine}): "
             f"`{MEASURE}` measures this one"
         )
-    return KnownCosts(costs=shipped, is_of_here=False, source=why)
+    return KnownCosts(costs=shipped, source=why)
 
 
 def keep_machine_costs(costs: PictureCosts) -> Path:

@@ -162,7 +162,7 @@ def test_the_network_is_no_way_at_widths_at_which_it_was_not_judged() -> None:
 
 def test_a_choice_says_what_it_is_and_whether_it_fits() -> None:
     table = shipped_table()
-    known = KnownCosts(costs=table.costs, is_of_here=False, source="costs as shipped")
+    known = KnownCosts(costs=table.costs, source="costs as shipped")
     ways = [priced(0.25, 30.0, spp=4)]
     for seconds, lead in ((1.0, "chosen"), (1e-9, "nothing is as quick; the quickest is chosen")):
         choice = chosen_way(ways, table, known, seconds=seconds, error_db=None, width=64)
