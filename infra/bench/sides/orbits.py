@@ -3,7 +3,10 @@
 With E the error of log10(1 + radiance) of a frame, flicker is the mean square of the change of E
 from one frame to the next (storage.metrics.flicker_log_db). Raw halves A and B of each frame give
 two such changes whose noises have nothing to do with each other: in the mean of their product the
-noise of the references cancels.
+noise of the references cancels. What is left of it is that the mean of noisy logarithms lies below
+the logarithm of the mean, which hardly changes from frame to frame. (Secants, as errors of single
+pictures are taken with, are worse here: one bright sample in one half flattens the secant of both,
+and where the noise is as large as the flicker the product then comes out below 0.)
 """
 
 import time
@@ -17,7 +20,6 @@ from infra.bench.sides.judged_pictures import LEAST_ERROR, Reference
 from infra.bench.sides.rung_pictures import Rung, sampled_rung
 from infra.bench.sides.shots import warm_up_denoiser
 from infra.rendering.cameras import orbit, own_camera
-from pipeline.renders.noise_floor import secant_slope
 from pipeline.renders.settings import Filtered
 from storage.conventions import log10_radiance
 from storage.records.scene import Scene
@@ -75,22 +77,11 @@ def true_flicker_db(
         frames_rgb: [N, R, R, 3] linear radiance, two frames at least.
         references: of each frame, of the same width.
     """
-    a, b = (np.diff(errors, axis=0) for errors in _errors(frames_rgb, references))
+    shown = log10_radiance(frames_rgb.astype(np.float64))
+    halves = ([each.a_rgb for each in references], [each.b_rgb for each in references])
+    a, b = (np.diff(shown - log10_radiance(np.stack(half)), axis=0) for half in halves)
     flicker = float((a * b).mean())
     change, noise_sq = 0.5 * (a + b), np.square(0.5 * (a - b))
     spread = float(np.sqrt(((np.square(change) + noise_sq) * noise_sq).sum())) / a.size
     flicker = max(flicker, LEAST_ERROR)
     return -10 * np.log10(flicker), 10 * np.log10(1 + spread / flicker)
-
-
-def _errors(
-    frames_rgb: NDArray[np.float32], references: Sequence[Reference]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the errors [N, R, R, 3] of log10(1 + radiance) as each half sees them."""
-    found = []
-    for frame, reference in zip(frames_rgb.astype(np.float64), references, strict=True):
-        mean = 0.5 * (reference.a_rgb + reference.b_rgb)
-        slope = secant_slope(log10_radiance, frame, mean)
-        found.append([slope * (frame - half) for half in (reference.a_rgb, reference.b_rgb)])
-    of_a, of_b = (np.stack(halves) for halves in zip(*found, strict=True))
-    return of_a, of_b
