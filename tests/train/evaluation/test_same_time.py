@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from storage.dataset.training_data import open_training_data
 from storage.records.sample import Sample
 from tests.train.kit import tiny_run
 from tests.train.toy import write_toy_dataset
@@ -47,7 +48,7 @@ def judging(tmp_path_factory: pytest.TempPathFactory) -> tuple[Contest, list[Jud
     dataset = write_toy_dataset(tmp_path_factory.mktemp("toy"), train=1, validation=3)
     contest = Contest(
         network=new_state(tiny_run()).model,
-        shards=dataset.split("validation"),
+        shards=open_training_data([str(dataset.folder.root)]).split("validation"),
         resolution=32,
         rivals=None,
         lpips=None,
@@ -94,5 +95,8 @@ def test_sheets_show_it_beside_the_prediction(
     contest, views = judging
     alone = drawn_sheet(sheet_views(dataclasses.replace(contest, traced=None), views), ("title",))
     shown = sheet_views(contest, views)
-    np.testing.assert_array_equal(shown[1].beside_rgb[TRACER], shown[1].target_rgb.astype("f4"))
+    # the target went through float32 logarithms
+    np.testing.assert_allclose(
+        shown[1].beside_rgb[TRACER], shown[1].target_rgb, rtol=1e-5, atol=1e-6
+    )
     assert drawn_sheet(shown, ("title",)).width > alone.width
