@@ -15,7 +15,6 @@ from model.open import find_network
 from model.weights import network_digest
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
-from storage.errors import TrilightError
 from train.evaluation.evaluate import (
     Contest,
     judged_views,
@@ -33,6 +32,9 @@ from train.loop.checkpoints import network_of_run
 from train.loop.crew import choose_device
 from train.loss.lpips import load_lpips
 from train.result import pretty_json
+
+Told = Callable[[Sequence[JudgedView]], dict[str, Any]]
+"""Says of the judged views what the same time buys elsewhere."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,37 +104,16 @@ def judge_network(
     )
 
 
-Told = Callable[[Sequence[JudgedView]], dict[str, Any] | None]
-"""Says of the judged views how the path tracer does on them."""
-
-
 @contextlib.contextmanager
 def _tracing(contest: Contest, most_views: int) -> Iterator[tuple[Contest, Told]]:
     """Enter a contest with the path tracer in the network's own time, if one can be had."""
-    if not most_views:
-        yield contest, lambda views: None
-        return
-    try:
-        rival = TracerRival(
-            contest.resolution, most_views=most_views, num_scenes=_num_scenes(contest)
-        )
-    except TrilightError as error:
-        yield contest, _untraced(error)
-        return
+    rival = TracerRival(contest.resolution, most_views=most_views, num_scenes=_num_scenes(contest))
     with contextlib.closing(rival):
         samples = list(itertools.islice(contest.samples(), TIMED_SCENES))
-        try:
-            times = rival.measure(contest.network, samples)
-        except TrilightError as error:
-            yield contest, _untraced(error)
-        else:
-            beside = dataclasses.replace(contest, traced=rival)
-            yield beside, lambda views: same_time(views, times, rival.which)
-
-
-def _untraced(error: TrilightError) -> Told:
-    missing = str(error).rstrip(".")
-    return lambda views: {"missing": missing}
+        times = rival.measure(contest.network, samples)
+        if times.preview is not None:
+            contest = dataclasses.replace(contest, traced=rival)
+        yield contest, lambda views: same_time(views, times, rival.which)
 
 
 def write_judgement(judgement: Judgement, out: str | Path) -> None:

@@ -25,7 +25,7 @@ from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.errors import Rejected, TrilightError
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from train.evaluation.same_time import Times
+from train.evaluation.same_time import Preview, Times
 
 TIMED_SCENES = 4
 """Scenes on which both are timed."""
@@ -44,6 +44,9 @@ LADDER = tuple(1 << step for step in range(MOST_SPP.bit_length()))
 Level = tuple[int, Literal["fast", "high"]]
 """Samples a pixel, and the filter."""
 
+LEAST: Level = (1, "fast")
+"""What is cheapest."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Price:
@@ -56,82 +59,98 @@ class Price:
 
 
 class TracerRival:
-    """Traces pictures of stored scenes in a child of its own; one thread, nothing timed."""
+    """Traces pictures of stored scenes in a child of its own, on one thread."""
 
     def __init__(self, resolution: int, *, most_views: int, num_scenes: int) -> None:
         """Remember what is asked; a child is started when it is first needed.
 
         Args:
-            resolution: pixels across, a multiple of 8.
-            most_views: how many views it is judged on at most, one at least.
+            resolution: pixels across.
+            most_views: how many views it is judged on at most; with 0 nothing is traced.
             num_scenes: how many are judged.
         """
         self._resolution = resolution
-        self._every = max(1, -(-num_scenes // most_views))
+        self._most_views = most_views
+        self._every = max(1, -(-num_scenes // max(most_views, 1)))
         self._views = max(1, most_views // max(num_scenes, 1))
+        self._level: Level = LEAST
         self._variant: Variant | None = None
         self._child: IsolatedChild | None = None
         self._number: dict[str, int] = {}
-        self._settings = PreviewSettings(resolution=resolution, spp=1)
+        self._asked_views = 0
 
     @property
     def which(self) -> str:
-        """Which views it is judged on, in words."""
-        views = "the first view" if self._views == 1 else f"the first {self._views} views"
-        scenes = "each scene" if self._every == 1 else f"one scene in {self._every}"
-        return f"at most {views} of {scenes}"
+        """Which views it was judged on, in words."""
+        views = f"the first {self._views} views" if self._views > 1 else "the first view"
+        if self._asked_views <= self._views:
+            views = "all views"
+        return f"{views} of {'each scene' if self._every == 1 else f'one scene in {self._every}'}"
 
     def measure(self, network: RenderFormer, samples: Sequence[Sample]) -> Times:
         """Time both on some scenes, in turns, and remember the samples that fit.
 
+        Args:
+            network: wherever it is; it is timed on the processor.
+            samples: one at least.
+
         Raises:
-            TrilightError: no path tracer works here, or it can trace none of these scenes.
+            TrilightError: the network cannot show such pictures.
         """
         renderer = NeuralRenderer(copy.deepcopy(network).cpu())
         ours: list[Price] = []
         theirs: list[Mapping[Level, Price]] = []
-        why, spent = "there is none", 0.0
+        missing = "" if self._most_views else "nobody asked for its views"
+        began = time.process_time()
         for sample in samples:
-            if spent > TIMED_S:
+            if ours and time.process_time() - began > TIMED_S:
                 break
-            began = time.process_time()
-            own = _network_price(renderer, sample.scene, self._resolution)
-            spent += time.process_time() - began
+            ours.append(_network_price(renderer, sample.scene, self._resolution))
+            if missing:
+                continue
             try:
-                theirs.append(
-                    self._open().call(preview_prices, sample.scene, self._resolution, own.further_s)
-                )
-                ours.append(own)
-            except (Rejected, ChildFailed) as error:
-                why = str(error)
-        if not ours:
-            raise TrilightError(f"no scene of the split could be traced ({why})")
+                theirs.append(self._prices(sample.scene, ours[-1].further_s))
+            except (Rejected, ChildFailed):
+                continue
+            except TrilightError as error:
+                missing = str(error).rstrip(".")
         further_s = float(np.median([each.further_s for each in ours]))
-        spp, denoiser = level = chosen_level(theirs, further_s)
-        self._settings = PreviewSettings(resolution=self._resolution, spp=spp, denoiser=denoiser)
+        preview = None if missing or not theirs else self._chosen(theirs, further_s)
         return Times(
-            samples=spp,
-            denoiser=denoiser,
-            tracer_first_s=float(np.median([each[level].first_s for each in theirs])),
-            tracer_further_s=float(np.median([each[level].further_s for each in theirs])),
             network_first_s=float(np.median([each.first_s for each in ours])),
             network_further_s=further_s,
             scenes=len(ours),
+            preview=preview,
+            missing=missing or ("" if preview else "the scenes that were timed cannot be traced"),
+        )
+
+    def _prices(self, scene: Scene, most_s: float) -> Mapping[Level, Price]:
+        return self._open().call(preview_prices, scene, self._resolution, most_s)
+
+    def _chosen(self, prices: Sequence[Mapping[Level, Price]], most_s: float) -> Preview:
+        level = self._level = chosen_level(prices, most_s)
+        return Preview(
+            samples=level[0],
+            denoiser=level[1],
+            first_s=float(np.median([each[level].first_s for each in prices])),
+            further_s=float(np.median([each[level].further_s for each in prices])),
             note=self._variant.note if self._variant else "",
         )
 
     def judged(self, sample: Sample, view: int) -> NDArray[np.float32] | None:
         """Return linear radiance [R, R, 3], or None of a view that it is not judged on."""
         number = self._number.setdefault(sample.key, len(self._number))
+        self._asked_views = max(self._asked_views, view + 1)
         if number % self._every or view >= self._views:
             return None
         return self.shown(sample, view)
 
     def shown(self, sample: Sample, view: int) -> NDArray[np.float32] | None:
         """Return the same of any view; None where it cannot be traced."""
-        scene, child = sample.scene, self._open()
+        scene, child, (spp, denoiser) = sample.scene, self._open(), self._level
+        settings = PreviewSettings(resolution=self._resolution, spp=spp, denoiser=denoiser)
         try:
-            return with_retries(lambda: child.call(preview, scene, view, self._settings))
+            return with_retries(lambda: child.call(traced_view, scene, view, settings))
         except (Rejected, ChildFailed):
             return None
 
@@ -164,7 +183,7 @@ def chosen_level(prices: Sequence[Mapping[Level, Price]], most_s: float) -> Leve
     fits = [
         level for level in common if np.median([each[level].further_s for each in prices]) <= most_s
     ]
-    return max(fits, key=lambda level: (level[0], level[1] == "high"), default=(1, "fast"))
+    return max(fits, key=lambda level: (level[0], level[1] == "high"), default=LEAST)
 
 
 def set_up_child(variant: Variant) -> None:
@@ -173,7 +192,7 @@ def set_up_child(variant: Variant) -> None:
     set_threads(1)
 
 
-def preview(scene: Scene, view: int, settings: PreviewSettings) -> NDArray[np.float32]:
+def traced_view(scene: Scene, view: int, settings: PreviewSettings) -> NDArray[np.float32]:
     """Return the picture of one of a scene's cameras; runs in the child."""
     return _show(PreviewRenderer(scene, settings), scene, view)
 

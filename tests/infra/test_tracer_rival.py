@@ -17,11 +17,11 @@ from train.loop.state import new_state
 
 
 def prices(*, sample_s: float, fast_s: float, high_s: float, most: int) -> Mapping[Level, Price]:
-    return {
-        (spp, name): Price(first_s=1.0, further_s=spp * sample_s + filter_s)
-        for spp in LADDER[:most]
-        for name, filter_s in (("fast", fast_s), ("high", high_s))
-    }
+    found: dict[Level, Price] = {}
+    for spp in LADDER[:most]:
+        found[spp, "fast"] = Price(first_s=1.0, further_s=spp * sample_s + fast_s)
+        found[spp, "high"] = Price(first_s=1.0, further_s=spp * sample_s + high_s)
+    return found
 
 
 @given(st.floats(0, 100))
@@ -68,16 +68,24 @@ def test_it_is_judged_on_no_more_views_than_asked_from_all_over_the_split(
     numbers = [number for number, picture in asked if picture is not None]
     assert len(numbers) == judged <= most
     assert max(numbers) >= scenes // 2 or most == 1
-    assert rival.which.startswith("at most the first")
+    views = "all views" if most == 64 else "the first view"
+    assert rival.which.startswith(f"{views} of ")
+    assert ("each scene" in rival.which) == (most >= scenes)
 
 
-def test_without_a_path_tracer_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_path_tracer_it_says_so_and_the_network_is_timed_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("TRILIGHT_VARIANT", "none_such")
-    rival = TracerRival(16, most_views=4, num_scenes=2)
-    with pytest.raises(TrilightError, match="TRILIGHT_VARIANT is 'none_such'"):
-        rival.measure(new_state(tiny_run()).model, [toy_sample(0)])
-    with pytest.raises(TrilightError, match="multiple of 8"):
-        TracerRival(20, most_views=4, num_scenes=2)
+    network, samples = new_state(tiny_run()).model, [toy_sample(0), toy_sample(1)]
+    lacking = TracerRival(16, most_views=4, num_scenes=2).measure(network, samples)
+    assert lacking.preview is None and "TRILIGHT_VARIANT is 'none_such'" in lacking.missing
+    unasked = TracerRival(16, most_views=0, num_scenes=2).measure(network, samples)
+    assert unasked.preview is None and unasked.missing == "nobody asked for its views"
+    for times in (lacking, unasked):
+        assert times.scenes == 2 and 0 < times.network_further_s < times.network_first_s
+    with pytest.raises(TrilightError, match="resolution is 20"):
+        TracerRival(20, most_views=4, num_scenes=2).measure(network, samples)
 
 
 @pytest.mark.slow
@@ -90,9 +98,8 @@ def test_it_is_timed_beside_the_network_and_traces_the_stored_scene() -> None:
     dark = dataclasses.replace(dark, scene=dataclasses.replace(dark.scene, materials=unlit))
     try:
         times = rival.measure(network, [toy_sample(0), dark])
-        assert times.scenes == 1, "what cannot be traced is not timed"
-        assert 0 < times.tracer_further_s < times.tracer_first_s
-        assert 0 < times.network_further_s < times.network_first_s
+        assert times.preview is not None and times.scenes == 2
+        assert 0 < times.preview.further_s < times.preview.first_s
         sample = toy_sample(0)
         once, again = rival.judged(sample, 0), rival.shown(sample, 0)
         other = rival.shown(sample, 1)
@@ -101,8 +108,8 @@ def test_it_is_timed_beside_the_network_and_traces_the_stored_scene() -> None:
         np.testing.assert_array_equal(once, again)
         assert not np.array_equal(once, other)
         assert rival.shown(dark, 0) is None
-        with pytest.raises(TrilightError, match="no scene of the split could be traced"):
-            rival.measure(network, [dark])
+        alone = rival.measure(network, [dark])
+        assert alone.missing == "the scenes that were timed cannot be traced"
         rival.close()
         after = rival.shown(sample, 0)
         assert after is not None

@@ -30,7 +30,7 @@ def record(
     Args:
         views: the rows.
         about: network, data, split, resolution, as they are to be told.
-        traced: the path tracer in the network's time (evaluation.same_time), if it was asked for.
+        traced: the path tracer in the network's time (evaluation.same_time), if that was measured.
     """
     return {
         "about": dict(about),
@@ -96,11 +96,11 @@ def _against_noise(network: Mapping[str, Any]) -> list[str]:
 
 
 def _same_time(traced: Mapping[str, Any] | None) -> list[str]:
-    if not (told := sentences(traced)):
+    if traced is None:
         return []
     lines = ["", "## Beside the path tracer, in the network's own time", ""]
-    lines += [_escaped(" ".join(told))]
-    if traced is None or "tracer" not in traced:
+    lines += [_escaped(" ".join(sentences(traced)))]
+    if "tracer" not in traced:
         return lines
     both = {name: traced[part] for name, part in ((NETWORK, "network"), (TRACER, "tracer"))}
     return [*lines, "", *_contestants(both)]

@@ -20,30 +20,35 @@ TRACER = "path tracer, same time"
 
 
 @dataclass(frozen=True, kw_only=True)
+class Preview:
+    """What the path tracer does in that time."""
+
+    samples: int
+    """Samples a pixel."""
+    denoiser: str
+    """The filter."""
+    first_s: float
+    """Core-seconds of the first view of a scene."""
+    further_s: float
+    """And of a further view."""
+    note: str
+    """What a person should know of the machine's tracer; empty if nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Times:
     """What was timed, on one thread of a processor once everything was warm; medians."""
 
-    samples: int
-    """Samples a pixel of the path tracer."""
-    denoiser: str
-    """Its filter."""
-    tracer_first_s: float
-    """Core-seconds of the path tracer for the first view of a scene."""
-    tracer_further_s: float
-    """And for a further view."""
     network_first_s: float
     """Core-seconds of the network for the first view of a scene."""
     network_further_s: float
     """And for a further view."""
     scenes: int
     """Scenes that were timed."""
-    note: str
-    """What a person should know of the machine's tracer; empty if nothing."""
-
-    @property
-    def fits(self) -> bool:
-        """Whether the tracer's further view takes no longer than the network's."""
-        return self.tracer_further_s <= self.network_further_s
+    preview: Preview | None
+    """None where nothing is traced."""
+    missing: str = ""
+    """Why nothing is."""
 
 
 class TracedBeside(Protocol):
@@ -68,7 +73,9 @@ def same_time(views: Sequence[JudgedView], times: Times, which: str) -> dict[str
         which: says which views the tracer was judged on.
     """
     both = [view for view in views if TRACER in view.scores]
-    found = dataclasses.asdict(times) | {"fits": times.fits, "which": which, "views": len(both)}
+    found = dataclasses.asdict(times) | {"which": which, "views": len(both)}
+    if times.preview is None:
+        return found
     if not both:
         return found | {"missing": "none of the judged views could be traced"}
     leads_db = [
@@ -84,26 +91,28 @@ def same_time(views: Sequence[JudgedView], times: Times, which: str) -> dict[str
     }
 
 
-def sentences(found: Mapping[str, Any] | None) -> list[str]:
-    """Return what a person reads of it; nothing where nobody asked."""
-    if found is None:
-        return []
-    if "missing" in found:
-        return [f"The path tracer in the network's time is not shown: {found['missing']}."]
-    plural = "s" if found["samples"] > 1 else ""
-    fits = "" if found["fits"] else ", longer than the network, and nothing traced is cheaper"
-    median = {name: found[name]["psnr_log_db"]["median"] for name in ("network", "tracer")}
-    lead = found["lead_db"]
+def sentences(found: Mapping[str, Any]) -> list[str]:
+    """Return what a person reads of it."""
+    own = (
+        f"A further view takes the network {found['network_further_s']:.3g} core-seconds, the "
+        f"first of a scene {found['network_first_s']:.3g} (medians of {found['scenes']} scenes, "
+        "one thread of a processor)."
+    )
+    if found["missing"]:
+        return [own, f"The path tracer in that time is not shown: {found['missing']}."]
+    preview, lead = found["preview"], found["lead_db"]
+    longer = preview["further_s"] > found["network_further_s"]
     lines = [
-        f"A further view takes the network {found['network_further_s']:.3g} core-seconds (the "
-        f"first of a scene {found['network_first_s']:.3g}), and the path tracer with "
-        f"{found['samples']} sample{plural} a pixel and its {found['denoiser']} filter "
-        f"{found['tracer_further_s']:.3g} ({found['tracer_first_s']:.3g}){fits}: medians of "
-        f"{found['scenes']} scenes, one thread of a processor.",
-        f"Over {found['views']} views ({found['which']}) the network has {median['network']:.2f} "
-        f"dB and the path tracer {median['tracer']:.2f} dB, medians of psnr_log_db; view by view "
+        own,
+        f"The path tracer takes {preview['further_s']:.3g} ({preview['first_s']:.3g}) with "
+        f"{preview['samples']} sample{'s' if preview['samples'] > 1 else ''} a pixel and its "
+        f"{preview['denoiser']} filter"
+        f"{': longer than the network, and it has nothing cheaper' if longer else ''}.",
+        f"Over {found['views']} views ({found['which']}) the network has "
+        f"{found['network']['psnr_log_db']['median']:.2f} dB and the path tracer "
+        f"{found['tracer']['psnr_log_db']['median']:.2f} dB, medians of psnr_log_db; view by view "
         f"the network is better by {lead['mean']:+.2f} dB ({lead['low']:+.2f} to "
-        f"{lead['high']:+.2f}, 95 % by scene), and better in {found['share_better']:.0%}. The "
-        "targets went through the same denoiser, which favours the path tracer a little.",
+        f"{lead['high']:+.2f}, 95 % by scene), and better in {found['share_better']:.0%}.",
+        "The targets went through the same denoiser, which favours the path tracer a little.",
     ]
-    return [*lines, *([f"{found['note']}."] if found["note"] else [])]
+    return [*lines, *([f"{preview['note']}."] if preview["note"] else [])]

@@ -303,7 +303,7 @@ def test_without_a_path_tracer_the_report_says_why(
     weights.write_bytes(encode_weights(new_state(tiny_run()).model))
     data = ["--data", str(dataset.folder.root), "--split", "validation", "--most-scenes", "1"]
     told = trilight(["evaluate", str(weights), *data, "--out", str(tmp_path / "out")]).output
-    assert "The path tracer in the network's time is not shown: TRILIGHT_VARIANT is" in told
+    assert "The path tracer in that time is not shown: TRILIGHT_VARIANT is" in told
     assert "is not shown: TRILIGHT" in (tmp_path / "out" / "evaluation.md").read_text()
 
 
