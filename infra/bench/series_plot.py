@@ -40,11 +40,11 @@ def plot_series(
     axes.margins(x=0.14, y=0.12)
     axes.tick_params(labelsize=_FONT)
     assert experiment.error is not None
-    axes.set_xlabel("core-seconds", fontsize=_FONT)
     axes.set_ylabel(f"{experiment.error.name}, {experiment.better} is better", fontsize=_FONT)
     kinds = list(dict.fromkeys(kind(one.point.name) for one in points))
     colours = {name: _COLOURS[row % len(_COLOURS)] for row, name in enumerate(kinds)}
     costs = (experiment.cost.name, *experiment.also_cost)
+    axes.set_xlabel(" or ".join(costs), fontsize=_FONT)
     names = [
         _draw(axes, one, experiment.error.name, costs, colours[kind(one.point.name)])
         for one in points

@@ -8,6 +8,7 @@ import numpy as np
 from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Point, TurnFigures
 from infra.bench.experiments.rungs import (
+    LAMPS,
     PHYSICS,
     kind_of,
     means,
@@ -39,7 +40,8 @@ SAMPLES: Mapping[str, tuple[int, Filtered, bool]] = {
 
 
 def _points(effort: Effort) -> list[Point]:
-    return [Point(name=PHYSICS), *(Point(name=name, settings=SAMPLES[name]) for name in SAMPLES)]
+    traced = [Point(name=name) for name in (LAMPS, PHYSICS)]
+    return [*traced, *(Point(name=name, settings=SAMPLES[name]) for name in SAMPLES)]
 
 
 def _turns(effort: Effort) -> list[str]:
