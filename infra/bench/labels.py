@@ -22,7 +22,11 @@ _CLEAR_PX = 7
 
 
 def place_labels(
-    axes: Any, names: Sequence[tuple[str, tuple[float, float]]], *, font: int = FONT
+    axes: Any,
+    names: Sequence[tuple[str, tuple[float, float]]],
+    *,
+    font: int = FONT,
+    also_clear: Sequence[tuple[float, float]] = (),
 ) -> None:
     """Write names beside their points, where they cover neither a point nor a name.
 
@@ -32,11 +36,12 @@ def place_labels(
         axes: of matplotlib, drawn once, so that places are known.
         names: with the point of each, in the order in which they matter.
         font: size of the names, in printer's points.
+        also_clear: other points that no name covers.
     """
     from matplotlib.transforms import Bbox
 
     lines = [axes.transData.transform_path(line.get_path()) for line in axes.lines]
-    centres = [axes.transData.transform(at) for _, at in names]
+    centres = [axes.transData.transform(at) for at in (*(at for _, at in names), *also_clear)]
     taken = [
         Bbox.from_extents(x - _CLEAR_PX, y - _CLEAR_PX, x + _CLEAR_PX, y + _CLEAR_PX)
         for x, y in centres

@@ -44,7 +44,7 @@ def plot_series(
     kinds = list(dict.fromkeys(kind(one.point.name) for one in points))
     colours = {name: _COLOURS[row % len(_COLOURS)] for row, name in enumerate(kinds)}
     costs = (experiment.cost.name, *experiment.also_cost)
-    axes.set_xlabel(" or ".join(costs), fontsize=_FONT)
+    axes.set_xlabel(costs[0] if len(costs) == 1 else "core-seconds", fontsize=_FONT)
     names = [
         _draw(axes, one, experiment.error.name, costs, colours[kind(one.point.name)])
         for one in points
@@ -52,7 +52,9 @@ def plot_series(
     plain_log(axes.xaxis)
     _legend(axes, costs, colours)
     figure.canvas.draw()  # places are known from here on
-    place_labels(axes, names, font=_FONT)
+    name = experiment.error.name
+    others = [(one.values[cost], one.values[name]) for one in points for cost in costs[1:]]
+    place_labels(axes, names, font=_FONT, also_clear=others)
     figure.savefig(path, metadata={"Software": None})
     plt.close(figure)
 
