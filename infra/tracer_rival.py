@@ -6,6 +6,7 @@ takes no longer than the network's; where even one sample takes longer, it is th
 """
 
 import copy
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -58,6 +59,10 @@ class Price:
     """Of a further one."""
 
 
+DEARER = Price(first_s=math.inf, further_s=math.inf)
+"""What was not tried, since fewer samples took too long."""
+
+
 class TracerRival:
     """Traces pictures of stored scenes in a child of its own, on one thread."""
 
@@ -90,6 +95,8 @@ class TracerRival:
     def measure(self, network: RenderFormer, samples: Sequence[Sample]) -> Times:
         """Time both on some scenes, in turns, and remember the samples that fit.
 
+        The network comes first, then the path tracer, then the network once more.
+
         Args:
             network: wherever it is; it is timed on the processor.
             samples: one at least.
@@ -98,42 +105,47 @@ class TracerRival:
             TrilightError: the network cannot show such pictures.
         """
         renderer = NeuralRenderer(copy.deepcopy(network).cpu())
+        scenes: list[Scene] = []
         ours: list[Price] = []
-        theirs: list[Mapping[Level, Price]] = []
-        missing = "" if self._most_views else "nobody asked for its views"
         began = time.process_time()
         for sample in samples:
-            if ours and time.process_time() - began > TIMED_S:
-                break
-            ours.append(_network_price(renderer, sample.scene, self._resolution))
-            if missing:
-                continue
+            if not scenes or time.process_time() - began < TIMED_S:
+                scenes.append(sample.scene)
+                ours.append(_network_price(renderer, sample.scene, self._resolution))
+        theirs, missing = self._prices(scenes, _middle([each.further_s for each in ours]))
+        ours += [_network_price(renderer, scene, self._resolution) for scene in scenes]
+        further_s = _middle([each.further_s for each in ours])
+        return Times(
+            network_first_s=_middle([each.first_s for each in ours]),
+            network_further_s=further_s,
+            scenes=len(scenes),
+            preview=self._chosen(theirs, further_s) if theirs else None,
+            missing=missing,
+        )
+
+    def _prices(
+        self, scenes: Sequence[Scene], most_s: float
+    ) -> tuple[list[Mapping[Level, Price]], str]:
+        """Return the prices of each scene that can be traced, or none and why."""
+        if not self._most_views:
+            return [], "nobody asked for its views"
+        found: list[Mapping[Level, Price]] = []
+        for scene in scenes:
             try:
-                theirs.append(self._prices(sample.scene, ours[-1].further_s))
+                found.append(self._open().call(preview_prices, scene, self._resolution, most_s))
             except (Rejected, ChildFailed):
                 continue
             except TrilightError as error:
-                missing = str(error).rstrip(".")
-        further_s = float(np.median([each.further_s for each in ours]))
-        preview = None if missing or not theirs else self._chosen(theirs, further_s)
-        return Times(
-            network_first_s=float(np.median([each.first_s for each in ours])),
-            network_further_s=further_s,
-            scenes=len(ours),
-            preview=preview,
-            missing=missing or ("" if preview else "the scenes that were timed cannot be traced"),
-        )
-
-    def _prices(self, scene: Scene, most_s: float) -> Mapping[Level, Price]:
-        return self._open().call(preview_prices, scene, self._resolution, most_s)
+                return [], str(error).rstrip(".")
+        return found, "" if found else "the scenes that were timed cannot be traced"
 
     def _chosen(self, prices: Sequence[Mapping[Level, Price]], most_s: float) -> Preview:
         level = self._level = chosen_level(prices, most_s)
         return Preview(
             samples=level[0],
             denoiser=level[1],
-            first_s=float(np.median([each[level].first_s for each in prices])),
-            further_s=float(np.median([each[level].further_s for each in prices])),
+            first_s=_middle([each.get(level, DEARER).first_s for each in prices]),
+            further_s=_middle([each.get(level, DEARER).further_s for each in prices]),
             note=self._variant.note if self._variant else "",
         )
 
@@ -173,17 +185,22 @@ class TracerRival:
 def chosen_level(prices: Sequence[Mapping[Level, Price]], most_s: float) -> Level:
     """Return the most samples whose median further view fits, of equal ones the better filter.
 
-    Where none fits it is one sample with the fast filter.
+    Where none fits it is LEAST.
 
     Args:
-        prices: of each scene; all have that level.
+        prices: of each scene; what is not among them takes longer than `most_s`.
         most_s: core-seconds of a further view.
     """
-    common = set.intersection(*(set(each) for each in prices))
     fits = [
-        level for level in common if np.median([each[level].further_s for each in prices]) <= most_s
+        level
+        for level in set().union(*prices)
+        if _middle([each.get(level, DEARER).further_s for each in prices]) <= most_s
     ]
     return max(fits, key=lambda level: (level[0], level[1] == "high"), default=LEAST)
+
+
+def _middle(seconds: Sequence[float]) -> float:
+    return float(np.median(seconds))
 
 
 def set_up_child(variant: Variant) -> None:

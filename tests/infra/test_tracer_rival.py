@@ -38,11 +38,12 @@ def test_the_most_samples_that_fit_and_then_the_better_filter(most_s: float) -> 
             assert (other_spp, other == "high") <= (spp, denoiser == "high")
 
 
-def test_scenes_vote_by_their_median_on_what_all_were_asked() -> None:
+def test_scenes_vote_by_their_median_and_what_was_not_tried_takes_longer() -> None:
     cheap = prices(sample_s=1.0, fast_s=0.0, high_s=0.5, most=5)
     dear = prices(sample_s=10.0, fast_s=0.0, high_s=0.5, most=3)
-    assert chosen_level([cheap, cheap, dear], 4.2) == (4, "fast")
+    assert chosen_level([cheap, cheap, dear], 8.2) == (8, "fast"), "one is outvoted"
     assert chosen_level([cheap, dear, dear], 12.0) == (1, "high")
+    assert chosen_level([cheap, dear], 16.0) == (2, "high"), "of two, both have to be asked"
     assert chosen_level([dear], 1.0) == (1, "fast")
 
 
