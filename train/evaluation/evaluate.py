@@ -31,7 +31,7 @@ from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, facts_of
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.order import SceneCount, Width
 from train.evaluation.rivals import Rivals
-from train.evaluation.same_time import TRACER, TracedBeside
+from train.evaluation.same_time import CAPTION, TRACER, TracedBeside
 from train.evaluation.sheet import SheetView
 from train.loss.lpips import Lpips
 
@@ -164,7 +164,7 @@ def sheet_views(contest: Contest, chosen: Sequence[JudgedView]) -> list[SheetVie
                 if contest.traced is not None:
                     traced = contest.traced.shown(sample, row.view)
                     black = np.zeros_like(shown.target_rgb)
-                    beside = {TRACER: black if traced is None else traced}
+                    beside = {CAPTION: black if traced is None else traced}
                     shown = dataclasses.replace(shown, beside_rgb=beside)
                 found[row.key, row.view] = shown
     return [found[row.key, row.view] for row in chosen]

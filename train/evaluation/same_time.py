@@ -18,6 +18,9 @@ from train.evaluation.judged_view import NETWORK, JudgedView, summary
 TRACER = "path tracer, same time"
 """Name of the contestant."""
 
+CAPTION = "path tracer"
+"""Its name on sheets, where there is less room."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Preview:
@@ -111,8 +114,9 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         f"Over {found['views']} views ({found['which']}) the network has "
         f"{found['network']['psnr_log_db']['median']:.2f} dB and the path tracer "
         f"{found['tracer']['psnr_log_db']['median']:.2f} dB, medians of psnr_log_db; view by view "
-        f"the network is better by {lead['mean']:+.2f} dB ({lead['low']:+.2f} to "
-        f"{lead['high']:+.2f}, 95 % by scene), and better in {found['share_better']:.0%}.",
+        f"the network less the path tracer is {lead['mean']:+.2f} dB ({lead['low']:+.2f} to "
+        f"{lead['high']:+.2f}, 95 % by scene), and the network is better in "
+        f"{found['share_better']:.0%}.",
         "The targets went through the same denoiser, which favours the path tracer a little.",
     ]
     return [*lines, *([f"{preview['note']}."] if preview["note"] else [])]

@@ -14,7 +14,7 @@ from tests.train.toy import write_toy_dataset
 from train.evaluation.evaluate import Contest, judged_views, sheet_views
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.report import markdown, record
-from train.evaluation.same_time import TRACER, Preview, Times, same_time, sentences
+from train.evaluation.same_time import CAPTION, TRACER, Preview, Times, same_time, sentences
 from train.evaluation.sheet import drawn_sheet
 from train.loop.state import new_state
 
@@ -96,6 +96,6 @@ def test_sheets_show_it_beside_the_prediction(
     shown = sheet_views(contest, views)
     # the target went through float32 logarithms
     np.testing.assert_allclose(
-        shown[1].beside_rgb[TRACER], shown[1].target_rgb, rtol=1e-5, atol=1e-6
+        shown[1].beside_rgb[CAPTION], shown[1].target_rgb, rtol=1e-5, atol=1e-6
     )
     assert drawn_sheet(shown, ("title",)).width > alone.width
