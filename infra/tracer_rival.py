@@ -26,7 +26,7 @@ from pipeline.renders.variant import Variant, activate, choose_variant
 from storage.errors import Rejected, TrilightError
 from storage.records.sample import Sample
 from storage.records.scene import Scene
-from train.evaluation.same_time import Preview, Times
+from train.evaluation.same_time import Times, TracerTimes
 
 TIMED_SCENES = 4
 """Scenes on which both are timed."""
@@ -139,9 +139,9 @@ class TracerRival:
                 return [], str(error).rstrip(".")
         return found, "" if found else "the scenes that were timed cannot be traced"
 
-    def _chosen(self, prices: Sequence[Mapping[Level, Price]], most_s: float) -> Preview:
+    def _chosen(self, prices: Sequence[Mapping[Level, Price]], most_s: float) -> TracerTimes:
         level = self._level = chosen_level(prices, most_s)
-        return Preview(
+        return TracerTimes(
             samples=level[0],
             denoiser=level[1],
             first_s=_middle([each.get(level, DEARER).first_s for each in prices]),

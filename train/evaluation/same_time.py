@@ -23,7 +23,7 @@ CAPTION = "path tracer"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Preview:
+class TracerTimes:
     """What the path tracer does in that time."""
 
     samples: int
@@ -48,7 +48,7 @@ class Times:
     """And for a further view."""
     scenes: int
     """Scenes that were timed."""
-    preview: Preview | None
+    preview: TracerTimes | None
     """None where nothing is traced."""
     missing: str = ""
     """Why nothing is."""

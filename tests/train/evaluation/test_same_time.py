@@ -14,7 +14,7 @@ from tests.train.toy import write_toy_dataset
 from train.evaluation.evaluate import Contest, judged_views, sheet_views
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.report import markdown, record
-from train.evaluation.same_time import CAPTION, TRACER, Preview, Times, same_time, sentences
+from train.evaluation.same_time import CAPTION, TRACER, Times, TracerTimes, same_time, sentences
 from train.evaluation.sheet import drawn_sheet
 from train.loop.state import new_state
 
@@ -22,7 +22,7 @@ TIMES = Times(
     network_first_s=0.12,
     network_further_s=0.06,
     scenes=4,
-    preview=Preview(samples=4, denoiser="fast", first_s=0.025, further_s=0.022, note=""),
+    preview=TracerTimes(samples=4, denoiser="fast", first_s=0.025, further_s=0.022, note=""),
 )
 
 
@@ -75,7 +75,7 @@ def test_what_takes_longer_and_what_is_missing_is_said(
     judging: tuple[Contest, list[JudgedView]],
 ) -> None:
     _, views = judging
-    dearest = Preview(samples=1, denoiser="fast", first_s=0.1, further_s=0.07, note="slow")
+    dearest = TracerTimes(samples=1, denoiser="fast", first_s=0.1, further_s=0.07, note="slow")
     dear = dataclasses.replace(TIMES, preview=dearest)
     told = " ".join(sentences(same_time(views, dear, "all")))
     assert "1 sample a pixel" in told and "longer than the network" in told and "slow." in told
