@@ -136,7 +136,8 @@ def _network_and_width(asked: Asked) -> tuple[str | None, int]:
     checkpoint = asked.checkpoint or BUILTIN
     if asked.resolution is not None:
         return checkpoint, asked.resolution
-    return checkpoint, find_network(checkpoint, network_of_run).trained.resolution or _RESOLUTION
+    found = find_network(checkpoint, network_of_run)
+    return checkpoint, _RESOLUTION if found.any_width else found.trained.resolution or _RESOLUTION
 
 
 def _settings(asked: Asked, resolution: int) -> RenderSettings | PreviewSettings:

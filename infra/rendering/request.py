@@ -31,8 +31,8 @@ class Asked:
     checkpoint: str | None = None
     """neural: model.safetensors of a run; by default the small network that comes with Trilight."""
     resolution: Resolution | None = None
-    """Width of a picture in pixels; by default 512, or with a network the width that it was trained
-    on."""
+    """Width of a picture in pixels; by default 512, or with a network of ray bundles the width that
+    it was trained on."""
     noise_floor_db: NoiseFloor | None = None
     """mitsuba: sampling stops at this measured noise floor in dB (psnr_log_db; higher is cleaner);
     by default 40, unless another floor is asked for. Of several, all are reached."""

@@ -100,7 +100,9 @@ def judged_views(contest: Contest, scene_done: Callable[[], None]) -> list[Judge
             _judged(contest, sample, judged, view, contestants)
             for view in range(len(judged.target_VRR3))
         ]
-        rows += found if before is None else _with_swapped(found, contest.network, judged, before)
+        if before is not None and contest.network.config.scene_tokens:
+            found = _with_swapped(found, contest.network, judged, before)
+        rows += found
         before = judged.scene.tensors
         scene_done()
     if not rows:
@@ -206,10 +208,10 @@ def grouped_pictures(
     """Return what `trilight render` shows of a scene, its groups of lights added up.
 
     Returns:
-        Linear radiance [V, R, R, 3] of at least 0, or None where one group holds every light, so
-        that one pass is the same.
+        Linear radiance [V, R, R, 3] of at least 0, or None where one pass takes every light.
     """
-    if len(light_groups(scene, MAX_LIGHTS)) == 1:
+    by_hits = network.config.view_stage == "hits"
+    if by_hits or len(light_groups(scene, MAX_LIGHTS)) == 1:
         return None
     renderer = NeuralRenderer(network)
     prepared = renderer.prepare(scene)
@@ -238,6 +240,8 @@ def withheld_pictures(
         return {}
     found = {}
     for index, name in enumerate(INPUTS):
+        if name == "tokens" and not network.config.scene_tokens:
+            continue
         kept_VI = torch.ones_like(traced.given_VI)
         kept_VI[:, index] = 0
         tensors = dataclasses.replace(scene.tensors, traced=traced.without(kept_VI))

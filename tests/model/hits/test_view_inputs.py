@@ -162,4 +162,3 @@ def test_a_lamp_without_area_gives_nothing() -> None:
 def test_a_grazing_mirror_is_finite() -> None:
     scene = join(EXTREMES["mirror"], eye=(0, -1.9, 1e-4), target=(0, 2, 0), fov_deg=60.0)
     assert np.isfinite(traced(scene, 16).pixels).all()
-
