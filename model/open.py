@@ -102,7 +102,8 @@ def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
     """Return a network before its weights are read; of a published name, after it is fetched.
 
     Args:
-        place: one of BUILTIN_NETWORKS, a file, a folder, or the name of a repository on the Hugging Face hub.
+        place: one of BUILTIN_NETWORKS, a file, a folder, or the name of a repository on the
+            Hugging Face hub.
         finders: are asked first, such as `train.loop.checkpoints.network_of_run`.
 
     Raises:

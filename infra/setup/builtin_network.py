@@ -33,8 +33,8 @@ MOST_BYTES = 10_000_000
 _HEADS = {
     "builtin:hits": (
         "What `trilight render --engine neural` uses where no other is named: first hits, direct "
-        "light and one bounce are traced, and the network learns what that leaves out. Small enough "
-        "to ship and to train on two processor cores in an hour, and sharp at any width."
+        "light and one bounce are traced, and the network filters what is noisy and learns what is "
+        "left out. Small enough to ship and to train on two processor cores in an hour."
     ),
     "builtin:tokens": (
         "RenderFormer as published, small enough to ship and to train on two processor cores, and "
@@ -140,7 +140,8 @@ def _scores(judged: Mapping[str, Any]) -> list[str]:
     contestants = {NETWORK: everybody[NETWORK]} | everybody  # the file has them by their names
     traced = judged["path tracer"] or {}
     lines = [
-        f"Scores on `{about['data']}`, build {about['build']} ({about['scenes']} scenes of split {about['split']}, "
+        f"Scores on `{about['data']}`, build {about['build']}, split {about['split']} "
+        f"({about['scenes']} scenes, "
         f"{len(judged['views'])} views of {about['resolution']} pixels, objects that it has not "
         "seen; medians, in brackets the worse 5 %):",
         "",

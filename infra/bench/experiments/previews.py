@@ -15,7 +15,7 @@ from infra.bench.experiments.engines import build_within
 from infra.bench.experiments.rungs import TRIANGLES, one_view_scene
 from infra.bench.experiments.sampling import DB
 from infra.bench.sides.preview_pictures import preview_ladder
-from infra.bench.sides.rung_pictures import RungPicture, judged, network_rung
+from infra.bench.sides.rung_pictures import judged, network_rung, timed_rung
 from infra.bench.workshop import Workshop
 from infra.rendering.way_table import NETWORK_SCENE, NETWORK_VIEW
 from pipeline.objects.generated import BENCHMARK
@@ -51,7 +51,7 @@ def _measure(workshop: Workshop, points: Sequence[Point], turn: str, *, px: int)
     renderer, child, build = workshop.kept("previews", lambda: _set_up(workshop))
     scene = child.call(one_view_scene, build, int(turn.split()[-1]))
     found, reference = child.call(preview_ladder, scene, px, ladder(px), WIDTHS[px][1])
-    yield NETWORK, judged(network_rung(renderer, scene, px), scene, reference)
+    yield NETWORK, judged(timed_rung(network_rung(renderer, px), scene), scene, reference)
     for one, picture in zip(ladder(px), found, strict=True):
         yield preview_name(*one), judged(picture, scene, reference)
 
@@ -75,8 +75,9 @@ def _measure_parts(workshop: Workshop, points: Sequence[Point], turn: str) -> Tu
     scene = child.call(one_view_scene, build, int(turn.split()[-1]))
     for px in WIDTHS:
         found: dict[str, float] = child.call(timed_parts, scene, px, time.process_time)
-        network: RungPicture = network_rung(renderer, scene, px)
-        found |= {NETWORK_SCENE: network.scene_s, NETWORK_VIEW: network.view_s}
+        network = timed_rung(network_rung(renderer, px), scene)
+        found[NETWORK_SCENE] = network.first_s - network.further_s
+        found[NETWORK_VIEW] = network.further_s
         for part, core_s in found.items():
             yield part_name(part, px), {"core_s": core_s}
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from infra.bench.sides.judged_pictures import Reference, raw_reference
-from infra.bench.sides.rung_pictures import RungPicture
 from infra.bench.sides.shots import SEED, RememberingTracer, warm_up_denoiser
+from infra.timed_views import TimedViews
 from pipeline.renders.camera import Camera
 from pipeline.renders.preview import PreviewRenderer, PreviewSettings
 from pipeline.renders.renderer import finished
@@ -27,7 +27,7 @@ class RememberingPreviews(PreviewRenderer):
         self._remembering = RememberingTracer(self._tracer)
         self._tracer = self._remembering
 
-    def timed(self, settings: PreviewSettings, scene_s: float) -> RungPicture:
+    def timed(self, settings: PreviewSettings, scene_s: float) -> TimedViews:
         """Return the first view under other settings, with the core-seconds it would take alone."""
         other = copy.copy(self)
         other._settings = settings
@@ -35,12 +35,14 @@ class RememberingPreviews(PreviewRenderer):
         began = time.process_time()
         preview = finished(other.view_steps(*self._camera, SEED))
         view_s = time.process_time() - began + self._remembering.ledger.owed_core_s
-        return RungPicture(radiance_rgb=preview.radiance_rgb, scene_s=scene_s, view_s=view_s)
+        return TimedViews(
+            radiance_rgb=preview.radiance_rgb, first_s=scene_s + view_s, further_s=view_s
+        )
 
 
 def preview_ladder(
     scene: Scene, resolution: int, wanted: Sequence[tuple[int, Filtered]], reference_spp: int
-) -> tuple[list[RungPicture], Reference]:
+) -> tuple[list[TimedViews], Reference]:
     """Return previews of the first view by samples and filter, and raw halves of it.
 
     Runs in a render child.

@@ -94,7 +94,8 @@ def lamps_rung(resolution: int) -> Rung:
 def physics_alone() -> "NeuralRenderer":
     """Return what shows the traced light of the view stage `hits` and has learned nothing.
 
-    Every gain is 1, nothing is added, and gathered light is mixed by how near anchors are. Layers
+    Every gain is 1, nothing is added or filtered, and gathered light is mixed by how near anchors
+    are. Layers
     are as small as they can be: what is timed is the tracing.
     """
     import dataclasses
@@ -104,7 +105,7 @@ def physics_alone() -> "NeuralRenderer":
     smallest = dataclasses.replace(
         hits_smoke(), width=2 * VERTEX_COORDINATES, num_heads=1, rope_num_freqs=1,
         encoder_layers=1, decoder_layers=1, hidden_width=1, num_registers=0, pixel_width=1,
-        scene_tokens=False,
+        filter_width=0, scene_tokens=False,
     )  # fmt: skip
     return untaught(smallest)
 

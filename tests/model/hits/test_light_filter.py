@@ -66,7 +66,7 @@ def test_a_level_is_its_slow_twin(step: int) -> None:
     expected = torch.zeros_like(both)
     for row in range(px):
         for column in range(px):
-            total = 0.0
+            total = torch.zeros((), dtype=torch.float64)
             for tap in range(TAPS):
                 y, x = row + (tap // 3 - 1) * step, column + (tap % 3 - 1) * step
                 if not (0 <= y < px and 0 <= x < px):
