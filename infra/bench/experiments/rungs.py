@@ -32,7 +32,9 @@ from storage.errors import Rejected
 from storage.records.scene import Scene
 
 LAMPS, PHYSICS = "direct light, no network", "all traced light, no network"
-SHIPPED = "builtin:"
+SHIPPED = ("builtin:", "builtin:tokens")
+"""Networks that come along: the better one, and the one that traces nothing."""
+
 SAMPLES: tuple[tuple[int, Filtered], ...] = (
     (1, "fast"),
     (1, "high"),
@@ -66,9 +68,9 @@ def network_name(label: str) -> str:
 
 
 def network_points(asked: Asked) -> list[Point]:
-    """Return the networks asked for, after the one that comes with Trilight."""
-    others = [label for label in asked.network_names if label != SHIPPED]
-    return [Point(name=network_name(label)) for label in (SHIPPED, *others)]
+    """Return the networks asked for, after those that come with Trilight."""
+    others = [label for label in asked.network_names if label not in SHIPPED]
+    return [Point(name=network_name(label)) for label in (*SHIPPED, *others)]
 
 
 def rival(asked: Asked) -> str:
@@ -128,7 +130,7 @@ def _set_up(workshop: Workshop, px: int) -> Means:
     torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
     rungs: dict[str, Rung] = {}
     places = dict(zip(workshop.asked.network_names, workshop.asked.checkpoint, strict=True))
-    for label, place in ({SHIPPED: SHIPPED} | places).items():
+    for label, place in (dict(zip(SHIPPED, SHIPPED, strict=True)) | places).items():
         renderer = NeuralRenderer.load(place, device="cpu", finders=[network_of_run])
         rungs[network_name(label)] = network_rung(renderer, px)
         workshop.note(f"{network_name(label)} is {renderer.digest[:8]}")
