@@ -26,7 +26,7 @@ BEYOND = 4.0
 """Bundles beyond the border at which everything farther out lands."""
 
 
-class PicturePlaces:
+class PictureRotary:
     """Turns the pairs of channels that vertices leave free."""
 
     def __init__(self, config: ModelConfig) -> None:

@@ -17,7 +17,7 @@ from model.image_head import build_head, stack_taps
 from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
 from model.positions import Rotation, TriangleRotary, camera_rotation
 from model.precision import as_given
-from model.projected import PicturePlaces
+from model.projected import PictureRotary
 from model.rays import bundle_rays, ray_directions
 from model.scene_tensors import Cameras
 from model.windows import Windows, cut_windows
@@ -37,7 +37,7 @@ class ViewDecoder(nn.Module):
         self.rotary = rotary
         self.patch_px = config.patch_px
         self.window_bundles = config.window_bundles
-        self.projected = PicturePlaces(config) if config.projected_freqs else None
+        self.projected = PictureRotary(config) if config.projected_freqs else None
         self.recompute = False
         self.token_W = nn.Parameter(torch.zeros(config.width))
         self.rays = nn.Linear(3 * config.patch_px**2, config.width)
