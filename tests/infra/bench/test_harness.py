@@ -75,7 +75,7 @@ def test_a_turn_that_fails_for_one_point_counts_for_none(tmp_path: Path) -> None
 
 def test_results_name_a_dataset_and_not_where_it_lies(tmp_path: Path) -> None:
     named = [
-        measured(tmp_path, experiment("a"), f"/home/someone/{folder}/set").plan["asked"]["data"]
+        measured(tmp_path, experiment("a"), f"/srv/someone/{folder}/set").plan["asked"]["data"]
         for folder in ("here", "there")
     ]
     assert all(re.fullmatch(r"set \([0-9a-f]{8}\)", name) for name in named)
