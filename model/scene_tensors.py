@@ -46,6 +46,9 @@ class SceneTensors:
     traced: Traced | None = None
     """What was traced of these views, for a network with the view stage `hits`; where it is None,
     such a network traces them itself."""
+    albedo_VRR6: Tensor | None = None
+    """Albedo of what their pixels see first, for a demodulated network; where it is None, such a
+    network asks for it itself (model.demodulated)."""
 
     @property
     def num_triangles(self) -> int:
@@ -89,6 +92,8 @@ class SceneBatch:
     columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """As in SceneTensors."""
     traced: Traced | None = None
+    """As in SceneTensors; None where a scene has None."""
+    albedo_BVRR6: Tensor | None = None
     """As in SceneTensors; None where a scene has None."""
 
     @property
@@ -180,6 +185,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
     longest = max(lengths)
     padded = min(lengths) < longest
     traced = [scene.traced for scene in scenes if scene.traced is not None]
+    albedo = [scene.albedo_VRR6 for scene in scenes if scene.albedo_VRR6 is not None]
     return SceneBatch(
         triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
         normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
@@ -189,6 +195,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
         is_triangle_BT=torch.arange(longest) < torch.tensor(lengths)[:, None] if padded else None,
         columns=scenes[0].columns,
         traced=stack_traced(traced, longest) if len(traced) == len(scenes) else None,
+        albedo_BVRR6=torch.stack(albedo) if len(albedo) == len(scenes) else None,
     )
 
 

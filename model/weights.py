@@ -220,6 +220,8 @@ _LATER = (
     "gather_rays",
     "pixel_width",
     "scene_tokens",
+    "projected_freqs",
+    "demodulated",
 )
 
 

@@ -46,8 +46,8 @@ def anchors_a_side(config: ModelConfig, resolution: int) -> int:
     return int(np.gcd(config.hit_anchors, resolution))
 
 
-def traced_scene(triangles_T33: Tensor, normals_T33: Tensor, materials_TM: Tensor) -> TracedScene:
-    """Return a scene ready for rays.
+def lit_scene(triangles_T33: Tensor, normals_T33: Tensor, materials_TM: Tensor) -> LitScene:
+    """Return the surfaces of a scene.
 
     Args:
         triangles_T33, normals_T33: as in SceneTensors.
@@ -57,20 +57,24 @@ def traced_scene(triangles_T33: Tensor, normals_T33: Tensor, materials_TM: Tenso
     for column, part in laid_out(PUBLISHED_COLUMNS):
         if column.is_log_encoded:
             materials[:, part] = np.maximum(radiance_from_log10(materials[:, part]), 0)
-    lit = LitScene(
+    return LitScene(
         triangles_T33.detach().cpu().numpy(), normals_T33.detach().cpu().numpy(), materials
     )
-    return TracedScene(lit=lit, light=scene_light(lit))
 
 
 def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
-    """Return the scenes of a batch, without their padding."""
+    """Return the scenes of a batch, without their padding, ready for rays."""
+    return tuple(TracedScene(lit=lit, light=scene_light(lit)) for lit in lit_scenes(batch))
+
+
+def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
+    """Return the surfaces of the scenes of a batch, without their padding."""
     materials = batch.material_of(PUBLISHED_COLUMNS)
     found = []
     for row in range(len(materials)):
         there = slice(None) if batch.is_triangle_BT is None else batch.is_triangle_BT[row]
         found.append(
-            traced_scene(
+            lit_scene(
                 batch.triangles_BT33[row][there],
                 batch.normals_BT33[row][there],
                 materials[row][there],
@@ -86,11 +90,17 @@ def with_traced(
 
     `seed` is that of the noise: a network that saw one noise alone might learn it.
     """
+    lit = lit_scene_of(scene)
+    ready = TracedScene(lit=lit, light=scene_light(lit))
+    traced = traced_views(ready, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)
+    return dataclasses.replace(scene, traced=traced)
+
+
+def lit_scene_of(scene: SceneTensors) -> LitScene:
+    """Return the surfaces of a scene."""
     columns = {column.name: part for column, part in laid_out(scene.columns)}
     numbers = [scene.material_TM[:, columns[name]] for name in PUBLISHED_COLUMNS]
-    lit = traced_scene(scene.triangles_T33, scene.normals_T33, torch.cat(numbers, dim=-1))
-    traced = traced_views(lit, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)
-    return dataclasses.replace(scene, traced=traced)
+    return lit_scene(scene.triangles_T33, scene.normals_T33, torch.cat(numbers, dim=-1))
 
 
 def traced_cameras(

@@ -112,6 +112,8 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
     (ModelConfig, "decoder_layers", "low"): {"dpt_taps": (0, 0, 0, 0)},
     (ModelConfig, "patch_px", "low"): _LINEAR,
     (ModelConfig, "patch_px", "high"): _LINEAR,
+    (ModelConfig, "projected_freqs", "high"): {"width": 2 * (9 + 128), "num_heads": 1,
+                                               "rope_num_freqs": 1},
     (ModelConfig, "dpt_features", "low"): _LINEAR,
     (ModelConfig, "dpt_taps", "high"): {"decoder_layers": 256},
     **{(ModelConfig, name, "high"): _LINEAR | _HITS

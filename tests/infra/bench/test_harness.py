@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 import subprocess
 from pathlib import Path
 
@@ -73,6 +74,17 @@ def test_a_turn_that_fails_for_one_point_counts_for_none(tmp_path: Path) -> None
     assert found.left_out == {"bad": "no_scene: it has no light"}
     with pytest.raises(TrilightError, match="no turn could be measured: no_scene: it has no light"):
         measured(tmp_path / "none", experiment("bad"))
+
+
+def test_results_name_a_dataset_and_not_where_it_lies(tmp_path: Path) -> None:
+    named = [
+        measured(tmp_path, experiment("a"), f"/srv/someone/{folder}/set").plan["asked"]["data"]
+        for folder in ("here", "there")
+    ]
+    assert all(re.fullmatch(r"set \([0-9a-f]{8}\)", name) for name in named)
+    assert len(set(named)) == 2 and all(
+        "someone" not in path.read_text() for path in tmp_path.glob("*.jsonl")
+    )
 
 
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
