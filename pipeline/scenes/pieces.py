@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +98,7 @@ def _surfaced(
     return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
 
 
-def joined(pieces: Sequence[ScenePiece]) -> dict[str, NDArray]:
+def joined(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
     """Return the geometry and material arrays of a Scene, in the order of the pieces."""
     vertex_start = _starts([len(piece.mesh.positions) for piece in pieces])
     material_start = _starts([len(piece.materials) for piece in pieces])

@@ -24,7 +24,6 @@ from storage.records.objects import LockedObject, decode_objects_lock
 from storage.records.parts import part_names, sum_of_parts
 from storage.records.passes.stored import COVERAGE, decode_passes_exr, picture_passes
 from storage.records.sample import Sample, decode_sample
-from storage.records.scene import Scene
 from storage.remote.fetch import download
 from storage.remote.tries import TransferFailed
 
@@ -255,7 +254,7 @@ def check_sample(
     yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
     stored = manifest.settings.get("storage")
     yield from _check_passes(sample, stored.get("passes") if isinstance(stored, Mapping) else ())
-    if mixed := mixed_share_alike(_licences(sample.scene)):
+    if mixed := mixed_share_alike(sample.scene.licences):
         yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
     for entry in sample.scene.objects:
         if entry.kind != "object":
@@ -265,14 +264,6 @@ def check_sample(
             yield f"sample {sample.key}: object {entry.uid!r} is not in objects.lock.jsonl"
         elif lock.split != split:
             yield f"sample {sample.key}: object {entry.uid!r} belongs to split {lock.split}"
-
-
-def _licences(scene: Scene) -> Iterator[str]:
-    """Yield the licence of everything that a scene shows."""
-    yield from (entry.licence for entry in scene.objects)
-    yield from (texture.source.licence for texture in scene.textures)
-    if scene.environment is not None:
-        yield scene.environment.source.licence
 
 
 def _check_lights(sample: Sample, *, apart: bool) -> Iterator[str]:

@@ -129,6 +129,13 @@ class Scene:
         material_emits: NDArray[np.bool_] = np.any(self.materials[:, EMISSION] > 0, axis=1)
         return material_emits[self.material_index]
 
+    @property
+    def licences(self) -> tuple[str, ...]:
+        """Licence of every object, texture and environment map, in this order."""
+        sky = () if self.environment is None else (self.environment.source.licence,)
+        textures = (texture.source.licence for texture in self.textures)
+        return (*(entry.licence for entry in self.objects), *textures, *sky)
+
     def with_cameras(self, c2w: NDArray[np.float32], fov_deg: NDArray[np.float32]) -> "Scene":
         """Return the same scene seen by other cameras ([C, 4, 4] and [C])."""
         return dataclasses.replace(self, c2w=c2w, fov_deg=fov_deg)

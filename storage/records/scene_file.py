@@ -91,8 +91,8 @@ def decode_arrays(data: bytes, maps: Any = None) -> dict[str, NDArray]:
     if missing := set(ARRAY_FIELDS) - set(arrays):
         raise TrilightError(f"scene: the array {min(missing)} is missing.")
     arrays["materials"] = completed_rows(arrays["materials"], metadata.get(_COLUMNS))
-    expected = None if maps is None else maps_digest(maps)
-    if not np.array_equal(arrays.get(_MAPS_DIGEST), expected):
+    found = arrays[_MAPS_DIGEST].tobytes() if _MAPS_DIGEST in arrays else None
+    if found != (None if maps is None else maps_digest(maps).tobytes()):
         raise TrilightError(
             "scene: its record and its arrays do not speak of the same textures and environment. "
             "Run `trilight verify`."
@@ -171,11 +171,12 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
         arrays, metadata = read_safetensors(data, MAX_HEADER_BYTES)
         record = _metadata_record(metadata)
         arrays["materials"] = completed_rows(arrays["materials"], record.get(_COLUMNS))
+        fields = _maps(record, arrays)
+        fields |= {name: arrays[name] for name in (*ARRAY_FIELDS, *MAP_ARRAYS) if name in arrays}
         scene = Scene(
             objects=scene_objects(record.get("objects")),
             provenance=scene_provenance(record.get("provenance")),
-            **_maps(record, arrays),
-            **{name: arrays[name] for name in (*ARRAY_FIELDS, *MAP_ARRAYS) if name in arrays},
+            **fields,
         )
         scene.check()
     except TrilightError as error:

@@ -1,8 +1,9 @@
 """Textures and environment light of a scene: their laws, and what a constant texture is.
 
 A scene that has no textures has no texture coordinates and no `material_textures` either: the three
-come together. A texture stands in the place of one of the columns TEXTURED. Readers that know no
-textures see the column itself, which holds its mean by convention.
+come together. A texture stands in the place of one of the columns TEXTURED; what the material row
+itself says there counts for nothing, and is by convention the texture's mean, for readers that know
+no textures.
 """
 
 import dataclasses
@@ -190,14 +191,53 @@ def without_constant_textures(scene: AnyScene) -> AnyScene:
     )
 
 
-def without_maps(scene: AnyScene, *, environment: bool = True) -> AnyScene:
-    """Return the same scene as readers see it that know no textures, and no environment either."""
+def with_textures(
+    scene: AnyScene,
+    uv: NDArray[np.float32],
+    textures: tuple[Texture, ...],
+    material_textures: NDArray[np.int32],
+) -> AnyScene:
+    """Return the same scene with textures, whose columns hold their means.
+
+    Args:
+        scene: any; its own textures go.
+        uv: [3T, 2] of each corner of each triangle.
+        textures: each used, and each content once.
+        material_textures: [M, 3] rows of `textures`, or CONSTANT, in the order of TEXTURED.
+    """
     return dataclasses.replace(
         scene,
-        uv=None,
-        material_textures=None,
-        textures=(),
-        environment=None if environment else scene.environment,
+        materials=_with_means(scene.materials, textures, material_textures),
+        uv=uv,
+        textures=textures,
+        material_textures=material_textures,
+    )
+
+
+def _with_means(
+    materials: NDArray[np.float32],
+    textures: tuple[Texture, ...],
+    material_textures: NDArray[np.int32],
+) -> NDArray[np.float32]:
+    rows, places = materials.copy(), {column.name: part for column, part in laid_out()}
+    for place, name in enumerate(TEXTURED):
+        for row in np.flatnonzero(material_textures[:, place] != CONSTANT):
+            rows[row, places[name]] = textures[material_textures[row, place]].mean
+    return rows
+
+
+def without_maps(scene: AnyScene, *, textures: bool = True, environment: bool = True) -> AnyScene:
+    """Return the same scene without its textures, or its environment, or both.
+
+    In the place of a texture stands its mean.
+    """
+    if environment:
+        scene = dataclasses.replace(scene, environment=None)
+    if not textures or scene.material_textures is None:
+        return scene
+    materials = _with_means(scene.materials, scene.textures, scene.material_textures)
+    return dataclasses.replace(
+        scene, materials=materials, uv=None, material_textures=None, textures=()
     )
 
 

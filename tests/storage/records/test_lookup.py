@@ -81,7 +81,7 @@ def test_a_texture_is_the_sum_of_its_tents(texture: Texture) -> None:
 
 
 def test_row_0_is_the_bottom_and_column_0_the_left() -> None:
-    texture = Texture(texels=np.arange(4, dtype=np.float32).reshape(2, 2, 1) / 4)
+    texture = Texture(texels=np.array([[[0], [0.25]], [[0.5], [0.75]]], np.float32))
     corners = {(0.25, 0.25): 0, (0.75, 0.25): 1, (0.25, 0.75): 2, (0.75, 0.75): 3}
     for place, value in corners.items():
         assert texture_values(texture, place) == value / 4
@@ -142,6 +142,6 @@ def test_rows_of_materials_take_what_is_textured() -> None:
 
 def test_far_coordinates_lose_no_digits() -> None:
     """1023 + 1/8 is exact in float32, and means 1/8."""
-    far = texture_values(colour_texture(), np.float32([1023.125, -1023.875]))
+    far = texture_values(colour_texture(), np.array([1023.125, -1023.875], np.float32))
     assert (far == texture_values(colour_texture(), (0.125, 0.125))).all()
     assert math.isfinite(far.sum())

@@ -11,7 +11,11 @@ from storage.errors import TrilightError
 from storage.records.sample import encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_arrays, encode_scene, scene_digest
-from storage.records.scene_maps import without_constant_textures, without_maps
+from storage.records.scene_maps import (
+    with_textures,
+    without_constant_textures,
+    without_maps,
+)
 from storage.records.texture import MAX_MAPS_BYTES, Texture
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_sample, tiny_scene
 from tests.textured_by_hand import (
@@ -35,9 +39,10 @@ def test_a_textured_and_a_sky_lit_scene_are_lawful() -> None:
 def test_a_sky_is_light_enough_unless_it_is_black() -> None:
     """Without an emitter, a scene is lit by its environment or not at all."""
     plain = tiny_scene()
-    dark = {"materials": plain.materials.copy(), "objects": (plain.objects[0],) * 2}
-    dark["materials"][LIGHT, 7:] = 0
-    dark["objects"] = (plain.objects[0], dataclasses.replace(plain.objects[0], name="other"))
+    materials = plain.materials.copy()
+    materials[LIGHT, 7:] = 0
+    objects = (plain.objects[0], dataclasses.replace(plain.objects[0], name="other"))
+    dark: dict[str, Any] = {"materials": materials, "objects": objects}
     tiny_scene(**dark, environment=sky()).check()
     black = sky(radiance_rgb=np.zeros((1, 2, 3), np.float32))
     with pytest.raises(TrilightError, match="expected at least one emitter"):
@@ -227,7 +232,12 @@ def test_one_constant_texture_among_others_goes_alone() -> None:
 
 def test_what_lies_beyond_a_reader_is_left_out() -> None:
     scene = textured_scene(environment=sky())
-    assert encode_arrays(without_maps(scene)) == encode_arrays(tiny_scene())
+    plain = without_maps(scene)
+    assert (plain.materials[FLOOR, :3] == colour_texture().mean).all()
+    assert encode_arrays(plain) == encode_arrays(tiny_scene(materials=plain.materials))
+    again = with_textures(plain, scene.uv, scene.textures, scene.material_textures)  # type: ignore[arg-type]
+    assert (again.materials == plain.materials).all()
+    assert encode_arrays(without_maps(again)) == encode_arrays(plain)
     kept = without_maps(scene, environment=False)
     assert kept.environment is scene.environment and not kept.textures
 
