@@ -15,8 +15,8 @@ from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, face_normals, flat_shaded, smooth_shaded
 from storage.errors import Rejected, TrilightError
+from storage.records.retextured import without_maps
 from storage.records.scene import Scene
-from storage.records.scene_maps import without_maps
 
 LEAST = 4
 """Fewest triangles that an object is brought down to."""

@@ -33,15 +33,16 @@ from storage.records.packed_maps import packed_maps, unpacked_maps
 from storage.records.parts import KNOWN_PARTS, Parts, decode_parts_exr, encode_parts_exr
 from storage.records.passes.stored import picture_passes
 from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
+from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
 from storage.records.scene_file import (
     decode_arrays,
     encode_arrays,
+    require_version_of_maps,
     scene_objects,
     scene_provenance,
     scene_record,
 )
-from storage.records.scene_maps import without_constant_textures
 
 _FAR = 1000.0
 """A bound beyond any noise floor in dB and any share."""
@@ -298,6 +299,7 @@ def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
     try:
         views = tuple(_view(view, row) for row, view in enumerate(record["views"]))
         objects = scene_objects(record["objects"])
+        require_version_of_maps(record)
         maps = record.get("maps")
         fields = {} if maps is None else unpacked_maps(maps, members)
         fields |= decode_arrays(unpack_arrays(members), maps)

@@ -35,9 +35,10 @@ from storage.records.map_references import (
 )
 from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
 from storage.records.packed_maps import held_values, stored_values
+from storage.records.retextured import without_constant_textures
 from storage.records.safe_read import read_safetensors, safetensors_header
 from storage.records.scene import ARRAY_FIELDS, OBJECT_KINDS, Scene, SceneObject
-from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES, without_constant_textures
+from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
 from storage.records.texture import MAX_MAPS_BYTES
 
 MAX_FILE_BYTES = (256 << 20) + MAX_MAPS_BYTES
@@ -195,6 +196,17 @@ def scene_record(scene: Scene) -> dict[str, Any]:
     }
 
 
+def require_version_of_maps(record: Mapping[str, Any]) -> None:
+    """Raise TrilightError unless a record has MAPS_VERSION exactly where it names maps."""
+    version = record.get("schema_version")
+    if (version == MAPS_VERSION) != (_MAPS in record):
+        has = "names" if _MAPS in record else "does not name"
+        raise TrilightError(
+            f"scene: its record {has} {_MAPS} and has schema version {version!r:.60}; expected "
+            f"{MAPS_VERSION} exactly where there are any."
+        )
+
+
 def scene_objects(value: Any) -> tuple[SceneObject, ...]:
     """Return the objects that a JSON value lists.
 
@@ -314,6 +326,7 @@ def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
             f"scene: schema version {version!r:.60}; this Trilight reads {SCHEMA_VERSION} and "
             f"{MAPS_VERSION}. Use the release that made it."
         )
+    require_version_of_maps(record)
     return dict(record)
 
 

@@ -1,4 +1,4 @@
-"""Textures and environment light of a scene: their laws, and what a constant texture is.
+"""Laws of the textures and the environment of a scene.
 
 A scene that has no textures has no texture coordinates and no `material_textures` either: the three
 come together. A texture stands in the place of one of the columns TEXTURED; what the material row
@@ -6,9 +6,8 @@ itself says there counts for nothing, and is by convention the texture's mean, f
 no textures.
 """
 
-import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +38,6 @@ MAP_ARRAYS: Mapping[str, tuple[type, tuple[int | None, ...]]] = {
 
 _DIFFUSE, _SPECULAR = (TEXTURED.index(name) for name in ("diffuse", "specular"))
 _BLOCK = 256  # rows of a texture that are compared at a time
-
-AnyScene = TypeVar("AnyScene", bound="Scene")
 
 
 def has_maps(scene: "Scene") -> bool:
@@ -153,92 +150,6 @@ def _greatest_sum(one: Texture, other: Texture) -> NDArray[np.float64]:
         total = texture_values(one, uv) + texture_values(other, uv)
         found = np.maximum(found, total.max(axis=(0, 1)))
     return found
-
-
-def without_constant_textures(scene: AnyScene) -> AnyScene:
-    """Return the same scene with every texture of one colour as the constant that it is.
-
-    Textures that are then used by no material go, and the texture coordinates with the last one: a
-    scene of constant textures has the bytes of the scene without them.
-    """
-    constants = {
-        row: texture.constant
-        for row, texture in enumerate(scene.textures)
-        if texture.constant is not None
-    }
-    if not constants or scene.material_textures is None:
-        return scene
-    materials, index = scene.materials.copy(), scene.material_textures.copy()
-    places = {column.name: part for column, part in laid_out()}
-    for place, name in enumerate(TEXTURED):
-        for row, value in constants.items():
-            chosen = np.flatnonzero(index[:, place] == row)
-            if len(chosen):  # else it is one of another width
-                materials[chosen, places[name]] = value
-                index[chosen, place] = CONSTANT
-    if len(constants) == len(scene.textures):
-        return dataclasses.replace(
-            scene, materials=materials, uv=None, material_textures=None, textures=()
-        )
-    kept = [row for row in range(len(scene.textures)) if row not in constants]
-    renumbered = np.full(len(scene.textures) + 1, CONSTANT, np.int32)  # the last one: CONSTANT
-    renumbered[kept] = np.arange(len(kept))
-    return dataclasses.replace(
-        scene,
-        materials=materials,
-        material_textures=renumbered[index],
-        textures=tuple(scene.textures[row] for row in kept),
-    )
-
-
-def with_textures(
-    scene: AnyScene,
-    uv: NDArray[np.float32],
-    textures: tuple[Texture, ...],
-    material_textures: NDArray[np.int32],
-) -> AnyScene:
-    """Return the same scene with textures, whose columns hold their means.
-
-    Args:
-        scene: any; its own textures go.
-        uv: [3T, 2] of each corner of each triangle.
-        textures: each used, and each content once.
-        material_textures: [M, 3] rows of `textures`, or CONSTANT, in the order of TEXTURED.
-    """
-    return dataclasses.replace(
-        scene,
-        materials=_with_means(scene.materials, textures, material_textures),
-        uv=uv,
-        textures=textures,
-        material_textures=material_textures,
-    )
-
-
-def _with_means(
-    materials: NDArray[np.float32],
-    textures: tuple[Texture, ...],
-    material_textures: NDArray[np.int32],
-) -> NDArray[np.float32]:
-    rows, places = materials.copy(), {column.name: part for column, part in laid_out()}
-    for place, name in enumerate(TEXTURED):
-        for row in np.flatnonzero(material_textures[:, place] != CONSTANT):
-            rows[row, places[name]] = textures[material_textures[row, place]].mean
-    return rows
-
-
-def without_maps(scene: AnyScene, *, textures: bool = True, environment: bool = True) -> AnyScene:
-    """Return the same scene without its textures, or its environment, or both.
-
-    In the place of a texture stands its mean.
-    """
-    if environment:
-        scene = dataclasses.replace(scene, environment=None)
-    if not textures or scene.material_textures is None:
-        return scene
-    materials = _with_means(scene.materials, scene.textures, scene.material_textures)
-    return dataclasses.replace(
-        scene, materials=materials, uv=None, material_textures=None, textures=()
-    )
 
 
 def _widths() -> dict[str, int]:

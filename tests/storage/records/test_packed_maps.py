@@ -157,6 +157,7 @@ def _claiming(shape: Any, dtype: str = "U8") -> Callable[[bytes], bytes]:
 def _drop_maps(members: Members) -> None:
     record = json.loads(members["json"])
     del record["maps"]
+    record["schema_version"] = 3
     members["json"] = json.dumps(record).encode()
 
 
@@ -204,6 +205,10 @@ HOSTILE: dict[str, tuple[Callable[[Members], object], str]] = {
         "do not speak of the same",
     ),
     "no maps in the record": (_drop_maps, "do not speak of the same"),
+    "maps of version 3": (
+        lambda m: m.update(json=m["json"].replace(b'"schema_version":4', b'"schema_version":3')),
+        "expected 4 exactly where there are any",
+    ),
 }  # fmt: skip
 
 
@@ -230,6 +235,7 @@ def test_maps_are_counted_before_they_are_unpacked() -> None:
     record = json.loads(members["json"])
     rights = {"name": "", "licence": "", "attribution": "", "source_url": ""}
     packed = _claiming([12000, 12000, 3])(b"")
+    record["schema_version"] = MAPS_VERSION
     record["maps"] = {"textures": [{"sha256": digit * 64, **rights} for digit in "01"]}
     members |= {map_member(digit * 64): packed for digit in "01"}
     members["json"] = json.dumps(record).encode()
@@ -262,7 +268,11 @@ SCENE_FILES: dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object],
     "sRGB said of one alone": (
         lambda _, record: record.update(is_srgb=[True]), "for each texture"
     ),
-    "no word of maps": (lambda _, record: record.pop("maps"), "textures is missing"),
+    "no word of maps": (lambda _, record: record.pop("maps"), "exactly where there are any"),
+    "no word of maps, and an older version": (
+        lambda _, record: (record.pop("maps"), record.update(schema_version=3)),
+        "textures is missing",
+    ),
 }  # fmt: skip
 
 

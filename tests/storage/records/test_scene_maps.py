@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from storage.errors import TrilightError
-from storage.records.sample import encode_sample
-from storage.records.scene import Scene
-from storage.records.scene_file import encode_arrays, encode_scene, scene_digest
-from storage.records.scene_maps import (
+from storage.records.retextured import (
     with_textures,
     without_constant_textures,
     without_maps,
 )
+from storage.records.sample import encode_sample
+from storage.records.scene import Scene
+from storage.records.scene_file import encode_arrays, encode_scene, scene_digest
 from storage.records.texture import MAX_MAPS_BYTES, Texture
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_sample, tiny_scene
 from tests.textured_by_hand import (
