@@ -39,9 +39,9 @@ def without_constant_textures(scene: AnyScene) -> AnyScene:
             if len(chosen):  # else it is one of another width
                 materials[chosen, places[name]] = value
                 index[chosen, place] = CONSTANT
-    uv, textures, index = _used(scene.uv, scene.textures, index)
+    uv, textures, rows = _used(scene.uv, scene.textures, index)
     return dataclasses.replace(
-        scene, materials=materials, uv=uv, textures=textures, material_textures=index
+        scene, materials=materials, uv=uv, textures=textures, material_textures=rows
     )
 
 
