@@ -162,7 +162,7 @@ class FirstHits:
         """[..., M] row of `Scene.materials`, with its textures; NaN where nothing is met."""
         rows, scene = self.seen.materials[self.triangle], self.seen.scene
         if scene.textures:
-            rows, met = np.array(rows), self.met  # of a single pixel, it is a part of the table
+            met = self.met
             index = scene.material_index[self.triangle[met]]
             rows[met] = textured_rows(scene, index, self.uv[met])
         return rows
