@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_templates.exact import cosine, sine
+from scene_templates.exact import cosine, mixed, sine
 
-Kind = Literal["uniform", "whole number", "share", "colour", "direction", "choice"]
+Kind = Literal["uniform", "whole number", "share", "colour", "shade", "direction", "choice"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,13 +22,18 @@ class StatedDraw:
 
     kind: Kind
     """Distribution: uniform in the range, uniform whole numbers, true with a probability, a colour
-    with independent uniform channels, a direction uniform by solid angle, or equally likely words.
+    with independent uniform channels, a uniform place between two colours, a direction uniform by solid angle, or equally likely words.
     """
     stated: Any
-    """Lowest and highest value; a probability; the lowest and highest colour; the lowest and
-    highest elevation in degrees; or the words."""
+    """Lowest and highest value; a probability; the two colours; the lowest and highest elevation in
+    degrees; or the words."""
     values: list[Any] = field(default_factory=list)
-    """What was drawn, in order: one number, or as many as the sky or surface has such things."""
+    """What was drawn, in order: one number, or as many as the sky or surface has such things; of a
+    shade, its place between the two colours."""
+
+    def __str__(self) -> str:
+        """Return the distribution as the end of a sentence."""
+        return _row(self)
 
 
 class StatedDraws:
@@ -62,6 +67,13 @@ class StatedDraws:
         """Return a colour [3] whose channels are independent and uniform in their ranges."""
         drawn = np.array([self._between(*ends) for ends in zip(low, high, strict=True)])
         return self._remembered(name, "colour", (tuple(low), tuple(high)), drawn)
+
+    def shade(
+        self, name: str, one: Sequence[float], other: Sequence[float]
+    ) -> NDArray[np.float64]:
+        """Return a colour [3] on the straight line between two, uniform along it."""
+        share = self._remembered(name, "shade", (tuple(one), tuple(other)), self._between(0, 1))
+        return mixed(one, other, share)
 
     def direction(self, name: str, low_deg: float, high_deg: float) -> NDArray[np.float64]:
         """Return a unit vector [3] between two elevations, uniform by solid angle; +Z is up."""
@@ -98,23 +110,16 @@ class StatedDraws:
         return value
 
 
-def rows(made: Mapping[str, StatedDraw]) -> dict[str, str]:
-    """Return the distribution of each name as the end of a sentence, for people."""
-    return {name: _row(draw) for name, draw in made.items()}
-
-
 def _row(draw: StatedDraw) -> str:
-    match draw.kind:
-        case "share":
-            return f"holds with probability {draw.stated:g}"
-        case "choice":
-            return f"one of {', '.join(draw.stated)}, equally likely"
-        case "colour":
-            low, high = (" ".join(f"{c:g}" for c in end) for end in draw.stated)
-            return f"each channel uniform from ({low}) to ({high})"
-        case "direction":
-            low, high = draw.stated
-            return f"uniform by solid angle, elevation {low:g} to {high:g} degrees"
-        case kind:
-            low, high = draw.stated
-            return f"{kind}, {low:g} to {high:g}" if kind != "uniform" else f"uniform, {low:g} to {high:g}"
+    if draw.kind == "share":
+        return f"true with probability {draw.stated:g}"
+    if draw.kind == "choice":
+        return f"one of {', '.join(draw.stated)}, equally likely"
+    low, high = draw.stated
+    if draw.kind in ("colour", "shade"):
+        one, other = (f"({' '.join(f'{c:g}' for c in end)})" for end in (low, high))
+        shape = "each channel uniform" if draw.kind == "colour" else "uniform on the line"
+        return f"{shape} from {one} to {other}"
+    if draw.kind == "direction":
+        return f"uniform by solid angle, elevation {low:g} to {high:g} degrees"
+    return f"{draw.kind}, {low:g} to {high:g}"

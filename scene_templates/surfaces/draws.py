@@ -1,12 +1,16 @@
 """`SurfaceDraws`: the draws of a surface, with colours either natural or anything."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scene_templates.stated_draws import StatedDraws
 from scene_templates.surfaces.maps import Finish, finish
 
 RGB = tuple[float, float, float]
 """Linear, Rec.709 primaries."""
+
+LEAST_TINT = 0.88
+"""A natural colour is one between two, each channel times a number from this to 1."""
 
 
 class SurfaceDraws(StatedDraws):
@@ -36,12 +40,18 @@ class SurfaceDraws(StatedDraws):
         roughness: tuple[float, float],
         metal: bool = False,
     ) -> Finish:
-        """Return a finish; `low` and `high` are its natural base colours."""
-        least, most = self._albedo
-        ends = (low, high) if self._natural else ((least,) * 3, (most,) * 3)
+        """Return a finish; natural base colours lie between `low` and `high`."""
         return finish(
-            self.colour(f"{name}: base colour", *ends),
+            self._natural_colour(name, low, high) if self._natural else self._any_colour(name),
             specular_share=self.uniform(f"{name}: specular share", *specular),
             roughness=self.uniform(f"{name}: roughness", *roughness),
             metal=metal,
         )
+
+    def _natural_colour(self, name: str, low: RGB, high: RGB) -> NDArray[np.float64]:
+        tint = self.colour(f"{name}: tint", (LEAST_TINT,) * 3, (1.0,) * 3)
+        return tint * self.shade(f"{name}: colour", low, high)
+
+    def _any_colour(self, name: str) -> NDArray[np.float64]:
+        least, most = self._albedo
+        return self.colour(f"{name}: any colour", (least,) * 3, (most,) * 3)

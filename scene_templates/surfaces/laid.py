@@ -122,10 +122,10 @@ def bricks(draws: SurfaceDraws, texels: Texels) -> Finish:
     shifts = {"running": running, "stacked": np.zeros(rows), "random": loose}[bond]
     pieces = laid(texels, rows, columns, shifts)
     clay = texels.noise(draws.stream(), (16, 16), octaves=3)
-    worn = texels.noise(draws.stream(), (12, 12), octaves=3) * 0.04 / rows
+    worn = texels.noise(draws.stream(), (12, 12), octaves=3) * 0.05 / rows
     baked = brick.toned(1 - spread * pieces.of_each(tones)).toned(0.85 + 0.25 * clay)
     return mortar.toned(0.9 + 0.15 * clay).covered(
-        baked, ramp((pieces.edge + 4 * worn - joint / 2 / rows) * texels.size)
+        baked, ramp((pieces.edge + worn - joint / 2 / rows) * texels.size)
     )
 
 

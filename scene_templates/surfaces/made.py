@@ -35,7 +35,7 @@ def rust(draws: SurfaceDraws, texels: Texels) -> Finish:
     eaten = texels.noise(draws.stream(), (cells, cells), octaves=6)
     tone = texels.noise(draws.stream(), (2 * cells, 2 * cells), octaves=5)
     scratched = texels.noise(draws.stream(), (4, 4), octaves=4)
-    covered = eased(0.5 + (eaten - exceeded_by(eaten, share)) / 0.2)
+    covered = eased(0.5 + (eaten - exceeded_by(eaten, share)) / 0.12)
     return under.rougher(0.15 * eased(0.5 + scratched)).covered(
         fresh.covered(old, eased(0.5 + 0.9 * tone)), covered
     )
