@@ -21,9 +21,9 @@ class StatedDraw:
     """What one name was said to be drawn from, and what came out."""
 
     kind: Kind
-    """Distribution: uniform in the range, uniform whole numbers, true with a probability, a colour
-    with independent uniform channels, a uniform place between two colours, a direction uniform by solid angle, or equally likely words.
-    """
+    """Distribution: uniform in a range; uniform whole numbers; true with a probability; a colour
+    with independent uniform channels; a uniform place on the line between two colours; a direction
+    uniform by solid angle; or equally likely words."""
     stated: Any
     """Lowest and highest value; a probability; the two colours; the lowest and highest elevation in
     degrees; or the words."""
@@ -68,9 +68,7 @@ class StatedDraws:
         drawn = np.array([self._between(*ends) for ends in zip(low, high, strict=True)])
         return self._remembered(name, "colour", (tuple(low), tuple(high)), drawn)
 
-    def shade(
-        self, name: str, one: Sequence[float], other: Sequence[float]
-    ) -> NDArray[np.float64]:
+    def shade(self, name: str, one: Sequence[float], other: Sequence[float]) -> NDArray[np.float64]:
         """Return a colour [3] on the straight line between two, uniform along it."""
         share = self._remembered(name, "shade", (tuple(one), tuple(other)), self._between(0, 1))
         return mixed(one, other, share)

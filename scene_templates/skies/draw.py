@@ -17,8 +17,7 @@ from storage.settings.ranges import Share, Within
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SkyMap:
-    """A latitude-longitude map of linear radiance, oriented as scene_templates.skies.texels says.
-    """
+    """A latitude-longitude map of linear radiance; scene_templates.skies.texels orients it."""
 
     family: str
     """Name of the family that it was drawn from."""
@@ -45,8 +44,8 @@ class SkyMapSettings:
     sun_elevation_deg: Annotated[Range, Within(-90, 90, unit="degrees")] = (2.0, 75.0)
     """Range of the elevation of a sun, uniform by solid angle."""
     sun_to_sky: Annotated[Range, Within(0, 1e9)] = (0.5, 8.0)
-    """Range of the irradiance of a sun, on a plane that faces it, over the irradiance of the rest of
-    the upper half of the sky on a horizontal plane."""
+    """Range of the irradiance of a sun, on a plane that faces it, over the irradiance of the rest
+    of the upper half of the sky on a horizontal plane."""
 
     def __post_init__(self) -> None:
         require(len(self.families) > 0, "families", self.families, "at least one")

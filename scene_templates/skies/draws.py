@@ -10,6 +10,10 @@ PALEST = 0.1
 """Least channel of a coloured light before its mean is made 1: no light is quite monochrome."""
 
 
+DEEP_BLUE, PALE_BLUE = (0.3, 0.75, 1.95), (0.75, 0.97, 1.28)
+"""Colours, of mean 1, of a clean and of a hazy sky: bluer than any black body is."""
+
+
 class SkyDraws(StatedDraws):
     """Draws by name, and colours of lights that follow the sky's own choice."""
 
@@ -43,6 +47,15 @@ class SkyDraws(StatedDraws):
         """
         if not self._coloured:
             return planckian_rgb(self.uniform(f"{name}: mired", *mired))
+        return self._any_colour(name)
+
+    def blue(self, name: str) -> Numbers:
+        """Return the colour [3], of mean 1, of a sky that is blue where lights are natural."""
+        if not self._coloured:
+            return self.shade(f"{name}: colour", DEEP_BLUE, PALE_BLUE)
+        return self._any_colour(name)
+
+    def _any_colour(self, name: str) -> Numbers:
         rgb = self.colour(f"{name}: any colour", (PALEST,) * 3, (1.0,) * 3)
         result: Numbers = rgb / ((rgb[0] + rgb[1] + rgb[2]) / 3)
         return result

@@ -23,15 +23,17 @@ def sun_and_sky(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     """
     towards = draws.direction("sun", *draws.sun_elevation_deg)
     ratio = draws.uniform("irradiance of the sun over that of the sky", *draws.sun_to_sky)
-    zenith = draws.light("zenith", mired=(45, 90))
+    zenith = draws.blue("zenith")
     horizon = draws.light("horizon", mired=(120, 170))
     brightening = draws.uniform("horizon over zenith", 1.5, 5.0)
-    haze = draws.uniform("share of the glow around the sun", 0.05, 0.4)
+    haze = draws.uniform("share of the glow around the sun", 0.02, 0.3)
     sharpness = draws.uniform("sharpness of the glow", 4.0, 60.0)
     sun = planckian_rgb(_sun_mired(float(towards[2])))
     low = 1 - np.clip(texels.z, 0, 1)
     near = low * low * low
-    sky = mixed(zenith, brightening * horizon, near[..., None]) + np.zeros((1, 2 * texels.height, 1))
+    sky = mixed(zenith, brightening * horizon, near[..., None]) + np.zeros(
+        (1, 2 * texels.height, 1)
+    )
     glow = texels.lobe(towards, sharpness)[..., None] * sun
     sky = sky * (1 - haze) + glow * (haze * _mean(texels.flux(sky)))
     from_sky = _mean(texels.irradiance(_above(sky, texels)))
@@ -51,12 +53,12 @@ def clouds(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     times as bright above as at the horizon.
     """
     cover = draws.uniform("level of the clouds", -0.6, 0.8)
-    softness = draws.uniform("softness of their edges", 0.2, 1.0)
-    cells = draws.uniform("cells of the clouds along a radius", 1.5, 4.0)
+    softness = draws.uniform("softness of their edges", 0.4, 1.4)
+    cells = draws.uniform("cells of the clouds along a radius", 1.0, 2.5)
     shading = draws.uniform("darkening within the clouds", 0.2, 0.7)
     bright = draws.uniform("clouds over blue sky", 1.5, 5.0)
     cloud = draws.light("cloud", mired=(125, 180))
-    blue = draws.light("blue sky", mired=(45, 90))
+    blue = draws.blue("blue sky")
     towards = draws.direction("brightest place", 10, 80)
     shape = texels.noise(draws.stream(), cells, octaves=5)
     thickness = texels.noise(draws.stream(), 2 * cells, octaves=4)
@@ -73,7 +75,7 @@ def night(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     count = draws.whole("lamps", 1, 6)
     dark = draws.uniform("share of the sky", 0.005, 0.1)
     tint = draws.light("sky", mired=(40, 120))
-    low = 1 - np.abs(texels.z)
+    low = 1 - texels.z * texels.z
     sky = (0.3 + low * low)[..., None] * tint + np.zeros((1, 2 * texels.height, 1))
     lamps = np.zeros_like(sky)
     for _ in range(count):
@@ -89,7 +91,7 @@ def night(draws: SkyDraws, texels: SkyTexels) -> Numbers:
 def _with_ground(draws: SkyDraws, texels: SkyTexels, sky: Numbers) -> Numbers:
     """Return a sky above ground that reflects, as a Lambert surface, what the sky sends onto it."""
     albedo = draws.uniform("albedo of the ground", 0.05, 0.5)
-    tint = draws.colour("tint of the ground", (0.6, 0.5, 0.4), (1.0, 1.0, 1.0))
+    tint = draws.colour("tint of the ground", (0.75, 0.7, 0.5), (1.0, 1.0, 0.9))
     ground = albedo * tint * texels.irradiance(_above(sky, texels)) / np.pi
     return mixed(ground, sky, _above_share(texels)[..., None])
 

@@ -7,6 +7,7 @@ looks at azimuth (0.5 - u) 2 pi, from +X towards +Y, and elevation (v - 0.5) pi.
 """
 
 import functools
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -172,16 +173,19 @@ def _axes(towards: NDArray, roll_rad: float) -> tuple[Numbers, Numbers]:
 
 def _noise_in_space(points: NDArray, rng: np.random.Generator) -> Numbers:
     """Return gradient noise at points [..., 3], of a lattice that repeats after LATTICE cells."""
-    slopes = 2 * rng.random((LATTICE, LATTICE, LATTICE, 3)) - 1
-    corner = np.floor(points)
-    inside = points - corner
-    whole = corner.astype(np.int64)
-    fade = inside * inside * inside * (inside * (6 * inside - 15) + 10)
+    slopes = 2 * rng.random((3, LATTICE**3)) - 1
+    axes = [np.ascontiguousarray(points[..., axis]) for axis in range(3)]
+    corners = [np.floor(axis) for axis in axes]
+    insides = [axis - corner for axis, corner in zip(axes, corners, strict=True)]
+    fades = [x * x * x * (x * (6 * x - 15) + 10) for x in insides]
     total = np.zeros(points.shape[:-1])
-    for number in range(8):
-        step = np.array([number & 1, number >> 1 & 1, number >> 2 & 1])
-        at = (whole + step) % LATTICE
-        slope = slopes[at[..., 0], at[..., 1], at[..., 2]]
-        part = np.where(step == 1, fade, 1 - fade)
-        total = total + dot(slope, inside - step) * part[..., 0] * part[..., 1] * part[..., 2]
+    for steps in itertools.product((0, 1), repeat=3):
+        place = np.zeros(total.shape, np.int64)
+        weight, height = np.ones_like(total), np.zeros_like(total)
+        for corner, step, fade in zip(corners, steps, fades, strict=True):
+            place = place * LATTICE + (corner.astype(np.int64) + step) % LATTICE
+            weight = weight * (fade if step else 1 - fade)
+        for slope, inside, step in zip(slopes, insides, steps, strict=True):
+            height = height + slope[place] * (inside - step)
+        total = total + height * weight
     return total

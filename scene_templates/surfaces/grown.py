@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.exact import Numbers, eased, ramp
-from scene_templates.surfaces.draws import SurfaceDraws
+from scene_templates.surfaces.draws import Gloss, SurfaceDraws
 from scene_templates.surfaces.laid import laid
 from scene_templates.surfaces.maps import Finish
 from scene_templates.surfaces.texels import Texels, stones
@@ -38,15 +38,13 @@ def wood(draws: SurfaceDraws, texels: Texels) -> Finish:
 
 
 def _woods(draws: SurfaceDraws) -> tuple[Finish, Finish]:
-    varnish = {"specular": (0.02, 0.25), "roughness": (0.15, 0.8)}
+    varnish = Gloss(specular=(0.02, 0.25), roughness=(0.15, 0.8))
     light = draws.finish("early wood", low=(0.35, 0.17, 0.07), high=(0.8, 0.55, 0.35), **varnish)
     dark = draws.finish("late wood", low=(0.08, 0.03, 0.01), high=(0.35, 0.18, 0.1), **varnish)
     return light, dark
 
 
-def _grain(
-    draws: SurfaceDraws, texels: Texels, moved: tuple[NDArray, NDArray] | None
-) -> Numbers:
+def _grain(draws: SurfaceDraws, texels: Texels, moved: tuple[NDArray, NDArray] | None) -> Numbers:
     """Return how much of each texel is late wood: bent rings, and fibres along u."""
     rings = draws.whole("rings", 4, 12)
     bend = draws.uniform("bend of the rings, in rings", 0.3, 2.0)
@@ -55,7 +53,9 @@ def _grain(
     phase = rings * (texels.v + (0.0 if moved is None else moved[1])) + bend * bent
     place = phase - np.floor(phase)
     ring = np.where(
-        place < LATE_WOOD, eased(place / LATE_WOOD), 1 - eased((place - LATE_WOOD) / (1 - LATE_WOOD))
+        place < LATE_WOOD,
+        eased(place / LATE_WOOD),
+        1 - eased((place - LATE_WOOD) / (1 - LATE_WOOD)),
     )
     return np.clip(0.1 + 0.6 * ring + 0.3 * fibres, 0, 1)
 
@@ -65,12 +65,10 @@ def marble(draws: SurfaceDraws, texels: Texels) -> Finish:
     cells = draws.whole("cells of the veins a side", 2, 4)
     width = draws.uniform("width of the veins", 0.05, 0.25)
     bend = draws.uniform("bend of the veins, in widths of the map", 0.03, 0.12)
-    polish = {"specular": (0.04, 0.35), "roughness": (0.03, 0.35)}
+    polish = Gloss(specular=(0.04, 0.35), roughness=(0.03, 0.35))
     stone = draws.finish("stone", low=(0.3, 0.3, 0.28), high=(0.9, 0.9, 0.88), **polish)
     vein = draws.finish("vein", low=(0.03, 0.03, 0.03), high=(0.5, 0.4, 0.3), **polish)
-    moved = tuple(
-        bend * texels.noise(draws.stream(), (cells, cells), octaves=4) for _ in "uv"
-    )
+    moved = tuple(bend * texels.noise(draws.stream(), (cells, cells), octaves=4) for _ in "uv")
     bent = (moved[0], moved[1])
     broad = texels.noise(draws.stream(), (cells, cells), octaves=2, moved=bent)
     fine = texels.noise(draws.stream(), (2 * cells, 2 * cells), octaves=2, moved=bent)
@@ -85,7 +83,7 @@ def terrazzo(draws: SurfaceDraws, texels: Texels) -> Finish:
     """Chips of three stones in polished cement."""
     cells = draws.whole("chips a side", 6, 20)
     gap = draws.uniform("cement between chips, in spacings", 0.1, 0.45)
-    polish = {"specular": (0.04, 0.25), "roughness": (0.05, 0.4)}
+    polish = Gloss(specular=(0.04, 0.25), roughness=(0.05, 0.4))
     cement = draws.finish("cement", low=(0.45, 0.43, 0.4), high=(0.9, 0.88, 0.85), **polish)
     chips = [
         draws.finish(f"{name} chip", low=(0.05, 0.04, 0.04), high=(0.85, 0.7, 0.6), **polish)

@@ -4,12 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.exact import Numbers, eased
-from scene_templates.surfaces.draws import SurfaceDraws
+from scene_templates.surfaces.draws import RGB, Gloss, SurfaceDraws
 from scene_templates.surfaces.maps import Finish
 from scene_templates.surfaces.texels import TEXELS_PER_CELL, Texels
 
-METAL = {"low": (0.5, 0.42, 0.3), "high": (0.95, 0.92, 0.9), "metal": True}
-"""From copper and brass to steel and silver, roughly."""
+DARK_METAL, BRIGHT_METAL = (0.5, 0.42, 0.3), (0.95, 0.92, 0.9)
+"""From bronze to silver, roughly."""
 
 
 def rust(draws: SurfaceDraws, texels: Texels) -> Finish:
@@ -25,7 +25,14 @@ def rust(draws: SurfaceDraws, texels: Texels) -> Finish:
             roughness=(0.1, 0.6),
         )
     else:
-        under = draws.finish("steel", specular=(0.7, 0.95), roughness=(0.1, 0.5), **METAL)
+        under = draws.finish(
+            "steel",
+            low=DARK_METAL,
+            high=BRIGHT_METAL,
+            metal=True,
+            specular=(0.7, 0.95),
+            roughness=(0.1, 0.5),
+        )
     fresh = draws.finish(
         "fresh rust", low=(0.35, 0.1, 0.02), high=(0.6, 0.25, 0.08), roughness=(0.7, 1.0)
     )
@@ -52,7 +59,14 @@ def brushed_metal(draws: SurfaceDraws, texels: Texels) -> Finish:
     along = draws.choice("brushed along", ("u", "v"))
     depth = draws.uniform("darkening of the scratches", 0.05, 0.4)
     uneven = draws.uniform("roughness that the smudges add", 0.0, 0.25)
-    metal = draws.finish("metal", specular=(0.75, 0.95), roughness=(0.1, 0.5), **METAL)
+    metal = draws.finish(
+        "metal",
+        low=DARK_METAL,
+        high=BRIGHT_METAL,
+        metal=True,
+        specular=(0.75, 0.95),
+        roughness=(0.1, 0.5),
+    )
     coarse, fine = ((1, 16), (2, 64)) if along == "u" else ((16, 1), (64, 2))
     lines = texels.noise(draws.stream(), coarse, octaves=2) + texels.noise(draws.stream(), fine)
     smudges = texels.noise(draws.stream(), (3, 3), octaves=4)
@@ -65,7 +79,7 @@ def fabric(draws: SurfaceDraws, texels: Texels) -> Finish:
     threads = 4 * draws.whole("threads a side, in fours", 3, 8)
     weave = draws.choice("weave", ("plain", "twill"))
     wear = draws.uniform("unevenness of the threads", 0.0, 0.5)
-    cloth = {"specular": (0.0, 0.06), "roughness": (0.6, 1.0)}
+    cloth = Gloss(specular=(0.0, 0.06), roughness=(0.6, 1.0))
     along = draws.finish("warp", low=(0.05, 0.05, 0.06), high=(0.85, 0.75, 0.65), **cloth)
     across = draws.finish("weft", low=(0.05, 0.05, 0.06), high=(0.85, 0.8, 0.75), **cloth)
     column, row = np.floor(texels.u * threads), np.floor(texels.v * threads)
@@ -74,7 +88,8 @@ def fabric(draws: SurfaceDraws, texels: Texels) -> Finish:
     in_v = 2 * (texels.v * threads - row) - 1 + np.zeros((1, texels.size))
     rim, crown = np.where(over, in_u, in_v), np.where(over, in_v, in_u)
     shown = min(1.0, texels.size / (TEXELS_PER_CELL * threads))
-    shade = 1 - shown * (0.7 * rim * rim + 0.2 * crown * crown)
+    # 0.3 is the mean of what is taken off: where threads are too fine to show, it alone is left
+    shade = 0.7 - shown * (0.7 * rim * rim + 0.2 * crown * crown - 0.3)
     random = draws.stream()
     uneven = np.where(over, *_of_threads(random, threads, column, row))
     fluff = texels.noise(draws.stream(), (32, 32), octaves=2)
@@ -87,14 +102,14 @@ def _of_threads(
 ) -> tuple[NDArray, NDArray]:
     """Return a number in [0, 1] for the thread of each column and for that of each row."""
     warp, weft = random.random(threads), random.random(threads)
-    return warp[column.astype(np.int64)], weft[row.astype(np.int64)]
+    return warp[column.astype(np.int64) % threads], weft[row.astype(np.int64) % threads]
 
 
 def camouflage(draws: SurfaceDraws, texels: Texels) -> Finish:
     """Blotches of three paints on a fourth."""
     cells = draws.whole("blotches a side", 2, 6)
-    paint = {"specular": (0.0, 0.15), "roughness": (0.4, 1.0)}
-    ranges = {
+    paint = Gloss(specular=(0.0, 0.15), roughness=(0.4, 1.0))
+    ranges: dict[str, tuple[RGB, RGB]] = {
         "ground": ((0.25, 0.22, 0.12), (0.6, 0.55, 0.4)),
         "first blotch": ((0.05, 0.1, 0.03), (0.2, 0.3, 0.12)),
         "second blotch": ((0.1, 0.05, 0.02), (0.3, 0.18, 0.1)),
