@@ -5,8 +5,9 @@ factor, which `draw_sky` chooses.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scene_templates.exact import Numbers, eased, mixed, ramp
+from scene_templates.exact import Numbers, eased, mixed
 from scene_templates.skies.colour import planckian_rgb
 from scene_templates.skies.draws import SkyDraws
 from scene_templates.skies.texels import SkyTexels
@@ -19,7 +20,8 @@ def sun_and_sky(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     """A clear or hazy sky, bluest above and bright at the horizon, with a sun and its glow.
 
     The sun is a spot of a few texels at most. Its irradiance on a plane that faces it is the stated
-    multiple of what the rest of the upper half sends onto a horizontal plane.
+    multiple of what the rest of the upper half sends onto a horizontal plane, wherever a texel of
+    it is above the horizon.
     """
     towards = draws.direction("sun", *draws.sun_elevation_deg)
     ratio = draws.uniform("irradiance of the sun over that of the sky", *draws.sun_to_sky)
@@ -37,8 +39,15 @@ def sun_and_sky(draws: SkyDraws, texels: SkyTexels) -> Numbers:
     glow = texels.lobe(towards, sharpness)[..., None] * sun
     sky = sky * (1 - haze) + glow * (haze * _mean(texels.flux(sky)))
     from_sky = _mean(texels.irradiance(_above(sky, texels)))
-    disk = texels.spot(towards)[..., None] * sun * (ratio * from_sky)
+    disk = _spot_above(texels, towards)[..., None] * sun * (ratio * from_sky)
     return _with_ground(draws, texels, sky + disk)
+
+
+def _spot_above(texels: SkyTexels, towards: NDArray) -> Numbers:
+    """Return a spot [H, 2H] whose part above the horizon has unit flux, or none if it has set."""
+    spot = texels.spot(towards)
+    seen = float(texels.flux(spot * _above_share(texels)))
+    return spot / seen if seen > 0 else np.zeros_like(spot)
 
 
 def _sun_mired(height: float) -> float:
@@ -103,7 +112,7 @@ def _above(sky: Numbers, texels: SkyTexels) -> Numbers:
 
 def _above_share(texels: SkyTexels) -> Numbers:
     """[H, 1] how much of each row is above the horizon."""
-    return ramp(texels.z * texels.height / np.pi)
+    return np.clip(texels.height / 2 - np.arange(texels.height)[:, None], 0, 1)
 
 
 def _mean(rgb: Numbers) -> float:
