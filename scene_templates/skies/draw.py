@@ -33,7 +33,7 @@ class SkyMapSettings:
 
     families: tuple[str, ...] = OUR_SKIES
     """Families of skies, each equally likely; a name that stands twice is twice as likely."""
-    height: Annotated[int, Within(1, 2048, unit="rows")] = 256
+    height: Annotated[int, Within(1, 1024, unit="rows")] = 256
     """Rows of a map, which has twice as many columns. The same seed gives the same sky at every
     height, and the same irradiance of its sun."""
     mean_radiance: Annotated[Range, Within(0, 1e9)] = (0.2, 2.0)

@@ -19,7 +19,7 @@ class SurfaceMapSettings:
 
     families: tuple[str, ...] = OUR_SURFACES
     """Families of surfaces, each equally likely; a name that stands twice is twice as likely."""
-    size: Annotated[int, Within(1, 4096, unit="texels")] = 256
+    size: Annotated[int, Within(1, 2048, unit="texels")] = 256
     """Width and height of a map, a power of two. The same seed gives the same surface at every
     size; below 64 the finest pattern is a blur."""
     natural_share: Share = 0.7

@@ -30,7 +30,7 @@ class SurfaceMaps:
     roughness: NDArray[np.float32]
     """[N, N, 1] roughness; the GGX width is its square."""
     parameters: Mapping[str, tuple[Any, ...]]
-    """What was drawn, by the names of docs/explanation/surfaces-and-skies.md."""
+    """What was drawn, by the names of docs/reference/surfaces-and-skies.md."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -35,7 +35,7 @@ def test_all_of_ours_are_drawn_by_default() -> None:
         ("families", ()),
         ("families", ("fog",)),
         ("height", 0),
-        ("height", 4096),
+        ("height", 2048),
         ("height", 8.5),
         ("mean_radiance", (-1.0, 1.0)),
         ("coloured_share", 2.0),

@@ -48,7 +48,7 @@ def test_colours_that_are_not_natural_are_in_the_stated_range() -> None:
         ("families", ("gold",)),
         ("size", 0),
         ("size", 100),
-        ("size", 8192),
+        ("size", 4096),
         ("size", 64.0),
         ("natural_share", 1.1),
         ("albedo", (0.5, 0.1)),
