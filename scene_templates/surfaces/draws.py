@@ -12,7 +12,7 @@ RGB = tuple[float, float, float]
 """Linear, Rec.709 primaries."""
 
 
-class Gloss(TypedDict):
+class GlossRanges(TypedDict):
     """Ranges that several finishes share."""
 
     specular: tuple[float, float]

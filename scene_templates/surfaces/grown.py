@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.exact import Numbers, eased, ramp
-from scene_templates.surfaces.draws import Gloss, SurfaceDraws
+from scene_templates.surfaces.draws import GlossRanges, SurfaceDraws
 from scene_templates.surfaces.laid import laid
 from scene_templates.surfaces.maps import Finish
 from scene_templates.surfaces.texels import Texels, stones
@@ -38,7 +38,7 @@ def wood(draws: SurfaceDraws, texels: Texels) -> Finish:
 
 
 def _woods(draws: SurfaceDraws) -> tuple[Finish, Finish]:
-    varnish = Gloss(specular=(0.02, 0.25), roughness=(0.15, 0.8))
+    varnish = GlossRanges(specular=(0.02, 0.25), roughness=(0.15, 0.8))
     light = draws.finish("early wood", low=(0.35, 0.17, 0.07), high=(0.8, 0.55, 0.35), **varnish)
     dark = draws.finish("late wood", low=(0.08, 0.03, 0.01), high=(0.35, 0.18, 0.1), **varnish)
     return light, dark
@@ -65,7 +65,7 @@ def marble(draws: SurfaceDraws, texels: Texels) -> Finish:
     cells = draws.whole("cells of the veins a side", 2, 4)
     width = draws.uniform("width of the veins", 0.05, 0.25)
     bend = draws.uniform("bend of the veins, in widths of the map", 0.03, 0.12)
-    polish = Gloss(specular=(0.04, 0.35), roughness=(0.03, 0.35))
+    polish = GlossRanges(specular=(0.04, 0.35), roughness=(0.03, 0.35))
     stone = draws.finish("stone", low=(0.3, 0.3, 0.28), high=(0.9, 0.9, 0.88), **polish)
     vein = draws.finish("vein", low=(0.03, 0.03, 0.03), high=(0.5, 0.4, 0.3), **polish)
     moved = tuple(bend * texels.noise(draws.stream(), (cells, cells), octaves=4) for _ in "uv")
@@ -83,7 +83,7 @@ def terrazzo(draws: SurfaceDraws, texels: Texels) -> Finish:
     """Chips of three stones in polished cement."""
     cells = draws.whole("chips a side", 6, 20)
     gap = draws.uniform("cement between chips, in spacings", 0.1, 0.45)
-    polish = Gloss(specular=(0.04, 0.25), roughness=(0.05, 0.4))
+    polish = GlossRanges(specular=(0.04, 0.25), roughness=(0.05, 0.4))
     cement = draws.finish("cement", low=(0.45, 0.43, 0.4), high=(0.9, 0.88, 0.85), **polish)
     chips = [
         draws.finish(f"{name} chip", low=(0.05, 0.04, 0.04), high=(0.85, 0.7, 0.6), **polish)

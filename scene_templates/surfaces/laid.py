@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.exact import Numbers, ramp
-from scene_templates.surfaces.draws import Gloss, SurfaceDraws
+from scene_templates.surfaces.draws import GlossRanges, SurfaceDraws
 from scene_templates.surfaces.maps import Finish
 from scene_templates.surfaces.texels import Texels
 
@@ -135,7 +135,7 @@ def tiles(draws: SurfaceDraws, texels: Texels) -> Finish:
     side = 2 * draws.whole("pairs of tiles a side", 1, 5)
     pattern = draws.choice("pattern", ("plain", "scattered", "chequered"))
     joint = draws.uniform("joint, in widths of a tile", 0.02, 0.08)
-    glaze = Gloss(specular=(0.04, 0.4), roughness=(0.05, 0.4))
+    glaze = GlossRanges(specular=(0.04, 0.4), roughness=(0.05, 0.4))
     first = draws.finish("first tile", low=(0.5, 0.5, 0.45), high=(0.9, 0.9, 0.9), **glaze)
     second = draws.finish("second tile", low=(0.02, 0.05, 0.1), high=(0.5, 0.5, 0.6), **glaze)
     grout = draws.finish("grout", low=(0.15, 0.15, 0.14), high=(0.7, 0.7, 0.68), roughness=(0.8, 1))
@@ -157,7 +157,7 @@ def hexagons(draws: SurfaceDraws, texels: Texels) -> Finish:
     columns, rows = HEXAGONS[draws.choice("hexagons", tuple(HEXAGONS))]
     joint = draws.uniform("joint, in widths of a tile", 0.03, 0.12)
     share = draws.uniform("share of the second tile", 0.0, 0.5)
-    glaze = Gloss(specular=(0.04, 0.4), roughness=(0.05, 0.6))
+    glaze = GlossRanges(specular=(0.04, 0.4), roughness=(0.05, 0.6))
     first = draws.finish("first tile", low=(0.4, 0.35, 0.3), high=(0.9, 0.88, 0.85), **glaze)
     second = draws.finish("second tile", low=(0.02, 0.05, 0.05), high=(0.6, 0.4, 0.4), **glaze)
     grout = draws.finish("grout", low=(0.1, 0.1, 0.1), high=(0.6, 0.6, 0.58), roughness=(0.8, 1))

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.exact import Numbers, eased
-from scene_templates.surfaces.draws import RGB, Gloss, SurfaceDraws
+from scene_templates.surfaces.draws import RGB, GlossRanges, SurfaceDraws
 from scene_templates.surfaces.maps import Finish
 from scene_templates.surfaces.texels import TEXELS_PER_CELL, Texels
 
@@ -79,7 +79,7 @@ def fabric(draws: SurfaceDraws, texels: Texels) -> Finish:
     threads = 4 * draws.whole("threads a side, in fours", 3, 8)
     weave = draws.choice("weave", ("plain", "twill"))
     wear = draws.uniform("unevenness of the threads", 0.0, 0.5)
-    cloth = Gloss(specular=(0.0, 0.06), roughness=(0.6, 1.0))
+    cloth = GlossRanges(specular=(0.0, 0.06), roughness=(0.6, 1.0))
     along = draws.finish("warp", low=(0.05, 0.05, 0.06), high=(0.85, 0.75, 0.65), **cloth)
     across = draws.finish("weft", low=(0.05, 0.05, 0.06), high=(0.85, 0.8, 0.75), **cloth)
     column, row = np.floor(texels.u * threads), np.floor(texels.v * threads)
@@ -108,7 +108,7 @@ def _of_threads(
 def camouflage(draws: SurfaceDraws, texels: Texels) -> Finish:
     """Blotches of three paints on a fourth."""
     cells = draws.whole("blotches a side", 2, 6)
-    paint = Gloss(specular=(0.0, 0.15), roughness=(0.4, 1.0))
+    paint = GlossRanges(specular=(0.0, 0.15), roughness=(0.4, 1.0))
     ranges: dict[str, tuple[RGB, RGB]] = {
         "ground": ((0.25, 0.22, 0.12), (0.6, 0.55, 0.4)),
         "first blotch": ((0.05, 0.1, 0.03), (0.2, 0.3, 0.12)),

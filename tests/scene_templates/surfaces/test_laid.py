@@ -68,3 +68,20 @@ def test_hexagons_are_equal_and_nearly_regular(name: str) -> None:
     # a hexagon of unit width shrunk by d on all sides keeps (1 - 2 d)^2 of its area
     assert (edge > 0.1).mean() == pytest.approx(0.8 * 0.8, abs=0.02)
     assert edge.min() > -0.02
+
+
+def test_grout_has_the_area_of_its_joints() -> None:
+    """Seen in the specular albedo, which tones of tiles leave alone."""
+    settings = SurfaceMapSettings(families=("tiles",), size=256)
+    found = [draw_surface(rng_for(seed, "laid"), settings) for seed in range(16)]
+    plain = [maps for maps in found if maps.parameters["pattern"] == ("plain",)]
+    assert len(plain) >= 3
+    for maps in plain:
+        tile, grout = (
+            maps.parameters[f"{name}: specular share"][0] for name in ("first tile", "grout")
+        )
+        share = (maps.specular_rgb.mean(dtype=float) - tile) / (grout - tile)
+        joint = maps.parameters["joint, in widths of a tile"][0]
+        side = 2 * maps.parameters["pairs of tiles a side"][0]
+        # ramps keep areas but for joints thinner than a texel, which get a quarter too much of it
+        assert share == pytest.approx(1 - (1 - joint) ** 2, abs=0.25 * 2 * side / 256)
