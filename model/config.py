@@ -84,6 +84,9 @@ class ModelConfig:
     that of lamps is traced. 0 with bundles."""
     pixel_width: Annotated[int, Within(0, 4096)] = 0
     """hits: width of the network that each pixel passes; 0 with bundles."""
+    filter_width: Annotated[int, Within(0, 1024)] = 0
+    """hits: width of the network that says which pixels share what their mirrored rays found; 0
+    leaves each pixel its own. 0 with bundles."""
     scene_tokens: bool = True
     """hits: whether anchors ask the scene's tokens; false leaves out the view-independent stage."""
     material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
@@ -129,7 +132,7 @@ class ModelConfig:
                     f"and patch_px {self.patch_px}",
                     f"linear, 0 and {HITS_PX}",
                 )
-        elif any(needed.values()) or self.gather_rays or not self.scene_tokens:
+        elif any([*needed.values(), self.gather_rays, self.filter_width, not self.scene_tokens]):
             _wrong("fields of hits beside view_stage bundles", "0, and scene_tokens true")
 
     @property
@@ -167,8 +170,9 @@ def hits_smoke() -> ModelConfig:
         view_stage="hits",
         hit_rays=2,
         hit_anchors=16,
-        gather_rays=32,
+        gather_rays=16,
         pixel_width=64,
+        filter_width=32,
     )
 
 
@@ -186,6 +190,7 @@ def hits_base() -> ModelConfig:
         hit_anchors=32,
         gather_rays=64,
         pixel_width=128,
+        filter_width=64,
     )
 
 

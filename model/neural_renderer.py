@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from model.encoded_scene import EncodedScene
-from model.light_groups import light_groups
+from model.light_groups import LightGroup, light_groups
 from model.open import Finder, find_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
@@ -133,15 +133,18 @@ class NeuralRenderer:
 
         Args:
             scene: passes `Scene.check`; its cameras do not matter.
-            lights_per_pass: most emitting triangles of a group (model.light_groups).
+            lights_per_pass: most emitting triangles of a group (model.light_groups). The lamps of
+                a network of hits are traced, any number at a time.
 
         Raises:
             TrilightError: the scene is larger than memory.
         """
         self._require_memory(scene.num_triangles)
+        by_hits = self._model.config.view_stage == "hits"
+        all_lights = [LightGroup(scene=scene, share=1.0)]
         groups = [
             (_encode(self._model, group.scene, self.device), group.share)
-            for group in light_groups(scene, lights_per_pass)
+            for group in (all_lights if by_hits else light_groups(scene, lights_per_pass))
         ]
         return PreparedScene(groups=tuple(groups), notes=self._notes(scene, len(groups)))
 

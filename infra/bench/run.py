@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from infra.bench.effort import Asked, Effort
-from infra.bench.experiment import Experiment
+from infra.bench.experiment import Experiment, points_of
 from infra.bench.machine import ROOT, machine
 from infra.bench.plot import plot
 from infra.bench.store import Run, Store
@@ -89,22 +89,28 @@ def _plan(experiment: Experiment, effort: Effort, asked: Asked) -> dict[str, obj
         from infra.bench.sides.blender_environment import blender_python
 
         blender_python()  # before anything is measured
-    wanted = {**dataclasses.asdict(asked), "scenes": asked.scenes.name if asked.scenes else None}
+    wanted = {
+        **dataclasses.asdict(asked),
+        "scenes": asked.scenes.name if asked.scenes else None,
+        "checkpoint": asked.network_names,
+    }
     folder = described(asked.scenes) if experiment.takes_scenes else []
+    rival = {"rival": experiment.rival(asked)} if experiment.rival else {}
     return {
         "experiment": experiment.name,
         "effort": dataclasses.asdict(effort),
         "asked": wanted,
         "machine": machine(),
-        "points": [point.name for point in experiment.points(effort)],
+        "points": [point.name for point in points_of(experiment, effort, asked)],
         "turns": [*(named.name for named in folder), *experiment.turns(effort)],
+        **rival,
     }
 
 
 def _measure(
     experiment: Experiment, current: Run, store: Store, workshop: Workshop, turn_done: TurnDone
 ) -> None:
-    points = experiment.points(workshop.effort)
+    points = points_of(experiment, workshop.effort, workshop.asked)
     missing, total = current.missing_turns(), len(current.plan["turns"])
     if experiment.warm_up and missing:
         for _ in experiment.measure(workshop, points, missing[0]):

@@ -5,7 +5,7 @@ Each pixel mixes what the nine nearest anchors know, by what it is like them, an
 says how much of each light that was traced counts, and what is missing:
 
     radiance = diffuse albedo * (gain * mixed gathered light + irradiance)
-             + specular albedo * radiance + gain * direct light + gain * mirrored light
+             + specular albedo * radiance + gain * direct light + gain * filtered mirrored light
 
 Nothing of it is negative. All light is in units of the scene's mean light, by colour: the picture
 scales with the lamps exactly. There are no pixels from elsewhere in it, so any width will do.
@@ -23,7 +23,8 @@ from torch.nn.functional import silu, softplus
 from model.attention import attend
 from model.config import ModelConfig
 from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
-from model.hits.traced import CHANNELS, INPUTS, Traced
+from model.hits.light_filter import LightFilter, filter_flops
+from model.hits.traced import INPUTS, Traced
 from model.hits.view_inputs import Channel
 from model.layers import (
     LAYER_NORM_EPS,
@@ -41,12 +42,18 @@ from model.precision import as_given
 NEIGHBOURS = 9
 """Anchors that a pixel reads: that of its own part of the picture and those around it."""
 
-_SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1
-"""Numbers that say what surface a pixel sees (`_told`)."""
+_SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1 + 1 + 4
+"""Numbers that say what surface a pixel sees, and what its mirrored ray (`_surface`)."""
 
-_LIGHTS = tuple(channel for channels in CHANNELS.values() for channel in channels)
+_LIGHTS = (
+    Channel.OPEN_DIFFUSE,
+    Channel.OPEN_SPECULAR,
+    Channel.DIRECT_DIFFUSE,
+    Channel.DIRECT_SPECULAR,
+    Channel.SHOWN_DIFFUSE,
+)
 
-TOLD = _SURFACE + 3 * len(_LIGHTS) + len(INPUTS)
+TOLD = _SURFACE + 3 * (len(_LIGHTS) + 1) + len(INPUTS)
 """Numbers that a pixel is told; an anchor is told three more, its gathered light."""
 
 _PLACE = 6
@@ -65,7 +72,7 @@ that the first picture is what was traced, with dim shadows."""
 _GAINED = 3
 """Lights that are multiplied by a learned gain: gathered, direct, mirrored."""
 
-BLOCK_PIXELS = 2**14
+BLOCK_PIXELS = 2**12
 """Pixels that are computed at a time while rendering."""
 
 
@@ -76,7 +83,9 @@ def view_flops(config: ModelConfig, tokens: int, resolution: int) -> dict[str, i
     asks = 4 * a * d * d + 4 * a * tokens * d if config.scene_tokens else 0
     pixel = TOLD * p + p * p + NEIGHBOURS * (2 * p + 3) + _PLACE * p + NEIGHBOURS * 4 * 3
     pixel += (2 * p + 3) * 2 * p + 2 * p * p + p * 3 * (_GAINED + 2)
+    width = config.filter_width
     return {
+        "filter": filter_flops(TOLD, width, resolution**2) if width else 0,
         "anchors": 2 * a * ((TOLD + 3) * d + d * d),
         "cross-attention": config.decoder_layers * asks,
         "view feed-forward": config.decoder_layers * 6 * a * d * config.hidden_width,
@@ -173,6 +182,7 @@ class HitDecoder(nn.Module):
         self.config = config
         self.rotary = rotary
         self.recompute = False
+        self.filter = LightFilter(TOLD, config.filter_width) if config.filter_width else None
         self.told = nn.Linear(TOLD + 3, config.width)
         self.anchors = nn.Linear(config.width, config.width)
         self.layers = nn.ModuleList(AnchorLayer(config) for _ in range(config.decoder_layers))
@@ -197,9 +207,7 @@ class HitDecoder(nn.Module):
         """
         with as_given(traced.pixels_VRRC.device):
             unit_B1113 = traced.unit_3[:, None, None, None, :]
-            surface, light = _told(traced.pixels_VRRC, unit_B1113)
-            given = traced.given_VI[:, :, None, None, :].expand(*surface.shape[:-1], -1)
-            told = torch.cat([surface, torch.log1p(4 * light), given], dim=-1)
+            told, mirrored = self._told(traced, unit_B1113)
             at = _at_anchors(traced)
             anchor = torch.cat(
                 [at(told), torch.log1p(4 * traced.gathered_VA3 / unit_B1113[..., 0, :])], dim=-1
@@ -207,7 +215,26 @@ class HitDecoder(nn.Module):
             place = at(traced.pixels_VRRC)
         x_BVAW = self._asked(scene, traced, anchor, place[..., Channel.POSITION])
         with as_given(traced.pixels_VRRC.device):
-            return self._pictures(traced, told, x_BVAW.to(told.dtype), place, unit_B1113)
+            return self._pictures(traced, told, mirrored, x_BVAW.to(told.dtype), place, unit_B1113)
+
+    def _told(self, traced: Traced, unit_B1113: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what pixels are told [B, V, R, R, F], and their mirrored light, filtered."""
+        pixels = traced.pixels_VRRC
+        surface = _surface(pixels)
+        light = torch.cat([pixels[..., channel] / unit_B1113 for channel in _LIGHTS], dim=-1)
+        given = traced.given_VI[:, :, None, None, :].expand(*surface.shape[:-1], -1)
+        mirrored = pixels[..., Channel.MIRRORED] / unit_B1113
+
+        def told() -> Tensor:
+            lights = torch.log1p(4 * torch.cat([light, mirrored], dim=-1))
+            return torch.cat([surface, lights, given], dim=-1)
+
+        if self.filter is not None:
+            albedo = pixels[..., Channel.SPECULAR] * pixels[..., Channel.COVERAGE]
+            views = mirrored.shape[:2]
+            flat = [each.flatten(0, 1) for each in (told(), mirrored, albedo)]
+            mirrored = self.filter(*flat).unflatten(0, views)
+        return told(), mirrored
 
     def _asked(
         self, scene: EncodedScene, traced: Traced, anchor_BVAF: Tensor, position_BVA3: Tensor
@@ -233,6 +260,7 @@ class HitDecoder(nn.Module):
         self,
         traced: Traced,
         told: Tensor,
+        mirrored: Tensor,
         x_BVAW: Tensor,
         place_BVAC: Tensor,
         unit_B1113: Tensor,
@@ -254,6 +282,7 @@ class HitDecoder(nn.Module):
         ]
         told_VMPF = _in_parts(told.flatten(0, 1), side)
         pixels_VMPC = _in_parts(traced.pixels_VRRC.flatten(0, 1), side)
+        mirrored_VMP3 = _in_parts(mirrored.flatten(0, 1), side)
         size = told_VMPF.shape[2]
         pictures = []
         for view in range(len(told_VMPF)):
@@ -271,14 +300,16 @@ class HitDecoder(nn.Module):
                     place[..., 0] > 0,
                     light,
                 )
-                rows.append(_composed(learned, mixed, pixels_MPC, unit[view]))
+                rows.append(
+                    _composed(learned, mixed, mirrored_VMP3[view, some], pixels_MPC, unit[view])
+                )
             pictures.append(_whole(torch.cat(rows), side))
         log10 = torch.log1p(torch.stack(pictures)) / math.log(10)
         return log10.reshape(*views, resolution, resolution, 3)
 
 
-def _told(pixels: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what is said of surfaces [..., 18], and their light in units of the scene's."""
+def _surface(pixels: Tensor) -> Tensor:
+    """Return what is said of surfaces [..., 23]."""
     normal = nn.functional.normalize(pixels[..., Channel.NORMAL], dim=-1)
     toward = nn.functional.normalize(pixels[..., Channel.TOWARD], dim=-1)
     cosine = (normal * toward).sum(dim=-1, keepdim=True)
@@ -291,9 +322,11 @@ def _told(pixels: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
         pixels[..., Channel.SPECULAR],
         pixels[..., Channel.ROUGHNESS],
         pixels[..., Channel.COVERAGE],
+        torch.log1p(pixels[..., Channel.DISTANCE]),
+        pixels[..., Channel.SEEN_ALBEDO],
+        pixels[..., Channel.SEEN_NEARNESS],
     ]
-    light = torch.cat([pixels[..., channel] / unit for channel in _LIGHTS], dim=-1)
-    return torch.cat(surface, dim=-1), light
+    return torch.cat(surface, dim=-1)
 
 
 def _at_anchors(traced: Traced) -> Callable[[Tensor], Tensor]:
@@ -372,8 +405,10 @@ def _lies(pixels_MPC: Tensor, anchors_M9C: Tensor) -> Lie:
     )
 
 
-def _composed(learned: Tensor, gathered: Tensor, pixels: Tensor, unit: Tensor) -> Tensor:
-    """Return radiance [..., 3] of at least 0."""
+def _composed(
+    learned: Tensor, gathered: Tensor, mirrored: Tensor, pixels: Tensor, unit: Tensor
+) -> Tensor:
+    """Return radiance [..., 3] of at least 0; gathered and mirrored light are in units."""
     gain_gathered, gain_direct, gain_mirrored, diffuse, specular = learned.split(3, dim=-1)
     gains = [2 * torch.sigmoid(gain) for gain in (gain_gathered, gain_direct, gain_mirrored)]
     coverage = pixels[..., Channel.COVERAGE]
@@ -381,6 +416,5 @@ def _composed(learned: Tensor, gathered: Tensor, pixels: Tensor, unit: Tensor) -
     learned_light = learned_light + pixels[..., Channel.SPECULAR] * softplus(specular + _START)
     gathered_light = pixels[..., Channel.DIFFUSE] * gains[0] * gathered
     direct = pixels[..., Channel.SHOWN_DIFFUSE] + pixels[..., Channel.DIRECT_SPECULAR]
-    mirrored = pixels[..., Channel.MIRRORED]
-    indirect = coverage * unit * (learned_light + gathered_light)
-    return indirect + gains[1] * direct + gains[2] * mirrored
+    indirect = coverage * (learned_light + gathered_light) + gains[2] * mirrored
+    return unit * indirect + gains[1] * direct

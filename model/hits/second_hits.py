@@ -18,7 +18,7 @@ from model.hits.radiosity import SceneLight
 from model.hits.reflectance import drawn, gloss_at, lobe
 from model.hits.vectors import Floats, brightest, dot
 
-WIDENED_ALPHA = np.float32(0.25)
+WIDENED_ALPHA = np.float32(0.4)
 """GGX width that surfaces have at least, where a ray has met them."""
 
 SMOOTH_ALPHA = np.float32(0.1)
