@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
@@ -46,6 +47,9 @@ class SceneTensors:
     traced: Traced | None = None
     """What was traced of these views, for a network with the view stage `hits`; where it is None,
     such a network traces them itself."""
+    textures: SurfaceTextures | None = None
+    """What such a network reads at each hit in the place of material columns; `material_TM` holds
+    the means. None where nothing is textured."""
 
     @property
     def num_triangles(self) -> int:
@@ -90,6 +94,8 @@ class SceneBatch:
     """As in SceneTensors."""
     traced: Traced | None = None
     """As in SceneTensors; None where a scene has None."""
+    textures: tuple[SurfaceTextures | None, ...] | None = None
+    """Those of each scene; None where no scene has any."""
 
     @property
     def cameras(self) -> Cameras:
@@ -147,6 +153,7 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
         c2w_V44=torch.from_numpy(scene.c2w.copy()),
         fov_deg_V=torch.from_numpy(scene.fov_deg.copy()),
         columns=columns,
+        textures=surface_textures(scene),
     )
 
 
@@ -180,6 +187,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
     longest = max(lengths)
     padded = min(lengths) < longest
     traced = [scene.traced for scene in scenes if scene.traced is not None]
+    textures = tuple(scene.textures for scene in scenes)
     return SceneBatch(
         triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
         normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
@@ -189,6 +197,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
         is_triangle_BT=torch.arange(longest) < torch.tensor(lengths)[:, None] if padded else None,
         columns=scenes[0].columns,
         traced=stack_traced(traced, longest) if len(traced) == len(scenes) else None,
+        textures=None if all(each is None for each in textures) else textures,
     )
 
 
