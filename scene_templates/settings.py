@@ -104,8 +104,8 @@ class SceneSettings:
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave `textures` out where there are none: digests of earlier builds stay."""
         record: dict[str, Any] = as_usual(self)
-        plain = self.textures == TextureSettings()
-        return {name: value for name, value in record.items() if name != "textures" or not plain}
+        some = self.textures.share > 0
+        return {name: value for name, value in record.items() if name != "textures" or some}
 
     def __post_init__(self) -> None:
         require(len(self.families) > 0, "families", self.families, "at least one")

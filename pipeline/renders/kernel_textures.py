@@ -88,7 +88,8 @@ class KernelTextures:
     def _texel(self, kind: Any, index: Any, active: Any) -> Any:
         if kind is mi.Float:
             return dr.gather(mi.Float, self._numbers, index, active)
-        return mi.Color3f(dr.gather(mi.Vector4f, self._colours, index, active).xyz)
+        texel: Any = dr.gather(mi.Vector4f, self._colours, index, active)
+        return mi.Color3f(texel.xyz)
 
 
 def _neighbours(place: Any, count: Any) -> tuple[Any, Any, Any]:

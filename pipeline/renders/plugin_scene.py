@@ -167,7 +167,8 @@ def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int, *, on: bool) 
 
 def _mesh(scene: Scene, triangles: NDArray[np.intp], material: Any) -> Any:
     """Return triangles as a mesh; corners have texture coordinates of their own, if any."""
-    vertices, faces = np.arange(len(scene.vertex_positions)), scene.faces[triangles].ravel()
+    faces = scene.faces[triangles].ravel()
+    vertices = np.arange(len(scene.vertex_positions), dtype=np.uint32)
     if scene.uv is not None:
         vertices, faces = faces, np.arange(len(faces), dtype=np.uint32)
     properties = mi.Properties()

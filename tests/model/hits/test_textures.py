@@ -1,7 +1,5 @@
 """Textures in what is traced for a network: exact at every hit, whatever its symmetries did."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -98,15 +96,12 @@ def test_plain_triangles_of_a_textured_scene_and_plain_scenes_stay() -> None:
 def test_textures_go_through_the_symmetries_of_training(symmetry: str) -> None:
     scene = _textured()
     tensors = scene_tensors(scene)
-    empty = torch.zeros(1, 4, 4, 3)
     training = TrainingScene(
+        key="",
         tensors=tensors,
-        target_VRR3=empty,
-        **{
-            field.name: None
-            for field in dataclasses.fields(TrainingScene)
-            if field.name not in ("tensors", "target_VRR3")
-        },
+        target_VRR3=torch.zeros(1, 4, 4, 3),
+        noise_V=torch.zeros(1),
+        light_T=torch.zeros(tensors.num_triangles, dtype=torch.int64),
     )
     order = np.array([2, 0, 1])
     if symmetry == "turned":

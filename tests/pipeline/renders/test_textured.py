@@ -51,7 +51,8 @@ def _textured(
     index = np.full((len(parts), 3), -1, np.int32)
     index[0] = of_floor
     xy = scene.vertex_positions[scene.faces.ravel(), :2]
-    textured = with_textures(scene, scale * (xy + 1) / 2, textures, index)
+    uv = (scale * (xy + 1) / 2).astype(np.float32)
+    textured = with_textures(scene, uv, textures, index)
     textured.check()
     return textured
 
@@ -61,7 +62,7 @@ def _noise(seed: int, channels: int, low: float, high: float) -> Texture:
     return Texture(texels=drawn.astype(np.float32))
 
 
-LAMP = light([[-1, -1, 3], [2, -1, 3], [0, 1, 2.5]], 5.0)
+LAMP = light(np.array([[-1, -1, 3], [2, -1, 3], [0, 1, 2.5]]), 5.0)
 
 
 @pytest.mark.parametrize("plugins", [False, True])
@@ -81,7 +82,7 @@ def test_guides_are_the_lookup_of_the_records(plugins: bool) -> None:
     """Coordinates from -1.75 to 1.25 wrap; a diffuse and a specular map of unlike sizes add up."""
     maps = _noise(1, 3, 0, 0.6), CORNERS_OF_LESS
     scene = _textured([_floor(material(roughness=0.4)), LAMP], maps, [0, 1, -1])
-    scene = dataclasses.replace(scene, uv=(3 * scene.uv - 1.75).astype(np.float32))
+    scene = _moved(scene, 3.0, np.array([-1.75, -1.75]))
     tracer: Tracer = (PluginTracer if plugins else load_tracer)(scene, max_depth=2, rr_depth=5)
     albedo = tracer.features(camera_of(scene, 32), spp=1).albedo
     rows = np.nan_to_num(first_hits(scene, resolution=32).material)
@@ -95,9 +96,14 @@ def test_guides_are_the_lookup_of_the_records(plugins: bool) -> None:
 CORNERS_OF_LESS = Texture(texels=(0.3 * CORNERS.texels).astype(np.float32))
 
 
+def _moved(scene: Scene, scale: float, shift: NDArray[np.float64]) -> Scene:
+    assert scene.uv is not None
+    return dataclasses.replace(scene, uv=(scale * scene.uv + shift).astype(np.float32))
+
+
 def test_far_coordinates_lose_no_digits() -> None:
     scene = _textured([_floor(material()), LAMP], (_noise(2, 3, 0, 1),), [0, -1, -1])
-    far = dataclasses.replace(scene, uv=(scene.uv + np.array([1000, -512])).astype(np.float32))
+    far = _moved(scene, 1.0, np.array([1000.0, -512.0]))
     camera = camera_of(scene, 16)
     near, moved = (
         load_tracer(each, max_depth=2, rr_depth=5).features(camera, spp=1).albedo
