@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
@@ -49,6 +50,9 @@ class SceneTensors:
     albedo_VRR6: Tensor | None = None
     """Albedo of what their pixels see first, for a demodulated network; where it is None, such a
     network asks for it itself (model.demodulated)."""
+    textures: SurfaceTextures | None = None
+    """What such a network reads at each hit in the place of material columns; `material_TM` holds
+    the means. None where nothing is textured."""
 
     @property
     def num_triangles(self) -> int:
@@ -95,6 +99,8 @@ class SceneBatch:
     """As in SceneTensors; None where a scene has None."""
     albedo_BVRR6: Tensor | None = None
     """As in SceneTensors; None where a scene has None."""
+    textures: tuple[SurfaceTextures | None, ...] | None = None
+    """Those of each scene; None where no scene has any."""
 
     @property
     def cameras(self) -> Cameras:
@@ -152,6 +158,7 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
         c2w_V44=torch.from_numpy(scene.c2w.copy()),
         fov_deg_V=torch.from_numpy(scene.fov_deg.copy()),
         columns=columns,
+        textures=surface_textures(scene),
     )
 
 
@@ -186,6 +193,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
     padded = min(lengths) < longest
     traced = [scene.traced for scene in scenes if scene.traced is not None]
     albedo = [scene.albedo_VRR6 for scene in scenes if scene.albedo_VRR6 is not None]
+    textures = tuple(scene.textures for scene in scenes)
     return SceneBatch(
         triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
         normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
@@ -196,6 +204,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
         columns=scenes[0].columns,
         traced=stack_traced(traced, longest) if len(traced) == len(scenes) else None,
         albedo_BVRR6=torch.stack(albedo) if len(albedo) == len(scenes) else None,
+        textures=None if all(each is None for each in textures) else textures,
     )
 
 

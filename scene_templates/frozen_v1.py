@@ -12,6 +12,8 @@ from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.settings import SceneSettings, ViewLaws
+from scene_templates.surfaces.draw import SurfaceMapSettings
+from scene_templates.textures import TextureSettings
 
 _ROOM = SharedRoom(
     square_share=0.5, scale=(1.0, 1.35), shift=0.05, raise_z=(-0.05, 0.25), tilt_deg=3.0
@@ -53,6 +55,7 @@ SCENES_V1 = SceneSettings(
         coloured_specular_share=0.0,
         smooth_angle_deg=30.0,
     ),
+    textures=TextureSettings(share=0.0, tile_m=(0.4, 1.6), surfaces=SurfaceMapSettings()),
     lights=LightSettings(
         count=(1, 8),
         total_emission=(2500.0, 5000.0),

@@ -11,12 +11,15 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated, Any, Literal
 
+import pydantic
+
 from scene_templates.cameras import CameraSettings
 from scene_templates.checks import OFFSET, require
 from scene_templates.families import Family
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
+from scene_templates.textures import TextureSettings
 from storage.settings.changes import changed
 from storage.settings.described import checked
 from storage.settings.ranges import FLOAT32_MAX, Share, Within
@@ -85,6 +88,8 @@ class SceneSettings:
     """Placement of objects in the room."""
     materials: MaterialSettings = field(default_factory=MaterialSettings)
     """Materials of objects, floor and walls."""
+    textures: TextureSettings = field(default_factory=TextureSettings)
+    """Procedural textures of objects, floor and walls."""
     lights: LightSettings = field(default_factory=LightSettings)
     """Emitters of the scenes."""
     cameras: CameraSettings = field(default_factory=CameraSettings)
@@ -94,6 +99,13 @@ class SceneSettings:
     excursions: tuple[Excursion, ...] = ()
     """Values beyond the usual ranges, for tests out of distribution: scenes take these excursions
     in turn, one each."""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `textures` out where there are none: digests of earlier builds stay."""
+        record: dict[str, Any] = as_usual(self)
+        some = self.textures.share > 0
+        return {name: value for name, value in record.items() if name != "textures" or some}
 
     def __post_init__(self) -> None:
         require(len(self.families) > 0, "families", self.families, "at least one")

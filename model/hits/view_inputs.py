@@ -135,8 +135,8 @@ def view_inputs(
 class _Shaded:
     """Points at which light is computed.
 
-    One of a pixel whose rays all meet one triangle stands for all of them; else each ray has its
-    own.
+    One of a pixel whose rays all meet one triangle without textures stands for all of them; else
+    each ray has its own.
     """
 
     points: Points
@@ -163,6 +163,8 @@ def _shaded(
     drawn_turn = np.minimum((chance * turns).astype(np.intp), turns - 1)
     alone = np.arange(turns)[:, None] == drawn_turn
     is_one = (triangle == triangle[0]).all(axis=0)
+    if scene.textures is not None:
+        is_one &= ~scene.textures.is_textured[triangle[0]]
     turn, pixel = np.nonzero((triangle >= 0) & (alone | ~is_one))
     ray = turn * count + pixel
     points = scene.points(
@@ -208,9 +210,9 @@ def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) ->
     block.add(Channel.DISTANCE, np.sqrt(dot(away, away))[None])
     block.add(Channel.NORMAL, points.normal)
     block.add(Channel.TOWARD, points.toward)
-    block.add(Channel.DIFFUSE, np.take(scene.diffuse, points.triangle, axis=1))
+    block.add(Channel.DIFFUSE, scene.diffuse_at(points))
     block.add(Channel.SPECULAR, block.gloss.colour)
-    block.add(Channel.ROUGHNESS, scene.roughness[points.triangle][None])
+    block.add(Channel.ROUGHNESS, scene.roughness_at(points)[None])
 
 
 def _add_direct(
@@ -221,7 +223,7 @@ def _add_direct(
     block.add(Channel.DIRECT_DIFFUSE, lit.diffuse)
     block.add(Channel.OPEN_SPECULAR, lit.open_specular)
     block.add(Channel.DIRECT_SPECULAR, lit.specular)
-    albedo = np.take(scene.diffuse, block.points.triangle, axis=1)
+    albedo = scene.diffuse_at(block.points)
     block.add(Channel.SHOWN_DIFFUSE, albedo * lit.diffuse)
 
 
@@ -268,7 +270,7 @@ def _add_lobe_rays(
         counts = shading[rows] / block.weight[rows]
         block.add(Channel.MIRRORED, found * arrives[:, asked] * counts, rows)
         way = seen.position - points.position[:, asked]
-        albedo = np.take(scene.diffuse + scene.specular, seen.triangle, axis=1)
+        albedo = scene.diffuse_at(seen) + scene.specular_at(seen)
         block.add(Channel.SEEN_ALBEDO, albedo * counts, rows)
         block.add(Channel.SEEN_NEARNESS, (counts / (1 + np.sqrt(dot(way, way))))[None], rows)
 

@@ -29,7 +29,7 @@ from pipeline.renders.light_kernel import trace_light
 from pipeline.renders.path_kernel import trace
 from pipeline.renders.photon_kernel import PhotonRecords, trace_photons
 from pipeline.renders.splats import Splats, splat_unit
-from pipeline.renders.surface_table import SurfaceTable
+from pipeline.renders.textured_table import surface_table
 from pipeline.renders.tracer import Chosen, Features, split_triangles
 from storage.records.scene import Scene
 from storage.seeds import seed_for
@@ -59,7 +59,7 @@ class VectorTracer:
         self._scene = KernelScene(
             surfaces=seen,
             everything=_load(scene, order, beside=seen),
-            table=SurfaceTable(scene, order),
+            table=surface_table(scene, order),
             emitters=EmitterTable(scene, emitters),
             cone=EmissionCone(scene),
             num_surfaces=len(surfaces),

@@ -16,11 +16,13 @@ from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.posing import posed
 from pipeline.scenes.shapes import MeshShape
 from pipeline.scenes.subdivision import filled
+from pipeline.scenes.textured_pieces import with_drawn_textures
 from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
 from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
 from scene_templates.settings import SceneSettings
 from storage.errors import TrilightError
+from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
 
@@ -66,11 +68,12 @@ def compose_scene(
         for entry, level in zip(chosen, levels, strict=True)
     ]
     layout = layout_rand(rng, settings, plan, shapes)
-    pieces = scene_pieces(layout, chosen, shapes, settings, rng)
-    arrays = joined(pieces)
-    arrays["materials"] = with_drawn_columns(
-        arrays["materials"], seed=seed, scene_index=scene_index, attempt=attempt
+    name = {"seed": seed, "scene_index": scene_index, "attempt": attempt}
+    pieces = with_drawn_textures(
+        scene_pieces(layout, chosen, shapes, settings, rng), layout, settings.textures, **name
     )
+    arrays = joined(pieces)
+    arrays["materials"] = with_drawn_columns(arrays["materials"], **name)
     scene = Scene(
         **arrays,
         c2w=np.zeros((0, 4, 4), np.float32),
@@ -78,7 +81,7 @@ def compose_scene(
         objects=tuple(piece.entry for piece in pieces),
         provenance=provenance,
     )
-    scene = with_first_cameras(scene, settings)
+    scene = with_first_cameras(without_constant_textures(scene), settings)
     require_laws(scene, settings)
     return scene
 

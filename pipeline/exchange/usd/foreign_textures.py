@@ -25,7 +25,7 @@ _STEPS = 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Texture:
+class ForeignTexture:
     """A picture as a material uses it."""
 
     linear: NDArray[np.float32]  # [H, W, C] linear values, row 0 on top
@@ -61,7 +61,7 @@ class Texture:
         return np.repeat(whole[..., ["rgba".index(self.output)]], 3, axis=-1)
 
 
-def read_texture(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Texture | None:
+def read_texture(shader: Any, output: str, time: Any, opened: OpenedUsd) -> ForeignTexture | None:
     """Return the texture of a UsdUVTexture shader, or None, with a note, if unreadable.
 
     Raises:
@@ -81,7 +81,7 @@ def read_texture(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
         return None
     space = _get(shader, "sourceColorSpace", time, "auto")
     linear = _linear(pixels) if space != "raw" and pixels.shape[2] >= 3 else pixels
-    return Texture(
+    return ForeignTexture(
         linear=linear,
         wrap=(
             str(_get(shader, "wrapS", time, "repeat")),
