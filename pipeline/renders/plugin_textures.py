@@ -77,7 +77,11 @@ def _bitmap(texels: NDArray[np.float64]) -> dict[str, Any]:
 @cache
 def _register() -> None:
     """Make both textures known to Mitsuba; a variant must be set, and stays for the process."""
+    _register_width()
+    _register_again()
 
+
+def _register_width() -> None:
     class SquaredRoughness(mi.Texture):
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
@@ -95,6 +99,10 @@ def _register() -> None:
         def is_spatially_varying(self) -> bool:
             return True
 
+    mi.register_texture(_WIDTH, SquaredRoughness)
+
+
+def _register_again() -> None:
     class ScatteredAgain(mi.Texture):
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
@@ -121,5 +129,4 @@ def _register() -> None:
         def is_spatially_varying(self) -> bool:
             return True
 
-    mi.register_texture(_WIDTH, SquaredRoughness)
     mi.register_texture(_AGAIN, ScatteredAgain)
