@@ -3,20 +3,19 @@
 from pipeline.renders.tracer import Tracer
 from storage.errors import TrilightError
 from storage.records.scene import Scene
-from storage.records.scene_maps import has_maps
 
 
 def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> Tracer:
     """Return the fastest tracer of the variant that `activate` has set, with the scene loaded.
 
     Raises:
-        TrilightError: the scene has textures or an environment, which no tracer knows yet: their
-            picture would be that of another scene.
+        TrilightError: the scene has textures, which no tracer knows yet: its picture would be that
+            of another scene.
     """
-    if has_maps(scene):
+    if scene.textures:
         raise TrilightError(
-            "scene: it has textures or an environment; expected neither, since renderers do not "
-            "know them yet. `trilight convert` writes it without them, in a form that has none."
+            "scene: it has textures; expected none, since renderers do not know them yet. "
+            "`trilight convert` writes it without them, in a form that has none."
         )
     import mitsuba  # not before `activate`, which says where compiled kernels are kept
 
