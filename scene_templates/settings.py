@@ -11,12 +11,15 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated, Any, Literal
 
+import pydantic
+
 from scene_templates.cameras import CameraSettings
 from scene_templates.checks import OFFSET, require
 from scene_templates.families import Family
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
+from scene_templates.skies.settings import SkySettings
 from storage.settings.changes import changed
 from storage.settings.described import checked
 from storage.settings.ranges import FLOAT32_MAX, Share, Within
@@ -91,9 +94,17 @@ class SceneSettings:
     """Cameras of the scenes."""
     views: ViewLaws = field(default_factory=ViewLaws)
     """Conditions that every view must meet."""
+    skies: SkySettings = field(default_factory=SkySettings)
+    """Light from all around; by default there is none."""
     excursions: tuple[Excursion, ...] = ()
     """Values beyond the usual ranges, for tests out of distribution: scenes take these excursions
     in turn, one each."""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `skies` out where no scene has one: digests of earlier builds stay."""
+        record: dict[str, Any] = as_usual(self)
+        return {name: value for name, value in record.items() if name != "skies" or value["share"]}
 
     def __post_init__(self) -> None:
         require(len(self.families) > 0, "families", self.families, "at least one")

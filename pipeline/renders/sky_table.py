@@ -115,7 +115,7 @@ class SkyTable:
         return mi.Color3f(mean.xyz), nearest.w * self._share
 
     def _drawn(self, table: Any, first: Any, count: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """Return a number below `count` drawn from a part of an alias table, and a fresh uniform"""
+        """Return a number below `count` drawn from a part of an alias table, and a fresh one."""
         scaled = u * mi.Float(count)
         place = dr.minimum(mi.UInt32(scaled), count - 1)
         fraction = scaled - mi.Float(place)

