@@ -34,7 +34,7 @@ def plugin_sky(sky: Environment, sampling_weight: float) -> Any:
 
 def from_pole_to_pole(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return a map [H, W, 3] as rows [2 H + 1, W, 3] at equal steps, from +Z to -Z."""
-    rows = np.empty((2 * len(radiance_rgb) + 1, *radiance_rgb.shape[1:]), np.float32)
+    rows = np.zeros((2 * len(radiance_rgb) + 1, *radiance_rgb.shape[1:]), np.float32)
     rows[1::2] = radiance_rgb
     rows[2:-1:2] = (radiance_rgb[:-1] + radiance_rgb[1:]) / 2
     rows[0], rows[-1] = radiance_rgb[0], radiance_rgb[-1]
