@@ -19,6 +19,7 @@ from scene_templates.families import Family
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
+from scene_templates.skies.settings import SkySettings
 from scene_templates.textures import TextureSettings
 from storage.settings.changes import changed
 from storage.settings.described import checked
@@ -96,16 +97,18 @@ class SceneSettings:
     """Cameras of the scenes."""
     views: ViewLaws = field(default_factory=ViewLaws)
     """Conditions that every view must meet."""
+    skies: SkySettings = field(default_factory=SkySettings)
+    """Light from all around; by default there is none."""
     excursions: tuple[Excursion, ...] = ()
     """Values beyond the usual ranges, for tests out of distribution: scenes take these excursions
     in turn, one each."""
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `textures` out where there are none: digests of earlier builds stay."""
+        """Leave out `textures` and `skies` that no scene has: digests of earlier builds stay."""
         record: dict[str, Any] = as_usual(self)
-        some = self.textures.share > 0
-        return {name: value for name, value in record.items() if name != "textures" or some}
+        absent = {name for name in ("textures", "skies") if not record[name]["share"]}
+        return {name: value for name, value in record.items() if name not in absent}
 
     def __post_init__(self) -> None:
         require(len(self.families) > 0, "families", self.families, "at least one")

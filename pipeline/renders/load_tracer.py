@@ -1,7 +1,6 @@
 """Chooses the tracer for the variant that runs."""
 
 from pipeline.renders.tracer import Tracer
-from storage.errors import TrilightError
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
 
@@ -10,16 +9,7 @@ def load_tracer(scene: Scene, *, max_depth: int, rr_depth: int) -> Tracer:
     """Return the fastest tracer of the variant that `activate` has set, with the scene loaded.
 
     Textures of one value are the constants that they are: they cost nothing.
-
-    Raises:
-        TrilightError: the scene has an environment, which no tracer knows yet: its picture would
-            be that of another scene.
     """
-    if scene.environment is not None:
-        raise TrilightError(
-            "scene: it has an environment; expected none, since renderers do not know it yet. "
-            "`trilight convert` writes it without, in a form that has none."
-        )
     scene = without_constant_textures(scene)
     import mitsuba  # not before `activate`, which says where compiled kernels are kept
 

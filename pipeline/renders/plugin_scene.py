@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.compensated_texture import PLUGIN, register_plugin
+from pipeline.renders.plugin_sky import plugin_sky
 from pipeline.renders.plugin_textures import textured_albedo, textured_slots
+from pipeline.renders.sky_share import lamp_power, shining_sky, sky_share
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
 from storage.records.lobes import lobes_of, scaled_albedos
@@ -59,7 +61,7 @@ def _material(scene: Scene, row: int) -> Any:
 
 
 def plugin_scene(scene: Scene, *, only_light: int | None = None) -> Any:
-    """Return the mi.Scene of everything, with one emitter object switched on or all of them."""
+    """Return the mi.Scene of everything, with one emitter object switched on or all light."""
     register_plugin()
     surfaces, emitters = split_triangles(scene)
     shapes = {
@@ -69,7 +71,13 @@ def plugin_scene(scene: Scene, *, only_light: int | None = None) -> Any:
     is_on = np.ones(len(emitters), bool)
     if only_light is not None:
         is_on = scene.object_index[emitters] == only_light
-    if not is_on.any():
+    sky = shining_sky(scene) if only_light is None else None
+    if sky is not None:
+        share = sky_share(scene, sky)
+        weight = lamp_power(scene) * share / (1 - share) if share < 1 else 1.0
+        # Its lamps are two-sided twins, each of which has the power of the lamp.
+        shapes["sky"] = plugin_sky(sky, 2 * weight)
+    if not is_on.any() and sky is None:
         raise Rejected("unlit_scene", "0 emitting triangles have no area")
     for on in (True, False):
         kept = emitters[is_on == on]
@@ -96,6 +104,17 @@ def _meshes(scene: Scene, triangles: NDArray[np.intp]) -> list[tuple[int, NDArra
         return [(0, triangles)] if len(triangles) else []
     rows = scene.material_index[triangles]
     return [(int(row), triangles[rows == row]) for row in np.unique(rows)]
+
+
+def plugin_background(scene: Scene) -> Any:
+    """Return the mi.Scene of black surfaces before the sky; None where cameras see none."""
+    sky = shining_sky(scene)
+    if sky is None or not sky.is_seen:
+        return None
+    surfaces, _ = split_triangles(scene)
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    mesh = _mesh(scene, surfaces, _two_sided(black))
+    return mi.load_dict({"type": "scene", "surfaces": mesh, "sky": plugin_sky(sky, 1.0)})
 
 
 def _surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:

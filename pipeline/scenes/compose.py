@@ -3,6 +3,7 @@
 Scene k is a pure function of (settings, pool, seed, k, attempt).
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,7 +22,9 @@ from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
 from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
 from scene_templates.settings import SceneSettings
+from scene_templates.skies.drawn_scene import scene_sky
 from storage.errors import TrilightError
+from storage.records.material import EMISSION
 from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
@@ -47,7 +50,7 @@ def compose_scene(
     Returns:
         A checked scene with `settings.num_views` cameras. Its provenance holds template, family,
         scene_index, attempt, seed and camera_attempts (per view, the proposal that passed), and
-        where the scene is an excursion its axis and value.
+        where the scene is an excursion its axis and value, and where it has a sky, what was drawn.
 
     Raises:
         Rejected: no_room, over_budget, no_faces, no_camera, emitter_inside or law_broken; equal
@@ -81,9 +84,28 @@ def compose_scene(
         objects=tuple(piece.entry for piece in pieces),
         provenance=provenance,
     )
+    scene = _with_sky(scene, settings, seed, scene_index, attempt)
     scene = with_first_cameras(without_constant_textures(scene), settings)
     require_laws(scene, settings)
     return scene
+
+
+def _with_sky(
+    scene: Scene, settings: SceneSettings, seed: int, scene_index: int, attempt: int
+) -> Scene:
+    emits = scene.triangle_emits
+    sky = scene_sky(
+        settings.skies,
+        scene.vertex_positions[scene.faces[emits]].astype(np.float64),
+        scene.materials[scene.material_index[emits], EMISSION].astype(np.float64),
+        seed=seed,
+        scene_index=scene_index,
+        attempt=attempt,
+    )
+    if sky is None:
+        return scene
+    lit = dataclasses.replace(scene, environment=sky.environment)
+    return lit.with_provenance({**scene.provenance, "sky": sky.origin})
 
 
 def _provenance(

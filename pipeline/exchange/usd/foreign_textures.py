@@ -128,7 +128,7 @@ def _pixels(resolved: str) -> NDArray[np.float32] | None:
     from PIL import Image
 
     name = Path(resolved).name
-    data = _bytes(resolved, name)
+    data = asset_bytes(resolved)
     if data is None:
         return None
     try:
@@ -146,8 +146,9 @@ def _pixels(resolved: str) -> NDArray[np.float32] | None:
     return values if values.ndim == 3 else values[..., None]
 
 
-def _bytes(resolved: str, name: str) -> bytes | None:
+def asset_bytes(resolved: str) -> bytes | None:
     """Return the bytes of a plain file, or of a member of an archive; None where there are none."""
+    name = Path(resolved).name
     outer, _, member = resolved.partition("[")
     try:
         if member:
