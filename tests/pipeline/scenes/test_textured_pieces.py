@@ -4,14 +4,20 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipeline.builds.named import named_build
-from pipeline.scenes.textured_pieces import cube_places
+from pipeline.scenes.pieces import ScenePiece
+from pipeline.scenes.shading import flat_shaded
+from pipeline.scenes.textured_pieces import cube_places, with_drawn_textures
 from scene_templates.families import DEFAULT_FAMILIES
+from scene_templates.layout import Layout, ObjectPlacement, Pose, SurfaceLook
+from scene_templates.rotations import rotated
 from scene_templates.settings import SceneSettings
 from scene_templates.surfaces.draw import SurfaceMapSettings
 from scene_templates.textures import TextureSettings
-from storage.records.scene import Scene
+from storage.records.material import default_rows
+from storage.records.scene import Scene, SceneObject
 from storage.settings.changes import changed
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scene_templates.statistics import require_plausible, share
@@ -89,9 +95,41 @@ def test_floors_are_one_flat_chart_of_the_stated_width() -> None:
 
 
 def test_an_objects_texture_turns_with_it() -> None:
-    """Where a triangle lies flat on its cube's side, a step of one tile is one in u or v."""
-    settings = changed(TEXTURED, {"textures.share": 1.0})
-    scene = _scene(settings, 1)
+    """The same box has the same coordinates however it is posed, but for float32."""
+    corners = np.eye(3)[[[0, 1, 2], [2, 1, 0]]] + np.arange(3) * 0.1
+    found = []
+    for rotation in (np.eye(3), Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()):
+        centre = np.array([0.3, -0.2, 0.5])
+        placed = rotated(corners.reshape(-1, 3), rotation) + centre
+        faces = np.arange(6, dtype=np.uint32).reshape(-1, 3)
+        piece = ScenePiece(
+            entry=SceneObject(name="box", kind="object"),
+            mesh=flat_shaded(placed.astype(np.float32), faces),
+            materials=default_rows(1),
+            material_index=np.zeros(2, np.int64),
+        )
+        look = SurfaceLook(
+            diffuse_scale=1.0,
+            diffuse_rgb=(0, 0, 0),
+            specular_rgb=(0, 0, 0),
+            roughness=1.0,
+            smooth=False,
+            colours="one",
+        )
+        pose = Pose(centre=centre, radius=1.0, rotation=rotation)
+        placement = ObjectPlacement(pose=pose, surface=look)
+        layout = Layout(shell=(), objects=(placement,), emitters=())
+        textures = TextureSettings(share=1.0, surfaces=SMALL)
+        (textured,) = with_drawn_textures(
+            [piece], layout, textures, seed=0, scene_index=0, attempt=0
+        )
+        assert textured.skin is not None
+        found.append(textured.skin.uv)
+    assert np.abs(found[0] - found[1]).max() < 1e-5
+
+
+def test_an_objects_texture_is_never_mirrored_and_hardly_stretched() -> None:
+    scene = _scene(changed(TEXTURED, {"textures.share": 1.0}), 1)
     assert scene.uv is not None and scene.material_textures is not None
     row = next(row for row, entry in enumerate(scene.objects) if entry.kind == "object")
     mine = scene.object_index == row
