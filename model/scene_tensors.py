@@ -135,9 +135,15 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
             (`ModelConfig.material_columns`); None: all that are declared, for any network.
 
     Raises:
-        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis, or a
-            column is not declared.
+        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis, a
+            column is not declared, or an environment lights the scene, whose light no network
+            knows: its picture would be that of another scene.
     """
+    if scene.environment is not None:
+        raise TrilightError(
+            "scene: it has an environment, and networks do not know its light; expected none. "
+            "Render it with --engine mitsuba."
+        )
     farthest = np.abs(scene.vertex_positions).max()
     if not farthest <= MAX_POSITION_M:  # not a number is no place either
         raise TrilightError(
