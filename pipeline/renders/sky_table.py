@@ -110,7 +110,8 @@ class SkyTable:
             ]
             for row in rows
         )
-        mean = dr.lerp(dr.lerp(*upper, along), dr.lerp(*lower, along), down)
+        above, below = (dr.lerp(row[0], row[1], along) for row in (upper, lower))
+        mean = dr.lerp(above, below, down)
         nearest = dr.select(down < 0.5, *(dr.select(along < 0.5, *row) for row in (upper, lower)))
         return mi.Color3f(mean.xyz), nearest.w * self._share
 

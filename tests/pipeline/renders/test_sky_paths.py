@@ -111,8 +111,8 @@ def test_a_lamp_alone_has_no_sky() -> None:
     with_sky, without = (open_scene(sky) for sky in (constant(3.0), None))
     row = len(with_sky.objects) - 1
     camera = camera_of(without, 16)
-    pictures = [
+    below_sky, alone = (
         load_tracer(scene, max_depth=5, rr_depth=5).only_light(row).radiance(camera, seed=2, spp=16)
         for scene in (with_sky, without)
-    ]
-    np.testing.assert_array_equal(*pictures)
+    )
+    np.testing.assert_array_equal(below_sky, alone)
