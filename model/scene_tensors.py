@@ -142,7 +142,7 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
     if scene.environment is not None:
         raise TrilightError(
             "scene: it has an environment, and networks do not know its light; expected none. "
-            "Render it with --engine mitsuba."
+            "Train on scenes without one (scenes.skies.share=0)."
         )
     farthest = np.abs(scene.vertex_positions).max()
     if not farthest <= MAX_POSITION_M:  # not a number is no place either

@@ -174,9 +174,9 @@ def _engines(
 def _engine_of(way: Way, asked: Asked, resolution: int) -> EnginePlan:
     """Return the engine of a way that was chosen."""
     if way.rung == "network":
-        from model.open import BUILTIN
+        from model.open import BUILTIN_TOKENS
 
-        return _neural(asked, BUILTIN, resolution)
+        return _neural(asked, BUILTIN_TOKENS, resolution)
     settings = PreviewSettings(resolution=resolution, spp=way.spp, denoiser=way.denoiser)
     return _mitsuba(asked, settings)
 

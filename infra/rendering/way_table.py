@@ -28,13 +28,13 @@ SHIPPED = Path(__file__).with_name("previews.json")
 """Made by infra.setup.preview_table from results of `trilight bench previews`."""
 
 NETWORK_SCENE, NETWORK_VIEW = "network scene", "network view"
-"""Parts of a picture of the network builtin:, beside pipeline.renders.preview_parts."""
+"""Parts of a picture of the network builtin:tokens, beside pipeline.renders.preview_parts."""
 
 MEASURE = "trilight doctor --measure"
 """Writes the costs of this machine."""
 
 Rung = Literal["traced", "network"]
-"""Few samples and a filter, or the network builtin: that comes with Trilight."""
+"""Few samples and a filter, or the network builtin:tokens, whose further views cost the least."""
 
 Seconds = Annotated[float, Within(0, 1e6, unit="seconds")]
 Decibels = Annotated[float, Within(-MAX_DB, MAX_DB, unit="dB")]

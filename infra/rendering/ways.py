@@ -43,7 +43,7 @@ class Way:
     def __str__(self) -> str:
         """Return the way for a person."""
         if self.rung == "network":
-            return "the network builtin:"
+            return "the network builtin:tokens"
         return f"{self.spp} sample{'s' if self.spp > 1 else ''} a pixel, filter {self.denoiser}"
 
     @property

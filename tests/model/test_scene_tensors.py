@@ -66,5 +66,5 @@ def test_equal_lengths_need_no_mask() -> None:
 def test_a_scene_below_a_sky_is_refused() -> None:
     """Without its light the picture would be that of another scene."""
     environment = Environment(radiance_rgb=np.ones((2, 4, 3), np.float32))
-    with pytest.raises(TrilightError, match="it has an environment.*--engine mitsuba"):
+    with pytest.raises(TrilightError, match="it has an environment.*skies.share=0"):
         scene_tensors(dataclasses.replace(toy_scene(0), environment=environment))

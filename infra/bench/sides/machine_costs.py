@@ -127,7 +127,7 @@ def _network_parts(scene: Scene, threads: int) -> dict[int, dict[str, float]]:
     from model.neural_renderer import NeuralRenderer
 
     torch.set_num_threads(threads)
-    renderer, found = NeuralRenderer.load("builtin:"), {}
+    renderer, found = NeuralRenderer.load("builtin:tokens"), {}
     for px in PROBED_PX:
         spent = []
         for _ in range(4):
