@@ -51,8 +51,7 @@ def trace(
         ray: Ray3f from `film`.
     """
     hit = scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
-    active = mi.Bool(hit.is_valid())
-    distance, triangle, barycentric = _met(hit)
+    active, (distance, triangle, barycentric) = mi.Bool(hit.is_valid()), _met(hit)
     origin, direction = mi.Point3f(ray.o), mi.Vector3f(ray.d)
     radiance, throughput, share = _begun(scene, parts, direction, active)
     density, depth, guided = mi.Float(0), mi.UInt32(0), mi.Float(1)
@@ -85,8 +84,8 @@ def trace(
         direction = mi.Vector3f(vertex.frame.to_world(local))
         origin = off_surface(point, direction)
         hit = scene.everything.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
-        lit = _missed(scene, direction, density, active, hit)
-        radiance = radiance if lit is None else parts.add(radiance, throughput * lit, depth, share)
+        lit = _missed(scene, direction, density, throughput, active, hit)
+        radiance = radiance if lit is None else parts.add(radiance, lit, depth, share)
         active &= hit.is_valid()
         distance, triangle, barycentric = _met(hit)
     return radiance
@@ -140,23 +139,23 @@ def _seen_emission(
     return dr.select(shines, emitted / (1 + others), 0)
 
 
-def _background(
-    scene: KernelScene, parts: KernelParts, dark: list[Any], direction: Any, share: Any, met: Any
-) -> list[Any]:
+def _background(scene: KernelScene, parts: KernelParts, direction: Any, met: Any) -> list[Any]:
     """Return the sums with what a camera ray sees that meets nothing; it is direct light."""
     if scene.sky is None or not scene.sky.is_seen:
-        return dark
+        return parts.dark()
     seen, _ = scene.sky.radiance_and_density(direction, ~met)
-    return parts.add(dark, dr.select(met, 0, seen), mi.UInt32(1), share)
+    return parts.add(parts.dark(), dr.select(met, 0, seen), mi.UInt32(1), parts.first_share())
 
 
-def _missed(scene: KernelScene, direction: Any, density: Any, active: Any, hit: Any) -> Any:
+def _missed(
+    scene: KernelScene, direction: Any, density: Any, throughput: Any, active: Any, hit: Any
+) -> Any:
     """Return the sky's light where a drawn direction meets nothing; None where there is no sky."""
     if scene.sky is None:
         return None
     free = active & ~hit.is_valid()
     radiance, picks = scene.sky.radiance_and_density(direction, free)
-    return dr.select(free, radiance / (1 + dr.square(picks / density)), 0)
+    return throughput * dr.select(free, radiance / (1 + dr.square(picks / density)), 0)
 
 
 def _guidance(scene: KernelScene, vertex: Vertex, active: Any) -> Guidance | None:

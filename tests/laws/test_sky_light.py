@@ -27,7 +27,7 @@ TRACERS = [load_tracer, PluginTracer]
 def test_white_and_convex_things_vanish_in_a_white_sky(shape: Any, tracer: Any) -> None:
     """The furnace: radiance 1 from everywhere, and a Lambert surface of albedo 1 sends out 1."""
     thing = shape([0, 0, 0], 0.5, material(diffuse=1.0))
-    scene = join([thing], eye=(0.4, -2, 0.7), fov_deg=20, sky=constant(1.0))
+    scene = join([thing], eye=(0.4, -2, 0.7), fov_deg=30, sky=constant(1.0))
     loaded = tracer(scene, max_depth=6, rr_depth=5)
     camera = camera_of(scene, 16)
     covered = loaded.features(camera, spp=64).albedo
@@ -90,7 +90,9 @@ def test_a_seen_sky_stands_behind_everything(tracer: Any) -> None:
     loaded = [tracer(scene, max_depth=3, rr_depth=5) for scene in (hidden, seen)]
     # where surfaces cover nothing of a pixel, nor of its neighbours
     covered = loaded[0].features(camera, spp=64).albedo.any(axis=-1)
-    empty = ~covered
+    wide = np.pad(covered, 1)
+    around = np.array([wide[i : i + 64, j : j + 64] for i in range(3) for j in range(3)])
+    empty, inside = ~around.any(axis=0), around.all(axis=0)
     without, with_sky = (one.radiance(camera, seed=1, spp=64) for one in loaded)
     assert empty.sum() > 500 and (without[empty] == 0).all()
     _, rays = camera_rays(hidden.c2w[0], float(hidden.fov_deg[0]), 64)
@@ -98,5 +100,5 @@ def test_a_seen_sky_stands_behind_everything(tracer: Any) -> None:
     expected = environment_values(hidden.environment, rays)
     # A pixel is 0.8 degrees wide, over which this sky changes by 1 % at most.
     assert np.abs(with_sky[empty] / expected[empty] - 1).max() < 0.01
-    inside = loaded[0].features(camera, spp=64).albedo.min(axis=-1) > 0
+    # The same samples of the same light; a few of these pixels have a silhouette through them.
     assert abs(with_sky[inside].mean() / without[inside].mean() - 1) < 0.02
