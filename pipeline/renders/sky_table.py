@@ -110,7 +110,8 @@ class SkyTable:
             ]
             for row in rows
         )
-        mean = dr.lerp(dr.lerp(*upper, along), dr.lerp(*lower, along), down)
+        high, low = (row[0] + (row[1] - row[0]) * along for row in (upper, lower))
+        mean = high + (low - high) * down
         nearest = dr.select(down < 0.5, *(dr.select(along < 0.5, *row) for row in (upper, lower)))
         return mi.Color3f(mean.xyz), nearest.w * self._share
 

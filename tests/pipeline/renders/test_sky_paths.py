@@ -115,4 +115,4 @@ def test_a_lamp_alone_has_no_sky() -> None:
         load_tracer(scene, max_depth=5, rr_depth=5).only_light(row).radiance(camera, seed=2, spp=16)
         for scene in (with_sky, without)
     ]
-    np.testing.assert_array_equal(*pictures)
+    np.testing.assert_array_equal(pictures[0], pictures[1])

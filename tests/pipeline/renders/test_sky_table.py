@@ -109,7 +109,7 @@ def test_texel_means_are_means_over_texels() -> None:
 def test_the_share_goes_by_peaks_and_is_a_lamps_at_least() -> None:
     floor = quad([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], material(diffuse=0.5))
     lamps = [
-        light([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2]], 20.0),
+        light([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0], [0.0, 0.1, 2.0]], 20.0),
         light([[0, 1, 2], [1, 1, 2], [0, 2, 2]], 1.0),
     ]
     scene = join([floor, *lamps])
