@@ -53,8 +53,8 @@ def trace(
     hit = scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
     active, (distance, triangle, barycentric) = mi.Bool(hit.is_valid()), _met(hit)
     origin, direction = mi.Point3f(ray.o), mi.Vector3f(ray.d)
-    radiance, throughput, share = _begun(scene, parts, direction, active)
-    density, depth, guided = mi.Float(0), mi.UInt32(0), mi.Float(1)
+    radiance, throughput = _background(scene, parts, direction, active), mi.Color3f(1)
+    share, density, depth, guided = parts.first_share(), mi.Float(0), mi.UInt32(0), mi.Float(1)
     odds = light_paths * dr.square(distance) / film.density(direction)
     while active:
         point = scene.table.point(triangle, barycentric, active)
@@ -71,7 +71,8 @@ def trace(
         lit, local = _direct_light(scene, vertex, guidance, odds, depth, u, active)
         lit_share = parts.carried(vertex, local, depth, share)
         radiance = parts.add(radiance, throughput * lit, depth, lit_share)
-        local = _drawn(scene, vertex, guidance, sampler, active)
+        u_lobe, u_local = sampler.next_1d(active), sampler.next_2d(active)
+        local = _drawn(scene, vertex, guidance, u_lobe, u_local, active)
         reflected, unguided = _reflected(vertex, local)
         density = _density(scene, vertex, guidance, unguided, local, active)
         share = parts.carried(vertex, local, depth, share)
@@ -89,15 +90,6 @@ def trace(
         active &= hit.is_valid()
         distance, triangle, barycentric = _met(hit)
     return radiance
-
-
-def _begun(
-    scene: KernelScene, parts: KernelParts, direction: Any, active: Any
-) -> tuple[list[Any], Any, Any]:
-    """Return radiance, throughput and share of the parts where paths begin."""
-    share = parts.first_share()
-    radiance = _background(scene, parts, parts.dark(), direction, share, active)
-    return radiance, mi.Color3f(1), share
 
 
 def _met(hit: Any) -> tuple[Any, Any, Any]:
@@ -169,11 +161,11 @@ def _drawn(
     scene: KernelScene,
     vertex: Vertex,
     guidance: Guidance | None,
-    sampler: Any,
+    u_lobe: Any,
+    u_local: Any,
     active: Any,
 ) -> Any:
     """Return the direction (in the frame) in which a path goes on."""
-    u_lobe, u_local = sampler.next_1d(active), sampler.next_2d(active)
     if scene.guide is None or guidance is None:
         return ggx.sample(vertex.lobes, vertex.incoming, u_lobe, u_local)
     guided = u_lobe < guidance.share
