@@ -70,7 +70,7 @@ def test_rungs_come_nearer_with_samples_and_with_what_is_traced(tmp_path: Path) 
     assert all(
         row.values["a scene's first view, core-s"] > cost[name] for name, row in found.items()
     )
-    assert not found["network builtin:"].intervals and len(found) == 9
+    assert not found["network builtin:"].intervals and len(found) == 10
 
 
 @pytest.mark.slow
