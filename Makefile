@@ -48,10 +48,11 @@ lock: setup-all  ## write the lock files anew from requirements/*.in
 third-party: setup-all  ## write docs/third_party.md anew
 	python -m infra.setup.third_party
 
-settings: setup-all  ## write settings.md, passes.md, quantities.md and command-line.md of docs/reference anew
+settings: setup-all  ## write settings.md, passes.md, quantities.md, surfaces-and-skies.md and command-line.md of docs/reference anew
 	python -m infra.setup.settings_page
 	python -m infra.setup.passes_page
 	python -m infra.setup.quantities_page
+	python -m infra.setup.maps_page
 	python -m infra.setup.command_line_page
 
 docs: $(VENV)/.docs-ready  ## the documentation as a site that opens from disk: site/index.html

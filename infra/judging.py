@@ -1,12 +1,16 @@
 """A trained network judged on a dataset: the figures, and the files that show them."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from infra.tracer_rival import TIMED_SCENES, TracerRival
 from model.open import find_network
 from model.weights import network_digest
 from storage.atomic import write_atomically
@@ -22,11 +26,15 @@ from train.evaluation.evaluate import (
 )
 from train.evaluation.judged_view import NETWORK, JudgedView
 from train.evaluation.report import markdown, record
+from train.evaluation.same_time import same_time
 from train.evaluation.sheet import drawn_sheet, write_picture
 from train.loop.checkpoints import network_of_run
 from train.loop.crew import choose_device
 from train.loss.lpips import load_lpips
 from train.result import pretty_json
+
+Told = Callable[[Sequence[JudgedView]], dict[str, Any]]
+"""Says of the judged views what the same time buys elsewhere."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,6 +57,7 @@ def judge_network(
     train_data: Sequence[str] | None = None,
     resolution: int | None = None,
     most_scenes: int = 10**6,
+    tracer_views: int = 64,
     lpips: str | None = None,
     device: str | None = None,
     done: Callable[[int, int], None] = lambda now, total: None,
@@ -62,6 +71,8 @@ def judge_network(
         train_data: data of the baselines' training pictures; by default `data`, if it has any.
         resolution: pixels across; by default what the network was trained at, else the data's.
         most_scenes: the first so many scenes are judged.
+        tracer_views: on so many views at most the path tracer is judged in the network's own time
+            (infra.tracer_rival); 0: nothing is traced. Where it cannot be, the record says why.
         lpips: folder of LPIPS' weights, or `hub`; without them LPIPS is n/a.
         device: cpu or cuda; by default cuda where there is one.
         done: called with (finished, all) scenes.
@@ -85,9 +96,24 @@ def judge_network(
         most_scenes=most_scenes,
     )
     counted = _Counted(done, _num_scenes(contest))
-    views = judged_views(contest, counted.one_more)
+    with _tracing(contest, tracer_views) as (contest, traced):
+        views = judged_views(contest, counted.one_more)
     about = _about(checkpoint, opened, contest, split, views)
-    return Judgement(record=record(views, about), views=tuple(views), contest=contest)
+    return Judgement(
+        record=record(views, about, traced(views)), views=tuple(views), contest=contest
+    )
+
+
+@contextlib.contextmanager
+def _tracing(contest: Contest, most_views: int) -> Iterator[tuple[Contest, Told]]:
+    """Enter a contest with the path tracer in the network's own time, if one can be had."""
+    rival = TracerRival(contest.resolution, most_views=most_views, num_scenes=_num_scenes(contest))
+    with contextlib.closing(rival):
+        samples = list(itertools.islice(contest.samples(), TIMED_SCENES))
+        times = rival.measure(contest.network, samples)
+        if times.preview is not None:
+            contest = dataclasses.replace(contest, traced=rival)
+        yield contest, lambda views: same_time(views, times, rival.which)
 
 
 def write_judgement(judgement: Judgement, out: str | Path) -> None:
@@ -104,7 +130,9 @@ def write_judgement(judgement: Judgement, out: str | Path) -> None:
     if excursions := worst_of_each_excursion(views):
         chosen["worst of each axis"] = excursions
         plot_excursions(folder / "excursions.png", views)
-    shown = iter(sheet_views(contest, [row for rows in chosen.values() for row in rows]))
+    with contextlib.closing(contest.traced) if contest.traced else contextlib.nullcontext():
+        pictures = sheet_views(contest, [row for rows in chosen.values() for row in rows])
+    shown = iter(pictures)
     for name, rows in chosen.items():
         title = (f"{name}, of {len(views)} views at {contest.resolution} pixels, by psnr_log_db",)
         sheet = drawn_sheet([next(shown) for _ in rows], title)

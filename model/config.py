@@ -54,6 +54,9 @@ class ModelConfig:
     """Rotary frequencies per coordinate; 2 x 9 x rope_num_freqs may not exceed the head width."""
     rope_max_freq: Annotated[float, Within(1, 1000, unit="radians per metre")]
     """Highest rotary frequency in radians per metre; the lowest is 1, the rest log-spaced."""
+    projected_freqs: Annotated[int, Within(0, 64)] = 0
+    """bundles: rotary frequencies of each of the two picture coordinates at which a token lands, in
+    pairs of the head that vertices leave free; with 0, bundles are not told where tokens land."""
     register_eps: Annotated[float, Within(0, 1)] = 0.0
     """Added to the number of triangles by which the registers' mean position is divided; the
     published weights use 1e-5."""
@@ -75,8 +78,11 @@ class ModelConfig:
     view_stage: ViewStage = "bundles"
     """What a view begins with: `bundles` of rays, as published, or traced `hits`, after which the
     network learns only what is not traced. `hits` needs a linear head."""
+    demodulated: bool = False
+    """bundles: whether the network predicts the light that arrives, diffuse and specular apart, by
+    which the traced albedo of what each pixel sees first is multiplied."""
     hit_rays: Annotated[int, Within(0, 8, unit="rays")] = 0
-    """hits: rays along a side of each pixel, its square in all; 0 with bundles."""
+    """hits, and demodulated bundles: rays along a side of each pixel, its square in all; else 0."""
     hit_anchors: Annotated[int, Within(0, 256, unit="anchors")] = 0
     """hits: anchors along a side of the picture, which ask the scene's tokens; 0 with bundles."""
     gather_rays: Annotated[int, Within(0, 4096, unit="rays")] = 0
@@ -84,6 +90,9 @@ class ModelConfig:
     that of lamps is traced. 0 with bundles."""
     pixel_width: Annotated[int, Within(0, 4096)] = 0
     """hits: width of the network that each pixel passes; 0 with bundles."""
+    filter_width: Annotated[int, Within(0, 1024)] = 0
+    """hits: width of the network that says which pixels share what their mirrored rays found; 0
+    leaves each pixel its own. 0 with bundles."""
     scene_tokens: bool = True
     """hits: whether anchors ask the scene's tokens; false leaves out the view-independent stage."""
     material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
@@ -92,9 +101,15 @@ class ModelConfig:
     def __post_init__(self) -> None:
         if self.width % self.num_heads or self.head_width % 2:
             _wrong(f"width {self.width} in {self.num_heads} heads", "even heads of equal width")
-        if 2 * VERTEX_COORDINATES * self.rope_num_freqs > self.head_width:
+        if self.free_pairs < 0:
             most = self.head_width // (2 * VERTEX_COORDINATES)
             _wrong(f"rope_num_freqs {self.rope_num_freqs}", f"at most {most} for this head width")
+        if 2 * self.projected_freqs > self.free_pairs:
+            _wrong(
+                f"projected_freqs {self.projected_freqs} beside rope_num_freqs "
+                f"{self.rope_num_freqs}",
+                f"at most {self.free_pairs // 2} for this head width",
+            )
         if self.window_bundles % 2:
             _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
         _check_columns(self.material_columns)
@@ -115,10 +130,9 @@ class ModelConfig:
             _wrong(f"patch_px {self.patch_px} with a dpt head", "8, which its grids multiply up to")
 
     def _check_hits(self) -> None:
-        needed = {"hit_rays": self.hit_rays, "hit_anchors": self.hit_anchors}
-        needed["pixel_width"] = self.pixel_width
+        needed = {"hit_anchors": self.hit_anchors, "pixel_width": self.pixel_width}
         if self.view_stage == "hits":
-            for name, value in needed.items():
+            for name, value in {"hit_rays": self.hit_rays, **needed}.items():
                 if value < 1:
                     _wrong(f"{name} {value} with view_stage hits", "1 or more")
             if self.hit_anchors % HITS_PX:
@@ -129,13 +143,28 @@ class ModelConfig:
                     f"and patch_px {self.patch_px}",
                     f"linear, 0 and {HITS_PX}",
                 )
-        elif any(needed.values()) or self.gather_rays or not self.scene_tokens:
+            if self.projected_freqs or self.demodulated:
+                _wrong("projected_freqs or demodulated with view_stage hits", "0 and false")
+        elif any([*needed.values(), self.gather_rays, self.filter_width, not self.scene_tokens]):
             _wrong("fields of hits beside view_stage bundles", "0, and scene_tokens true")
+        elif self.demodulated != (self.hit_rays > 0):
+            expected = "1 or more" if self.demodulated else "0, or demodulated true"
+            _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)
 
     @property
     def head_width(self) -> int:
         """Width of one attention head."""
         return self.width // self.num_heads
+
+    @property
+    def vertex_pairs(self) -> int:
+        """Pairs of channels of a head that vertices turn: the first ones."""
+        return VERTEX_COORDINATES * self.rope_num_freqs
+
+    @property
+    def free_pairs(self) -> int:
+        """Pairs of channels of a head that no vertex turns."""
+        return self.head_width // 2 - self.vertex_pairs
 
     @property
     def picture_px(self) -> int:
@@ -167,8 +196,9 @@ def hits_smoke() -> ModelConfig:
         view_stage="hits",
         hit_rays=2,
         hit_anchors=16,
-        gather_rays=32,
+        gather_rays=16,
         pixel_width=64,
+        filter_width=32,
     )
 
 
@@ -186,6 +216,7 @@ def hits_base() -> ModelConfig:
         hit_anchors=32,
         gather_rays=64,
         pixel_width=128,
+        filter_width=64,
     )
 
 

@@ -14,7 +14,7 @@ import torch
 
 from model.config import ModelConfig
 from model.hits.decoder import view_flops
-from model.image_head import LAST_CHANNELS
+from model.image_head import LAST_CHANNELS, picture_channels
 from model.positions import encoded_normal_width
 from model.precision import PRECISIONS, rounded_parts
 from model.renderformer import RenderFormer, count_parameters
@@ -137,7 +137,7 @@ def _pairs(config: ModelConfig, per_side: int) -> int:
 
 def _head(config: ModelConfig, per_side: int) -> int:
     if config.head == "linear":
-        return 2 * per_side**2 * config.width * 3 * config.patch_px**2
+        return 2 * per_side**2 * config.width * picture_channels(config) * config.patch_px**2
     features, half = config.dpt_features, (per_side + 1) // 2
     grids = (4 * per_side, 2 * per_side, per_side, half)
     total = 0
@@ -148,5 +148,5 @@ def _head(config: ModelConfig, per_side: int) -> int:
         total += config.width * wide * per_side**2 + resize + refine + features**2 * side**2
     full = (8 * per_side) ** 2
     halve = 9 * features * (features // 2) * full
-    last = (9 * (features // 2) * LAST_CHANNELS + 3 * LAST_CHANNELS) * full
+    last = (9 * (features // 2) * LAST_CHANNELS + picture_channels(config) * LAST_CHANNELS) * full
     return 2 * (total + halve + last)

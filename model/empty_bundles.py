@@ -43,11 +43,11 @@ def fill_absent(tokens_1KW: Tensor, sees_Q: Tensor) -> Tensor:
     return filled_1QW
 
 
-def blacken_absent(picture_3RR: Tensor, sees_Q: Tensor, patch_px: int) -> Tensor:
+def blacken_absent(picture_CRR: Tensor, sees_Q: Tensor, patch_px: int) -> Tensor:
     """Return the picture, log10(1 + radiance), with 0 where no bundle was computed."""
-    per_side = picture_3RR.shape[-1] // patch_px
+    per_side = picture_CRR.shape[-1] // patch_px
     sees_RR = sees_Q.unflatten(0, (per_side, per_side)).repeat_interleave(patch_px, dim=0)
-    return picture_3RR * sees_RR.repeat_interleave(patch_px, dim=1)
+    return picture_CRR * sees_RR.repeat_interleave(patch_px, dim=1)
 
 
 def _cut_corners(triangles_BVT33: Tensor) -> tuple[Tensor, Tensor]:

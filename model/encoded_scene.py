@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 if TYPE_CHECKING:
+    from model.hits.lit_scene import LitScene
     from model.hits.tracing import TracedScene
 
 KeysValues = tuple[Tensor, Tensor]
@@ -42,6 +43,8 @@ class EncodedScene:
     world."""
     traced: "tuple[TracedScene, ...]" = ()
     """Of the view stage of hits: each scene, ready for rays; none where its views come traced."""
+    surfaces: "tuple[LitScene, ...]" = ()
+    """Of demodulated bundles: each scene, whose albedo rays ask; none where it is known."""
 
     def only(self, index: int) -> "EncodedScene":
         """Return one scene of the batch, without the padding that its company brought."""
@@ -58,4 +61,5 @@ class EncodedScene:
                 (k[[index]][:, :, exists], v[[index]][:, :, exists]) for k, v in self.keys_values
             ),
             traced=self.traced[index : index + 1],
+            surfaces=self.surfaces[index : index + 1],
         )

@@ -1,7 +1,8 @@
 """Bundle tokens -> pixels: a linear map of each bundle, or a dense prediction transformer (DPT).
 
 The linear head is smaller and as good for minutes of training; the DPT (Ranftl et al. 2021) mixes
-neighbouring bundles, so that their borders do not show. Both start at a black picture.
+neighbouring bundles, so that their borders do not show. Both start at a black picture, or,
+where they predict light (model.demodulated), at equal dim light everywhere.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,18 +21,24 @@ LAST_CHANNELS = 32
 """Channels before the DPT's last 1x1, as published."""
 
 
+def picture_channels(config: ModelConfig) -> int:
+    """Return how many numbers a head gives each pixel: a colour, or two kinds of light."""
+    return 6 if config.demodulated else 3
+
+
 class LinearHead(nn.Module):
-    """Last layer's tokens -> 3 P P values each."""
+    """Last layer's tokens -> P P colours each."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.patch_px = config.patch_px
         self.taps = (config.decoder_layers - 1,)
         self.norm = Norm(config.width, eps=LAYER_NORM_EPS)
-        self.last = nn.Linear(config.width, 3 * config.patch_px**2)
+        self.channels = picture_channels(config)
+        self.last = nn.Linear(config.width, self.channels * config.patch_px**2)
 
     def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
-        """Return pictures [M, 3, R, R]."""
+        """Return pictures [M, channels, R, R]."""
         tokens_MQW = taps_MQW[0].to(self.last.weight.dtype)
         with as_given(tokens_MQW.device):
             return unbundle(self.last(self.norm(tokens_MQW)), self.patch_px)
@@ -101,10 +108,11 @@ class DptHead(nn.Module):
         )
         self.halve = nn.Conv2d(features, features // 2, 3, padding=1)
         self.widen = nn.Conv2d(features // 2, LAST_CHANNELS, 3, padding=1)
-        self.last = nn.Conv2d(LAST_CHANNELS, 3, 1)
+        self.channels = picture_channels(config)
+        self.last = nn.Conv2d(LAST_CHANNELS, self.channels, 1)
 
     def forward(self, taps_MQW: Sequence[Tensor]) -> Tensor:
-        """Return pictures [M, 3, R, R]."""
+        """Return pictures [M, channels, R, R]."""
         grids = [self._grid(level, tokens) for level, tokens in enumerate(taps_MQW)]
         fused: Tensor | None = None
         for level in reversed(range(NUM_TAPS)):

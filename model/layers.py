@@ -119,7 +119,8 @@ class CrossAttention(nn.Module):
     """Attention of ray bundles to the tokens of their scene.
 
     Keys and values are projected once per scene and rotated once per view: the rotation is what
-    carries the camera. Queries stand at the camera's origin, where the rotation is the identity.
+    carries the camera. Queries stand at the camera's origin, where the rotation is the identity,
+    but for where on the picture they are, if keys are told that too (model.projected).
     """
 
     def __init__(self, width: int, num_heads: int) -> None:
@@ -145,13 +146,16 @@ class CrossAttention(nn.Module):
         keys_values: KeysValues,
         rotation_BVNA: Rotation,
         is_key_BN: Tensor | None,
+        rotation_QA: Rotation | None = None,
     ) -> Tensor:
-        """[B, V, Q, W] -> [B, V, Q, W]."""
+        """[B, V, Q, W] -> [B, V, Q, W]; keys turn by the first rotation, queries by the second."""
         num_views = x_BVQW.shape[1]
         k_BHND, v_BHND = keys_values
         k_BVHND = rotate(k_BHND[:, None], *rotation_BVNA)
         v_BVHND = v_BHND[:, None].expand_as(k_BVHND)
         q_BVHQD = split_heads(self.q_norm(self.q(x_BVQW)), self.num_heads)
+        if rotation_QA is not None:
+            q_BVHQD = rotate(q_BVHQD, *rotation_QA)
         mask = None if is_key_BN is None else is_key_BN.repeat_interleave(num_views, dim=0)
         attended = attend(q_BVHQD.flatten(0, 1), k_BVHND.flatten(0, 1), v_BVHND.flatten(0, 1), mask)
         return self.out(merge_heads(attended)).unflatten(0, x_BVQW.shape[:2])
@@ -192,12 +196,15 @@ class DecoderLayer(nn.Module):
         x_BVQW: Tensor,
         keys_values: KeysValues,
         rotation_BVNA: Rotation,
+        rotation_QA: Rotation | None,
         is_key_BN: Tensor | None,
         windows: Windows | None,
     ) -> Tensor:
         """[B, V, Q, W] -> [B, V, Q, W]; `keys_values` are those of this layer's `cross`."""
         views = x_BVQW.shape[:2]
-        x_BVQW = x_BVQW + self.cross(self.cross_norm(x_BVQW), keys_values, rotation_BVNA, is_key_BN)
+        x_BVQW = x_BVQW + self.cross(
+            self.cross_norm(x_BVQW), keys_values, rotation_BVNA, is_key_BN, rotation_QA
+        )
         x_MQW = torch.flatten(x_BVQW, 0, 1)
         x_MQW = x_MQW + self.self_attention(self.self_norm(x_MQW), windows=windows)
         return (x_MQW + self.ffn(self.ffn_norm(x_MQW))).unflatten(0, views)

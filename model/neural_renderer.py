@@ -6,6 +6,7 @@ picture = renderer.render(read_scene_file("scene.safetensors"), resolution=512)
 All of the network that is used here is in `_encode` and `_decode`.
 """
 
+import dataclasses
 import functools
 import warnings
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from model.encoded_scene import EncodedScene
-from model.light_groups import light_groups
+from model.light_groups import LightGroup, light_groups
 from model.open import Finder, find_network
 from model.precision import set_precision
 from model.renderformer import RenderFormer, radiance
@@ -133,17 +134,21 @@ class NeuralRenderer:
 
         Args:
             scene: passes `Scene.check`; its cameras do not matter.
-            lights_per_pass: most emitting triangles of a group (model.light_groups).
+            lights_per_pass: most emitting triangles of a group (model.light_groups). The lamps of
+                a network of hits are traced, any number at a time.
 
         Raises:
             TrilightError: the scene is larger than memory.
         """
         self._require_memory(scene.num_triangles)
+        below_sky, scene = scene, dataclasses.replace(scene, environment=None)
+        by_hits = self._model.config.view_stage == "hits"
+        all_lights = [LightGroup(scene=scene, share=1.0)]
         groups = [
             (_encode(self._model, group.scene, self.device), group.share)
-            for group in light_groups(scene, lights_per_pass)
+            for group in (all_lights if by_hits else light_groups(scene, lights_per_pass))
         ]
-        return PreparedScene(groups=tuple(groups), notes=self._notes(scene, len(groups)))
+        return PreparedScene(groups=tuple(groups), notes=self._notes(below_sky, len(groups)))
 
     @torch.inference_mode()
     def view(
@@ -200,6 +205,10 @@ class NeuralRenderer:
 
     def _notes(self, scene: Scene, num_groups: int) -> tuple[str, ...]:
         notes = []
+        if scene.environment is not None:
+            notes.append(
+                "the scene has an environment, whose light networks do not know: it is missing here"
+            )
         if num_groups > 1:
             notes.append(
                 f"the {int(scene.triangle_emits.sum())} emitting triangles are rendered in "

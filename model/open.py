@@ -1,6 +1,6 @@
 """Opens a network from any source; the only place that does, and without pickle.
 
-ours, shipped      builtin:
+ours, shipped      builtin:hits (builtin: for short), builtin:tokens
 our own            model.safetensors of `trilight train`, or the folder that holds one
 published, local   a folder with config.json and model.safetensors
 published, hub     microsoft/renderformer-v1-base, microsoft/renderformer-v1.1-swin-large
@@ -24,13 +24,14 @@ from model.weights import (
     CONFIG_KEY,
     PUBLISHED_RANGE,
     TrainedRange,
+    decode_config,
     from_tensors,
     read_metadata,
     read_tensors,
     trained_range,
 )
 from storage.atomic import write_atomically
-from storage.errors import TrilightError
+from storage.errors import TrilightError, expected_one_of
 
 WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
 """What a checkpoint's folder holds; only published ones have the second."""
@@ -38,11 +39,20 @@ WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
 PUBLISHED = ("microsoft/renderformer-v1-base", "microsoft/renderformer-v1.1-swin-large")
 """The published checkpoints' names on the Hugging Face hub."""
 
-BUILTIN = "builtin:"
-"""Name of the small network that comes with Trilight; model/builtin/README.md is its card."""
+_SHIPPED = Path(__file__).parent / "builtin"
 
-BUILTIN_WEIGHTS = Path(__file__).parent / "builtin" / WEIGHTS_NAME
-"""File of the builtin network."""
+BUILTIN = "builtin:"
+"""Name of the better of the small networks that come with Trilight."""
+
+BUILTIN_TOKENS = "builtin:tokens"
+"""Name of the one whose view stage is RenderFormer's: nothing is traced."""
+
+BUILTIN_NETWORKS = {
+    BUILTIN: _SHIPPED / "hits" / WEIGHTS_NAME,
+    "builtin:hits": _SHIPPED / "hits" / WEIGHTS_NAME,
+    BUILTIN_TOKENS: _SHIPPED / "tokens" / WEIGHTS_NAME,
+}
+"""File of each network that comes along, by its name; its card, README.md, is beside it."""
 
 MAX_CONFIG_BYTES = 1 << 16
 """A published config.json has about 1 KiB."""
@@ -62,6 +72,8 @@ class FoundNetwork:
     """The file that holds them."""
     trained: TrainedRange
     """What it was trained on, as far as the file says."""
+    any_width: bool
+    """Whether pictures of other widths than that are as good."""
     open: Callable[[], RenderFormer]
     """Returns the network, float32, in evaluation mode on the CPU; raises TrilightError where the
     file is damaged, or its tensors are not those of its configuration."""
@@ -90,25 +102,38 @@ def find_network(place: str | Path, *finders: Finder) -> FoundNetwork:
     """Return a network before its weights are read; of a published name, after it is fetched.
 
     Args:
-        place: BUILTIN, a file, a folder, or the name of a repository on the Hugging Face hub.
+        place: one of BUILTIN_NETWORKS, a file, a folder, or the name of a repository on the
+            Hugging Face hub.
         finders: are asked first, such as `train.loop.checkpoints.network_of_run`.
 
     Raises:
         TrilightError: there is none, or it holds pickled code.
     """
     source = str(place)
-    path = BUILTIN_WEIGHTS if source == BUILTIN else Path(source)
+    if source.startswith(BUILTIN) and source not in BUILTIN_NETWORKS:
+        raise TrilightError(
+            f"checkpoint {source}: no such network comes along; "
+            f"{expected_one_of(source, sorted(BUILTIN_NETWORKS))}."
+        )
+    path = BUILTIN_NETWORKS.get(source, Path(source))
     for finder in finders:
         if found := finder(path):
             return found
     weights = _weights_file(source, path)
     metadata = read_metadata(weights)
     if CONFIG_KEY in metadata:
-        trained = trained_range(metadata) or TrainedRange()
         return FoundNetwork(
-            path=weights, trained=trained, open=lambda: from_tensors(*read_tensors(weights))
+            path=weights,
+            trained=trained_range(metadata) or TrainedRange(),
+            any_width=decode_config(metadata[CONFIG_KEY]).view_stage == "hits",
+            open=lambda: from_tensors(*read_tensors(weights)),
         )
-    return FoundNetwork(path=weights, trained=PUBLISHED_RANGE, open=lambda: _published(weights))
+    return FoundNetwork(
+        path=weights,
+        trained=PUBLISHED_RANGE,
+        any_width=False,
+        open=lambda: _published(weights),
+    )
 
 
 def _weights_file(source: str, path: Path) -> Path:

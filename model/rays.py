@@ -39,7 +39,7 @@ def bundle_rays(direction_V3RR: Tensor, patch_px: int) -> Tensor:
 
 
 def unbundle(bundles_MQC: Tensor, patch_px: int) -> Tensor:
-    """[M, Q, 3 P P] -> [M, 3, R, R]: the inverse of `bundle_rays` for a square picture."""
+    """[M, Q, C P P] -> [M, C, R, R]: the inverse of `bundle_rays` for a square picture."""
     per_side = round(bundles_MQC.shape[1] ** 0.5)
-    grid = bundles_MQC.unflatten(2, (3, patch_px, patch_px)).unflatten(1, (per_side, per_side))
+    grid = bundles_MQC.unflatten(2, (-1, patch_px, patch_px)).unflatten(1, (per_side, per_side))
     return grid.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)

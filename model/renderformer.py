@@ -7,9 +7,18 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from model.config import ModelConfig
+from model.demodulated import albedo_of_cameras, composed
 from model.encoded_scene import EncodedScene, KeysValues
 from model.hits.decoder import HitDecoder
-from model.hits.tracing import TracedScene, like, sides_of, traced_batch, traced_cameras
+from model.hits.lit_scene import LitScene
+from model.hits.tracing import (
+    TracedScene,
+    like,
+    lit_scenes,
+    sides_of,
+    traced_batch,
+    traced_cameras,
+)
 from model.image_head import blacken
 from model.positions import TriangleRotary, token_places
 from model.precision import tf32
@@ -51,9 +60,13 @@ class RenderFormer(nn.Module):
         Raises:
             TrilightError: the resolution is not a multiple of `config.picture_px`.
         """
-        if self.config.view_stage == "bundles":
+        if batch.albedo_BVRR6 is None and self.config.view_stage == "bundles":
             return self.decode(self.encode(batch), batch.cameras, resolution)
         self._require(resolution, skip_empty_bundles=False)
+        if self.config.view_stage == "bundles":
+            return self._bundles(
+                self._encoded(batch), batch.cameras, resolution, batch.albedo_BVRR6
+            )
         scenes: tuple[TracedScene, ...] = ()
         traced = batch.traced
         if traced is None:
@@ -67,7 +80,8 @@ class RenderFormer(nn.Module):
     def encode(self, batch: SceneBatch) -> EncodedScene:
         """Return the scenes of a batch ready to be seen; their cameras are not looked at."""
         if self.config.view_stage == "bundles":
-            return self._encoded(batch)
+            surfaces = lit_scenes(batch) if self.config.demodulated else ()
+            return self._encoded(batch, surfaces=surfaces)
         scenes = traced_batch(batch)
         lights = [scene.light for scene in scenes]
         longest = batch.triangles_BT33.shape[1]
@@ -84,6 +98,7 @@ class RenderFormer(nn.Module):
         traced: tuple[TracedScene, ...] = (),
         sides_BT12: Tensor | None = None,
         unit_B3: Tensor | None = None,
+        surfaces: tuple[LitScene, ...] = (),
     ) -> EncodedScene:
         """Return the scenes after the view-independent stage, if there is one."""
         places = token_places(
@@ -100,7 +115,9 @@ class RenderFormer(nn.Module):
             with tf32(self.tf32):
                 context_BNW = self.encoder(batch, places, sides_BT12)
                 keys_values = self.decoder.keys_values(context_BNW, places)
-        return EncodedScene(places=places, keys_values=keys_values, traced=traced)
+        return EncodedScene(
+            places=places, keys_values=keys_values, traced=traced, surfaces=surfaces
+        )
 
     def decode(
         self,
@@ -126,17 +143,40 @@ class RenderFormer(nn.Module):
                 network with windows, which have to be whole.
         """
         self._require(resolution, skip_empty_bundles)
-        with tf32(self.tf32):
-            if isinstance(self.decoder, HitDecoder):
+        if isinstance(self.decoder, HitDecoder):
+            with tf32(self.tf32):
                 traced = traced_cameras(scene.traced, cameras, resolution, self.config)
                 return self.decoder(scene, traced)
-            if not skip_empty_bundles:
-                return self.decoder(scene, cameras, resolution)
-            pictures = [
-                self.decoder.where_seen(scene.only(index), cameras.only(index), resolution)
-                for index in range(len(cameras.fov_deg_BV))
-            ]
-            return torch.cat(pictures)
+        albedo_BVRR6 = None
+        if self.config.demodulated:
+            rays = self.config.hit_rays
+            albedo_BVRR6 = albedo_of_cameras(scene.surfaces, cameras, resolution, rays)
+        return self._bundles(
+            scene, cameras, resolution, albedo_BVRR6, skip_empty_bundles=skip_empty_bundles
+        )
+
+    def _bundles(
+        self,
+        scene: EncodedScene,
+        cameras: Cameras,
+        resolution: int,
+        albedo_BVRR6: Tensor | None,
+        *,
+        skip_empty_bundles: bool = False,
+    ) -> Tensor:
+        """Return the pictures of ray bundles; `albedo` is that of a demodulated network."""
+        with tf32(self.tf32):
+            if skip_empty_bundles:
+                pictures = [
+                    self.decoder.where_seen(scene.only(index), cameras.only(index), resolution)
+                    for index in range(len(cameras.fov_deg_BV))
+                ]
+                picture_BVRRC = torch.cat(pictures)
+            else:
+                picture_BVRRC = self.decoder(scene, cameras, resolution)
+        if not self.config.demodulated or albedo_BVRR6 is None:
+            return picture_BVRRC
+        return composed(picture_BVRRC, albedo_BVRR6)
 
     def _require(self, resolution: int, skip_empty_bundles: bool) -> None:
         picture_px = self.config.picture_px

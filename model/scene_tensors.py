@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
@@ -46,6 +47,12 @@ class SceneTensors:
     traced: Traced | None = None
     """What was traced of these views, for a network with the view stage `hits`; where it is None,
     such a network traces them itself."""
+    albedo_VRR6: Tensor | None = None
+    """Albedo of what their pixels see first, for a demodulated network; where it is None, such a
+    network asks for it itself (model.demodulated)."""
+    textures: SurfaceTextures | None = None
+    """What such a network reads at each hit in the place of material columns; `material_TM` holds
+    the means. None where nothing is textured."""
 
     @property
     def num_triangles(self) -> int:
@@ -90,6 +97,10 @@ class SceneBatch:
     """As in SceneTensors."""
     traced: Traced | None = None
     """As in SceneTensors; None where a scene has None."""
+    albedo_BVRR6: Tensor | None = None
+    """As in SceneTensors; None where a scene has None."""
+    textures: tuple[SurfaceTextures | None, ...] | None = None
+    """Those of each scene; None where no scene has any."""
 
     @property
     def cameras(self) -> Cameras:
@@ -124,9 +135,15 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
             (`ModelConfig.material_columns`); None: all that are declared, for any network.
 
     Raises:
-        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis, or a
-            column is not declared.
+        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis, a
+            column is not declared, or an environment lights the scene, whose light no network
+            knows: its picture would be that of another scene.
     """
+    if scene.environment is not None:
+        raise TrilightError(
+            "scene: it has an environment, and networks do not know its light; expected none. "
+            "Train on scenes without one (scenes.skies.share=0)."
+        )
     farthest = np.abs(scene.vertex_positions).max()
     if not farthest <= MAX_POSITION_M:  # not a number is no place either
         raise TrilightError(
@@ -147,6 +164,7 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
         c2w_V44=torch.from_numpy(scene.c2w.copy()),
         fov_deg_V=torch.from_numpy(scene.fov_deg.copy()),
         columns=columns,
+        textures=surface_textures(scene),
     )
 
 
@@ -180,6 +198,8 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
     longest = max(lengths)
     padded = min(lengths) < longest
     traced = [scene.traced for scene in scenes if scene.traced is not None]
+    albedo = [scene.albedo_VRR6 for scene in scenes if scene.albedo_VRR6 is not None]
+    textures = tuple(scene.textures for scene in scenes)
     return SceneBatch(
         triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
         normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
@@ -189,6 +209,8 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
         is_triangle_BT=torch.arange(longest) < torch.tensor(lengths)[:, None] if padded else None,
         columns=scenes[0].columns,
         traced=stack_traced(traced, longest) if len(traced) == len(scenes) else None,
+        albedo_BVRR6=torch.stack(albedo) if len(albedo) == len(scenes) else None,
+        textures=None if all(each is None for each in textures) else textures,
     )
 
 

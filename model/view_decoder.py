@@ -17,12 +17,16 @@ from model.image_head import build_head, stack_taps
 from model.layers import TOKEN_NORM_EPS, DecoderLayer, Norm, dtype_of, run_layer
 from model.positions import Rotation, TriangleRotary, camera_rotation
 from model.precision import as_given
+from model.projected import PictureRotary
 from model.rays import bundle_rays, ray_directions
 from model.scene_tensors import Cameras
 from model.windows import Windows, cut_windows
 
 Cuts = tuple[Windows | None, Windows | None]
 """Windows of even and of odd layers; None where every bundle sees all others."""
+
+Rotations = tuple[Rotation, Rotation | None]
+"""Of keys [B, V, N, A] and of bundles [Q, A]; None where bundles do not turn."""
 
 
 class ViewDecoder(nn.Module):
@@ -33,6 +37,7 @@ class ViewDecoder(nn.Module):
         self.rotary = rotary
         self.patch_px = config.patch_px
         self.window_bundles = config.window_bundles
+        self.projected = PictureRotary(config) if config.projected_freqs else None
         self.recompute = False
         self.token_W = nn.Parameter(torch.zeros(config.width))
         self.rays = nn.Linear(3 * config.patch_px**2, config.width)
@@ -52,12 +57,15 @@ class ViewDecoder(nn.Module):
         return tuple(layer.cross.keys_values(context_BNW) for layer in layers)
 
     def forward(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
-        """Return log10(1 + radiance) before the ELU, [B, V, R, R, 3]."""
+        """Return log10(1 + radiance) before the ELU, [B, V, R, R, 3].
+
+        Of a network that predicts light, what `model.demodulated.composed` reads, [B, V, R, R, 6].
+        """
         x_BVQW = self.bundle_tokens(cameras.fov_deg_BV, resolution)
-        rotation_BVNA = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
+        rotations = self._rotations(scene, cameras, resolution)
         cuts = self._cuts(resolution // self.patch_px, x_BVQW.device)
-        picture_M3RR = self.head(self._taps(x_BVQW, scene, rotation_BVNA, cuts))
-        return picture_M3RR.movedim(1, -1).unflatten(0, cameras.fov_deg_BV.shape)
+        picture_MCRR = self.head(self._taps(x_BVQW, scene, rotations, cuts))
+        return picture_MCRR.movedim(1, -1).unflatten(0, cameras.fov_deg_BV.shape)
 
     def where_seen(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
         """Return what `forward` returns for one scene, from the bundles that see it alone.
@@ -67,21 +75,31 @@ class ViewDecoder(nn.Module):
         """
         x_1VQW = self.bundle_tokens(cameras.fov_deg_BV, resolution)
         sees_VQ = bundles_that_see(scene.places, cameras, resolution, self.patch_px)[0]
-        cos, sin = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
+        (cos, sin), asks = self._rotations(scene, cameras, resolution)
         pictures = []
         for view, sees_Q in enumerate(sees_VQ):
-            picture_3RR = x_1VQW.new_zeros((3, resolution, resolution))
+            picture_CRR = x_1VQW.new_zeros((self.head.channels, resolution, resolution))
             if sees_Q.any():
                 x_11QW = x_1VQW[:, [view]][:, :, sees_Q]
-                rotation = cos[:, [view]], sin[:, [view]]
-                taps_1QW = self._taps(x_11QW, scene, rotation, (None, None))
+                keys = cos[:, [view]], sin[:, [view]]
+                some = None if asks is None else (asks[0][sees_Q], asks[1][sees_Q])
+                taps_1QW = self._taps(x_11QW, scene, (keys, some), (None, None))
                 filled_1QW = [fill_absent(tap_1QW, sees_Q) for tap_1QW in taps_1QW]
-                picture_3RR = blacken_absent(self.head(filled_1QW)[0], sees_Q, self.patch_px)
-            pictures.append(picture_3RR)
+                picture_CRR = blacken_absent(self.head(filled_1QW)[0], sees_Q, self.patch_px)
+            pictures.append(picture_CRR)
         return torch.stack(pictures).movedim(1, -1)[None]
 
+    def _rotations(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Rotations:
+        """Return the rotations of keys [B, V, N, A] and of bundles [Q, A]."""
+        keys_BVNA = camera_rotation(self.rotary, scene.places, cameras.c2w_BV44)
+        if self.projected is None:
+            return keys_BVNA, None
+        per_side = resolution // self.patch_px
+        bundles_QA = self.projected.of_bundles(per_side, keys_BVNA)
+        return self.projected.of_tokens(keys_BVNA, scene.places, cameras, per_side), bundles_QA
+
     def _taps(
-        self, x_BVQW: Tensor, scene: EncodedScene, rotation_BVNA: Rotation, cuts: Cuts
+        self, x_BVQW: Tensor, scene: EncodedScene, rotations: Rotations, cuts: Cuts
     ) -> list[Tensor]:
         """Return what the head reads, [B V, Q, W] each."""
         x_BVQW = x_BVQW.to(dtype_of(self.layers))
@@ -93,7 +111,7 @@ class ViewDecoder(nn.Module):
                 layer,
                 x_BVQW,
                 keys_values,
-                rotation_BVNA,
+                *rotations,
                 scene.places.is_key_BN,
                 cuts[index % 2],
                 recompute=self.recompute,

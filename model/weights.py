@@ -219,7 +219,10 @@ _LATER = (
     "hit_anchors",
     "gather_rays",
     "pixel_width",
+    "filter_width",
     "scene_tokens",
+    "projected_freqs",
+    "demodulated",
 )
 
 

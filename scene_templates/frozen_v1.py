@@ -12,6 +12,10 @@ from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.settings import SceneSettings, ViewLaws
+from scene_templates.skies.draw import SkyMapSettings
+from scene_templates.skies.settings import SkySettings
+from scene_templates.surfaces.draw import SurfaceMapSettings
+from scene_templates.textures import TextureSettings
 
 _ROOM = SharedRoom(
     square_share=0.5, scale=(1.0, 1.35), shift=0.05, raise_z=(-0.05, 0.25), tilt_deg=3.0
@@ -53,6 +57,7 @@ SCENES_V1 = SceneSettings(
         coloured_specular_share=0.0,
         smooth_angle_deg=30.0,
     ),
+    textures=TextureSettings(share=0.0, tile_m=(0.4, 1.6), surfaces=SurfaceMapSettings()),
     lights=LightSettings(
         count=(1, 8),
         total_emission=(2500.0, 5000.0),
@@ -70,6 +75,19 @@ SCENES_V1 = SceneSettings(
     ),
     views=ViewLaws(
         coverage_grid=32, min_coverage=0.02, min_lit=0.05, max_shell_back=0.1, min_depth=0.01
+    ),
+    skies=SkySettings(
+        share=0.0,
+        over_lamps_log=(0.05, 5.0),
+        seen_share=0.0,
+        maps=SkyMapSettings(
+            families=("constant",),
+            height=256,
+            mean_radiance=(0.2, 2.0),
+            coloured_share=0.1,
+            sun_elevation_deg=(2.0, 75.0),
+            sun_to_sky=(0.5, 8.0),
+        ),
     ),
     excursions=(),
 )

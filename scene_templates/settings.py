@@ -11,12 +11,16 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated, Any, Literal
 
+import pydantic
+
 from scene_templates.cameras import CameraSettings
 from scene_templates.checks import OFFSET, require
 from scene_templates.families import Family
 from scene_templates.lights import LightSettings
 from scene_templates.materials import MaterialSettings
 from scene_templates.placement import PlacementSettings
+from scene_templates.skies.settings import SkySettings
+from scene_templates.textures import TextureSettings
 from storage.settings.changes import changed
 from storage.settings.described import checked
 from storage.settings.ranges import FLOAT32_MAX, Share, Within
@@ -85,15 +89,26 @@ class SceneSettings:
     """Placement of objects in the room."""
     materials: MaterialSettings = field(default_factory=MaterialSettings)
     """Materials of objects, floor and walls."""
+    textures: TextureSettings = field(default_factory=TextureSettings)
+    """Procedural textures of objects, floor and walls."""
     lights: LightSettings = field(default_factory=LightSettings)
     """Emitters of the scenes."""
     cameras: CameraSettings = field(default_factory=CameraSettings)
     """Cameras of the scenes."""
     views: ViewLaws = field(default_factory=ViewLaws)
     """Conditions that every view must meet."""
+    skies: SkySettings = field(default_factory=SkySettings)
+    """Light from all around; by default there is none."""
     excursions: tuple[Excursion, ...] = ()
     """Values beyond the usual ranges, for tests out of distribution: scenes take these excursions
     in turn, one each."""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `textures` and `skies` that no scene has: digests of earlier builds stay."""
+        record: dict[str, Any] = as_usual(self)
+        absent = {name for name in ("textures", "skies") if not record[name]["share"]}
+        return {name: value for name, value in record.items() if name not in absent}
 
     def __post_init__(self) -> None:
         require(len(self.families) > 0, "families", self.families, "at least one")

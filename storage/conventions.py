@@ -5,6 +5,11 @@ Colour: linear, Rec.709 primaries, scene-referred radiance. Only PNG previews ar
 Camera: `c2w` [4, 4] maps camera to world; it looks along -Z with +Y up (Blender, OpenGL, USD).
 `fov_deg` is the full angle, equal in width and height because pictures are square.
 Pictures: row 0 is the top, pixel (i, j) covers the square around its centre (j + 0.5, i + 0.5).
+Texture coordinates: u to the right and v up, both repeat. Row 0 of a texture is its BOTTOM: texel
+(i, j) of H x W has its centre at u = (j + 0.5) / W, v = (i + 0.5) / H. Readers of pictures, whose
+row 0 is the top, turn them over.
+Environment maps: latitude-longitude, linear radiance, +Z up; row 0 is the top (+Z), as of a
+picture. The centre of the picture is +X, u = 0.25 is +Y, u = 0.75 is -Y, both borders are -X.
 """
 
 import numpy as np
@@ -13,9 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from storage.errors import TrilightError
 
 SCHEMA_VERSION = 3
-"""Version of everything that Trilight stores; a change of meaning needs a new one."""
+"""Version of everything that Trilight stores and that holds no maps; a change of meaning needs a
+new one."""
 
-READABLE_VERSIONS = (2, 3)
+MAPS_VERSION = 4
+"""Version of what holds textures or an environment map: version 3, and those."""
+
+READABLE_VERSIONS = (2, 3, 4)
 """What this code reads. Version 2 is version 3 with the profile `lossless` alone."""
 
 SPLITS = ("train", "validation", "test")
@@ -27,7 +36,8 @@ HALF_FLOAT_MAX = 65504.0
 def require_readable(version: object, where: str) -> None:
     """Raise TrilightError unless `version` is among READABLE_VERSIONS; `where` names the file."""
     if version not in READABLE_VERSIONS:
-        readable = " and ".join(str(known) for known in READABLE_VERSIONS)
+        *others, last = map(str, READABLE_VERSIONS)
+        readable = f"{', '.join(others)} and {last}"
         raise TrilightError(
             f"{where}: schema version {version}; this Trilight reads {readable}. Use the release "
             "that made it, or make it again with `trilight generate`."
@@ -123,6 +133,31 @@ def pixel_places(
     return 0.5 * resolution + np.stack([local[..., 0], -local[..., 1]], axis=-1) * scale[..., None]
 
 
+def latlong_uv(directions: ArrayLike) -> NDArray[np.float64]:
+    """Return where an environment map holds directions: the inverse of `latlong_direction`.
+
+    Args:
+        directions: [..., 3] in the axes of the map, of any length but 0.
+
+    Returns:
+        u and v [..., 2] in [0, 1], float64; v is up, as everywhere: 1 at +Z, in the top row. At
+        the poles u is 0.5, or what rounding makes of it.
+    """
+    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    u = 0.5 - np.arctan2(y, x) / (2 * np.pi)
+    # of the two arcs, not of z alone: near the poles the arc cosine loses half of its digits
+    v = 1 - np.arctan2(np.hypot(x, y), z) / np.pi
+    return np.stack([u, v], axis=-1)
+
+
+def latlong_direction(uv: ArrayLike) -> NDArray[np.float64]:
+    """Return the unit directions [..., 3] that an environment map holds at u and v [..., 2]."""
+    u, v = np.moveaxis(np.asarray(uv, np.float64), -1, 0)
+    azimuth, polar = (0.5 - u) * 2 * np.pi, (1 - v) * np.pi
+    flat = np.sin(polar)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.cos(polar)], axis=-1)
+
+
 def log10_radiance(radiance_rgb: ArrayLike) -> NDArray:
     """Return log10(1 + radiance), the space of the network's output and of the noise floor."""
     return np.log10(1.0 + np.asarray(radiance_rgb))
@@ -138,6 +173,13 @@ def srgb8(linear: ArrayLike) -> NDArray[np.uint8]:
     clamped = np.clip(np.asarray(linear, np.float64), 0, 1)
     encoded = np.where(clamped <= 0.0031308, 12.92 * clamped, 1.055 * clamped ** (1 / 2.4) - 0.055)
     return np.round(encoded * 255).astype(np.uint8)
+
+
+def linear_from_srgb8() -> NDArray[np.float32]:
+    """Return the linear value [256] of every 8-bit sRGB value: the inverse of `srgb8`."""
+    coded = np.arange(256) / 255
+    linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
 
 
 def preview_srgb8(radiance_rgb: ArrayLike) -> NDArray[np.uint8]:

@@ -48,6 +48,20 @@ def object_psnr_log_db(a: ArrayLike, b: ArrayLike, hits: NDArray[np.bool_]) -> f
     return _db(_squared_log_error(a, b)[hits])
 
 
+def flicker_log_db(before: ArrayLike, now: ArrayLike) -> float:
+    """Return how calm an error is from one frame to the next, capped at MAX_DB; higher is calmer.
+
+    -10 log10 mean((E2 - E1)^2) of the errors E of log10(1 + radiance) of two frames in a row. What
+    the frames themselves show of motion is in both pictures of a frame, hence not in E. Errors that
+    have nothing to do with each other from frame to frame flicker 3 dB worse than they err.
+
+    Args:
+        before: log10(1 + radiance) of the frame before less that of its truth, any shape.
+        now: the same of this frame.
+    """
+    return _db(np.square(np.asarray(now, np.float64) - np.asarray(before, np.float64)))
+
+
 def _squared_log_error(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     difference = log10_radiance(np.asarray(a, np.float64)) - log10_radiance(
         np.asarray(b, np.float64)

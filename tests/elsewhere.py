@@ -57,6 +57,8 @@ CHOSEN = (
     "tests/pipeline/renders/test_stored_pictures.py",
     "tests/pipeline/scenes/test_compose.py",
     "tests/pipeline/scenes/test_shading.py",
+    "tests/scene_templates/skies/test_families.py",
+    "tests/scene_templates/surfaces/test_families.py",
     "tests/storage/test_metrics.py",
     "tests/storage/dataset/test_shard.py",
     "tests/train/data/test_augment.py",

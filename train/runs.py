@@ -57,13 +57,19 @@ def builtin() -> TrainSettings:
 
 
 def hits() -> TrainSettings:
-    """Return the run of a small network whose first hits and direct light are traced."""
+    """Return the run of a small network whose first hits and direct light are traced.
+
+    It asks no scene tokens: beside what is traced they bring nothing at this size (docs/log).
+    """
     return dataclasses.replace(
         builtin(),
         run="hits",
-        model=hits_smoke(),
-        num_steps=6_000,
+        model=dataclasses.replace(hits_smoke(), scene_tokens=False),
+        num_steps=2_400,
         views_per_scene=2,
+        ema_decay=0.998,
+        validate_every=200,
+        checkpoint_every=200,
         augmentation=AugmentationSettings(
             rotation="uniform",
             mirror=True,
@@ -72,6 +78,11 @@ def hits() -> TrainSettings:
             withheld_inputs=0.05,
         ),
     )
+
+
+def hits_tokens() -> TrainSettings:
+    """Return the run `hits` with the scene's tokens: what they bring is measured beside it."""
+    return dataclasses.replace(hits(), run="hits-tokens", model=hits_smoke())
 
 
 def hits_256() -> TrainSettings:
@@ -214,6 +225,7 @@ RUNS: Registry[Callable[[], TrainSettings]] = Registry(
         "smoke": smoke,
         "builtin": builtin,
         "hits": hits,
+        "hits-tokens": hits_tokens,
         "hits-256": hits_256,
         "pretrain": pretrain,
         "finetune": finetune,

@@ -12,6 +12,7 @@ from infra.bench.effort import CAREFUL, QUICK, Effort
 from infra.bench.experiment import Column, Experiment, Point
 from infra.bench.store import Run
 from storage.errors import TrilightError
+from storage.intervals import mean_interval
 
 COST_NOISE = 0.03
 """Costs that differ by less than this share count as equal: core-seconds vary by that much."""
@@ -39,6 +40,8 @@ class Row:
     """Value of each measured column, by name."""
     cost_ratio: float
     """The point's cost divided by the default's."""
+    intervals: Mapping[str, tuple[float, float]]
+    """The 95 % interval of each column over `pair`, by name."""
     cost_spread: Spread | None
     """The cost over the turns; None where it was not kept or there was one turn."""
     on_front: bool | None
@@ -63,6 +66,7 @@ def rows(experiment: Experiment, run: Run) -> list[Row]:
             point=point,
             values=values[point.name],
             cost_ratio=values[point.name][experiment.cost.name] / base,
+            intervals=_intervals(experiment, run, point.name),
             cost_spread=_cost_spread(experiment, run, point.name),
             on_front=front.get(point.name),
         )
@@ -97,6 +101,7 @@ def spread(values: Sequence[float]) -> Spread:
 _OVER: Mapping[str, Callable[[Sequence[float]], Any]] = {
     "median": np.median,
     "mean": np.mean,
+    "pair": np.mean,
     "least": np.min,
     "most": np.max,
     "p5": lambda values: np.percentile(values, 5),
@@ -129,36 +134,39 @@ def _values(experiment: Experiment, run: Run, point: str) -> dict[str, float]:
     clusters = [experiment.cluster(turn) for turn in whole]
     found = dict(run.columns.get(point, {}))
     for column in columns_of(experiment):
-        figures = [turn[column.figure] for turn in turns if column.figure in turn]
+        figures = (
+            _differences(column, run, point)
+            if column.over == "pair"
+            else [turn[column.figure] for turn in turns if column.figure in turn]
+        )
         if figures:
             value = _over(column, figures, clusters)
             found[column.name] = column.then(value) if column.then else value
     return found
 
 
+def _differences(column: Column, run: Run, point: str) -> list[float]:
+    """Return a point's figures less the rival's, turn by turn; none of the rival itself."""
+    rival = run.plan.get("rival", point)
+    if rival == point:
+        return []
+    turns = [run.turns[turn] for turn in run.whole_turns()]
+    return [turn[point][column.figure] - turn[rival][column.figure] for turn in turns]
+
+
+def _intervals(experiment: Experiment, run: Run, point: str) -> dict[str, tuple[float, float]]:
+    clusters = [experiment.cluster(turn) for turn in run.whole_turns()]
+    return {
+        column.name: mean_interval(differences, clusters)
+        for column in columns_of(experiment)
+        if column.over == "pair" and (differences := _differences(column, run, point))
+    }
+
+
 def _over(column: Column, figures: Sequence[float], clusters: Sequence[str]) -> float:
     if column.over in ("low", "high"):
         return mean_interval(figures, clusters)[column.over == "high"]
     return float(_OVER[column.over](figures))
-
-
-def mean_interval(figures: Sequence[float], clusters: Sequence[str]) -> tuple[float, float]:
-    """Return the 95 % interval of a mean whose figures are alike within clusters.
-
-    It is bootstrapped over whole clusters (2000 times, of a fixed seed).
-
-    Args:
-        figures: one for each turn.
-        clusters: the name of each turn's cluster.
-    """
-    names = sorted(set(clusters))
-    rows = np.array([names.index(name) for name in clusters])
-    sums = np.bincount(rows, weights=np.asarray(figures, np.float64))
-    counts = np.bincount(rows)
-    drawn = np.random.default_rng(0).integers(len(names), size=(2000, len(names)))
-    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)
 
 
 def _cost_spread(experiment: Experiment, run: Run, point: str) -> Spread | None:

@@ -73,6 +73,10 @@ QUICK = dataclasses.replace(
 )  # fmt: skip
 
 
+_WEIGHTS = "model.safetensors"
+"""File of weights in the folder of a run."""
+
+
 @checked()
 class Asked:
     """The inputs of the experiments."""
@@ -83,10 +87,24 @@ class Asked:
     """Licences of objects to allow in addition to the usual ones; by default there are none."""
     scenes: Path | None = None
     """Folder of RenderFormer scenes to render as well; by default none."""
-    checkpoint: str = "builtin:"
-    """Network to measure; by default the one that comes with Trilight."""
+    checkpoint: tuple[str, ...] = ("builtin:",)
+    """Networks to measure; by default the one that comes with Trilight. Experiments on one network
+    take the first, and those that compare pair every other row with it."""
     data: str | None = None
     """Finished dataset (a folder or a URL) for the experiment economy; by default none."""
+
+    @property
+    def network(self) -> str:
+        """The first network."""
+        return self.checkpoint[0]
+
+    @property
+    def network_names(self) -> tuple[str, ...]:
+        """What networks are called: by the folder of a run, and by no path of this machine."""
+        places = [Path(place) for place in self.checkpoint]
+        return tuple(
+            place.parent.name if place.name == _WEIGHTS else place.name for place in places
+        )
 
     @property
     def allowed_licences(self) -> tuple[str, ...]:

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from infra.bench.effort import Effort
+from infra.bench.effort import Asked, Effort
+from storage.errors import TrilightError
 
 if TYPE_CHECKING:
     from infra.bench.workshop import Workshop
@@ -19,9 +20,10 @@ Figures = Mapping[str, float]
 TurnFigures = Iterable[tuple[str, Figures]]
 """The figures of every point in one turn, in order, by the name of the point."""
 
-Over = Literal["median", "mean", "least", "most", "p5", "p95", "low", "high"]
+Over = Literal["median", "mean", "least", "most", "p5", "p95", "low", "high", "pair"]
 """How the figures of all turns become one number; `low` and `high` bound the mean: its 95 %
-interval, bootstrapped over clusters of turns."""
+interval, bootstrapped over clusters of turns. `pair` is the mean of the differences to the run's
+rival, turn by turn, and has its interval beside it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +73,10 @@ class Experiment:
     """The first column; above 0."""
     points: Callable[[Effort], Sequence[Point]]
     """The points, in the order of the table."""
+    asked_points: Callable[[Asked], Sequence[Point]] = lambda asked: ()
+    """Points of what the user asks for, before the others."""
+    rival: Callable[[Asked], str] | None = None
+    """Names the point that columns over `pair` take the others' differences to."""
     turns: Callable[[Effort], Sequence[str]]
     """Scenes, objects or repeats: in each turn every point is measured once."""
     measure: Measure = field(repr=False)
@@ -85,6 +91,9 @@ class Experiment:
     """Further columns."""
     also_cost: tuple[str, ...] = ()
     """Further columns that count as costs: a point cheaper in any of them is not dominated."""
+    kind: Callable[[str], str] | None = None
+    """Names what a point is one of. The figure then shows every cost as a series of its own, in
+    its unit, and a colour for each kind; without it, cost ratios."""
     because: str = ""
     """The default and its reason, or what the figures mean."""
     covers: tuple[str, ...] = ()
@@ -98,6 +107,22 @@ class Experiment:
     """Whether the scenes of the user's folder are turns as well."""
     needs: tuple[Literal["torch", "blender", "data"], ...] = ()
     """What the machine or the user has to provide."""
+
+
+def points_of(experiment: Experiment, effort: Effort, asked: Asked) -> list[Point]:
+    """Return all points of an experiment, in the order of the table.
+
+    Raises:
+        TrilightError: two have one name.
+    """
+    points = [*experiment.asked_points(asked), *experiment.points(effort)]
+    names = [point.name for point in points]
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise TrilightError(
+            f"bench {experiment.name}: {twice[0]!r} is there twice; expected each network once, in "
+            "folders of different names."
+        )
+    return points
 
 
 def percent(share: float) -> float:

@@ -9,16 +9,17 @@ import dataclasses
 import importlib.util
 import time
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from infra.bench.effort import Asked, Effort
-from infra.bench.experiment import Experiment
+from infra.bench.experiment import Experiment, points_of
 from infra.bench.machine import ROOT, machine
 from infra.bench.plot import plot
 from infra.bench.store import Run, Store
 from infra.bench.subjects.named_scenes import described
 from infra.bench.workshop import Workshop
 from pipeline.isolation import ChildFailed
+from storage.digests import sha256_hex
 from storage.errors import Rejected, TrilightError
 
 RESULTS = ROOT / "docs" / "bench"
@@ -89,22 +90,35 @@ def _plan(experiment: Experiment, effort: Effort, asked: Asked) -> dict[str, obj
         from infra.bench.sides.blender_environment import blender_python
 
         blender_python()  # before anything is measured
-    wanted = {**dataclasses.asdict(asked), "scenes": asked.scenes.name if asked.scenes else None}
+    # results are published, and nobody's folders with them
+    wanted = {
+        **dataclasses.asdict(asked),
+        "scenes": asked.scenes.name if asked.scenes else None,
+        "checkpoint": asked.network_names,
+        "data": _named(asked.data) if asked.data else None,
+    }
     folder = described(asked.scenes) if experiment.takes_scenes else []
+    rival = {"rival": experiment.rival(asked)} if experiment.rival else {}
     return {
         "experiment": experiment.name,
         "effort": dataclasses.asdict(effort),
         "asked": wanted,
         "machine": machine(),
-        "points": [point.name for point in experiment.points(effort)],
+        "points": [point.name for point in points_of(experiment, effort, asked)],
         "turns": [*(named.name for named in folder), *experiment.turns(effort)],
+        **rival,
     }
+
+
+def _named(data: str) -> str:
+    """Return the name of a dataset's root, with what tells it from others of that name."""
+    return f"{PurePosixPath(data).name} ({sha256_hex(data.encode())[:8]})"
 
 
 def _measure(
     experiment: Experiment, current: Run, store: Store, workshop: Workshop, turn_done: TurnDone
 ) -> None:
-    points = experiment.points(workshop.effort)
+    points = points_of(experiment, workshop.effort, workshop.asked)
     missing, total = current.missing_turns(), len(current.plan["turns"])
     if experiment.warm_up and missing:
         for _ in experiment.measure(workshop, points, missing[0]):

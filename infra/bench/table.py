@@ -18,10 +18,16 @@ def shown(value: float) -> str:
 
 
 def shown_in(column: Column, row: Row) -> str:
-    """Return one cell: decibels with one digit behind the point, n/a for what is not known."""
+    """Return one cell: decibels with one digit behind the point, n/a for what is not known.
+
+    A mean difference has its 95 % interval behind it.
+    """
     value = row.values.get(column.name)
     if value is None:
-        return "n/a"
+        return "" if column.over == "pair" else "n/a"
+    if column.name in row.intervals:
+        low, high = row.intervals[column.name]
+        return f"{value:+.1f} ({low:.1f} to {high:.1f})"
     return f"{value:.1f}" if "dB" in column.name else shown(value)
 
 

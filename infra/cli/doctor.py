@@ -9,6 +9,7 @@ from rich.text import Text
 
 from infra.cli.console import console, first_words, print_json
 from infra.cli.options import Shown, command
+from storage.settings.described import checked
 
 if TYPE_CHECKING:
     from infra.doctor import Finding
@@ -18,8 +19,17 @@ _WIDTHS = (7, 16)
 """Widths of the columns state and name: rows are printed one by one, as they are found."""
 
 
+@checked()
+class Looked:
+    """What is looked at."""
+
+    measure: bool = False
+    """Measure as well what previews take here, for --seconds and --error of trilight render: about
+    half a minute on a machine that does nothing else."""
+
+
 @command()
-def doctor(shown: Shown) -> None:
+def doctor(looked: Looked, shown: Shown) -> None:
     first_words("Looking at this machine", silent=shown.json)
     from infra.doctor import examine
 
@@ -29,10 +39,25 @@ def doctor(shown: Shown) -> None:
             findings.append(finding)
             if not shown.json:
                 console.print(_row(finding))
+    if looked.measure:
+        findings.append(_measured(silent=shown.json))
     if shown.json:
         print_json([asdict(finding) for finding in findings])
     if any(finding.state == "missing" for finding in findings):
         sys.exit(1)
+
+
+def _measured(*, silent: bool) -> "Finding":
+    from infra.bench.sides.machine_costs import measured_costs
+    from infra.doctor import Finding
+    from infra.rendering.way_table import keep_machine_costs, shipped_table
+
+    with console.status("measuring previews"):
+        path = keep_machine_costs(measured_costs(shipped_table()))
+    finding = Finding(name="previews", state="ok", found=f"measured, and kept in {path}")
+    if not silent:
+        console.print(_row(finding))
+    return finding
 
 
 def _row(finding: "Finding") -> Table:

@@ -27,6 +27,7 @@ def evaluate(order: EvaluationOrder, shown: Shown) -> None:
             train_data=order.train_data or None,
             resolution=order.resolution,
             most_scenes=order.most_scenes,
+            tracer_views=order.tracer_views,
             lpips=order.lpips,
             device=order.device,
             done=lambda now, total: bars.update(task, completed=now, total=total),
@@ -35,13 +36,14 @@ def evaluate(order: EvaluationOrder, shown: Shown) -> None:
     found = judgement.record
     write_judgement(judgement, order.out)
     if shown.json:
-        print_json({name: found[name] for name in ("about", "contestants")})
+        print_json({name: found[name] for name in ("about", "contestants", "path tracer")})
     else:
         _report(found, order.out)
 
 
 def _report(found: dict[str, Any], out: Path) -> None:
     from train.evaluation.metrics import METRICS
+    from train.evaluation.same_time import sentences
 
     contestants = found["contestants"]
     table = Table(box=None, title_justify="left", header_style="dim")
@@ -58,4 +60,6 @@ def _report(found: dict[str, Any], out: Path) -> None:
         "within 3 dB of the noise", *("" if share is None else f"{share:.1%}" for share in near)
     )
     console.print(table)
+    for sentence in sentences(found["path tracer"]):
+        console.print(sentence, soft_wrap=True)
     look_at(f"Read {out / 'evaluation.md'}, look at {out / 'worst.png'}")

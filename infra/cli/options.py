@@ -30,6 +30,7 @@ ALIASES = {
     "arc_deg": "--arc",
     "begin_with": "--from",
     "changes": "--set",
+    "error_db": "--error",
     "exposure_ev": "--exposure",
     "min_noise_floor_db": "--min-noise-floor",
     "most_unusable": "--skip-unusable",

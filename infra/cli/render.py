@@ -4,12 +4,14 @@ import time
 from typing import TYPE_CHECKING
 
 from rich.progress import Progress
+from rich.text import Text
 
 from infra.cli.console import progress_bars
 from infra.cli.options import Shown, command
 from infra.rendering.request import Asked
 
 if TYPE_CHECKING:
+    from infra.rendering.ways import Choice
     from pipeline.renders.renderer import Sampling
 
 
@@ -32,6 +34,10 @@ class _Bars:
         self._pictures = bars.add_task("pictures", total=None, note="", visible=False)
         self._samples = bars.add_task("samples", total=None, note="", visible=False)
         self._visible = visible
+
+    def chosen(self, choice: "Choice") -> None:
+        if self._visible:
+            self._bars.console.print(Text(choice.sentence), soft_wrap=True)
 
     def pictures(self, done: int, total: int) -> None:
         self._bars.update(self._pictures, completed=done, total=total, visible=self._visible)

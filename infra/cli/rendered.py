@@ -42,7 +42,7 @@ def print_outcome(outcome: RenderOutcome, seconds: float, *, as_json: bool) -> N
     """Print files and figures: of the only picture, or summed up over all."""
     plan = outcome.plan
     if as_json:
-        shots = [_shot_json(shot) for shot in outcome.shots]
+        shots = [_shot_json(shot, timed=plan.choice is not None) for shot in outcome.shots]
         common = {
             "engine": plan.engine,
             "notes": list(outcome.notes),
@@ -51,6 +51,8 @@ def print_outcome(outcome: RenderOutcome, seconds: float, *, as_json: bool) -> N
             "source": plan.source,
             "view": plan.view,
         }
+        if plan.choice is not None:
+            common["choice"] = plan.choice.sentence
         if not plan.place.is_sequence:
             print_json({**common, **shots[0]})
             return
@@ -65,10 +67,11 @@ def print_outcome(outcome: RenderOutcome, seconds: float, *, as_json: bool) -> N
         _print_one(plan, outcome.shots[0], seconds)
 
 
-def _shot_json(done: FinishedShot) -> dict[str, Any]:
+def _shot_json(done: FinishedShot, *, timed: bool) -> dict[str, Any]:
     """Return the figures of one shot; with one engine they stand beside those of the scene."""
     of_engines: Mapping[str, Any] = {
         name: {**picture.facts, "exr": str(picture.path), "kept": picture.was_kept}
+        | ({"picture_seconds": _rounded(picture.seconds)} if timed else {})
         for name, picture in done.pictures.items()
     }
     for facts in of_engines.values():
@@ -106,6 +109,7 @@ def _print_one(plan: RenderPlan, done: FinishedShot, seconds: float) -> None:
         rows += _engine(engine, done.pictures[engine.name].facts)
     if done.psnr_log_db is not None:
         rows.append(("agreement", f"{done.psnr_log_db:.1f} dB (psnr_log_db)"))
+    rows += _taken(plan, [done])
     rows += [("wall time", f"{seconds:.1f} s"), ("scene digest", scene.digest)]
     print_rows("Rendered", rows)
     measure = " and ".join(str(picture.path) for picture in done.pictures.values())
@@ -177,11 +181,26 @@ def _print_sequence(plan: RenderPlan, shots: Sequence[FinishedShot], seconds: fl
         rows += _spread("noise floor" if metric == "psnr_log_db" else "", values, metric)
     rows += _spread("agreement", agreements, "psnr_log_db")
     rows += _flicker([shot.flicker for shot in shots if shot.flicker is not None])
+    rows += _taken(plan, shots)
     rows.append(("wall time", f"{seconds:.1f} s"))
     print_rows("Rendered", rows)
     folder = plan.place.folder
     look = plan.place.video or folder
     _print_last(f"Look at {look}; measure with the pictures in {folder}", floors)
+
+
+def _taken(plan: RenderPlan, shots: Sequence[FinishedShot]) -> Rows:
+    """Return what pictures took beside what was expected, where a way was chosen by that."""
+    taken = [each.seconds for shot in shots for each in shot.pictures.values() if each.seconds]
+    if plan.choice is None or not taken:
+        return []
+    which = "" if len(taken) == 1 else f"median of {len(taken)}: "
+    text = f"{which}{np.median(taken):.2g} s after start-up"
+    return [("picture took", f"{text}; expected {plan.choice.priced.seconds:.2g} s")]
+
+
+def _rounded(seconds: float | None) -> float | None:
+    return None if seconds is None else float(f"{seconds:.4g}")
 
 
 def _spread(name: str, values_db: Sequence[float], metric: str) -> Rows:

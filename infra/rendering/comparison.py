@@ -1,9 +1,7 @@
 """Two engines' pictures of one view: side by side, and how their difference flickers.
 
-An error that stays where it is on the screen is hardly seen in motion; one that jumps is. With E
-the error of log10(1 + radiance) of a frame, flicker is the root mean square of the difference of E
-between two frames in a row, as a PSNR of peak 1. Errors that have nothing to do with each other
-from frame to frame flicker 3 dB worse than they err.
+An error that stays where it is on the screen is hardly seen in motion; one that jumps is
+(storage.metrics.flicker_log_db).
 """
 
 from dataclasses import dataclass
@@ -15,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from infra.rendering.look import Look, enlarged, shown
 from pipeline.exchange.formats import FORMATS, SceneSource
 from storage.conventions import log10_radiance
-from storage.metrics import psnr_log_db
+from storage.metrics import flicker_log_db, psnr_log_db
 from train.evaluation.sheet import ERROR_WHITE, error_picture
 
 _CAPTION_PX, _GAP_PX, _FONT_PX = 24, 8, 14
@@ -54,9 +52,8 @@ def flicker(before: Frame | None, now: Frame) -> Flicker | None:
     """Return the flicker from one frame to the next; None where the scenes are strangers."""
     if before is None or not _goes_on(before.source, now.source):
         return None
-    change = np.mean((now.error_RR3 - before.error_RR3) ** 2, dtype=np.float64)
     noise = 10 ** (-before.noise_floor_db / 10) + 10 ** (-now.noise_floor_db / 10)
-    return Flicker(db=_db(float(change)), noise_db=_db(noise))
+    return Flicker(db=flicker_log_db(before.error_RR3, now.error_RR3), noise_db=_db(noise))
 
 
 def comparison_sheet(

@@ -4,6 +4,7 @@ A plan of an engine is what a command decided about it; `start` loads what it ne
 engine opens one scene after the other, and an opened scene gives the pictures of its cameras.
 """
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,6 +50,8 @@ class OpenedScene:
     """What a person should know of this scene with this engine."""
     render: Callable[[ShotCamera, str], Rendered]
     """Returns the picture of a camera. Its name stands in the TrilightError of a failure."""
+    seconds: float
+    """Wall-clock seconds that taking it took, the start of a process aside."""
 
 
 class Engine(Protocol):
@@ -110,8 +113,8 @@ class MitsubaPlan:
         found = []
         if isinstance(self.settings, PreviewSettings):
             found.append(
-                "the error of a preview is not measured: leave --spp out for a picture with a "
-                "noise floor"
+                "the error of a preview is not measured, so that its noise floor is unknown: "
+                "--noise-floor 40 measures it and samples on to it"
             )
         elif any(int(facts["spp"]) < FIRST_SPP for facts in pictures):
             found.append(f"below {FIRST_SPP} samples the measured noise floor may flatter")
@@ -128,10 +131,13 @@ class MitsubaEngine:
         self.identity = tracer.identity
 
     def open(self, scene: Scene, name: str) -> OpenedScene:
+        self._tracer.wake(name)
+        began = time.perf_counter()
         self._tracer.open(scene, name)
+        seconds = time.perf_counter() - began
         unread = ", ".join(unread_columns(scene.materials, PUBLISHED_COLUMNS))
         notes = (f"{name}: the path tracer does not read {unread}",) if unread else ()
-        return OpenedScene(notes=notes, render=self._render)
+        return OpenedScene(notes=notes, render=self._render, seconds=seconds)
 
     def _render(self, camera: ShotCamera, name: str) -> Rendered:
         if self._is_preview:
@@ -218,7 +224,9 @@ class NeuralEngine:
 
     def open(self, scene: Scene, name: str) -> OpenedScene:
         renderer, plan = self._renderer, self._plan
+        began = time.perf_counter()
         prepared = renderer.prepare(scene, lights_per_pass=plan.lights_per_pass)
+        seconds = time.perf_counter() - began
 
         def render(camera: ShotCamera, name: str) -> Rendered:
             picture = renderer.view(
@@ -237,7 +245,9 @@ class NeuralEngine:
 
         of_scene = tuple(f"{name}: {note}" for note in prepared.notes)
         return OpenedScene(
-            notes=of_scene + renderer.resolution_notes(plan.resolution), render=render
+            notes=of_scene + renderer.resolution_notes(plan.resolution),
+            render=render,
+            seconds=seconds,
         )
 
     def close(self) -> None:

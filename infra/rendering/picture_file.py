@@ -71,6 +71,9 @@ class PictureFile:
     """Whether it was there already."""
     is_black: bool
     """Whether it shows nothing at all."""
+    seconds: float | None = None
+    """Wall-clock seconds that it took, with its scene where it is the first picture of it; None
+    where it was kept."""
 
 
 def kept_picture(path: Path, wanted: Request) -> tuple[PictureFile, Radiance] | None:

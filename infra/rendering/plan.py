@@ -1,5 +1,6 @@
 """All that one call of `trilight render` will do: decided once, before any picture is made."""
 
+import importlib.util
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ from infra.rendering.look import Look
 from infra.rendering.places import PicturePlaces, place
 from infra.rendering.request import Asked, EngineChoice
 from infra.rendering.sources import scene_sources
+from infra.rendering.way_table import known_costs, shipped_table
+from infra.rendering.ways import Choice, Way, chosen_way, priced_ways
 from infra.torch_library import require_torch
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
@@ -67,6 +70,8 @@ class RenderPlan:
     """Picture by picture; shots of one scene follow each other."""
     fps: int
     """Pictures a second of the video, if there is one."""
+    choice: Choice | None = None
+    """How the way to the pictures was chosen, where seconds or an error were asked for."""
 
 
 def plan_render(asked: Asked, reader: SceneReader) -> RenderPlan:
@@ -83,17 +88,22 @@ def plan_render(asked: Asked, reader: SceneReader) -> RenderPlan:
         scene_source(asked.source)  # a wrong name is said before any library is loaded
     where = place(asked.out)
     pairs = _pairs(asked, reader) if where.is_sequence else _one_pair(asked)
-    engines = _engines(asked, settings, checkpoint)
+    choice = _choice(asked, pairs, resolution)
+    if choice is None:
+        engines = _engines(asked, settings, checkpoint)
+    else:
+        engines = [_engine_of(choice.priced.way, asked, resolution)]
     return RenderPlan(
         source=asked.source,
         view=asked.view,
-        engine=asked.engine,
+        engine=asked.engine if choice is None else choice.engine,
         engines=engines,
         resolution=settings.resolution,
         look=look,
         place=where,
         shots=list(shots(pairs, where, [engine.name for engine in engines])),
         fps=asked.fps,
+        choice=choice,
     )
 
 
@@ -126,10 +136,14 @@ def _network_and_width(asked: Asked) -> tuple[str | None, int]:
     checkpoint = asked.checkpoint or BUILTIN
     if asked.resolution is not None:
         return checkpoint, asked.resolution
-    return checkpoint, find_network(checkpoint, network_of_run).trained.resolution or _RESOLUTION
+    found = find_network(checkpoint, network_of_run)
+    return checkpoint, _RESOLUTION if found.any_width else found.trained.resolution or _RESOLUTION
 
 
 def _settings(asked: Asked, resolution: int) -> RenderSettings | PreviewSettings:
+    """Return how pictures are made; for a choice the least preview, until pictures are counted."""
+    if asked.seconds is not None or asked.error_db is not None:
+        return PreviewSettings(resolution=resolution, spp=1)
     if asked.spp is not None:
         usual: Filtered = "fast" if asked.spp <= FAST_SPP else "high"
         return PreviewSettings(
@@ -151,24 +165,61 @@ def _engines(
 ) -> list[EnginePlan]:
     engines = list[EnginePlan]()
     if asked.engine != "neural":
-        mitsuba = MitsubaPlan(
-            settings=settings,
-            seed=asked.seed,
-            threads=asked.threads or os.cpu_count() or 1,
-            variant=choose_variant(),
-        )
-        engines.append(mitsuba)
+        engines.append(_mitsuba(asked, settings))
     if checkpoint is not None:
-        neural = NeuralPlan(
-            checkpoint=checkpoint,
-            precision=asked.precision,
-            resolution=settings.resolution,
-            lights_per_pass=asked.lights_per_pass,
-            skip_empty_bundles=asked.skip_empty_bundles,
-            threads=asked.threads,
-        )
-        engines.append(neural)
+        engines.append(_neural(asked, checkpoint, settings.resolution))
     return engines
+
+
+def _engine_of(way: Way, asked: Asked, resolution: int) -> EnginePlan:
+    """Return the engine of a way that was chosen."""
+    if way.rung == "network":
+        from model.open import BUILTIN_TOKENS
+
+        return _neural(asked, BUILTIN_TOKENS, resolution)
+    settings = PreviewSettings(resolution=resolution, spp=way.spp, denoiser=way.denoiser)
+    return _mitsuba(asked, settings)
+
+
+def _mitsuba(asked: Asked, settings: RenderSettings | PreviewSettings) -> MitsubaPlan:
+    return MitsubaPlan(
+        settings=settings,
+        seed=asked.seed,
+        threads=asked.threads or os.cpu_count() or 1,
+        variant=choose_variant(),
+    )
+
+
+def _neural(asked: Asked, checkpoint: str, resolution: int) -> NeuralPlan:
+    return NeuralPlan(
+        checkpoint=checkpoint,
+        precision=asked.precision,
+        resolution=resolution,
+        lights_per_pass=asked.lights_per_pass,
+        skip_empty_bundles=asked.skip_empty_bundles,
+        threads=asked.threads,
+    )
+
+
+def _choice(
+    asked: Asked, pairs: Sequence[tuple[SceneSource, ShotCamera | int]], resolution: int
+) -> Choice | None:
+    """Return the way that seconds or an error choose, where one of them was asked for."""
+    if asked.seconds is None and asked.error_db is None:
+        return None
+    table, known = shipped_table(), known_costs(choose_variant())
+    cores = os.cpu_count() or 1
+    ways = priced_ways(
+        table,
+        known.costs,
+        width=resolution,
+        threads=min(asked.threads or cores, cores),
+        per_scene=len(pairs) / len({source for source, _ in pairs}),
+        network=importlib.util.find_spec("torch") is not None,
+    )
+    return chosen_way(
+        ways, table, known, seconds=asked.seconds, error_db=asked.error_db, width=resolution
+    )
 
 
 def _one_pair(asked: Asked) -> list[tuple[SceneSource, ShotCamera | int]]:

@@ -8,6 +8,7 @@ from pipeline.exchange.from_description import AlbedoOverOne
 from pipeline.renders.preview import MOST_SPP
 from pipeline.renders.settings import Filtered, NoiseFloor, Resolution, Samples
 from storage.errors import TrilightError
+from storage.metrics import MAX_DB
 from storage.settings.described import checked
 from storage.settings.ranges import Seed, Within
 
@@ -30,8 +31,8 @@ class Asked:
     checkpoint: str | None = None
     """neural: model.safetensors of a run; by default the small network that comes with Trilight."""
     resolution: Resolution | None = None
-    """Width of a picture in pixels; by default 512, or with a network the width that it was trained
-    on."""
+    """Width of a picture in pixels; by default 512, or with a network of ray bundles the width that
+    it was trained on."""
     noise_floor_db: NoiseFloor | None = None
     """mitsuba: sampling stops at this measured noise floor in dB (psnr_log_db; higher is cleaner);
     by default 40, unless another floor is asked for. Of several, all are reached."""
@@ -46,6 +47,12 @@ class Asked:
     spp: Annotated[int | None, Within(1, MOST_SPP, unit="samples")] = None
     """mitsuba: a preview of exactly so many samples per pixel and one denoise, whose error is not
     measured; by default sampling goes on to the noise floor."""
+    seconds: Annotated[float | None, Within(0, 1e9, low_open=True, unit="seconds")] = None
+    """mitsuba: the preview of least expected error that takes so many seconds a picture after
+    start-up; by default nothing is chosen by time."""
+    error_db: Annotated[float | None, Within(0, MAX_DB, unit="dB")] = None
+    """mitsuba: the quickest preview whose expected error is this many dB (psnr_log_db, in the
+    median of measured scenes); by default nothing is chosen by it."""
     denoiser: Filtered | None = None
     """mitsuba with --spp: Open Image Denoise with its fast or its high filter, or off; by default
     fast up to 16 samples and high beyond."""
@@ -111,15 +118,22 @@ class Asked:
             "--split-lobes": self.split_lobes or None,
         }
         asked = [name for name, value in floors.items() if value is not None]
-        if self.spp is not None and asked:
-            raise TrilightError(
-                f"--spp is {self.spp} beside {asked[0]}; expected one of them: a preview measures "
-                "nothing and keeps nothing apart."
-            )
+        previews = {"--spp": self.spp, "--seconds": self.seconds, "--error": self.error_db}
+        wanted = [(name, value) for name, value in previews.items() if value is not None]
         if self.spp is None and self.denoiser is not None:
             raise TrilightError(f"--denoiser is {self.denoiser}; expected --spp beside it.")
-        if self.spp is not None and self.engine != "mitsuba":
+        if not wanted:
+            return
+        said = "{} is {:g}".format(*wanted[0])
+        if asked:
             raise TrilightError(
-                f"--spp is {self.spp} beside --engine {self.engine}; expected --engine mitsuba: a "
-                "network takes no samples, and a preview is nothing to judge one by."
+                f"{said} beside {asked[0]}; expected one of them: a preview measures nothing and "
+                "keeps nothing apart."
+            )
+        if len(wanted) > 1:
+            raise TrilightError(f"{said} beside {wanted[1][0]}; expected one of them.")
+        if self.engine != "mitsuba":
+            raise TrilightError(
+                f"{said} beside --engine {self.engine}; expected --engine mitsuba: a network takes "
+                "no samples, and a preview is nothing to judge one by."
             )

@@ -1,6 +1,8 @@
 """One call of `trilight render`: a plan, and then every picture of it, made or kept."""
 
+import dataclasses
 import itertools
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -20,6 +22,7 @@ from infra.rendering.picture_file import (
 from infra.rendering.plan import RenderPlan, Shot, plan_render
 from infra.rendering.request import Asked
 from infra.rendering.video import write_video
+from infra.rendering.ways import Choice
 from pipeline.documents.png import encode_png
 from pipeline.exchange.reader import SceneReader
 from storage.atomic import write_atomically
@@ -72,6 +75,9 @@ class RenderOutcome:
 class RenderWatcher(Protocol):
     """Is told how far a render is."""
 
+    def chosen(self, choice: Choice) -> None:
+        """The way to the pictures was chosen."""
+
     def pictures(self, done: int, total: int) -> None:
         """So many pictures are finished."""
 
@@ -93,6 +99,9 @@ def carry_out(plan: RenderPlan, reader: SceneReader, watcher: RenderWatcher) -> 
             cannot be written.
     """
     finished, notes = list[FinishedShot](), dict[str, None]()
+    choice = plan.choice
+    if choice is not None:
+        watcher.chosen(choice)
     before: Frame | None = None
     with ExitStack() as stack:
         engines = {
@@ -101,7 +110,10 @@ def carry_out(plan: RenderPlan, reader: SceneReader, watcher: RenderWatcher) -> 
         }
         watcher.pictures(0, len(plan.shots))
         for scene, shot in _with_scenes(plan.shots, reader):
-            made = {name: _picture(shot, name, engine, scene) for name, engine in engines.items()}
+            made = {
+                name: _picture(shot, name, engine, scene, choice)
+                for name, engine in engines.items()
+            }
             done, before = _finish(shot, scene.identity, made, plan.look, before)
             finished.append(done)
             notes |= dict.fromkeys(scene.notes)
@@ -140,7 +152,7 @@ def _with_scenes(shots: Sequence[Shot], reader: SceneReader) -> Iterator[tuple[_
 
 
 def _picture(
-    shot: Shot, name: str, engine: Engine, at_hand: _SceneAtHand
+    shot: Shot, name: str, engine: Engine, at_hand: _SceneAtHand, choice: Choice | None
 ) -> tuple[PictureFile, Radiance]:
     """Return the picture of one engine, which is kept or made."""
     view = shot.camera if isinstance(shot.camera, int) else None
@@ -156,11 +168,18 @@ def _picture(
     kept = kept_picture(shot.exrs[name], wanted) if shot.keep else None
     if kept is not None:
         return kept
+    seconds = 0.0
     if name not in at_hand.opened:
         at_hand.opened[name] = engine.open(at_hand.scene, shot.source.name)
         at_hand.notes.extend(at_hand.opened[name].notes)
+        seconds = at_hand.opened[name].seconds
+    began = time.perf_counter()
     rendered = at_hand.opened[name].render(camera, shot.name)
-    return write_picture(shot.exrs[name], wanted, rendered)
+    seconds += time.perf_counter() - began
+    if choice is not None:
+        rendered = dataclasses.replace(rendered, facts={**rendered.facts, **choice.facts})
+    written, radiance_rgb = write_picture(shot.exrs[name], wanted, rendered)
+    return dataclasses.replace(written, seconds=seconds), radiance_rgb
 
 
 def _finish(

@@ -1,7 +1,9 @@
-"""Ships a trained network: `model/builtin/`, its weights and its card.
+"""Ships a trained network: a folder of `model/builtin/`, its weights and its card.
 
     trilight evaluate RUN --data SET --split test --out EVALUATION
     python -m infra.setup.builtin_network RUN --data SET --evaluation EVALUATION --command "..."
+
+With `--also OTHER`, evaluations of it on other sets, such as benchmark-v1, stand on the card too.
 
 Only data of objects that ask for nothing (CC0) may be behind it, and only a small file is shipped.
 """
@@ -14,7 +16,7 @@ from typing import Annotated, Any
 import cyclopts
 from cyclopts import Parameter
 
-from model.open import BUILTIN, BUILTIN_WEIGHTS
+from model.open import BUILTIN_NETWORKS
 from model.weights import decode_weights, network_digest
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, open_dataset
@@ -22,19 +24,25 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import read_objects_lock
 from train.evaluation.judged_view import NETWORK
+from train.evaluation.same_time import sentences
 from train.folder import RunFolder
 
-MOST_BYTES = 8_000_000
+MOST_BYTES = 10_000_000
 """Of the weights: everybody who clones the project gets them."""
 
-_HEAD = (
-    f"# The network that comes with Trilight (`{BUILTIN}`)",
-    "",
-    "What `trilight render --engine neural` uses where no other is named: small enough to ship and "
-    "to train on two processor cores, and as blurred as that makes it. It shows that everything "
-    "works, and is something to beat; it does not replace the path tracer.",
-    "",
-)
+_HEADS = {
+    "builtin:hits": (
+        "What `trilight render --engine neural` uses where no other is named: first hits, direct "
+        "light and one bounce are traced, and the network filters what is noisy and learns what is "
+        "left out. Small enough to ship and to train on two processor cores in an hour."
+    ),
+    "builtin:tokens": (
+        "RenderFormer as published, small enough to ship and to train on two processor cores, and "
+        "as blurred as that makes it. It shows that everything works, and is something to beat; it "
+        "does not replace the path tracer."
+    ),
+}
+"""What each network that comes along is for, by its name."""
 
 ALLOWED_LICENCES = {"CC0-1.0"}
 
@@ -44,6 +52,8 @@ def main(
     data: Annotated[str, Parameter(help="root of the dataset that it learned from")],
     evaluation: Annotated[Path, Parameter(help="folder that `trilight evaluate` wrote")],
     command: Annotated[str, Parameter(help="how the dataset was made, for the card")],
+    also: Annotated[tuple[Path, ...], Parameter(help="folders of other evaluations of it")] = (),
+    name: Annotated[str, Parameter(help="by which it will be opened")] = "builtin:hits",
 ) -> None:
     """Copy the weights and write the card."""
     folder, dataset = RunFolder(run), open_dataset(data)
@@ -51,10 +61,18 @@ def main(
     about = json.loads(folder.settings.read_text())
     judged = json.loads((evaluation / "evaluation.json").read_text())
     _check(dataset, weights, about, judged["about"])
-    place = BUILTIN_WEIGHTS
+    others = [json.loads((each / "evaluation.json").read_text()) for each in also]
+    for each in others:
+        _require_same(each["about"], weights)
+    place = BUILTIN_NETWORKS[name]
+    summary = json.loads(folder.summary.read_text())
+    lines = [f"# The network `{name}`", "", _HEADS[name], ""]
+    lines += _card(dataset, about, judged, summary, weights, command)
+    for each in others:
+        lines += ["", *_scores(each)]
+    lines += ["", "```json", json.dumps(about["settings"], indent=1, sort_keys=True), "```", ""]
     write_atomically(place, weights)
-    card = _card(dataset, about, judged, json.loads(folder.summary.read_text()), weights, command)
-    write_atomically(place.with_name("README.md"), card.encode())
+    write_atomically(place.with_name("README.md"), "\n".join(lines).encode())
 
 
 def _check(
@@ -67,10 +85,6 @@ def _check(
         (judged["data digest"] == dataset.digest, "it was judged on other data"),
         (judged["split"] == "test", "it was not judged on the test split"),
         (
-            judged["network sha256"] == network_digest(decode_weights(weights)),
-            "another network was judged",
-        ),
-        (
             judged["resolution"] == run["settings"]["resolution"],
             "it was not judged at the resolution of the run",
         ),
@@ -78,6 +92,12 @@ def _check(
     ):
         if not law:
             raise TrilightError(f"builtin network: {complaint}.")
+    _require_same(judged, weights)
+
+
+def _require_same(judged: Mapping[str, Any], weights: bytes) -> None:
+    if judged["network sha256"] != network_digest(decode_weights(weights)):
+        raise TrilightError("builtin network: another network was judged.")
 
 
 def _card(
@@ -87,16 +107,18 @@ def _card(
     summary: Mapping[str, Any],
     weights: bytes,
     command: str,
-) -> str:
+) -> list[str]:
     settings, model = about["settings"], about["settings"]["model"]
-    swapped = judged["swapped scenes"]
     most = dataset.manifest.settings["scenes"]["max_triangles"]
+    by_hits = model.get("view_stage") == "hits"
+    encoder = model["encoder_layers"] if model.get("scene_tokens", True) else 0
     shape = (
-        f"{summary['num_parameters']} parameters ({model['encoder_layers']} and "
+        f"{summary['num_parameters']} parameters ({encoder} and "
         f"{model['decoder_layers']} layers, {model['width']} wide, {model['head']} head)"
     )
-    lines = [
-        *_HEAD,
+    px = settings["resolution"]
+    limits = f"at most {most} triangles" + ("" if by_hits else f" and pictures of {px} pixels")
+    return [
         f"- weights: `model.safetensors`, {len(weights)} bytes, sha256 `{sha256_hex(weights)}`",
         f"- size: {shape}",
         "- licence: Trilight's (MIT); its data was made from built-in objects, all CC0-1.0",
@@ -106,41 +128,45 @@ def _card(
         "",
         f"- training: `trilight train {settings['run']}`, {summary['num_steps']} steps of "
         f"{settings['scenes_per_step']} scenes and {settings['views_per_scene']} views, "
-        f"{settings['resolution']} x {settings['resolution']} pixels; all settings below",
-        f"- range: at most {most} triangles and pictures of {settings['resolution']} pixels; "
-        "beyond either it warns and gets worse",
+        f"{px} x {px} pixels; all settings below",
+        f"- range: {limits}; beyond that it warns and gets worse",
         "",
         *_scores(judged),
-        "",
-        f"With the triangles of another scene it loses {swapped['median_db']:.2f} dB of "
-        f"psnr_log_db in the median and {swapped['mean_db']:.2f} dB on average.",
-        "",
-        "```json",
-        json.dumps(settings, indent=1, sort_keys=True),
-        "```",
-        "",
     ]
-    return "\n".join(lines)
 
 
 def _scores(judged: Mapping[str, Any]) -> list[str]:
-    everybody = judged["contestants"]
+    everybody, about = judged["contestants"], judged["about"]
     contestants = {NETWORK: everybody[NETWORK]} | everybody  # the file has them by their names
-    return [
-        f"Scores on the test split ({judged['about']['scenes']} scenes, {len(judged['views'])} "
-        "views, objects that it has not seen; medians):",
+    traced = judged["path tracer"] or {}
+    lines = [
+        f"Scores on `{about['data']}`, build {about['build']}, split {about['split']} "
+        f"({about['scenes']} scenes, "
+        f"{len(judged['views'])} views of {about['resolution']} pixels, objects that it has not "
+        "seen; medians, in brackets the worse 5 %):",
         "",
-        f"| metric | {' | '.join(contestants)} |",
-        f"|{'---|' * (len(contestants) + 1)}",
+        f"| | {' | '.join(judged['metrics'])} |",
+        f"|{'---|' * (len(judged['metrics']) + 1)}",
         *(
-            f"| {metric} | {' | '.join(_shown(who[metric]) for who in contestants.values())} |"
-            for metric in judged["metrics"]
+            f"| {who} | {' | '.join(_shown(scores[each]) for each in judged['metrics'])} |"
+            for who, scores in contestants.items()
         ),
     ]
+    if traced:
+        lines += ["", " ".join(sentences(traced))]
+    if swapped := judged["swapped scenes"]:
+        lines += [
+            "",
+            f"With the triangles of another scene it loses {swapped['median_db']:.2f} dB of "
+            f"psnr_log_db in the median and {swapped['mean_db']:.2f} dB on average.",
+        ]
+    return lines
 
 
 def _shown(figures: Mapping[str, Any]) -> str:
-    return "n/a" if figures["median"] is None else f"{figures['median']:.4g}"
+    if figures["median"] is None:
+        return "n/a"
+    return f"{figures['median']:.4g} ({figures['worse_5_percent']:.4g})"
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ Each pixel mixes what the nine nearest anchors know, by what it is like them, an
 says how much of each light that was traced counts, and what is missing:
 
     radiance = diffuse albedo * (gain * mixed gathered light + irradiance)
-             + specular albedo * radiance + gain * direct light + gain * mirrored light
+             + specular albedo * radiance + gain * direct light + gain * filtered mirrored light
 
 Nothing of it is negative. All light is in units of the scene's mean light, by colour: the picture
 scales with the lamps exactly. There are no pixels from elsewhere in it, so any width will do.
@@ -13,7 +13,6 @@ scales with the lamps exactly. There are no pixels from elsewhere in it, so any 
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -23,7 +22,9 @@ from torch.nn.functional import silu, softplus
 from model.attention import attend
 from model.config import ModelConfig
 from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
-from model.hits.traced import CHANNELS, INPUTS, Traced
+from model.hits.lie import FARTHEST, NEIGHBOURS, PLACE, Lie, lies_to
+from model.hits.light_filter import LightFilter, filter_flops
+from model.hits.traced import INPUTS, Traced
 from model.hits.view_inputs import Channel
 from model.layers import (
     LAYER_NORM_EPS,
@@ -38,25 +39,19 @@ from model.layers import (
 from model.positions import Rotation, TriangleRotary, rotate, world_rotation
 from model.precision import as_given
 
-NEIGHBOURS = 9
-"""Anchors that a pixel reads: that of its own part of the picture and those around it."""
+_SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1 + 1 + 4
+"""Numbers that say what surface a pixel sees, and what its mirrored ray (`_surface`)."""
 
-_SURFACE = 3 + 3 + 3 + 1 + 3 + 3 + 1 + 1
-"""Numbers that say what surface a pixel sees (`_told`)."""
+_LIGHTS = (
+    Channel.OPEN_DIFFUSE,
+    Channel.OPEN_SPECULAR,
+    Channel.DIRECT_DIFFUSE,
+    Channel.DIRECT_SPECULAR,
+    Channel.SHOWN_DIFFUSE,
+)
 
-_LIGHTS = tuple(channel for channels in CHANNELS.values() for channel in channels)
-
-TOLD = _SURFACE + 3 * len(_LIGHTS) + len(INPUTS)
+TOLD = _SURFACE + 3 * (len(_LIGHTS) + 1) + len(INPUTS)
 """Numbers that a pixel is told; an anchor is told three more, its gathered light."""
-
-_PLACE = 6
-"""Numbers that say how a pixel lies to an anchor."""
-
-_NEAREST_M = 1e-3
-"""Added to distances, so that a pixel that meets nothing divides by more than 0."""
-
-_FARTHEST = 30.0
-"""What counts as far away: an anchor there has no share but where all are."""
 
 _START = -3.0
 """Of the light that is learned, before softplus: a twentieth of the scene's mean at the start, so
@@ -65,7 +60,7 @@ that the first picture is what was traced, with dim shadows."""
 _GAINED = 3
 """Lights that are multiplied by a learned gain: gathered, direct, mirrored."""
 
-BLOCK_PIXELS = 2**14
+BLOCK_PIXELS = 2**12
 """Pixels that are computed at a time while rendering."""
 
 
@@ -74,9 +69,11 @@ def view_flops(config: ModelConfig, tokens: int, resolution: int) -> dict[str, i
     d, p = config.width, config.pixel_width
     a = math.gcd(config.hit_anchors, resolution) ** 2
     asks = 4 * a * d * d + 4 * a * tokens * d if config.scene_tokens else 0
-    pixel = TOLD * p + p * p + NEIGHBOURS * (2 * p + 3) + _PLACE * p + NEIGHBOURS * 4 * 3
+    pixel = TOLD * p + p * p + NEIGHBOURS * (2 * p + 3) + PLACE * p + NEIGHBOURS * 4 * 3
     pixel += (2 * p + 3) * 2 * p + 2 * p * p + p * 3 * (_GAINED + 2)
+    width = config.filter_width
     return {
+        "filter": filter_flops(TOLD, width, resolution**2) if width else 0,
         "anchors": 2 * a * ((TOLD + 3) * d + d * d),
         "cross-attention": config.decoder_layers * asks,
         "view feed-forward": config.decoder_layers * 6 * a * d * config.hidden_width,
@@ -130,7 +127,7 @@ class PixelHead(nn.Module):
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(config.width, width)
         self.value = nn.Linear(config.width, width)
-        self.place = nn.Linear(_PLACE, width)
+        self.place = nn.Linear(PLACE, width)
         self.nearness = nn.Parameter(torch.full((3,), 2.0))
         self.first = nn.Linear(2 * width + 3, 2 * width)
         self.second = nn.Linear(2 * width, width)
@@ -145,7 +142,7 @@ class PixelHead(nn.Module):
         told_MPF: Tensor,
         key_M9W: Tensor,
         value_M9W: Tensor,
-        lies: "Lie",
+        lies: Lie,
         met_M9: Tensor,
         gathered_M93: Tensor,
     ) -> tuple[Tensor, Tensor]:
@@ -157,7 +154,7 @@ class PixelHead(nn.Module):
         alike_MP9 = self.query(pixel_MPW) @ key_M9W.mT / math.sqrt(key_M9W.shape[-1])
         for weight, unlike_MP9 in zip(softplus(self.nearness), lies.unlike, strict=True):
             alike_MP9 = alike_MP9 - weight * unlike_MP9
-        nothing_M19 = torch.where(met_M9, 0.0, -2 * _FARTHEST)[:, None]
+        nothing_M19 = torch.where(met_M9, 0.0, -2 * FARTHEST)[:, None]
         share_MP9 = (alike_MP9 + nothing_M19).softmax(dim=-1)
         known_MPW = share_MP9 @ value_M9W + self.place(lies.mixed(share_MP9))
         gathered_MP3 = share_MP9 @ gathered_M93
@@ -173,6 +170,7 @@ class HitDecoder(nn.Module):
         self.config = config
         self.rotary = rotary
         self.recompute = False
+        self.filter = LightFilter(TOLD, config.filter_width) if config.filter_width else None
         self.told = nn.Linear(TOLD + 3, config.width)
         self.anchors = nn.Linear(config.width, config.width)
         self.layers = nn.ModuleList(AnchorLayer(config) for _ in range(config.decoder_layers))
@@ -197,9 +195,7 @@ class HitDecoder(nn.Module):
         """
         with as_given(traced.pixels_VRRC.device):
             unit_B1113 = traced.unit_3[:, None, None, None, :]
-            surface, light = _told(traced.pixels_VRRC, unit_B1113)
-            given = traced.given_VI[:, :, None, None, :].expand(*surface.shape[:-1], -1)
-            told = torch.cat([surface, torch.log1p(4 * light), given], dim=-1)
+            told, mirrored = self._told(traced, unit_B1113)
             at = _at_anchors(traced)
             anchor = torch.cat(
                 [at(told), torch.log1p(4 * traced.gathered_VA3 / unit_B1113[..., 0, :])], dim=-1
@@ -207,7 +203,26 @@ class HitDecoder(nn.Module):
             place = at(traced.pixels_VRRC)
         x_BVAW = self._asked(scene, traced, anchor, place[..., Channel.POSITION])
         with as_given(traced.pixels_VRRC.device):
-            return self._pictures(traced, told, x_BVAW.to(told.dtype), place, unit_B1113)
+            return self._pictures(traced, told, mirrored, x_BVAW.to(told.dtype), place, unit_B1113)
+
+    def _told(self, traced: Traced, unit_B1113: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what pixels are told [B, V, R, R, F], and their mirrored light, filtered."""
+        pixels = traced.pixels_VRRC
+        surface = _surface(pixels)
+        light = torch.cat([pixels[..., channel] / unit_B1113 for channel in _LIGHTS], dim=-1)
+        given = traced.given_VI[:, :, None, None, :].expand(*surface.shape[:-1], -1)
+        mirrored = pixels[..., Channel.MIRRORED] / unit_B1113
+
+        def told() -> Tensor:
+            lights = torch.log1p(4 * torch.cat([light, mirrored], dim=-1))
+            return torch.cat([surface, lights, given], dim=-1)
+
+        if self.filter is not None:
+            albedo = pixels[..., Channel.SPECULAR] * pixels[..., Channel.COVERAGE]
+            views = mirrored.shape[:2]
+            flat = [each.flatten(0, 1) for each in (told(), mirrored, albedo)]
+            mirrored = self.filter(*flat).unflatten(0, views)
+        return told(), mirrored
 
     def _asked(
         self, scene: EncodedScene, traced: Traced, anchor_BVAF: Tensor, position_BVA3: Tensor
@@ -233,6 +248,7 @@ class HitDecoder(nn.Module):
         self,
         traced: Traced,
         told: Tensor,
+        mirrored: Tensor,
         x_BVAW: Tensor,
         place_BVAC: Tensor,
         unit_B1113: Tensor,
@@ -252,33 +268,42 @@ class HitDecoder(nn.Module):
                 place_BVAC.flatten(0, 1),
             )
         ]
-        told_VMPF = _in_parts(told.flatten(0, 1), side)
-        pixels_VMPC = _in_parts(traced.pixels_VRRC.flatten(0, 1), side)
-        size = told_VMPF.shape[2]
+        given = [
+            _in_parts(each.flatten(0, 1), side) for each in (told, traced.pixels_VRRC, mirrored)
+        ]
         pictures = []
-        for view in range(len(told_VMPF)):
+        for view in range(len(unit)):
+            step = side * side
+            if not torch.is_grad_enabled():
+                step = max(1, BLOCK_PIXELS * step // resolution**2)
             rows = []
-            step = len(told_VMPF[view]) if torch.is_grad_enabled() else max(1, BLOCK_PIXELS // size)
             for first in range(0, side * side, step):
-                some = slice(first, first + step)
-                pixels_MPC = pixels_VMPC[view, some]
-                key, value, light, place = (each[view, some] for each in around)
-                learned, mixed = head(
-                    told_VMPF[view, some],
-                    key,
-                    value,
-                    _lies(pixels_MPC, place),
-                    place[..., 0] > 0,
-                    light,
-                )
-                rows.append(_composed(learned, mixed, pixels_MPC, unit[view]))
+                some = [each[view, first : first + step] for each in (*given, *around)]
+                rows.append(self._some_parts(unit[view], *some))
             pictures.append(_whole(torch.cat(rows), side))
         log10 = torch.log1p(torch.stack(pictures)) / math.log(10)
         return log10.reshape(*views, resolution, resolution, 3)
 
+    def _some_parts(
+        self,
+        unit_13: Tensor,
+        told_MPF: Tensor,
+        pixels_MPC: Tensor,
+        mirrored_MP3: Tensor,
+        key_M9W: Tensor,
+        value_M9W: Tensor,
+        gathered_M93: Tensor,
+        place_M9C: Tensor,
+    ) -> Tensor:
+        """Return the radiance [M, P, 3] of some parts of a picture."""
+        lies = lies_to(pixels_MPC, place_M9C)
+        met_M9 = place_M9C[..., 0] > 0
+        learned, mixed = self.head(told_MPF, key_M9W, value_M9W, lies, met_M9, gathered_M93)
+        return _composed(learned, mixed, mirrored_MP3, pixels_MPC, unit_13)
 
-def _told(pixels: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what is said of surfaces [..., 18], and their light in units of the scene's."""
+
+def _surface(pixels: Tensor) -> Tensor:
+    """Return what is said of surfaces [..., 23]."""
     normal = nn.functional.normalize(pixels[..., Channel.NORMAL], dim=-1)
     toward = nn.functional.normalize(pixels[..., Channel.TOWARD], dim=-1)
     cosine = (normal * toward).sum(dim=-1, keepdim=True)
@@ -291,9 +316,11 @@ def _told(pixels: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
         pixels[..., Channel.SPECULAR],
         pixels[..., Channel.ROUGHNESS],
         pixels[..., Channel.COVERAGE],
+        torch.log1p(pixels[..., Channel.DISTANCE]),
+        pixels[..., Channel.SEEN_ALBEDO],
+        pixels[..., Channel.SEEN_NEARNESS],
     ]
-    light = torch.cat([pixels[..., channel] / unit for channel in _LIGHTS], dim=-1)
-    return torch.cat(surface, dim=-1), light
+    return torch.cat(surface, dim=-1)
 
 
 def _at_anchors(traced: Traced) -> Callable[[Tensor], Tensor]:
@@ -328,52 +355,10 @@ def _around(values_VAK: Tensor, side: int) -> Tensor:
     return values_VAK[:, rows.reshape(side * side, NEIGHBOURS)]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Lie:
-    """How pixels lie to nine anchors, in shares of their distance to the camera."""
-
-    unlike: tuple[Tensor, Tensor, Tensor]
-    """[M, P, 9] how far the anchor is, how far from the pixel's plane, and how the normals differ.
-    """
-    anchors_M93: Tensor
-    """Positions, from that of the part's own anchor."""
-    pixels_MP3: Tensor
-    """Likewise."""
-    distance_MP1: Tensor
-
-    def mixed(self, share_MP9: Tensor) -> Tensor:
-        """Return what lies between a pixel and a mixture of anchors, [M, P, 6]."""
-        unlike = [(share_MP9 * each).sum(dim=-1) for each in self.unlike]
-        way = (share_MP9 @ self.anchors_M93 - self.pixels_MP3) / self.distance_MP1
-        return torch.cat([torch.stack(unlike, dim=-1), 4 * way], dim=-1)
-
-
-def _lies(pixels_MPC: Tensor, anchors_M9C: Tensor) -> Lie:
-    """Return how pixels lie to the anchors around; products of matrices, without [M, P, 9, 3]."""
-    own = anchors_M9C[:, NEIGHBOURS // 2, None, Channel.POSITION]
-    pixels_MP3 = pixels_MPC[..., Channel.POSITION] - own
-    anchors_M93 = anchors_M9C[..., Channel.POSITION] - own
-    distance_MP1 = pixels_MPC[..., Channel.DISTANCE] + _NEAREST_M
-    normal = nn.functional.normalize(pixels_MPC[..., Channel.NORMAL], dim=-1)
-    other = nn.functional.normalize(anchors_M9C[..., Channel.NORMAL], dim=-1)
-    squares = pixels_MP3.square().sum(dim=-1, keepdim=True)
-    squares = squares + anchors_M93.square().sum(dim=-1)[:, None]
-    apart = (squares - 2 * pixels_MP3 @ anchors_M93.mT).clamp(min=0).sqrt()
-    above = normal @ anchors_M93.mT - (normal * pixels_MP3).sum(dim=-1, keepdim=True)
-    return Lie(
-        unlike=(
-            (8 * apart / distance_MP1).clamp(max=_FARTHEST),
-            (30 * above.abs() / distance_MP1).clamp(max=_FARTHEST),
-            2 - 2 * normal @ other.mT,
-        ),
-        anchors_M93=anchors_M93,
-        pixels_MP3=pixels_MP3,
-        distance_MP1=distance_MP1,
-    )
-
-
-def _composed(learned: Tensor, gathered: Tensor, pixels: Tensor, unit: Tensor) -> Tensor:
-    """Return radiance [..., 3] of at least 0."""
+def _composed(
+    learned: Tensor, gathered: Tensor, mirrored: Tensor, pixels: Tensor, unit: Tensor
+) -> Tensor:
+    """Return radiance [..., 3] of at least 0; gathered and mirrored light are in units."""
     gain_gathered, gain_direct, gain_mirrored, diffuse, specular = learned.split(3, dim=-1)
     gains = [2 * torch.sigmoid(gain) for gain in (gain_gathered, gain_direct, gain_mirrored)]
     coverage = pixels[..., Channel.COVERAGE]
@@ -381,6 +366,5 @@ def _composed(learned: Tensor, gathered: Tensor, pixels: Tensor, unit: Tensor) -
     learned_light = learned_light + pixels[..., Channel.SPECULAR] * softplus(specular + _START)
     gathered_light = pixels[..., Channel.DIFFUSE] * gains[0] * gathered
     direct = pixels[..., Channel.SHOWN_DIFFUSE] + pixels[..., Channel.DIRECT_SPECULAR]
-    mirrored = pixels[..., Channel.MIRRORED]
-    indirect = coverage * unit * (learned_light + gathered_light)
-    return indirect + gains[1] * direct + gains[2] * mirrored
+    indirect = coverage * (learned_light + gathered_light) + gains[2] * mirrored
+    return unit * indirect + gains[1] * direct

@@ -176,7 +176,7 @@ def chosen_lamp_light(
     solid = np.abs(dot(scene.plane[:, lamp], to_lamp)) * scene.area[lamp] / square / chance
     value, density = lobe(gloss, points, to_lamp, cosine)
     value = value / (1 + np.where(has_lobe_ray, np.square(density * solid), np.float32(0)))
-    albedo = np.take(scene.diffuse, points.triangle, axis=1)
+    albedo = scene.diffuse_at(points)
     reflected = albedo * (np.maximum(cosine, 0) * _INV_PI) + gloss.colour * value
     useful = np.flatnonzero(brightest(reflected) > 0)
     is_free = np.zeros(solid.shape, np.float32)

@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from model.hits.textures import SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
 from storage.records.lobes import lobes_of
 from storage.records.material import EMISSION, ROUGHNESS
@@ -15,6 +16,39 @@ from storage.records.surfaces import MetSurfaces, Triangles
 _OFFSET = np.float32(1500 * 2.0**-24)
 """How far rays start off a surface, as a share of 1 m plus their distance from the origin: the
 renderer's own (pipeline.renders.kernel_scene)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reflecting:
+    """How each of N triangles or points reflects; all float32."""
+
+    diffuse: Floats
+    """[3, N] diffuse albedo."""
+    specular: Floats
+    """[3, N] specular albedo."""
+    alpha: Floats
+    """[N] GGX width."""
+    again: Floats
+    """[3, N] Fms of storage.records.multiscatter."""
+    roughness: Floats
+    """[N] roughness."""
+
+    def only(self, rows: NDArray[np.intp]) -> "Reflecting":
+        """Return some of them."""
+        return Reflecting(**{name: each[..., rows] for name, each in vars(self).items()})
+
+
+def reflecting(materials: NDArray[np.float32]) -> Reflecting:
+    """Return how material rows [N, 10] reflect."""
+    lobes = lobes_of(materials)
+    again = scattered_again(lobes.specular, lobes.alpha, "correlated")
+    return Reflecting(
+        diffuse=lobes.diffuse.T.astype(np.float32),
+        specular=lobes.specular.T.astype(np.float32),
+        alpha=lobes.alpha.astype(np.float32),
+        again=again.T.astype(np.float32),
+        roughness=materials[:, ROUGHNESS].reshape(-1).astype(np.float32),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,6 +70,8 @@ class Points:
     """
     back: NDArray[np.bool_]
     """[P] whether the triangle is seen from the side from which its corners run clockwise."""
+    reflecting: Reflecting | None = None
+    """How the points reflect, in textured scenes; None: as their triangles do in the mean."""
 
     def only(self, rows: NDArray[np.intp]) -> "Points":
         """Return some of the points."""
@@ -47,6 +83,7 @@ class Points:
             toward=self.toward[:, rows],
             edge=self.edge[:, rows],
             back=self.back[rows],
+            reflecting=None if self.reflecting is None else self.reflecting.only(rows),
         )
 
     def start(self, direction: Floats) -> Floats:
@@ -66,14 +103,20 @@ class LitScene:
     """Tables of T triangles, components first: [3, T] and [T]."""
 
     def __init__(
-        self, corners_T33: Floats, normals_T33: Floats, materials_TM: NDArray[np.float32]
+        self,
+        corners_T33: Floats,
+        normals_T33: Floats,
+        materials_TM: NDArray[np.float32],
+        textures: SurfaceTextures | None = None,
     ) -> None:
         """Take triangles in world space.
 
         Args:
             corners_T33: positions in metres.
             normals_T33: unit shading normals at the corners.
-            materials_TM: the ten published numbers of each triangle's material, emission linear.
+            materials_TM: the ten published numbers of each triangle's material, emission linear;
+                of textures, their means.
+            textures: what stands for those numbers at each point; None where nothing is textured.
         """
         self.corners = np.ascontiguousarray(corners_T33.transpose(1, 2, 0))  # [corner, 3, T]
         self.normals = np.ascontiguousarray(normals_T33.transpose(1, 2, 0))
@@ -82,12 +125,10 @@ class LitScene:
         across = np.cross(edges[0], edges[1], axis=0)
         self.area = 0.5 * np.sqrt(dot(across, across))
         self.plane = unit(across)
-        lobes = lobes_of(materials_TM)
-        self.diffuse = lobes.diffuse.T.astype(np.float32)
-        self.specular = lobes.specular.T.astype(np.float32)
-        self.alpha = lobes.alpha.astype(np.float32)
-        self.again = scattered_again(lobes.specular, lobes.alpha, "correlated").T.astype(np.float32)
-        self.roughness = materials_TM[:, ROUGHNESS].reshape(-1).astype(np.float32)
+        means = reflecting(materials_TM)
+        self.diffuse, self.specular, self.again = means.diffuse, means.specular, means.again
+        self.alpha, self.roughness = means.alpha, means.roughness
+        self.textures, self._materials_TM = textures, materials_TM
         self.emission = np.ascontiguousarray(materials_TM[:, EMISSION].T.astype(np.float32))
         self._corner_rows = corners_T33
         self.emits = self.emission.max(axis=0) > 0
@@ -106,6 +147,36 @@ class LitScene:
     def everything(self) -> Triangles:
         """What blocks light and reflects it."""
         return Triangles(self._corner_rows, np.arange(self.num_triangles))
+
+    def diffuse_at(self, points: Points) -> Floats:
+        """Return the diffuse albedo [3, P]."""
+        if points.reflecting is not None:
+            return points.reflecting.diffuse
+        return np.take(self.diffuse, points.triangle, axis=1)
+
+    def specular_at(self, points: Points) -> Floats:
+        """Return the specular albedo [3, P]."""
+        if points.reflecting is not None:
+            return points.reflecting.specular
+        return np.take(self.specular, points.triangle, axis=1)
+
+    def again_at(self, points: Points) -> Floats:
+        """Return Fms of multiple scattering [3, P]."""
+        if points.reflecting is not None:
+            return points.reflecting.again
+        return np.take(self.again, points.triangle, axis=1)
+
+    def alpha_at(self, points: Points) -> Floats:
+        """Return the GGX width [P]."""
+        if points.reflecting is not None:
+            return points.reflecting.alpha
+        return self.alpha[points.triangle]
+
+    def roughness_at(self, points: Points) -> Floats:
+        """Return the roughness [P]."""
+        if points.reflecting is not None:
+            return points.reflecting.roughness
+        return self.roughness[points.triangle]
 
     def points(self, triangle: NDArray[np.intp], uv: Floats, direction: Floats) -> Points:
         """Return the points at which rays along unit `direction` [3, P] meet triangles.
@@ -131,7 +202,13 @@ class LitScene:
             toward=-direction,
             edge=np.take(self.edge, triangle, axis=1),
             back=back,
+            reflecting=self._textured(triangle, weights),
         )
+
+    def _textured(self, triangle: NDArray[np.intp], weights: Floats) -> Reflecting | None:
+        if self.textures is None:
+            return None
+        return reflecting(self.textures.materials(triangle, weights, self._materials_TM))
 
     def first_hits(self, origin: Floats, direction: Floats) -> MetSurfaces:
         """Return what rays [3, P] from one camera [3] see first."""

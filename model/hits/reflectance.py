@@ -45,7 +45,7 @@ class Gloss:
 
 def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None) -> Gloss:
     """Return the lobes of points, those that are narrower than `least_alpha` [P] widened to it."""
-    alpha = scene.alpha[points.triangle]
+    alpha = scene.alpha_at(points)
     if least_alpha is not None:
         alpha = np.maximum(alpha, least_alpha)
     cosine = dot(points.normal, points.toward)
@@ -53,8 +53,7 @@ def gloss_at(scene: LitScene, points: Points, least_alpha: Floats | None = None)
     stretch = stretched(seen, alpha)
     albedo = np.maximum(_albedo(seen / stretch, alpha), np.float32(1e-3))
     lost = (1 - albedo) / albedo
-    specular = np.take(scene.specular, points.triangle, axis=1)
-    again = np.take(scene.again, points.triangle, axis=1)
+    specular, again = scene.specular_at(points), scene.again_at(points)
     return Gloss(
         colour=specular * (1 + again * lost),
         alpha=alpha,

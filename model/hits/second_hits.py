@@ -18,7 +18,7 @@ from model.hits.radiosity import SceneLight
 from model.hits.reflectance import drawn, gloss_at, lobe
 from model.hits.vectors import Floats, brightest, dot
 
-WIDENED_ALPHA = np.float32(0.25)
+WIDENED_ALPHA = np.float32(0.4)
 """GGX width that surfaces have at least, where a ray has met them."""
 
 SMOOTH_ALPHA = np.float32(0.1)
@@ -56,16 +56,16 @@ def brought(
         is_sharp: [P] whether only mirrors have sent the rays.
         mirrors: followed at most.
     """
-    specular = np.take(scene.specular, points.triangle, axis=1)
-    is_mirror = scene.alpha[points.triangle] < SMOOTH_ALPHA
+    specular, alpha = scene.specular_at(points), scene.alpha_at(points)
+    is_mirror = alpha < SMOOTH_ALPHA
     is_mirror &= brightest(specular) > DIMMEST
     is_mirror &= mirrors > 0
-    spread_out = np.take(scene.diffuse, points.triangle, axis=1)
+    spread_out = scene.diffuse_at(points)
     spread_out = spread_out + np.where(is_mirror, np.float32(0), specular)
     sides = points.back.astype(np.intp)
     sent: Floats = spread_out * light.indirect_2T3[sides, points.triangle].T
     has_lobe_ray = is_sharp & is_mirror
-    keeps_width = has_lobe_ray | (is_sharp & (scene.alpha[points.triangle] >= SMOOTH_ALPHA))
+    keeps_width = has_lobe_ray | (is_sharp & (alpha >= SMOOTH_ALPHA))
     gloss = gloss_at(scene, points, np.where(keeps_width, np.float32(0), WIDENED_ALPHA))
     chances = lamp_chances(scene, points, gloss)
     if len(scene.lamps):

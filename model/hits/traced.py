@@ -15,7 +15,7 @@ shadows, light that one mirrored ray brings, light that anchors gather, and the 
 CHANNELS = {
     "open": (Channel.OPEN_DIFFUSE, Channel.OPEN_SPECULAR),
     "direct": (Channel.DIRECT_DIFFUSE, Channel.DIRECT_SPECULAR, Channel.SHOWN_DIFFUSE),
-    "mirrored": (Channel.MIRRORED,),
+    "mirrored": (Channel.MIRRORED, Channel.SEEN_ALBEDO, Channel.SEEN_NEARNESS),
 }
 """Where the inputs stand that pixels have."""
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from model.config import ModelConfig
 from model.hits.lit_scene import LitScene
 from model.hits.radiosity import SceneLight, scene_light
+from model.hits.textures import SurfaceTextures
 from model.hits.traced import INPUTS, Traced, stack_traced
 from model.hits.view_inputs import ViewInputs, view_inputs
 from model.scene_tensors import Cameras, SceneBatch, SceneTensors
@@ -46,34 +47,44 @@ def anchors_a_side(config: ModelConfig, resolution: int) -> int:
     return int(np.gcd(config.hit_anchors, resolution))
 
 
-def traced_scene(triangles_T33: Tensor, normals_T33: Tensor, materials_TM: Tensor) -> TracedScene:
-    """Return a scene ready for rays.
+def lit_scene(
+    triangles_T33: Tensor,
+    normals_T33: Tensor,
+    materials_TM: Tensor,
+    textures: SurfaceTextures | None = None,
+) -> LitScene:
+    """Return the surfaces of a scene.
 
     Args:
         triangles_T33, normals_T33: as in SceneTensors.
         materials_TM: its published columns.
+        textures: as in SceneTensors.
     """
     materials = materials_TM.detach().cpu().numpy().copy()
     for column, part in laid_out(PUBLISHED_COLUMNS):
         if column.is_log_encoded:
             materials[:, part] = np.maximum(radiance_from_log10(materials[:, part]), 0)
-    lit = LitScene(
-        triangles_T33.detach().cpu().numpy(), normals_T33.detach().cpu().numpy(), materials
-    )
-    return TracedScene(lit=lit, light=scene_light(lit))
+    triangles, normals = (each.detach().cpu().numpy() for each in (triangles_T33, normals_T33))
+    return LitScene(triangles, normals, materials, textures)
 
 
 def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
-    """Return the scenes of a batch, without their padding."""
+    """Return the scenes of a batch, without their padding, ready for rays."""
+    return tuple(TracedScene(lit=lit, light=scene_light(lit)) for lit in lit_scenes(batch))
+
+
+def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
+    """Return the surfaces of the scenes of a batch, without their padding."""
     materials = batch.material_of(PUBLISHED_COLUMNS)
     found = []
     for row in range(len(materials)):
         there = slice(None) if batch.is_triangle_BT is None else batch.is_triangle_BT[row]
         found.append(
-            traced_scene(
+            lit_scene(
                 batch.triangles_BT33[row][there],
                 batch.normals_BT33[row][there],
                 materials[row][there],
+                None if batch.textures is None else batch.textures[row],
             )
         )
     return tuple(found)
@@ -86,11 +97,18 @@ def with_traced(
 
     `seed` is that of the noise: a network that saw one noise alone might learn it.
     """
+    lit = lit_scene_of(scene)
+    ready = TracedScene(lit=lit, light=scene_light(lit))
+    traced = traced_views(ready, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)
+    return dataclasses.replace(scene, traced=traced)
+
+
+def lit_scene_of(scene: SceneTensors) -> LitScene:
+    """Return the surfaces of a scene."""
     columns = {column.name: part for column, part in laid_out(scene.columns)}
     numbers = [scene.material_TM[:, columns[name]] for name in PUBLISHED_COLUMNS]
-    lit = traced_scene(scene.triangles_T33, scene.normals_T33, torch.cat(numbers, dim=-1))
-    traced = traced_views(lit, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)
-    return dataclasses.replace(scene, traced=traced)
+    materials_TM = torch.cat(numbers, dim=-1)
+    return lit_scene(scene.triangles_T33, scene.normals_T33, materials_TM, scene.textures)
 
 
 def traced_cameras(

@@ -52,9 +52,13 @@ class Channel:
     """Diffuse radiance from lamps, shadowed: albedo times irradiance, over all rays."""
     MIRRORED = slice(33, 36)
     """Specular radiance from other surfaces, by one ray; over all rays of the pixel."""
+    SEEN_ALBEDO = slice(36, 39)
+    """Diffuse and specular albedo of what that ray met; 0 where it met nothing."""
+    SEEN_NEARNESS = slice(39, 40)
+    """1 / (1 + d) for a way of d metres to it; 0 where it met nothing."""
 
 
-NUM_CHANNELS = 36
+NUM_CHANNELS = 40
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,7 +66,7 @@ class ViewInputs:
     """One view of a scene; R pixels across, A anchors."""
 
     pixels: NDArray[np.float32]
-    """[R, R, 36], by `Channel`; 0 where nothing is met."""
+    """[R, R, 40], by `Channel`; 0 where nothing is met."""
     anchor: NDArray[np.int64]
     """[A] pixel that each anchor stands in, counted row by row: the fullest of its part."""
     gathered: NDArray[np.float32]
@@ -131,8 +135,8 @@ def view_inputs(
 class _Shaded:
     """Points at which light is computed.
 
-    One of a pixel whose rays all meet one triangle stands for all of them; else each ray has its
-    own.
+    One of a pixel whose rays all meet one triangle without textures stands for all of them; else
+    each ray has its own.
     """
 
     points: Points
@@ -159,6 +163,8 @@ def _shaded(
     drawn_turn = np.minimum((chance * turns).astype(np.intp), turns - 1)
     alone = np.arange(turns)[:, None] == drawn_turn
     is_one = (triangle == triangle[0]).all(axis=0)
+    if scene.textures is not None:
+        is_one &= ~scene.textures.is_textured[triangle[0]]
     turn, pixel = np.nonzero((triangle >= 0) & (alone | ~is_one))
     ray = turn * count + pixel
     points = scene.points(
@@ -180,7 +186,7 @@ class _Block:
     points: Points
     gloss: Gloss
     sums: NDArray[np.float32]
-    """[36, pixels of the block]"""
+    """[40, pixels of the block]"""
     pixel: NDArray[np.intp]
     """[P] which of the block's pixels the points belong to."""
     weight: NDArray[np.float32]
@@ -204,9 +210,9 @@ def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) ->
     block.add(Channel.DISTANCE, np.sqrt(dot(away, away))[None])
     block.add(Channel.NORMAL, points.normal)
     block.add(Channel.TOWARD, points.toward)
-    block.add(Channel.DIFFUSE, np.take(scene.diffuse, points.triangle, axis=1))
+    block.add(Channel.DIFFUSE, scene.diffuse_at(points))
     block.add(Channel.SPECULAR, block.gloss.colour)
-    block.add(Channel.ROUGHNESS, scene.roughness[points.triangle][None])
+    block.add(Channel.ROUGHNESS, scene.roughness_at(points)[None])
 
 
 def _add_direct(
@@ -217,7 +223,7 @@ def _add_direct(
     block.add(Channel.DIRECT_DIFFUSE, lit.diffuse)
     block.add(Channel.OPEN_SPECULAR, lit.open_specular)
     block.add(Channel.DIRECT_SPECULAR, lit.specular)
-    albedo = np.take(scene.diffuse, block.points.triangle, axis=1)
+    albedo = scene.diffuse_at(block.points)
     block.add(Channel.SHOWN_DIFFUSE, albedo * lit.diffuse)
 
 
@@ -258,11 +264,15 @@ def _add_lobe_rays(
     asked = np.flatnonzero(met & (shading[some] > 0))
     if len(asked):
         rows = some[asked]
-        is_sharp = gloss.alpha[asked] < SMOOTH_ALPHA
-        found = brought(scene, light, beyond.only(asked), u[2, rows], u[3:5, rows], is_sharp)
+        is_sharp, seen = gloss.alpha[asked] < SMOOTH_ALPHA, beyond.only(asked)
+        found = brought(scene, light, seen, u[2, rows], u[3:5, rows], is_sharp)
         # `add` counts the rays that a point stands for; here one stands for all of its pixel
-        found *= arrives[:, asked] * (shading[rows] / block.weight[rows])
-        block.add(Channel.MIRRORED, found, rows)
+        counts = shading[rows] / block.weight[rows]
+        block.add(Channel.MIRRORED, found * arrives[:, asked] * counts, rows)
+        way = seen.position - points.position[:, asked]
+        albedo = scene.diffuse_at(seen) + scene.specular_at(seen)
+        block.add(Channel.SEEN_ALBEDO, albedo * counts, rows)
+        block.add(Channel.SEEN_NEARNESS, (counts / (1 + np.sqrt(dot(way, way))))[None], rows)
 
 
 def _averaged(sums: NDArray[np.float32], turns: int) -> NDArray[np.float32]:

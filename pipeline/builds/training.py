@@ -1,4 +1,4 @@
-"""The builds that networks are trained on: `smoke`, `pretrain-256` and `finetune-512`.
+"""The builds that networks are trained on: `smoke`, `pretrain-256`, `finetune-512` and others.
 
 They keep the published ranges of sizes, materials, lights and cameras, and deviate where the
 published scenes have defects (reference: renderformer.md, G):
@@ -28,6 +28,8 @@ from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.renders.settings import RenderSettings
 from scene_templates.families import DEFAULT_FAMILIES
 from scene_templates.settings import SceneSettings
+from scene_templates.skies.settings import SkySettings
+from scene_templates.textures import TextureSettings
 from storage.dataset.settings import SplitSettings
 
 
@@ -68,8 +70,27 @@ def finetune_512() -> BuildSettings:
     )
 
 
+def textured_256() -> BuildSettings:
+    """`pretrain-256` with procedural textures on half of the objects, floors and walls."""
+    build = pretrain_256()
+    return dataclasses.replace(
+        build,
+        build="textured-256",
+        scenes=dataclasses.replace(build.scenes, textures=TextureSettings(share=0.5)),
+    )
+
+
+def sky_256() -> BuildSettings:
+    """Scenes of `pretrain-256`, three in four below a sky as well."""
+    build = pretrain_256()
+    scenes = dataclasses.replace(build.scenes, skies=SkySettings(share=0.75))
+    return dataclasses.replace(build, build="sky-256", scenes=scenes)
+
+
 TRAINING_BUILDS = {
     "smoke": NamedBuild(settings=smoke, num_scenes=24),
     "pretrain-256": NamedBuild(settings=pretrain_256, num_scenes=65_536),
     "finetune-512": NamedBuild(settings=finetune_512, num_scenes=16_384),
+    "textured-256": NamedBuild(settings=textured_256, num_scenes=16_384),
+    "sky-256": NamedBuild(settings=sky_256, num_scenes=65_536),
 }

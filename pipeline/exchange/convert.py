@@ -16,6 +16,7 @@ from pipeline.exchange.formats import (
     LoadedScene,
     SceneFormat,
     SceneSource,
+    carried_scene,
     lost_members,
     writable,
 )
@@ -92,7 +93,8 @@ def write_scene(
     """
     form = _form_of(target)
     assert form.write is not None
-    return (*lost_members(scene, form.carried), *form.write(target, scene, radiance_rgb))
+    shown = carried_scene(scene, form.carried)
+    return (*lost_members(scene, form.carried), *form.write(target, shown, radiance_rgb))
 
 
 def _form_of(target: Path) -> SceneFormat:
@@ -130,7 +132,7 @@ def _many(
             triangles += loaded.scene.num_triangles
             lost = lost_members(loaded.scene, form.carried)
             notes.extend((*loaded.notes, *_said(target, lost)))
-            yield str(key), loaded.scene
+            yield str(key), carried_scene(loaded.scene, form.carried)
 
     form.write_many(target, scenes())
     return Converted(files=(target,), triangles=triangles, notes=tuple(notes))

@@ -37,9 +37,11 @@ from storage.errors import TrilightError
 from storage.records import scene_file
 from storage.records.material import columns_in_use
 from storage.records.profiles import PACKED, PLAIN
+from storage.records.retextured import without_maps
 from storage.records.sample import decode_sample, decode_scene
 from storage.records.scene import Scene, SceneObject
 from storage.records.scene_file import encode_scene, read_scene_file
+from storage.records.scene_maps import MAP_ARRAYS
 from storage.registry import Registry
 
 SEPARATOR = "::"
@@ -266,5 +268,24 @@ def _members_in_use(scene: Scene) -> Iterator[str]:
             for part in dataclasses.fields(SceneObject):
                 if any(getattr(entry, part.name) != part.default for entry in scene.objects):
                     yield f"objects.{part.name}"
-        elif len(getattr(scene, field.name)):
-            yield field.name
+        elif field.name == "environment":
+            yield from ("environment",) if scene.environment is not None else ()
+        elif field.name not in MAP_ARRAYS and len(getattr(scene, field.name)):
+            yield field.name  # texture coordinates and the like come and go with `textures`
+
+
+def carried_scene(scene: Scene, carried: Collection[str]) -> Scene:
+    """Return what a form that carries these members shows of a scene: it, or it without its maps.
+
+    Raises:
+        TrilightError: nothing but its environment lights the scene, which the form cannot hold.
+    """
+    loses_sky = scene.environment is not None and "environment" not in carried
+    if not loses_sky and (not scene.textures or "textures" in carried):
+        return scene
+    if loses_sky and not scene.triangle_emits.any():
+        raise TrilightError(
+            "scene: its only light is its environment, which this form cannot hold; expected an "
+            "emitter too. Write it as .safetensors."
+        )
+    return without_maps(scene, textures="textures" not in carried, environment=loses_sky)

@@ -15,11 +15,13 @@ from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.posing import without_slivers
 from pipeline.scenes.shading import ShadedMesh, face_normals, flat_shaded, smooth_shaded
 from storage.errors import Rejected, TrilightError
+from storage.records.retextured import without_maps
 from storage.records.scene import Scene
 
 LEAST = 4
 """Fewest triangles that an object is brought down to."""
 
+_LOST = "textures became their means: reduced triangles have no texture coordinates"
 _SMOOTH_ANGLE_DEG = 30.0
 _FLAT = 1e-3
 
@@ -30,6 +32,8 @@ def within_budget(scene: Scene, budget: int) -> tuple[Scene, tuple[str, ...]]:
     Raises:
         TrilightError: emitters alone are more, or an object cannot be reduced that far.
     """
+    lost = [_LOST] if scene.textures else []
+    scene = without_maps(scene, environment=False)
     counts = np.bincount(scene.object_index, minlength=len(scene.objects))
     emits = np.array([entry.kind == "emitter" for entry in scene.objects])
     room = budget - int(counts[emits].sum())
@@ -54,9 +58,10 @@ def within_budget(scene: Scene, budget: int) -> tuple[Scene, tuple[str, ...]]:
         fov_deg=scene.fov_deg,
         objects=tuple(piece.entry for piece in pieces),
         provenance={**scene.provenance, "budget": budget},
+        environment=scene.environment,
     )
     reduced.check()
-    return reduced, (f"{scene.num_triangles} triangles reduced to {total}",)
+    return reduced, (f"{scene.num_triangles} triangles reduced to {total}", *lost)
 
 
 def _piece_of(scene: Scene, row: int) -> ScenePiece:

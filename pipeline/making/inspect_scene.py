@@ -70,7 +70,7 @@ def _facts(source: SceneSource) -> InspectedScene:
     scene = loaded.scene
     low, high = scene.vertex_positions.min(axis=0), scene.vertex_positions.max(axis=0)
     kinds = Counter(entry.kind for entry in scene.objects)
-    licences = Counter(entry.licence for entry in scene.objects)
+    licences = Counter(scene.licences)
     added = unread_columns(scene.materials, PUBLISHED_COLUMNS)
     facts = {
         "triangles": scene.num_triangles,
@@ -78,6 +78,7 @@ def _facts(source: SceneSource) -> InspectedScene:
         "objects": ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())),
         "materials": len(scene.materials),
         **({"added_columns": ", ".join(added)} if added else {}),
+        **_maps(scene),
         "lights": num_lights(scene),
         "cameras": ", ".join(f"{angle:.1f} deg" for angle in scene.fov_deg[:8]),
         "views": scene.num_views,
@@ -88,6 +89,24 @@ def _facts(source: SceneSource) -> InspectedScene:
         "scene_digest": scene_digest(scene),
     }
     return InspectedScene(facts=facts, notes=loaded.notes)
+
+
+def _maps(scene: Scene) -> dict[str, Any]:
+    """Return what there is to say of textures and environment, where there are any."""
+    found: dict[str, Any] = {}
+    if scene.textures:
+        sizes = (
+            f"{each.source.name or each.sha256[:8]} {each.texels.shape[1]} x {each.texels.shape[0]}"
+            for each in scene.textures[:8]
+        )
+        found["textures"] = f"{len(scene.textures)}: {', '.join(sizes)}"
+    if (sky := scene.environment) is not None:
+        height, width, _ = sky.radiance_rgb.shape
+        found["environment"] = (
+            f"{sky.source.name or sky.sha256[:8]} {width} x {height}, greatest radiance "
+            f"{float(sky.radiance_rgb.max()):.4g}, {'seen' if sky.is_seen else 'hidden'}"
+        )
+    return found
 
 
 def _turntable(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:

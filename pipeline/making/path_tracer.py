@@ -62,6 +62,10 @@ class PathTracer:
             limits=_LIMITS, setup=_set_up_child, setup_args=(variant, threads)
         )
 
+    def wake(self, name: str) -> None:
+        """Start the child and load the renderer, if that is to do; TrilightError as of `open`."""
+        self._call(name, lambda: self._child.call(_nothing))
+
     def open(self, scene: Scene, name: str) -> None:
         """Take the scene that is rendered from now on.
 
@@ -146,6 +150,10 @@ _state = _ChildState()
 def _set_up_child(variant: Variant, threads: int) -> None:
     activate(variant)
     set_threads(threads)
+
+
+def _nothing() -> None:
+    """A child that can do this is ready."""
 
 
 def _open_scene(scene: Scene, settings: RenderSettings | PreviewSettings) -> None:

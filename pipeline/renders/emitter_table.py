@@ -40,7 +40,12 @@ class EmitterTable:
     """The emitting triangles `order` of a scene, in that order."""
 
     def __init__(
-        self, scene: Scene, order: NDArray[np.intp], lit: NDArray[np.bool_] | None = None
+        self,
+        scene: Scene,
+        order: NDArray[np.intp],
+        lit: NDArray[np.bool_] | None = None,
+        *,
+        may_be_dark: bool = False,
     ) -> None:
         """Build the table.
 
@@ -48,6 +53,8 @@ class EmitterTable:
             scene: the scene.
             order: rows of its emitting triangles.
             lit: which of `order` are switched on; all by default. The others stay black bodies.
+            may_be_dark: whether something else lights the scene, so that a table of no light will
+                do; it gives points of no density and no radiance.
 
         Raises:
             Rejected: "unlit_scene" where no emitter that is on has both area and radiance.
@@ -59,6 +66,11 @@ class EmitterTable:
         edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         area = 0.5 * np.linalg.norm(np.cross(edge1, edge2), axis=1)
         power = area * radiance.mean(axis=1)
+        if not power.sum() > 0 and may_be_dark:
+            self._rows = own_floats(np.zeros((max(len(order), 1), 16)))
+            self._alias = own_floats(np.column_stack([np.ones(1), np.zeros(1)]))
+            self._count = dr.opaque(mi.UInt32, 1)
+            return
         if not power.sum() > 0:
             count = len(order) if lit is None else int(lit.sum())
             raise Rejected("unlit_scene", f"{count} emitting triangles have no area")

@@ -10,6 +10,7 @@ from pipeline.renders.emission_cone import EmissionCone
 from pipeline.renders.emitter_table import EmitterTable
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.guide_table import GuideTable
+from pipeline.renders.sky_table import SkyTable
 from pipeline.renders.surface_table import SurfacePoint, SurfaceTable
 
 MAX_SURVIVAL = 0.95
@@ -43,6 +44,7 @@ class KernelScene:
         max_depth: int,
         rr_depth: int,
         guide: GuideTable | None = None,
+        sky: SkyTable | None = None,
     ) -> None:
         """Bring the parts together.
 
@@ -56,6 +58,7 @@ class KernelScene:
             max_depth: longest path in edges.
             rr_depth: edges after which a path goes on by Russian roulette.
             guide: the directions in which camera paths look for light; None: by the BRDF alone.
+            sky: light from far away; None makes the kernel that knows of none.
         """
         self.surfaces = surfaces
         self.everything = everything
@@ -63,10 +66,15 @@ class KernelScene:
         self.emitters = emitters
         self.cone = cone
         self.guide = guide
+        self.sky = sky
         self.albedo = AlbedoLookup()
         self.num_surfaces = dr.opaque(mi.UInt32, num_surfaces)
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
+
+    def picked(self, density: Any) -> Any:
+        """Return a density (Float) of picks among lamps as one among all, the sky's too."""
+        return density if self.sky is None else self.sky.of_lamps(density)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

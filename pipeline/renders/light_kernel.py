@@ -26,6 +26,9 @@ The path tracer carries the ratio L / P * product of C+_i r_i / (c_i C-_(i+1)), 
 inverse, once for `hit` and once for `pick`. Roulette is in none of them. Direct light (k = 2) never
 lands: the stratified picks of the path tracer had 4 to 25 times less variance there (docs/log).
 
+Light from an environment map is found by the path tracer alone: its paths have no third density.
+Where there is one, `pick` goes by the share of the lamps too, and `land` does not.
+
 The BRDF is not reciprocal: in a light path the viewer's side is that of the next vertex. Light
 arrives by the cosine of the shading normal but spreads by that of the triangle, hence a factor
 C-/C+ at each vertex (Veach 1996).
@@ -91,7 +94,7 @@ def trace_light(
     hit = scene.everything.ray_intersect_preliminary(ray, active=active)
     active &= hit.is_valid()
     triangle, barycentric = mi.UInt32(hit.prim_index), mi.Point2f(hit.prim_uv)
-    pick_odds, depth = mi.Float(dr.square(hit.t) / leaving), mi.UInt32(1)
+    pick_odds, depth = mi.Float(scene.picked(dr.square(hit.t) / leaving)), mi.UInt32(1)
     while active:
         point = scene.table.point(triangle, barycentric, active)
         vertex = vertex_at(scene, point, triangle, barycentric, direction, active)

@@ -8,7 +8,8 @@ number of emitters.
 
 Both are weighed against light tracing too (pipeline.renders.light_kernel has the formulas), unless
 there are no light paths. Where the scene has a guide, half of the directions of rough surfaces come
-from its table (pipeline.renders.guide_table), which makes another kernel.
+from its table (pipeline.renders.guide_table), which makes another kernel. So does an environment
+map (pipeline.renders.sky_table): picks go to it in a stated share, and what meets nothing finds it.
 """
 
 from dataclasses import replace
@@ -30,10 +31,8 @@ from pipeline.renders.kernel_scene import (
     roulette,
     vertex_at,
 )
+from pipeline.renders.picked_light import picked_light
 from pipeline.renders.surface_table import SurfacePoint
-
-_SHORTENING = 1e-4
-"""Relative length that a shadow ray stops short of its emitter, so that it does not hit it."""
 
 
 @dr.syntax
@@ -52,11 +51,10 @@ def trace(
         ray: Ray3f from `film`.
     """
     hit = scene.surfaces.ray_intersect_preliminary(ray, coherent=True)
-    active = mi.Bool(hit.is_valid())
-    distance, triangle, barycentric = _met(hit)
+    active, (distance, triangle, barycentric) = mi.Bool(hit.is_valid()), _met(hit)
     origin, direction = mi.Point3f(ray.o), mi.Vector3f(ray.d)
-    radiance, throughput, share = parts.dark(), mi.Color3f(1), parts.first_share()
-    density, depth, guided = mi.Float(0), mi.UInt32(0), mi.Float(1)
+    radiance, throughput = _background(scene, parts, direction, active), mi.Color3f(1)
+    share, density, depth, guided = parts.first_share(), mi.Float(0), mi.UInt32(0), mi.Float(1)
     odds = light_paths * dr.square(distance) / film.density(direction)
     while active:
         point = scene.table.point(triangle, barycentric, active)
@@ -87,6 +85,8 @@ def trace(
         direction = mi.Vector3f(vertex.frame.to_world(local))
         origin = off_surface(point, direction)
         hit = scene.everything.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
+        lit = _missed(scene, direction, density, throughput, active, hit)
+        radiance = radiance if lit is None else parts.add(radiance, lit, depth, share)
         active &= hit.is_valid()
         distance, triangle, barycentric = _met(hit)
     return radiance
@@ -124,11 +124,30 @@ def _seen_emission(
     row = dr.select(emits, triangle - scene.num_surfaces, 0)
     area_density, emitted = scene.emitters.density_and_radiance(row, emits)
     cosine = dr.abs(dr.dot(point.geometric_normal, direction))
-    emitter_density = area_density * dr.square(distance) / cosine
+    emitter_density = scene.picked(area_density) * dr.square(distance) / cosine
     leaving = scene.cone.density(point.position, point.geometric_normal, -direction)
     others = dr.square(emitter_density / density) + dr.square(landing * area_density * leaving)
     shines = emits & (dr.max(emitted) > 0)  # one that is off has no density: 0/0 at grazing angles
     return dr.select(shines, emitted / (1 + others), 0)
+
+
+def _background(scene: KernelScene, parts: KernelParts, direction: Any, met: Any) -> list[Any]:
+    """Return the sums with what a camera ray sees that meets nothing; it is direct light."""
+    if scene.sky is None or not scene.sky.is_seen:
+        return parts.dark()
+    seen, _ = scene.sky.radiance_and_density(direction, ~met)
+    return parts.add(parts.dark(), dr.select(met, 0, seen), mi.UInt32(1), parts.first_share())
+
+
+def _missed(
+    scene: KernelScene, direction: Any, density: Any, throughput: Any, active: Any, hit: Any
+) -> Any:
+    """Return the sky's light where a drawn direction meets nothing; None where there is no sky."""
+    if scene.sky is None:
+        return None
+    free = active & ~hit.is_valid()
+    radiance, picks = scene.sky.radiance_and_density(direction, free)
+    return throughput * dr.select(free, radiance / (1 + dr.square(picks / density)), 0)
 
 
 def _guidance(scene: KernelScene, vertex: Vertex, active: Any) -> Guidance | None:
@@ -194,27 +213,18 @@ def _direct_light(
     u: Any,
     active: Any,
 ) -> tuple[Any, Any]:
-    """Return the light of one sampled emitter point, and its direction in the frame.
+    """Return the light of one pick, a point of a lamp or a direction of the sky, and its direction.
 
-    It is weighed against the other strategies.
+    The direction is in the frame. The light is weighed against the other strategies.
     """
-    emitter = scene.emitters.sample(u, active)
-    to_emitter = emitter.position - vertex.point.position
-    distance_sq = dr.squared_norm(to_emitter)
-    direction = to_emitter * dr.rsqrt(distance_sq)
-    emitter_density = emitter.area_density * distance_sq / dr.abs(dr.dot(emitter.normal, direction))
-    local = vertex.frame.to_local(direction)
+    pick = picked_light(scene, vertex.point.position, u, active)
+    local = vertex.frame.to_local(pick.direction)
     reflected, unguided = _reflected(vertex, local)
     density = _density(scene, vertex, guidance, unguided, local, active)
-    leaving = scene.cone.density(emitter.position, emitter.normal, -direction)
-    landing = odds * _turned_back(vertex, local, depth) * leaving / distance_sq
-    others = dr.square(density / emitter_density) + dr.square(dr.select(depth > 1, landing, 0))
-    useful = active & (dr.max(reflected) > 0) & dr.isfinite(emitter_density)
-    start = off_surface(vertex.point, direction)
-    remaining = emitter.position - start
-    length = dr.norm(remaining)
-    shadow_ray = mi.Ray3f(start, mi.Vector3f(remaining / length))
-    shadow_ray.maxt = length * (1 - _SHORTENING)
+    landing = odds * _turned_back(vertex, local, depth) * pick.leaving / pick.distance_sq
+    others = dr.square(density / pick.density) + dr.square(dr.select(depth > 1, landing, 0))
+    useful = active & (dr.max(reflected) > 0) & dr.isfinite(pick.density)
+    shadow_ray = pick.shadow_ray(off_surface(vertex.point, pick.direction))
     lit = useful & ~scene.everything.ray_test(shadow_ray, active=useful)
-    weighed = reflected * emitter.radiance / (emitter_density * (1 + others))
+    weighed = reflected * pick.radiance / (pick.density * (1 + others))
     return dr.select(lit, weighed, 0), local

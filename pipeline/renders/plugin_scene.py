@@ -1,8 +1,9 @@
 """A `Scene` as stock Mitsuba plugins, for either variant.
 
-One mesh holds all surfaces, with the material as attributes of its faces; emitters reflect by the
-same material. They are one shape per material row and side: Mitsuba's `area` emitter has one side,
-so each triangle has a turned twin, and both are moved apart, or rays would meet either of two
+One mesh holds all surfaces, with the material as attributes of its faces; in a textured scene each
+material row has one, with its textures. Emitters reflect by the same material. They are one shape
+per material row and side: Mitsuba's `area` emitter has one side, so each triangle has a turned
+twin, and both are moved apart, or rays would meet either of two
 coincident faces at random and half of the emission would be lost.
 """
 
@@ -13,11 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.compensated_texture import PLUGIN, register_plugin
+from pipeline.renders.plugin_sky import plugin_sky
+from pipeline.renders.plugin_textures import textured_albedo, textured_slots
+from pipeline.renders.sky_share import lamp_power, shining_sky, sky_share
 from pipeline.renders.tracer import split_triangles
 from storage.errors import Rejected
 from storage.records.lobes import lobes_of, scaled_albedos
 from storage.records.material import EMISSION
-from storage.records.multiscatter import scattered_again
+from storage.records.multiscatter import Smith, scattered_again
 from storage.records.scene import Scene
 
 _TWIN_OFFSET = 1e-4
@@ -28,35 +32,52 @@ def _face(name: str) -> dict[str, str]:
     return {"type": "mesh_attribute", "name": f"face_{name}"}
 
 
-_MATERIAL = {
-    "type": "blendbsdf",
-    "weight": _face("weight"),
-    "first": {"type": "diffuse", "reflectance": _face("diffuse")},
-    "second": {
-        "type": "roughconductor",
-        "material": "none",
-        "distribution": "ggx",
-        "alpha": _face("alpha"),
-        "specular_reflectance": {
-            "type": PLUGIN,
-            "specular": _face("specular"),
-            "again": _face("again"),
-            "alpha": _face("alpha"),
+_SLOTS = ("weight", "diffuse", "specular", "alpha", "again")
+_SMITH: Smith = "separable"
+
+
+def _blend(textures: dict[str, Any]) -> dict[str, Any]:
+    """Return diffuse and specular lobe as the blend of storage.records.lobes."""
+    specular = {name: textures[name] for name in ("specular", "again", "alpha")}
+    return {
+        "type": "blendbsdf",
+        "weight": textures["weight"],
+        "first": {"type": "diffuse", "reflectance": textures["diffuse"]},
+        "second": {
+            "type": "roughconductor",
+            "material": "none",
+            "distribution": "ggx",
+            "alpha": textures["alpha"],
+            "specular_reflectance": {"type": PLUGIN, **specular},
         },
-    },
-}
-"""Diffuse and specular lobe as the blend of storage.records.lobes, read from the face."""
+    }
+
+
+def _material(scene: Scene, row: int) -> Any:
+    """Return the BSDF of a mesh: of one material row in textured scenes, read from faces else."""
+    if scene.textures:
+        return _two_sided(_blend(textured_slots(scene, row, _SMITH)))
+    return _two_sided(_blend({name: _face(name) for name in _SLOTS}))
 
 
 def plugin_scene(scene: Scene, *, only_light: int | None = None) -> Any:
-    """Return the mi.Scene of everything, with one emitter object switched on or all of them."""
+    """Return the mi.Scene of everything, with one emitter object switched on or all light."""
     register_plugin()
     surfaces, emitters = split_triangles(scene)
-    shapes = {"surfaces": _surfaces(scene, surfaces)} if len(surfaces) else {}
+    shapes = {
+        f"surfaces_{row}": _surfaces(scene, triangles, row)
+        for row, triangles in _meshes(scene, surfaces)
+    }
     is_on = np.ones(len(emitters), bool)
     if only_light is not None:
         is_on = scene.object_index[emitters] == only_light
-    if not is_on.any():
+    sky = shining_sky(scene) if only_light is None else None
+    if sky is not None:
+        share = sky_share(scene, sky)
+        weight = lamp_power(scene) * share / (1 - share) if share < 1 else 1.0
+        # Its lamps are two-sided twins, each of which has the power of the lamp.
+        shapes["sky"] = plugin_sky(sky, 2 * weight)
+    if not is_on.any() and sky is None:
         raise Rejected("unlit_scene", "0 emitting triangles have no area")
     for on in (True, False):
         kept = emitters[is_on == on]
@@ -70,27 +91,58 @@ def plugin_scene(scene: Scene, *, only_light: int | None = None) -> Any:
 def plugin_feature_scene(scene: Scene) -> Any:
     """Return the mi.Scene of the surfaces alone, with diffuse + specular as its albedo."""
     surfaces, _ = split_triangles(scene)
-    lobes = lobes_of(scene.materials[scene.material_index[surfaces]])
-    mesh = _mesh(scene, surfaces, _two_sided({"type": "diffuse", "reflectance": _face("albedo")}))
-    _add_attribute(mesh, "albedo", lobes.diffuse + lobes.specular)
-    return mi.load_dict({"type": "scene", "surfaces": mesh})
+    shapes = {
+        f"surfaces_{row}": _feature_surfaces(scene, triangles, row)
+        for row, triangles in _meshes(scene, surfaces)
+    }
+    return mi.load_dict({"type": "scene", **shapes})
 
 
-def _surfaces(scene: Scene, triangles: NDArray[np.intp]) -> Any:
-    mesh = _mesh(scene, triangles, _two_sided(_MATERIAL))
+def _meshes(scene: Scene, triangles: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]]:
+    """Return what goes into each mesh: all, or where there are textures those of a material row."""
+    if not scene.textures:
+        return [(0, triangles)] if len(triangles) else []
+    rows = scene.material_index[triangles]
+    return [(int(row), triangles[rows == row]) for row in np.unique(rows)]
+
+
+def plugin_background(scene: Scene) -> Any:
+    """Return the mi.Scene of black surfaces before the sky; None where cameras see none."""
+    sky = shining_sky(scene)
+    if sky is None or not sky.is_seen:
+        return None
+    surfaces, _ = split_triangles(scene)
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    mesh = _mesh(scene, surfaces, _two_sided(black))
+    return mi.load_dict({"type": "scene", "surfaces": mesh, "sky": plugin_sky(sky, 1.0)})
+
+
+def _surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:
+    mesh = _mesh(scene, triangles, _material(scene, row))
     _add_material(mesh, scene, triangles)
     return mesh
 
 
+def _feature_surfaces(scene: Scene, triangles: NDArray[np.intp], row: int) -> Any:
+    if scene.textures:
+        return _mesh(scene, triangles, _two_sided(textured_albedo(scene, row)))
+    lobes = lobes_of(scene.materials[scene.material_index[triangles]])
+    mesh = _mesh(scene, triangles, _two_sided({"type": "diffuse", "reflectance": _face("albedo")}))
+    _add_attribute(mesh, "albedo", lobes.diffuse + lobes.specular)
+    return mesh
+
+
 def _add_material(mesh: Any, scene: Scene, triangles: NDArray[np.intp]) -> None:
-    """Give the faces of a mesh what _MATERIAL reads."""
+    """Give the faces of a mesh what `_material` reads from them: textured ones read no face."""
+    if scene.textures:
+        return
     lobes = lobes_of(scene.materials[scene.material_index[triangles]])
     diffuse, specular = scaled_albedos(lobes)
     _add_attribute(mesh, "weight", lobes.weight[:, None])
     _add_attribute(mesh, "alpha", lobes.alpha[:, None])
     _add_attribute(mesh, "diffuse", diffuse)
     _add_attribute(mesh, "specular", specular)
-    _add_attribute(mesh, "again", scattered_again(lobes.specular, lobes.alpha, "separable"))
+    _add_attribute(mesh, "again", scattered_again(lobes.specular, lobes.alpha, _SMITH))
 
 
 def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int, *, on: bool) -> Any:
@@ -109,35 +161,51 @@ def _emitter(scene: Scene, triangles: NDArray[np.intp], side: int, *, on: bool) 
     elif not power > 0:
         raise Rejected("unlit_scene", f"{len(triangles)} emitting triangles have no area")
     properties = mi.Properties()
-    properties["bsdf"] = _two_sided(_MATERIAL)
+    properties["bsdf"] = _material(scene, int(scene.material_index[triangles[0]]))
     colour = {"type": "rgb", "value": radiance.tolist()}
     properties["emitter"] = mi.load_dict(
         {"type": "area", "radiance": colour, "sampling_weight": power}
     )
-    mesh = mi.Mesh(f"emitter{side}", 3 * len(triangles), len(triangles), props=properties)
+    mesh = mi.Mesh(
+        f"emitter{side}",
+        3 * len(triangles),
+        len(triangles),
+        props=properties,
+        has_vertex_texcoords=scene.uv is not None,
+    )
     twin = corners[:, ::side] + side * _TWIN_OFFSET * normal[:, None]
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = twin.astype(np.float32).ravel()
     parameters["faces"] = np.arange(3 * len(triangles), dtype=np.uint32)
+    if scene.uv is not None:
+        parameters["vertex_texcoords"] = scene.uv.reshape(-1, 3, 2)[triangles, ::side].ravel()
     parameters.update()
     _add_material(mesh, scene, triangles)
     return mesh
 
 
 def _mesh(scene: Scene, triangles: NDArray[np.intp], material: Any) -> Any:
+    """Return triangles as a mesh; corners have texture coordinates of their own, if any."""
+    faces = scene.faces[triangles].ravel()
+    vertices = np.arange(len(scene.vertex_positions), dtype=np.uint32)
+    if scene.uv is not None:
+        vertices, faces = faces, np.arange(len(faces), dtype=np.uint32)
     properties = mi.Properties()
     properties["bsdf"] = material
     mesh = mi.Mesh(
         "surfaces",
-        len(scene.vertex_positions),
+        len(vertices),
         len(triangles),
         props=properties,
         has_vertex_normals=True,
+        has_vertex_texcoords=scene.uv is not None,
     )
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = scene.vertex_positions.ravel()
-    parameters["vertex_normals"] = scene.vertex_normals.ravel()
-    parameters["faces"] = scene.faces[triangles].ravel()
+    parameters["vertex_positions"] = scene.vertex_positions[vertices].ravel()
+    parameters["vertex_normals"] = scene.vertex_normals[vertices].ravel()
+    parameters["faces"] = faces
+    if scene.uv is not None:
+        parameters["vertex_texcoords"] = scene.uv.reshape(-1, 3, 2)[triangles].ravel()
     parameters.update()
     return mesh
 

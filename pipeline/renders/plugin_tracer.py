@@ -16,7 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
-from pipeline.renders.plugin_scene import plugin_feature_scene, plugin_scene
+from pipeline.renders.plugin_scene import (
+    plugin_background,
+    plugin_feature_scene,
+    plugin_scene,
+)
 from pipeline.renders.tracer import Chosen, Features, HostSum
 from storage.records.scene import Scene
 
@@ -37,12 +41,15 @@ class PluginTracer:
         self._path = _integrator(
             type="path", max_depth=max_depth, rr_depth=rr_depth, hide_emitters=True
         )
+        self._background = plugin_background(scene)
+        self._seen = _integrator(type="path", max_depth=1)
         self._features = _integrator(type="aov", aovs="albedo:albedo,normal:sh_normal")
         self._depth = _integrator(type="aov", aovs="depth:depth")
 
     def only_light(self, row: int) -> "PluginTracer":
         tracer = copy.copy(self)
         tracer._scene = plugin_scene(self._record, only_light=row)
+        tracer._background = None
         return tracer
 
     def apart(self, *, bounces: bool, lobes: bool) -> "PluginTracer":
@@ -56,6 +63,8 @@ class PluginTracer:
         self, camera: Camera, *, seed: int, spp: int, chosen: Chosen = None
     ) -> NDArray[np.float32]:
         picture = _render(self._scene, self._path, camera, seed=seed, spp=spp)
+        if self._background is not None:  # emitters are hidden from the camera all or none
+            picture += _render(self._background, self._seen, camera, seed=seed, spp=spp)
         return picture if chosen is None else picture * chosen[..., None]
 
     def pass_sum(self, camera: Camera) -> HostSum:

@@ -4,7 +4,7 @@ A measured error needs two halves of many samples (pipeline.renders.renderer). A
 of samples, so that nothing tells how far it is from the truth, and it says so.
 """
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -35,7 +35,8 @@ FAST_SPP = 16
 """Up to so many samples the fast filter is the better trade: more samples cost less than the better
 filter, 0.5 core-seconds at 256 pixels, and bring as much (docs/log)."""
 
-_PASSES = (*PASS_SPP, 1)
+PASSES = (*PASS_SPP, 1)
+"""Samples of a pass, the largest first."""
 
 
 @checked("preview settings")
@@ -124,7 +125,7 @@ def samples_sum(
         done: samples before.
         spp: samples that are wanted in all, above `done`.
     """
-    size = _largest_pass(spp - done)
+    size = next(pass_sizes(spp - done))
     pass_seed = seed_for(seed, "preview", done)
     picture = tracer.radiance(camera, seed=pass_seed, spp=size)
     return size * picture.astype(np.float64), done + size
@@ -136,10 +137,18 @@ def denoised(
     """Return a picture [R, R, 3] of `spp` samples without noise, guided by rays to first hits."""
     if quality == "off":
         return picture_rgb
+    return denoise(picture_rgb, tracer.features(camera, spp=guide_rays(spp)), quality)
+
+
+def pass_sizes(spp: int) -> Iterator[int]:
+    """Yield the samples of each pass of a preview, the largest first; they add up to `spp`."""
+    while spp > 0:
+        size = next(size for size in PASSES if size <= spp)
+        spp -= size
+        yield size
+
+
+def guide_rays(spp: int) -> int:
+    """Return the rays of a pixel for the guide pictures of a preview of `spp` samples."""
     # 4 rays cost as much as 1 and are 0.3 (fast) to 0.9 dB better; 16 pay from 16 samples on
-    rays = PASS_SPP[1] if spp >= PASS_SPP[1] else PASS_SPP[2]
-    return denoise(picture_rgb, tracer.features(camera, spp=rays), quality)
-
-
-def _largest_pass(spp: int) -> int:
-    return next(size for size in _PASSES if size <= spp)
+    return PASS_SPP[1] if spp >= PASS_SPP[1] else PASS_SPP[2]

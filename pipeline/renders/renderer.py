@@ -36,7 +36,7 @@ from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_
 from pipeline.renders.tiles import TileChoice
 from pipeline.renders.tracer import Features, Tracer
 from storage.conventions import HALF_FLOAT_MAX
-from storage.errors import Rejected
+from storage.errors import Rejected, TrilightError
 from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
 from storage.records.parts import MAX_PICTURES, Parts
 from storage.records.scene import Scene
@@ -114,6 +114,7 @@ class SceneRenderer:
                 none), "no_surfaces" where all triangles emit (emitters are hidden, so every
                 picture would be black), "too_many_lights" where more than MAX_PICTURES would be
                 kept apart.
+            TrilightError: with `per_light`, where an environment lights the scene too.
             NotImplementedError: RenderSettings.require_variant refuses the variant.
         """
         require_surfaces(scene)
@@ -122,7 +123,9 @@ class SceneRenderer:
         if settings.part_names:
             self._tracer = self._tracer.apart(bounces=settings.split, lobes=settings.split_lobes)
         self._tracers = [self._tracer]
+        self._sees_sky = scene.environment is not None and scene.environment.is_seen
         if settings.per_light:
+            _refuse_sky(scene)
             most = MAX_PICTURES // max(1, len(settings.part_names))
             self._tracers = _tracer_of_each_light(self._tracer, scene, most)
 
@@ -209,7 +212,7 @@ class SceneRenderer:
     ) -> Generator[Sampling, None, tuple[MeasuredFloor, dict[str, MeasuredFloor]]]:
         targets_db, max_spp = self._settings.targets_db, self._settings.max_spp
         measured: list[tuple[int, Floors]] = []
-        samples.counted = _shown(features)
+        samples.counted = np.ones(hits.shape, bool) if self._sees_sky else _shown(features)
         tiles = TileChoice(samples.counted)
         while True:
             quality = self._filter_of_halves(samples.spp)
@@ -336,6 +339,14 @@ def _tracer_of_each_light(tracer: Tracer, scene: Scene, most: int) -> list[Trace
     if len(rows) > most:
         raise Rejected("too_many_lights", f"{len(rows)} emitters apart; at most {most}")
     return [tracer.only_light(row) for row in rows]
+
+
+def _refuse_sky(scene: Scene) -> None:
+    if scene.environment is not None:
+        raise TrilightError(
+            "render settings: per_light is True and an environment lights the scene; expected "
+            "emitters alone, whose pictures add up to all light. Leave out --per-light."
+        )
 
 
 def _shares_of(parts_rgb: NDArray[np.float32]) -> NDArray[np.float32]:

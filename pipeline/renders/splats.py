@@ -26,7 +26,8 @@ _SMALLEST_EXPONENT = -90
 
 def splat_unit(scene: Scene) -> float:
     """Return the radiance of one unit."""
-    brightest = float(scene.materials[scene.material_index[scene.triangle_emits], EMISSION].max())
+    emission = scene.materials[scene.material_index[scene.triangle_emits], EMISSION]
+    brightest = float(emission.max(initial=0))
     return math.ldexp(0.5, max(math.frexp(brightest)[1], _SMALLEST_EXPONENT) + 1 - _STEPS)
 
 

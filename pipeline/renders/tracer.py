@@ -79,7 +79,8 @@ class Tracer(Protocol):
     def only_light(self, row: int) -> "Tracer":
         """Return the same loaded scene in which only the emitter `objects[row]` is switched on.
 
-        The others stay where they are, black. Equal seeds give equal camera rays in both.
+        The others stay where they are, black, and an environment is off. Equal seeds give equal
+        camera rays in both.
 
         Raises:
             Rejected: "unlit_scene" where it has no area.

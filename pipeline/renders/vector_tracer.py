@@ -28,8 +28,10 @@ from pipeline.renders.kernel_scene import KernelScene
 from pipeline.renders.light_kernel import trace_light
 from pipeline.renders.path_kernel import trace
 from pipeline.renders.photon_kernel import PhotonRecords, trace_photons
+from pipeline.renders.sky_share import shining_sky, sky_share
+from pipeline.renders.sky_table import SkyTable
 from pipeline.renders.splats import Splats, splat_unit
-from pipeline.renders.surface_table import SurfaceTable
+from pipeline.renders.textured_table import surface_table
 from pipeline.renders.tracer import Chosen, Features, split_triangles
 from storage.records.scene import Scene
 from storage.seeds import seed_for
@@ -55,16 +57,17 @@ class VectorTracer:
         surfaces, emitters = split_triangles(scene)
         order = np.concatenate([surfaces, emitters])
         self._record, self._emitters = scene, emitters
-        seen = _load(scene, surfaces)
+        seen, sky = _load(scene, surfaces), shining_sky(scene)
         self._scene = KernelScene(
             surfaces=seen,
             everything=_load(scene, order, beside=seen),
-            table=SurfaceTable(scene, order),
-            emitters=EmitterTable(scene, emitters),
+            table=surface_table(scene, order),
+            emitters=EmitterTable(scene, emitters, may_be_dark=sky is not None),
             cone=EmissionCone(scene),
             num_surfaces=len(surfaces),
             max_depth=max_depth,
             rr_depth=rr_depth,
+            sky=None if sky is None else SkyTable(sky, sky_share(scene, sky)),
         )
         self._parts = KernelParts(bounces=False, lobes=False)
         self._unit = splat_unit(scene)
@@ -75,6 +78,7 @@ class VectorTracer:
         tracer = copy.copy(self)
         tracer._scene = copy.copy(self._scene)
         tracer._scene.emitters = EmitterTable(self._record, self._emitters, lit)
+        tracer._scene.sky = None
         return tracer
 
     def apart(self, *, bounces: bool, lobes: bool) -> "VectorTracer":

@@ -3,6 +3,7 @@
 Scene k is a pure function of (settings, pool, seed, k, attempt).
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,11 +17,15 @@ from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.posing import posed
 from pipeline.scenes.shapes import MeshShape
 from pipeline.scenes.subdivision import filled
+from pipeline.scenes.textured_pieces import with_drawn_textures
 from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
 from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
 from scene_templates.settings import SceneSettings
+from scene_templates.skies.drawn_scene import scene_sky
 from storage.errors import TrilightError
+from storage.records.material import EMISSION
+from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene, SceneObject
 from storage.seeds import rng_for
 
@@ -45,7 +50,7 @@ def compose_scene(
     Returns:
         A checked scene with `settings.num_views` cameras. Its provenance holds template, family,
         scene_index, attempt, seed and camera_attempts (per view, the proposal that passed), and
-        where the scene is an excursion its axis and value.
+        where the scene is an excursion its axis and value, and where it has a sky, what was drawn.
 
     Raises:
         Rejected: no_room, over_budget, no_faces, no_camera, emitter_inside or law_broken; equal
@@ -66,11 +71,12 @@ def compose_scene(
         for entry, level in zip(chosen, levels, strict=True)
     ]
     layout = layout_rand(rng, settings, plan, shapes)
-    pieces = scene_pieces(layout, chosen, shapes, settings, rng)
-    arrays = joined(pieces)
-    arrays["materials"] = with_drawn_columns(
-        arrays["materials"], seed=seed, scene_index=scene_index, attempt=attempt
+    name = {"seed": seed, "scene_index": scene_index, "attempt": attempt}
+    pieces = with_drawn_textures(
+        scene_pieces(layout, chosen, shapes, settings, rng), layout, settings.textures, **name
     )
+    arrays = joined(pieces)
+    arrays["materials"] = with_drawn_columns(arrays["materials"], **name)
     scene = Scene(
         **arrays,
         c2w=np.zeros((0, 4, 4), np.float32),
@@ -78,9 +84,28 @@ def compose_scene(
         objects=tuple(piece.entry for piece in pieces),
         provenance=provenance,
     )
-    scene = with_first_cameras(scene, settings)
+    scene = _with_sky(scene, settings, seed, scene_index, attempt)
+    scene = with_first_cameras(without_constant_textures(scene), settings)
     require_laws(scene, settings)
     return scene
+
+
+def _with_sky(
+    scene: Scene, settings: SceneSettings, seed: int, scene_index: int, attempt: int
+) -> Scene:
+    emits = scene.triangle_emits
+    sky = scene_sky(
+        settings.skies,
+        scene.vertex_positions[scene.faces[emits]].astype(np.float64),
+        scene.materials[scene.material_index[emits], EMISSION].astype(np.float64),
+        seed=seed,
+        scene_index=scene_index,
+        attempt=attempt,
+    )
+    if sky is None:
+        return scene
+    lit = dataclasses.replace(scene, environment=sky.environment)
+    return lit.with_provenance({**scene.provenance, "sky": sky.origin})
 
 
 def _provenance(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,17 @@ from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.errors import Rejected
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR, default_rows
 from storage.records.scene import SceneObject
+from storage.records.texture import CONSTANT, TEXTURED, Texture
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Skin:
+    """The textures of a piece, whose material is one row."""
+
+    uv: NDArray[np.float32]
+    """[3T, 2] of each corner of each triangle."""
+    textures: tuple[Texture, Texture, Texture]
+    """Diffuse, specular and roughness."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -26,6 +38,8 @@ class ScenePiece:
     """[M, 10 or more], every declared column (storage.records.material)."""
     material_index: NDArray[np.int64]
     """[T] row of `materials`."""
+    skin: Skin | None = None
+    """Textures that stand for columns of the material; by default none."""
 
 
 def shell_piece(part: ShellPart, rng: np.random.Generator, smooth_angle_deg: float) -> ScenePiece:
@@ -97,8 +111,8 @@ def _surfaced(
     return ScenePiece(entry=entry, mesh=mesh, materials=materials, material_index=rows)
 
 
-def joined(pieces: Sequence[ScenePiece]) -> dict[str, NDArray]:
-    """Return the geometry and material arrays of a Scene, in the order of the pieces."""
+def joined(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
+    """Return the geometry, materials and textures of a Scene, in the order of the pieces."""
     vertex_start = _starts([len(piece.mesh.positions) for piece in pieces])
     material_start = _starts([len(piece.materials) for piece in pieces])
     rows = range(len(pieces))
@@ -114,6 +128,29 @@ def joined(pieces: Sequence[ScenePiece]) -> dict[str, NDArray]:
         ).astype(np.uint16),
         "materials": np.concatenate([piece.materials for piece in pieces]),
         "object_index": np.repeat(np.arange(len(pieces)), counts).astype(np.uint16),
+        **_skins(pieces),
+    }
+
+
+def _skins(pieces: Sequence[ScenePiece]) -> dict[str, Any]:
+    """Return the fields that textures take in a Scene: none where no piece has any."""
+    if all(piece.skin is None for piece in pieces):
+        return {}
+    textures, rows, corners = dict[str, Texture](), [], []
+    for piece in pieces:
+        index = np.full((len(piece.materials), len(TEXTURED)), CONSTANT, np.int32)
+        uv = np.zeros((3 * len(piece.mesh.faces), 2), np.float32)
+        if piece.skin is not None:
+            for texture in piece.skin.textures:
+                textures.setdefault(texture.sha256, texture)
+            index[:] = [list(textures).index(each.sha256) for each in piece.skin.textures]
+            uv = piece.skin.uv
+        rows.append(index)
+        corners.append(uv)
+    return {
+        "uv": np.concatenate(corners),
+        "textures": tuple(textures.values()),
+        "material_textures": np.concatenate(rows),
     }
 
 

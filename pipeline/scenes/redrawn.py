@@ -16,6 +16,7 @@ from scene_templates.materials import MaterialSettings, surface_rand
 from scene_templates.templates import TEMPLATES
 from storage.errors import Rejected
 from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR
+from storage.records.retextured import NEW, chosen_maps, without_maps
 from storage.records.scene import Scene
 from storage.records.scene_facts import surfaces
 from storage.seeds import rng_for
@@ -26,6 +27,8 @@ def with_new_materials(
 ) -> Scene:
     """Return the scene with materials drawn anew for each object, floor and wall; emitters stay.
 
+    New materials have no textures.
+
     Faces that shared a row of materials within an object share one still, and where there were many
     rows there are as many colours.
 
@@ -34,6 +37,7 @@ def with_new_materials(
         settings: the ranges to draw from.
         seed, index, attempt: a random stream belongs to each of these.
     """
+    scene = without_maps(scene, environment=False)
     rng = rng_for(seed, "new materials", index, attempt)
     rows, material_index = [scene.materials[:0]], scene.material_index.astype(np.int64)
     lit = {row for row, entry in enumerate(scene.objects) if entry.kind == "emitter"}
@@ -95,8 +99,13 @@ def with_new_lights(
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
     dark, new = _without(scene, kinds == "emitter"), joined(lamps)
     vertices, rows = len(dark.vertex_positions), len(dark.materials)
+    triangles, materials = (
+        np.append(np.arange(count), np.full(len(more), NEW))
+        for count, more in ((len(dark.faces), new["faces"]), (rows, new["materials"]))
+    )
     return dataclasses.replace(
         dark,
+        **chosen_maps(dark, triangles, materials),
         vertex_positions=np.concatenate([dark.vertex_positions, new["vertex_positions"]]),
         vertex_normals=np.concatenate([dark.vertex_normals, new["vertex_normals"]]),
         faces=np.concatenate([dark.faces, new["faces"] + np.uint32(vertices)]),
@@ -128,6 +137,7 @@ def _without(scene: Scene, gone: NDArray[np.bool_]) -> Scene:
     materials, rows_of = np.unique(scene.material_index[stays], return_inverse=True)
     return dataclasses.replace(
         scene,
+        **chosen_maps(scene, np.flatnonzero(stays), materials),
         vertex_positions=scene.vertex_positions[vertices],
         vertex_normals=scene.vertex_normals[vertices],
         faces=faces_of.reshape(faces.shape).astype(np.uint32),

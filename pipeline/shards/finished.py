@@ -11,6 +11,7 @@ from pipeline.shards.scene_values import asked_values
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
 from storage.dataset.progress import planned_shards
+from storage.dataset.shard import with_maps
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, read_objects_lock
@@ -108,22 +109,32 @@ class SampleReader:
         self._folder = dataset.folder
         self._shard: ShardEntry | None = None
         self._index: Mapping[str, Mapping[str, tuple[int, int]]] = {}
+        self._maps: Mapping[str, tuple[int, int]] = {}
         self._stream: BinaryIO | None = None
 
     def members(
         self, shard: ShardEntry, key: str, suffixes: tuple[str, ...] | None = None
     ) -> dict[str, bytes]:
-        """Return members of a sample by suffix, all of them by default; the shard was checked."""
+        """Return members of a sample by suffix, all of them by default; the shard was checked.
+
+        With its record come the maps that this names.
+        """
         if shard is not self._shard or self._stream is None:
             self.close()
             self._stream = self._folder.shard(shard.name).open("rb")
-            self._shard, self._index = shard, shard.index
-        members = {}
-        for suffix, (offset, num_bytes) in self._index[key].items():
-            if suffixes is None or suffix in suffixes:
-                self._stream.seek(offset)
-                members[suffix] = self._stream.read(num_bytes)
-        return members
+            self._shard, self._index, self._maps = shard, shard.index, shard.maps
+        members = {
+            suffix: self._read(place)
+            for suffix, place in self._index[key].items()
+            if suffixes is None or suffix in suffixes
+        }
+        return with_maps(members, self._maps, self._read)
+
+    def _read(self, place: tuple[int, int]) -> bytes:
+        offset, num_bytes = place
+        assert self._stream is not None
+        self._stream.seek(offset)
+        return self._stream.read(num_bytes)
 
     def close(self) -> None:
         if self._stream is not None:

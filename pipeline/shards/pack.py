@@ -10,6 +10,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard, shard_of_row, shard_row
 from storage.dataset.shard import write_shard
 from storage.dataset.staging import read_staged_scene
+from storage.records.map_references import MAP_NAME
 from storage.records.objects import Failure, write_failures
 from storage.records.sample import sample_key
 
@@ -33,6 +34,7 @@ def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardE
     staged_folder = folder.staged_shard(name)
     failures: list[Failure] = []
     samples: list[tuple[str, dict[str, bytes]]] = []
+    maps: dict[str, bytes] = {}
     for index in scene_indices:
         try:
             staged = read_staged_scene(staged_folder, index)
@@ -42,6 +44,8 @@ def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardE
             raise
         failures.extend(staged.failures)
         if staged.members:
+            for member in filter(MAP_NAME.fullmatch, staged.members):  # in memory once
+                staged.members[member] = maps.setdefault(member, staged.members[member])
             samples.append((sample_key(index), staged.members))
     write_failures(rejections_of_shard(folder, name), failures)
     path = folder.shard(name)

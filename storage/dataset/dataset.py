@@ -13,7 +13,7 @@ from typing import BinaryIO
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
-from storage.dataset.shard import samples_of
+from storage.dataset.shard import samples_of, with_maps
 from storage.digests import sha256_of_stream
 from storage.errors import TrilightError
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
@@ -255,21 +255,22 @@ class Dataset:
             TrilightError: the shard is missing or shorter than its index, or a scene in it is
                 unreadable or breaks a law.
         """
+        maps = shard.maps
         with self.files.open(shard, checked=False) as stream:
             for key, members in shard.index.items():
                 scene_members = [suffix for suffix in members if not suffix.endswith("exr")]
                 with reading(self.shown, shard.name):
-                    record = decode_scene(key, _read(stream, members, scene_members))
+                    record = decode_scene(key, _read(stream, members, scene_members, maps))
                     _require_lawful(record)
                 yield record
 
     def read_samples(self, shard: ShardEntry, keys: Iterable[str]) -> Iterator[Sample]:
         """Yield some samples of a shard with their pictures; otherwise as `read_scenes`."""
-        index = shard.index
+        index, maps = shard.index, shard.maps
         with self.files.open(shard, checked=False) as stream:
             for key in keys:
                 with reading(self.shown, shard.name):
-                    sample = decode_sample(key, _read(stream, index[key], index[key]))
+                    sample = decode_sample(key, _read(stream, index[key], index[key], maps))
                     _require_lawful(sample)
                 yield sample
 
@@ -287,15 +288,19 @@ def _read(
     stream: BinaryIO,
     index: Mapping[str, tuple[int, int]],
     suffixes: Iterable[str],
+    maps: Mapping[str, tuple[int, int]],
 ) -> dict[str, bytes]:
-    members = {}
-    for suffix in suffixes:
-        offset, num_bytes = index[suffix]
-        stream.seek(offset)
-        members[suffix] = stream.read(num_bytes)
-        if len(members[suffix]) != num_bytes:
-            raise TrilightError("shorter than the manifest says")
-    return members
+    members = {suffix: _read_at(stream, index[suffix]) for suffix in suffixes}
+    return with_maps(members, maps, lambda place: _read_at(stream, place))
+
+
+def _read_at(stream: BinaryIO, place: tuple[int, int]) -> bytes:
+    offset, num_bytes = place
+    stream.seek(offset)
+    data = stream.read(num_bytes)
+    if len(data) != num_bytes:
+        raise TrilightError("shorter than the manifest says")
+    return data
 
 
 def _require_lawful(record: SceneRecord | Sample) -> None:

@@ -17,26 +17,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from storage.atomic import atomic_writer
-from storage.conventions import SCHEMA_VERSION, SPLITS, require_readable
+from storage.conventions import MAPS_VERSION, SCHEMA_VERSION, SPLITS, require_readable
 from storage.dataset.json_pieces import entries
 from storage.dataset.layout import numbered
-from storage.dataset.shard import MAX_MEMBER_BYTES, MEMBER_NAME, scan_samples
+from storage.dataset.shard import MAX_MEMBER_BYTES, MEMBER_NAME, Member, scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
+from storage.records.map_references import MAP_NAME
 
 Row = tuple[str, int, int]
 """Name, offset of the first byte, number of bytes."""
 
 
+_A_MAP = re.compile(rb"(?m)^" + MAP_NAME.pattern.encode() + rb"$")
+
+
 class MemberTable(Sequence[Row]):
     """Rows that are unpacked when they are asked for: ask for all of them at once."""
 
-    __slots__ = ("_names", "_places")
+    __slots__ = ("_names", "_places", "has_maps")
 
     def __init__(self, rows: Iterable[Row] = ()) -> None:
         """Pack rows; names hold no line break, numbers are whole ones from 0 to below 2^63."""
         held = list(rows)
         self._names = "\n".join(name for name, _, _ in held).encode()
+        self.has_maps = _A_MAP.search(self._names) is not None
         self._places: NDArray[np.int64] = np.array(
             [(offset, num_bytes) for _, offset, num_bytes in held], np.int64
         ).reshape(-1, 2)
@@ -97,16 +102,26 @@ class ShardEntry:
     @property
     def keys(self) -> Sequence[str]:
         """The keys of its samples, in the order of the file."""
-        return list(dict.fromkeys(name.partition(".")[0] for name, _, _ in self.members))
+        names = (name.partition(".") for name, _, _ in self.members)
+        return list(dict.fromkeys(key for key, point, _ in names if point))  # maps have no point
 
     @property
     def index(self) -> Mapping[str, Mapping[str, tuple[int, int]]]:
         """Offset and number of bytes of each member, by key and suffix."""
         index: dict[str, dict[str, tuple[int, int]]] = {}
         for name, offset, num_bytes in self.members:
-            key, _, suffix = name.partition(".")
-            index.setdefault(key, {})[suffix] = (offset, num_bytes)
+            key, point, suffix = name.partition(".")
+            if point:  # a map has none
+                index.setdefault(key, {})[suffix] = (offset, num_bytes)
         return index
+
+    @property
+    def maps(self) -> Mapping[str, tuple[int, int]]:
+        """Offset and number of bytes of each texture and environment map, by its name."""
+        if not self.members.has_maps:
+            return {}
+        rows = self.members
+        return {name: (offset, num) for name, offset, num in rows if MAP_NAME.fullmatch(name)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,10 +143,15 @@ class Manifest:
     shards: tuple[ShardEntry, ...]
     """The finished shards, by name."""
     schema_version: int = SCHEMA_VERSION
-    """Version of the formats."""
+    """Version of the formats; with a map in a shard, that of maps, whatever was given."""
     extensions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """The sha256 of each extension that took part in making it, by its file name; nothing that is
     named here is ever imported (storage.extensions)."""
+
+    def __post_init__(self) -> None:
+        """Note that a dataset with textures or environment maps needs readers that know them."""
+        if any(shard.members.has_maps for shard in self.shards):
+            object.__setattr__(self, "schema_version", MAPS_VERSION)
 
     @property
     def num_samples(self) -> int:
@@ -163,7 +183,9 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
     match = SHARD_NAME.fullmatch(name)
     if match is None:
         raise TrilightError(f"{name}: not a shard; expected a name like train-000003.tar.")
-    samples = list(scan_samples(stream, name))
+    maps: dict[str, Member] = {}
+    samples = list(scan_samples(stream, name, maps))
+    every = [*maps.values(), *(member for _, members in samples for member in members.values())]
     num_bytes = stream.seek(0, 2)
     stream.seek(0)
     return ShardEntry(
@@ -173,9 +195,8 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
         num_bytes=num_bytes,
         sha256=sha256_of_stream(stream),
         members=MemberTable(
-            (f"{key}.{suffix}", member.offset, member.num_bytes)
-            for key, members in samples
-            for suffix, member in members.items()
+            (member.name, member.offset, member.num_bytes)
+            for member in sorted(every, key=lambda member: member.offset)
         ),
     )
 
@@ -269,6 +290,6 @@ def shard_of_row(row: dict[str, Any]) -> ShardEntry:
     members = [(str(name), int(at), int(size)) for name, at, size in row["members"]]
     for name, at, size in members:
         placed = 0 <= at < _MOST_BYTES and 0 <= size <= MAX_MEMBER_BYTES
-        if not (MEMBER_NAME.fullmatch(name) and placed):
+        if not ((MEMBER_NAME.fullmatch(name) or MAP_NAME.fullmatch(name)) and placed):
             raise ValueError(f"member {name!r} of {size} bytes at {at}")
     return ShardEntry(**{**row, "members": MemberTable(members)})

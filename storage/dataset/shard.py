@@ -3,18 +3,27 @@
 Written members are sorted and have no clock and no owner. The reader walks the headers itself, 512
 bytes at a time: anything that is not a plain file is refused before it is read, and no number in a
 header decides how much memory is taken.
+
+Textures and environment maps are no members of a sample: each stands once, between two samples,
+before the first one that uses it (storage.records.packed_maps). Whoever asks for the members of a
+sample gets with them those of its maps; writers take them in the same form.
 """
 
+import io
+import json
 import re
 import tarfile
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 from storage.atomic import atomic_writer
 from storage.errors import TrilightError
+from storage.records.map_references import MAP_NAME, referenced_maps
 from storage.records.safe_read import open_plain
+
+Place = TypeVar("Place")
 
 
 def write_shard(path: Path, samples: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
@@ -34,9 +43,22 @@ def write_tar(stream: BinaryIO, samples: Iterable[tuple[str, Mapping[str, bytes]
     """Write samples to an open file with WebDataset's own writer, and with fixed metadata."""
     from webdataset.writer import TarWriter  # not at the top: it is slow to import
 
+    written = set[str]()
     with TarWriter(stream, encoder=False, mtime=0, user="trilight", group="trilight") as writer:
         for key, members in samples:
-            writer.write({"__key__": key, **members})
+            for name in sorted(name for name in members if MAP_NAME.fullmatch(name)):
+                if name not in written:
+                    _add(writer.tarstream, name, members[name])
+                    written.add(name)
+            of_sample = {name: data for name, data in members.items() if name not in written}
+            writer.write({"__key__": key, **of_sample})
+
+
+def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+    """Add a member under its whole name, with the metadata that all members have."""
+    info = tarfile.TarInfo(name)
+    info.size, info.mode, info.uname, info.gname = len(data), 0o444, "trilight", "trilight"
+    archive.addfile(info, io.BytesIO(data))
 
 
 MAX_MEMBER_BYTES = 1 << 30
@@ -54,10 +76,15 @@ _BINARY = 0x80
 class Member:
     """One file in a shard."""
 
-    key: str  # key of its sample
-    suffix: str  # what it is in the sample
+    key: str  # key of its sample; empty for a map
+    suffix: str  # what it is in the sample, or the name of a map
     offset: int  # offset of its first byte in the shard
     num_bytes: int  # its size
+
+    @property
+    def name(self) -> str:
+        """Its name in the file."""
+        return f"{self.key}.{self.suffix}" if self.key else self.suffix
 
 
 def scan_members(stream: BinaryIO, name: str) -> Iterator[Member]:
@@ -80,33 +107,44 @@ def scan_members(stream: BinaryIO, name: str) -> Iterator[Member]:
         found = _checked(name, block, position + tarfile.BLOCKSIZE)
         position = found.offset + -(-found.num_bytes // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
         if position > end:
-            raise TrilightError(f"{name}: member {found.key}.{found.suffix} is cut short.")
+            raise TrilightError(f"{name}: member {found.name} is cut short.")
         yield found
 
 
-def scan_samples(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, Member]]]:
+def scan_samples(
+    stream: BinaryIO, name: str, maps: dict[str, Member] | None = None
+) -> Iterator[tuple[str, dict[str, Member]]]:
     """Yield (key, members by suffix) of each sample of an open shard, reading headers only.
 
     Members of one sample must stand together, as WebDataset demands.
 
+    Args:
+        stream: the shard.
+        name: of the shard, for messages.
+        maps: takes up the maps by their names: those before a sample are there when it is yielded,
+            and all of them in the end.
+
     Raises:
-        TrilightError: as `scan_members`, or a member or a key occurs twice.
+        TrilightError: as `scan_members`, or a member, a map or a key occurs twice.
     """
+    maps = {} if maps is None else maps
     seen: set[str] = set()
     current: str | None = None
     members: dict[str, Member] = {}
     for member in scan_members(stream, name):
         if member.key != current:
-            if current is not None:
+            if current:
                 yield current, members
             if member.key in seen:
                 raise TrilightError(f"{name}: sample {member.key} occurs twice.")
-            seen.add(member.key)
             current, members = member.key, {}
-        if member.suffix in members:
-            raise TrilightError(f"{name}: member {member.key}.{member.suffix} occurs twice.")
-        members[member.suffix] = member
-    if current is not None:
+            if current:
+                seen.add(current)
+        known = members if current else maps
+        if member.suffix in known:
+            raise TrilightError(f"{name}: member {member.name} occurs twice.")
+        known[member.suffix] = member
+    if current:
         yield current, members
 
 
@@ -116,8 +154,30 @@ def samples_of(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, byt
     Raises:
         TrilightError: as `scan_samples`.
     """
-    for key, members in scan_samples(stream, name):
-        yield key, {suffix: _read(stream, member) for suffix, member in members.items()}
+    maps: dict[str, Member] = {}
+    for key, members in scan_samples(stream, name, maps):
+        own = {suffix: _read(stream, member) for suffix, member in members.items()}
+        yield key, with_maps(own, maps, lambda member: _read(stream, member))
+
+
+def with_maps(
+    members: dict[str, bytes], maps: Mapping[str, Place], read: Callable[[Place], bytes]
+) -> dict[str, bytes]:
+    """Return the members of a sample with those of the maps that its record names.
+
+    Args:
+        members: of the sample, by suffix; without its record, nothing is added.
+        maps: where the maps of the shard are, by the names of their members. One that is missing
+            stays so: what decodes the sample says that.
+        read: returns the bytes at such a place.
+    """
+    if not maps or "json" not in members:
+        return members
+    try:
+        names = referenced_maps(json.loads(members["json"]))
+    except (ValueError, RecursionError):  # what decodes the sample says what is wrong
+        return members
+    return members | {name: read(maps[name]) for name in names if name in maps}
 
 
 def iterate_samples(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
@@ -138,12 +198,14 @@ def read_members(path: Path, key: str, suffixes: Collection[str]) -> dict[str, b
     """
     keys: list[str] = []
     found: dict[str, bytes] | None = None
+    maps: dict[str, Member] = {}
     with _opened(path) as stream:
-        for this, members in scan_samples(stream, path.name):
+        for this, members in scan_samples(stream, path.name, maps):
             keys.append(this)
             if this == key:
                 chosen = {suffix: members[suffix] for suffix in suffixes if suffix in members}
-                found = {suffix: _read(stream, member) for suffix, member in chosen.items()}
+                own = {suffix: _read(stream, member) for suffix, member in chosen.items()}
+                found = with_maps(own, maps, lambda member: _read(stream, member))
     if found is None:
         held = f"{keys[0]} to {keys[-1]}" if keys else "none"
         raise TrilightError(
@@ -173,7 +235,9 @@ def _checked(name: str, block: bytes, offset: int) -> Member:
     text = b"/".join(filter(None, map(_text, (block[345:500], block[:100]))))
     shown = text.decode("utf-8", "replace")
     match = MEMBER_NAME.fullmatch(shown)
-    if block[156:157] not in (tarfile.REGTYPE, tarfile.AREGTYPE) or match is None:
+    is_map = MAP_NAME.fullmatch(shown) is not None
+    is_plain = block[156:157] in (tarfile.REGTYPE, tarfile.AREGTYPE)
+    if not is_plain or (match is None and not is_map):
         raise TrilightError(
             f"{name}: member {shown!r} is refused; expected a plain file named KEY.SUFFIX."
         )
@@ -181,7 +245,8 @@ def _checked(name: str, block: bytes, offset: int) -> Member:
         raise TrilightError(
             f"{name}: member {shown} claims {num_bytes} bytes; expected at most {MAX_MEMBER_BYTES}."
         )
-    return Member(match[1], match[2], offset, num_bytes)
+    key, suffix = ("", shown) if match is None else match.groups()
+    return Member(key, suffix, offset, num_bytes)
 
 
 def _text(field: bytes) -> bytes:

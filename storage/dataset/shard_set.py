@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.shard import Member, scan_samples
+from storage.dataset.shard import Member, scan_samples, with_maps
 from storage.dataset.shard_places import ShardPlace
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -30,7 +30,10 @@ class OpenShard:
         """Look at the headers; raises TrilightError as `storage.dataset.shard`."""
         self.name = name
         self._stream = stream
-        self._samples: list[tuple[str, Mapping[str, Member]]] = list(scan_samples(stream, name))
+        self._maps: dict[str, Member] = {}
+        self._samples: list[tuple[str, Mapping[str, Member]]] = list(
+            scan_samples(stream, name, self._maps)
+        )
 
     @property
     def keys(self) -> Sequence[str]:
@@ -38,17 +41,24 @@ class OpenShard:
         return [key for key, _ in self._samples]
 
     def members(self, row: int) -> dict[str, bytes]:
-        """Return the members of a sample by suffix, in one read."""
+        """Return the members of a sample by suffix, in one read, and one for each of its maps."""
         _, members = self._samples[row]
         first = min(member.offset for member in members.values())
         end = max(member.offset + member.num_bytes for member in members.values())
-        data = os.pread(self._stream.fileno(), end - first, first)
-        if len(data) != end - first:
-            raise TrilightError(f"{self.name}: became shorter while it was read. Copy it anew.")
-        return {
+        data = self._read(first, end - first)
+        own = {
             suffix: data[member.offset - first : member.offset - first + member.num_bytes]
             for suffix, member in members.items()
         }
+        return with_maps(
+            own, self._maps, lambda member: self._read(member.offset, member.num_bytes)
+        )
+
+    def _read(self, offset: int, num_bytes: int) -> bytes:
+        data = os.pread(self._stream.fileno(), num_bytes, offset)
+        if len(data) != num_bytes:
+            raise TrilightError(f"{self.name}: became shorter while it was read. Copy it anew.")
+        return data
 
     def sample(self, row: int) -> Sample:
         """Return a sample that passes `Sample.check`.

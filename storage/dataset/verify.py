@@ -204,7 +204,7 @@ def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
 
 def _check_members(stream: BinaryIO, shard: ShardEntry) -> Iterator[str]:
     found = MemberTable(
-        (f"{member.key}.{member.suffix}", member.offset, member.num_bytes)
+        (member.name, member.offset, member.num_bytes)
         for member in scan_members(stream, shard.name)
     )
     if found != shard.members:
@@ -220,14 +220,17 @@ def _check_content(
 ) -> None:
     if index_stream(stream, shard.name) != shard:
         found.faults.append("sha256 or member index differs from the manifest")
+    unused = set(shard.maps)
     for key, members in samples_of(stream, shard.name):
         found.keys.append(key)
+        unused -= members.keys()
         try:
             sample = decode_sample(key, members)
         except TrilightError as error:
             found.faults.append(str(error))
             continue
         found.faults += check_sample(sample, shard.split, manifest, locked)
+    found.faults += [f"map {name} is used by no sample" for name in sorted(unused)]
 
 
 def check_sample(
@@ -251,7 +254,7 @@ def check_sample(
     yield from _check_parts(sample, part_names(bounces=bounces, lobes=lobes))
     stored = manifest.settings.get("storage")
     yield from _check_passes(sample, stored.get("passes") if isinstance(stored, Mapping) else ())
-    if mixed := mixed_share_alike(entry.licence for entry in sample.scene.objects):
+    if mixed := mixed_share_alike(sample.scene.licences):
         yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
     for entry in sample.scene.objects:
         if entry.kind != "object":

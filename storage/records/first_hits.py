@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
+from storage.records.lookup import textured_rows
 from storage.records.scene import Scene
 from storage.records.surfaces import MISS, Surfaces
 
@@ -75,6 +76,14 @@ class SeenFrom:
         """[T + 1, M] material rows."""
         rows = self.scene.materials[self.scene.material_index]
         return np.append(rows, np.full((1, rows.shape[1]), np.nan, np.float32), axis=0)
+
+    @cached_property
+    def corner_uv(self) -> NDArray[np.float64]:
+        """[T + 1, 3, 2] texture coordinates; NaN throughout where the scene has none."""
+        uv = np.full((self.scene.num_triangles + 1, 3, 2), np.nan)
+        if self.scene.uv is not None:
+            uv[:-1] = self.scene.uv.reshape(-1, 3, 2)
+        return uv
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,9 +153,19 @@ class FirstHits:
             return _unit(self.interpolated(self.seen.corner_normals))
 
     @cached_property
+    def uv(self) -> NDArray[np.float64]:
+        """[..., 2] texture coordinates; NaN where nothing is met or the scene has none."""
+        return self.interpolated(self.seen.corner_uv)
+
+    @cached_property
     def material(self) -> NDArray[np.float32]:
-        """[..., M] row of `Scene.materials`; NaN where nothing is met."""
-        return self.seen.materials[self.triangle]
+        """[..., M] row of `Scene.materials`, with its textures; NaN where nothing is met."""
+        rows, scene = self.seen.materials[self.triangle], self.seen.scene
+        if scene.textures:
+            met = self.met
+            index = scene.material_index[self.triangle[met]]
+            rows[met] = textured_rows(scene, index, self.uv[met])
+        return rows
 
     def interpolated(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return [..., K] between the corners of a table [T + 1, 3, K]."""

@@ -6,6 +6,8 @@
     000000123.0.lights.exr ...    optional: each emitter's part of it (storage.records.lights)
     000000123.0.parts.exr ...     optional: direct, indirect, ... light (storage.records.parts)
     000000123.0.passes.exr ...    optional: what its pixels see (storage.records.passes.stored)
+    __map-<sha256>__ ...          textures and environment map, where the scene has any: once in a
+                                  shard, before the first sample (storage.records.packed_maps)
 
 How both are packed is `storage.records.profiles`. The key is everything before the first dot, as
 WebDataset reads names.
@@ -21,19 +23,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import SCHEMA_VERSION, require_readable
+from storage.conventions import require_readable
 from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.records.first_hits import require_row
 from storage.records.lights import decode_lights_exr, encode_lights_exr, num_lights
+from storage.records.packed_maps import packed_maps, unpacked_maps
 from storage.records.parts import KNOWN_PARTS, Parts, decode_parts_exr, encode_parts_exr
 from storage.records.passes.stored import picture_passes
 from storage.records.profiles import Profile, pack_arrays, pack_picture, unpack_arrays
+from storage.records.retextured import without_constant_textures
 from storage.records.scene import Scene
 from storage.records.scene_file import (
     decode_arrays,
     encode_arrays,
+    require_version_of_maps,
     scene_objects,
     scene_provenance,
     scene_record,
@@ -195,12 +200,12 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
         TrilightError: a picture holds what half floats cannot (storage.records.exr).
         ValueError: pictures and view records differ in number.
     """
+    scene = without_constant_textures(sample.scene)
     record = {
-        "schema_version": SCHEMA_VERSION,
-        **scene_record(sample.scene),
+        **scene_record(scene),
         "views": [_view_record(view) for view in sample.views],
     }
-    members = pack_arrays(encode_arrays(sample.scene), profile) | {"json": canonical_json(record)}
+    members = pack_arrays(encode_arrays(scene), profile) | {"json": canonical_json(record)}
     together = sample.lights_rgb is None and sample.parts_rgb is None
     of_pictures = profile if together else "lossless"
     for view, (picture, made) in enumerate(zip(sample.radiance_rgb, sample.views, strict=True)):
@@ -214,7 +219,7 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
             members[f"{view}.parts.exr"] = encode_parts_exr(of_view)
     for view, packed in enumerate(sample.passes_exr or ()):
         members[f"{view}.passes.exr"] = packed
-    return {**members, **sample.kept_members}
+    return {**members, **packed_maps(scene), **sample.kept_members}
 
 
 def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
@@ -283,6 +288,8 @@ def _decode_parts(
 def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
     """Return a sample without its pictures, whose members may be absent.
 
+    The maps that its record names are among the members, under the names that shards give them.
+
     Raises:
         TrilightError: as `decode_sample`.
     """
@@ -292,7 +299,10 @@ def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
     try:
         views = tuple(_view(view, row) for row, view in enumerate(record["views"]))
         objects = scene_objects(record["objects"])
-        fields = decode_arrays(unpack_arrays(members))
+        require_version_of_maps(record)
+        maps = record.get("maps")
+        fields = {} if maps is None else unpacked_maps(maps, members)
+        fields |= decode_arrays(unpack_arrays(members), maps)
         provenance = scene_provenance(record["provenance"])
         scene = Scene(objects=objects, provenance=provenance, **fields)
     except KeyError as error:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
@@ -22,6 +22,9 @@ from storage.records.material import (
     material_columns,
     material_width,
 )
+from storage.records.scene_laws import broken_law, require_law
+from storage.records.scene_maps import MAX_TEXTURES, MAX_UV, check_maps, has_maps
+from storage.records.texture import CONSTANT, Texture
 from storage.settings.ranges import FLOAT32_MAX, Columns, Within, declared_ranges
 
 ObjectKind = Literal["object", "shell", "emitter"]
@@ -99,6 +102,18 @@ class Scene:
     """Names, kinds and rights; shell parts and emitters are objects too."""
     provenance: Mapping[str, Any]
     """template, scene index, attempt, seed, settings digest: JSON values only."""
+    uv: Annotated[NDArray[np.float32], Within(-MAX_UV, MAX_UV)] | None = None
+    """[3T, 2] texture coordinates of each corner of each triangle; None where nothing is textured.
+    """
+    textures: tuple[Texture, ...] = ()
+    """What materials are textured with; each is used, and each content is there once."""
+    material_textures: Annotated[NDArray[np.int32], Within(CONSTANT, MAX_TEXTURES - 1)] | None = (
+        None
+    )
+    """[M, 3] rows of `textures` that stand for diffuse, specular and roughness of each material, or
+    -1 where its own column does; None where nothing is textured."""
+    environment: Environment | None = None
+    """Light from far away; None where there is none."""
 
     @property
     def num_triangles(self) -> int:
@@ -113,6 +128,13 @@ class Scene:
         """[T] whether the triangle emits light; its albedos say what it reflects."""
         material_emits: NDArray[np.bool_] = np.any(self.materials[:, EMISSION] > 0, axis=1)
         return material_emits[self.material_index]
+
+    @property
+    def licences(self) -> tuple[str, ...]:
+        """Licence of every object, texture and environment map, in this order."""
+        sky = () if self.environment is None else (self.environment.source.licence,)
+        textures = (texture.source.licence for texture in self.textures)
+        return (*(entry.licence for entry in self.objects), *textures, *sky)
 
     def with_cameras(self, c2w: NDArray[np.float32], fov_deg: NDArray[np.float32]) -> "Scene":
         """Return the same scene seen by other cameras ([C, 4, 4] and [C])."""
@@ -130,6 +152,8 @@ class Scene:
         meshes and whether light reaches what they see (pipeline.scenes does that).
         """
         _check_arrays(self)
+        if has_maps(self) or self.uv is not None or self.material_textures is not None:
+            check_maps(self)
         _check_geometry(self)
         _check_materials(self)
         _check_objects(self)
@@ -153,19 +177,21 @@ def _check_arrays(scene: Scene) -> None:
     for name, (dtype, shape) in ARRAY_FIELDS.items():
         array = getattr(scene, name)
         if array.dtype != dtype:
-            _broken(f"{name} has dtype {array.dtype}", f"{np.dtype(dtype)}")
+            broken_law(f"{name} has dtype {array.dtype}", f"{np.dtype(dtype)}")
         fits = array.ndim == len(shape) and all(
             wanted in (None, got) for wanted, got in zip(shape, array.shape, strict=True)
         )
         if not fits:
-            _broken(f"{name} has shape {array.shape}", f"{shape} with None for any length")
+            broken_law(f"{name} has shape {array.shape}", f"{shape} with None for any length")
         if np.issubdtype(dtype, np.floating):
-            _require(np.isfinite(array), name, array, "finite values")
+            require_law(np.isfinite(array), name, array, "finite values")
     _check_columns(scene)
     for field in declared_ranges(Scene):
         values = getattr(scene, field.name)
+        if values is None:
+            continue
         part = "" if field.part is None else f"{field.part.name} "
-        _require(~field.outside(values), field.name, values, f"{part}{field.within}")
+        require_law(~field.outside(values), field.name, values, f"{part}{field.within}")
     for name, other in (("vertex_normals", "vertex_positions"), ("fov_deg", "c2w")):
         _same_length(scene, name, other)
     for name in ("material_index", "object_index"):
@@ -177,74 +203,64 @@ def _check_columns(scene: Scene) -> None:
     got, wanted = scene.materials.shape, material_width()
     if got[1] != wanted:
         names = ", ".join(column.name for column in material_columns())
-        _broken(f"materials has shape {got}", f"(None, {wanted}), since its columns are {names}")
+        broken_law(f"materials has shape {got}", f"(None, {wanted}), since its columns are {names}")
     for column, part in laid_out():
         if column.name not in PUBLISHED_COLUMNS:
             holds = np.ones(got, np.bool_)
             holds[:, part] = column.within.holds(scene.materials[:, part])
-            _require(holds, "materials", scene.materials, f"{column.name} {column.within}")
+            require_law(holds, "materials", scene.materials, f"{column.name} {column.within}")
 
 
 def _check_geometry(scene: Scene) -> None:
     if scene.num_triangles == 0:
-        _broken("faces is empty", "at least one triangle")
+        broken_law("faces is empty", "at least one triangle")
     count = len(scene.vertex_positions)
-    _require(scene.faces < count, "faces", scene.faces, f"vertex rows below {count}")
+    require_law(scene.faces < count, "faces", scene.faces, f"vertex rows below {count}")
     length = np.linalg.norm(scene.vertex_normals, axis=1)
-    _require(abs(length - 1) <= UNIT_NORMAL_TOLERANCE, "vertex_normals", length, "unit length")
+    require_law(abs(length - 1) <= UNIT_NORMAL_TOLERANCE, "vertex_normals", length, "unit length")
 
 
 def _check_materials(scene: Scene) -> None:
     rows = len(scene.materials)
-    _require(
+    require_law(
         scene.material_index < rows, "material_index", scene.material_index, f"rows below {rows}"
     )
     total = scene.materials[:, DIFFUSE] + scene.materials[:, SPECULAR]
     bound = 1 + ALBEDO_SUM_TOLERANCE
-    _require(total <= bound, "materials", total, "diffuse + specular at most 1")
-    if not scene.triangle_emits.any():
-        _broken("materials holds no emission that a triangle uses", "at least one emitter")
+    require_law(total <= bound, "materials", total, "diffuse + specular at most 1")
+    sky = scene.environment
+    if not scene.triangle_emits.any() and not (sky is not None and sky.radiance_rgb.any()):
+        broken_law("materials holds no emission that a triangle uses", "at least one emitter")
 
 
 def _check_objects(scene: Scene) -> None:
     rows = len(scene.objects)
-    _require(scene.object_index < rows, "object_index", scene.object_index, f"rows below {rows}")
+    require_law(scene.object_index < rows, "object_index", scene.object_index, f"rows below {rows}")
     names = set[str]()
     for entry in scene.objects:  # a set: a scene may hold 65536 of them
         if entry.name in names:
-            _broken(f"objects holds the name {entry.name!r} twice", "unique names")
+            broken_law(f"objects holds the name {entry.name!r} twice", "unique names")
         names.add(entry.name)
     is_emitter = np.array([entry.kind == "emitter" for entry in scene.objects])
     agrees = is_emitter[scene.object_index] == scene.triangle_emits
-    _require(agrees, "objects", scene.object_index, "kind emitter exactly where a triangle emits")
+    require_law(
+        agrees, "objects", scene.object_index, "kind emitter exactly where a triangle emits"
+    )
 
 
 def _check_cameras(scene: Scene) -> None:
     if scene.num_views == 0:
-        _broken("c2w is empty", "at least one camera")
+        broken_law("c2w is empty", "at least one camera")
     rotation = scene.c2w[:, :3, :3].astype(np.float64)
     gram = rotation.transpose(0, 2, 1) @ rotation
     orthonormal = abs(gram - np.eye(3)).max(axis=(1, 2)) <= POSE_TOLERANCE
-    _require(orthonormal, "c2w", scene.c2w, "an orthonormal rotation")
-    _require(np.linalg.det(rotation) > 0, "c2w", scene.c2w, "a rotation without mirroring")
+    require_law(orthonormal, "c2w", scene.c2w, "an orthonormal rotation")
+    require_law(np.linalg.det(rotation) > 0, "c2w", scene.c2w, "a rotation without mirroring")
     bottom = (scene.c2w[:, 3] == np.array([0, 0, 0, 1])).all(axis=1)
-    _require(bottom, "c2w", scene.c2w, "a last row of 0 0 0 1")
+    require_law(bottom, "c2w", scene.c2w, "a last row of 0 0 0 1")
 
 
 def _same_length(scene: Scene, name: str, other: str) -> None:
     got, wanted = len(getattr(scene, name)), len(getattr(scene, other))
     if got != wanted:
-        _broken(f"{name} has {got} rows", f"{wanted}, as {other} has")
-
-
-def _require(law: NDArray[np.bool_], name: str, values: NDArray, expected: str) -> None:
-    """Raise for the first index at which `law` is false."""
-    if law.all():
-        return
-    index = tuple(int(i) for i in np.argwhere(~law)[0])
-    found = " ".join(np.array2string(values[index], threshold=16).split())
-    _broken(f"{name}{list(index)} is {found}", expected)
-
-
-def _broken(found: str, expected: str) -> None:
-    raise TrilightError(f"scene: {found}; expected {expected}.")
+        broken_law(f"{name} has {got} rows", f"{wanted}, as {other} has")

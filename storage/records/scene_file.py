@@ -2,7 +2,8 @@
 
 A `.safetensors` scene holds the arrays of `Scene` under their names, and one metadata entry
 `trilight_scene`: JSON with schema version, objects and provenance. (One entry, because the library
-writes several in any order.) Equal scenes give equal bytes.
+writes several in any order.) Equal scenes give equal bytes. Of a textured scene, the textures stand
+among the arrays as `texture.0`, `texture.1`, ..., and the map of an environment as `environment`.
 
 Such a file comes from anywhere. Its size, its header and every shape are checked before an array is
 made, names and types must be exactly those of a scene, and the laws of `Scene.check` hold for
@@ -13,7 +14,7 @@ import dataclasses
 import json
 import math
 import stat
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,24 +22,45 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from storage.conventions import SCHEMA_VERSION
+from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
+from storage.records.map_references import (
+    described_environment,
+    described_texture,
+    environment_entries,
+    maps_digest,
+    maps_record,
+    texture_entries,
+)
 from storage.records.material import chosen_columns, completed_rows, stored_columns, stored_names
+from storage.records.packed_maps import held_values, stored_values
+from storage.records.retextured import without_constant_textures
 from storage.records.safe_read import read_safetensors, safetensors_header
 from storage.records.scene import ARRAY_FIELDS, OBJECT_KINDS, Scene, SceneObject
+from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
+from storage.records.texture import MAX_MAPS_BYTES
 
-MAX_FILE_BYTES = 256 << 20
+MAX_FILE_BYTES = (256 << 20) + MAX_MAPS_BYTES
 """A million triangles with three vertices each take 90 MB."""
 
 MAX_HEADER_BYTES = 8 << 20
 """An object takes 150 bytes and its attribution; there are at most 65,536."""
 
-CARRIED = frozenset({*ARRAY_FIELDS, "objects", "provenance"})
+CARRIED = frozenset({*ARRAY_FIELDS, "objects", "provenance", "textures", "environment"})
 """What the form holds of a scene (pipeline.exchange.formats): all of it, added columns too."""
 
 _METADATA, _COLUMNS = "trilight_scene", "material_columns"
-_DTYPE_NAMES: Mapping[type, str] = {np.float32: "F32", np.uint32: "U32", np.uint16: "U16"}
+_MAPS, _MAPS_DIGEST = "maps", "maps_sha256"
+_TEXTURE, _ENVIRONMENT = "texture.", "environment"
+_IS_SRGB = "is_srgb"
+_DTYPE_NAMES: Mapping[type, str] = {
+    np.float32: "F32",
+    np.uint32: "U32",
+    np.uint16: "U16",
+    np.int32: "I32",
+}
+_MAP_DTYPES = ("U8", "F16", "F32")
 
 
 def encode_arrays(scene: Scene) -> bytes:
@@ -47,21 +69,36 @@ def encode_arrays(scene: Scene) -> bytes:
     Material columns beyond the published ones stand there where they are not at their default; then
     the metadata name all of them.
     """
+    scene = without_constant_textures(scene)
     stated = stored_names(stored_columns(scene.materials))
-    return save(_arrays(scene), None if stated is None else {_COLUMNS: stated})
+    arrays = _arrays(scene)
+    if (maps := maps_record(scene)) is not None:
+        arrays[_MAPS_DIGEST] = maps_digest(maps)
+    return save(arrays, None if stated is None else {_COLUMNS: stated})
 
 
-def decode_arrays(data: bytes) -> dict[str, NDArray]:
+def decode_arrays(data: bytes, maps: Any = None) -> dict[str, NDArray]:
     """Return the array fields of a scene from the bytes of `encode_arrays`.
 
+    Args:
+        data: the bytes.
+        maps: what the record of the scene says of its maps (storage.records.map_references).
+
     Raises:
-        TrilightError: damaged, an array is missing, or a material column is not declared here.
+        TrilightError: damaged, an array is missing, a material column is not declared here, or the
+            arrays are those of a scene with other maps.
     """
     arrays, metadata = read_safetensors(data)
     if missing := set(ARRAY_FIELDS) - set(arrays):
         raise TrilightError(f"scene: the array {min(missing)} is missing.")
     arrays["materials"] = completed_rows(arrays["materials"], metadata.get(_COLUMNS))
-    return {name: arrays[name] for name in ARRAY_FIELDS}
+    found = arrays[_MAPS_DIGEST].tobytes() if _MAPS_DIGEST in arrays else None
+    if found != (None if maps is None else maps_digest(maps).tobytes()):
+        raise TrilightError(
+            "scene: its record and its arrays do not speak of the same textures and environment. "
+            "Run `trilight verify`."
+        )
+    return {name: arrays[name] for name in (*ARRAY_FIELDS, *MAP_ARRAYS) if name in arrays}
 
 
 def scene_digest(scene: Scene) -> str:
@@ -76,10 +113,19 @@ def encode_scene(scene: Scene) -> bytes:
         TrilightError: the scene breaks a law, or is larger than `decode_scene_file` accepts.
     """
     scene.check()
-    record = {"schema_version": SCHEMA_VERSION, **scene_record(scene)}
+    scene = without_constant_textures(scene)
+    record = scene_record(scene)
     if stated := stored_names(stored_columns(scene.materials)):
         record[_COLUMNS] = stated
-    data = save(_arrays(scene), {_METADATA: canonical_json(record).decode()})
+    arrays = _arrays(scene)
+    if scene.textures:
+        record[_IS_SRGB] = [texture.is_srgb for texture in scene.textures]
+    for row, texture in enumerate(scene.textures):
+        arrays[f"{_TEXTURE}{row}"] = np.ascontiguousarray(stored_values(texture.texels))
+    if scene.environment is not None:
+        radiance = stored_values(scene.environment.radiance_rgb)
+        arrays[_ENVIRONMENT] = np.ascontiguousarray(radiance)
+    data = save(arrays, {_METADATA: canonical_json(record).decode()})
     header_bytes = int.from_bytes(data[:8], "little")
     if len(data) > MAX_FILE_BYTES or header_bytes > MAX_HEADER_BYTES:
         raise TrilightError(
@@ -126,10 +172,12 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
         arrays, metadata = read_safetensors(data, MAX_HEADER_BYTES)
         record = _metadata_record(metadata)
         arrays["materials"] = completed_rows(arrays["materials"], record.get(_COLUMNS))
+        fields = _maps(record, arrays)
+        fields |= {name: arrays[name] for name in (*ARRAY_FIELDS, *MAP_ARRAYS) if name in arrays}
         scene = Scene(
             objects=scene_objects(record.get("objects")),
             provenance=scene_provenance(record.get("provenance")),
-            **arrays,
+            **fields,
         )
         scene.check()
     except TrilightError as error:
@@ -138,11 +186,25 @@ def decode_scene_file(data: bytes, name: str) -> Scene:
 
 
 def scene_record(scene: Scene) -> dict[str, Any]:
-    """Return what is no array of a scene, as JSON values."""
+    """Return what is no array of a scene, as JSON values, and the version that this needs."""
+    maps = maps_record(scene)
     return {
+        "schema_version": SCHEMA_VERSION if maps is None else MAPS_VERSION,
         "objects": [dataclasses.asdict(entry) for entry in scene.objects],
         "provenance": dict(scene.provenance),
+        **({} if maps is None else {_MAPS: maps}),
     }
+
+
+def require_version_of_maps(record: Mapping[str, Any]) -> None:
+    """Raise TrilightError unless a record has MAPS_VERSION exactly where it names maps."""
+    version = record.get("schema_version")
+    if (version == MAPS_VERSION) != (_MAPS in record):
+        has = "names" if _MAPS in record else "does not name"
+        raise TrilightError(
+            f"scene: its record {has} {_MAPS} and has schema version {version!r:.60}; expected "
+            f"{MAPS_VERSION} exactly where there are any."
+        )
 
 
 def scene_objects(value: Any) -> tuple[SceneObject, ...]:
@@ -177,29 +239,78 @@ def _object(value: Any, row: int) -> SceneObject:
 
 def _arrays(scene: Scene) -> dict[str, NDArray]:
     arrays = {name: np.ascontiguousarray(getattr(scene, name)) for name in ARRAY_FIELDS}
+    for name in MAP_ARRAYS:
+        if (array := getattr(scene, name)) is not None:
+            arrays[name] = np.ascontiguousarray(array)
     columns = stored_columns(scene.materials)
     return arrays | {"materials": chosen_columns(scene.materials, columns)}
+
+
+def _maps(record: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> dict[str, Any]:
+    """Return the fields `textures` and `environment` of what a file says, where it has any."""
+    if _MAPS not in record:
+        return {}
+    entries, fields = texture_entries(record[_MAPS]), dict[str, Any]()
+    is_srgb = record.get(_IS_SRGB, [])
+    if not isinstance(is_srgb, list) or [type(each) for each in is_srgb] != [bool] * len(entries):
+        _broken(_IS_SRGB, is_srgb, "true or false for each texture")
+    fields["textures"] = tuple(
+        described_texture(entry, _map_values(arrays, f"{_TEXTURE}{row}"), is_srgb=is_srgb[row])
+        for row, entry in enumerate(entries)
+    )
+    for entry in environment_entries(record[_MAPS]):
+        fields["environment"] = described_environment(entry, _map_values(arrays, _ENVIRONMENT))
+    return fields
+
+
+def _map_values(arrays: Mapping[str, NDArray], name: str) -> NDArray:
+    if name not in arrays:
+        raise TrilightError(f"scene: the array {name} is missing.")
+    return held_values(arrays[name])
 
 
 def _check_header(header: Mapping[str, Any]) -> None:
     """Refuse arrays that are not a scene's, before any of them is made."""
     names = set(header) - {"__metadata__"}
-    if names != set(ARRAY_FIELDS):
-        odd = ", ".join(f"{name!r:.60}" for name in sorted(names ^ set(ARRAY_FIELDS))[:3])
+    maps = {name for name in names if name == _ENVIRONMENT or name.startswith(_TEXTURE)}
+    others = names - maps - set(MAP_ARRAYS)
+    if others != set(ARRAY_FIELDS) or len(maps) > MAX_TEXTURES + 1:
+        odd = ", ".join(f"{name!r:.60}" for name in sorted(others ^ set(ARRAY_FIELDS))[:3])
         raise TrilightError(f"scene: arrays missing or not expected: {odd}.")
-    for name, (dtype, wanted) in ARRAY_FIELDS.items():
-        entry = header[name] if isinstance(header[name], dict) else {}
-        shape = entry.get("shape")
-        fits = (
-            entry.get("dtype") == _DTYPE_NAMES[dtype]
-            and isinstance(shape, list)
-            and len(shape) == len(wanted)
-            and all(type(got) is int and got >= 0 for got in shape)
-            and all(want in (None, got) for want, got in zip(wanted, shape, strict=True))
-            and math.prod(shape) <= MAX_FILE_BYTES
-        )
-        if not fits:
-            _broken(name, [entry.get("dtype"), shape], f"{_DTYPE_NAMES[dtype]} of shape {wanted}")
+    for name, (dtype, wanted) in {**ARRAY_FIELDS, **MAP_ARRAYS}.items():
+        if name in names:
+            _check_entry(header, name, (_DTYPE_NAMES[dtype],), wanted)
+    for name in maps:
+        _check_entry(header, name, _MAP_DTYPES, (None, None, None))
+    _check_total(header, maps)
+
+
+def _check_entry(
+    header: Mapping[str, Any], name: str, dtypes: Sequence[str], wanted: tuple[int | None, ...]
+) -> None:
+    entry = header[name] if isinstance(header[name], dict) else {}
+    shape = entry.get("shape")
+    fits = (
+        entry.get("dtype") in dtypes
+        and isinstance(shape, list)
+        and len(shape) == len(wanted)
+        and all(type(got) is int and got >= 0 for got in shape)
+        and all(want in (None, got) for want, got in zip(wanted, shape, strict=True))
+        and math.prod(shape) <= MAX_FILE_BYTES
+    )
+    if not fits:
+        expected = f"{' or '.join(dtypes)} of shape {wanted}"
+        _broken(name, [entry.get("dtype"), shape], expected)
+
+
+def _check_total(header: Mapping[str, Any], maps: Collection[str]) -> None:
+    """Refuse maps that would take too much memory; half floats take twice their size there."""
+    total = sum(
+        math.prod(header[name]["shape"]) * (1 if header[name]["dtype"] == "U8" else 4)
+        for name in maps
+    )
+    if total > MAX_MAPS_BYTES:
+        _broken("textures and environment", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
 
 
 def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
@@ -210,11 +321,12 @@ def _metadata_record(metadata: Mapping[str, str]) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise TrilightError(f"scene: metadata {_METADATA} are not JSON ({error}).") from error
     version = record.get("schema_version") if isinstance(record, dict) else None
-    if version != SCHEMA_VERSION:
+    if version not in (SCHEMA_VERSION, MAPS_VERSION):
         raise TrilightError(
-            f"scene: schema version {version!r:.60}; this Trilight reads {SCHEMA_VERSION}. Use the "
-            "release that made it."
+            f"scene: schema version {version!r:.60}; this Trilight reads {SCHEMA_VERSION} and "
+            f"{MAPS_VERSION}. Use the release that made it."
         )
+    require_version_of_maps(record)
     return dict(record)
 
 

@@ -209,6 +209,9 @@ def test_the_path_tracer_says_what_it_does_not_read() -> None:
     class Tracer:
         identity: ClassVar[dict[str, str]] = {}
 
+        def wake(self, name: str) -> None:
+            """It needs no child."""
+
         def open(self, scene: Scene, name: str) -> None:
             assert scene.num_triangles
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from model.open import BUILTIN
+from model.open import BUILTIN_TOKENS
 from tests.end_to_end.conftest import Trilight
 
 SCENES = (
@@ -20,7 +20,9 @@ SCENES = (
 def test_its_pictures_come_from_the_scene_it_is_shown(trilight: Trilight, tmp_path: Path) -> None:
     made = trilight("generate", "smoke", *SCENES, "--out", "set")
     assert made.returncode == 0, made.stderr
-    judged = trilight("evaluate", BUILTIN, "--data", "set", "--split", "test", "--out", "judged")
+    judged = trilight(
+        "evaluate", BUILTIN_TOKENS, "--data", "set", "--split", "test", "--out", "judged"
+    )
     assert judged.returncode == 0, judged.stderr
     found = json.loads((tmp_path / "judged/evaluation.json").read_text())
     swapped = found["swapped scenes"]

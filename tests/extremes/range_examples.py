@@ -28,6 +28,10 @@ from scene_templates.placement import PlacementSettings
 from scene_templates.rooms import SharedRoom
 from scene_templates.separate_sides import SideRanges
 from scene_templates.settings import MAX_TRIANGLES, Excursion, SceneSettings, ViewLaws
+from scene_templates.skies.draw import SkyMapSettings
+from scene_templates.skies.settings import SkySettings
+from scene_templates.surfaces.draw import SurfaceMapSettings
+from scene_templates.textures import TextureSettings
 from storage.dataset.settings import ListedShard, SplitSettings
 from storage.records.scene import Scene
 from storage.settings.ranges import Declared, declared_ranges
@@ -60,6 +64,10 @@ EXAMPLES: dict[type, Any] = {
     LightSettings: SMOKE.scenes.lights,
     CameraSettings: SMOKE.scenes.cameras,
     ViewLaws: SMOKE.scenes.views,
+    TextureSettings: TextureSettings(),
+    SurfaceMapSettings: SurfaceMapSettings(),
+    SkySettings: SkySettings(),
+    SkyMapSettings: SkyMapSettings(),
     Excursion: Excursion(axis="fov_deg", value=10.0, changes=()),
     RenderSettings: SMOKE.renders,
     SplitSettings: SMOKE.splits,
@@ -95,6 +103,10 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
     (MaterialSettings, "roughness_bias", "high"): {"roughness_log": (1.0, 2.0)},
     (RevisitSettings, "kept_cameras", "low"): {"new_cameras": 1},
     (RevisitSettings, "new_cameras", "high"): {"kept_cameras": 0},
+    (Asked, "seconds", "low"): {"noise_floor_db": None},
+    (Asked, "seconds", "high"): {"noise_floor_db": None},
+    (Asked, "error_db", "low"): {"noise_floor_db": None},
+    (Asked, "error_db", "high"): {"noise_floor_db": None},
     (Asked, "spp", "low"): {"noise_floor_db": None},
     (Asked, "spp", "high"): {"noise_floor_db": None},
     (RenderSettings, "min_spp", "high"): {"max_spp": MAX_SPP},
@@ -112,10 +124,12 @@ BESIDE: dict[tuple[type, str, End], dict[str, Any]] = {
     (ModelConfig, "decoder_layers", "low"): {"dpt_taps": (0, 0, 0, 0)},
     (ModelConfig, "patch_px", "low"): _LINEAR,
     (ModelConfig, "patch_px", "high"): _LINEAR,
+    (ModelConfig, "projected_freqs", "high"): {"width": 2 * (9 + 128), "num_heads": 1,
+                                               "rope_num_freqs": 1},
     (ModelConfig, "dpt_features", "low"): _LINEAR,
     (ModelConfig, "dpt_taps", "high"): {"decoder_layers": 256},
     **{(ModelConfig, name, "high"): _LINEAR | _HITS
-       for name in ("hit_rays", "hit_anchors", "gather_rays", "pixel_width")},
+       for name in ("hit_rays", "hit_anchors", "gather_rays", "pixel_width", "filter_width")},
 }  # fmt: skip
 """What must stand beside an end."""
 

@@ -15,7 +15,7 @@ from model.attention import attend
 from model.config import SIZES
 from model.layer_errors import layer_errors, probe_batch, random_network
 from model.layers import LAYER_NORM_EPS, Norm
-from model.open import BUILTIN, open_network
+from model.open import BUILTIN_TOKENS, open_network
 from model.positions import TriangleRotary
 from model.renderformer import RenderFormer, radiance
 from model.scene_tensors import SceneBatch, batch_scenes, scene_tensors
@@ -46,7 +46,7 @@ EMISSIONS = [0.0, 1e-6, 1.0, 1e6]
 
 NETWORKS = {
     "random": lambda: random_network(SIZES["tiny"]()),
-    "trained": lambda: open_network(BUILTIN),
+    "trained": lambda: open_network(BUILTIN_TOKENS),
 }
 """One with every part of the large ones, and the one that is shipped."""
 
@@ -147,7 +147,7 @@ def test_no_gradient_is_too_small_for_bfloat16(backward: dict[str, Tensor]) -> N
 
 def test_float16_would_lose_the_gradients_of_a_trained_network() -> None:
     """The loss is a mean over pixels, which makes them so: training offers no float16."""
-    gradients = [output.grad for output in backward_of(open_network(BUILTIN)).values()]
+    gradients = [output.grad for output in backward_of(open_network(BUILTIN_TOKENS)).values()]
     every = torch.cat([grad.flatten() for grad in gradients if grad is not None])
     # measured: 99.7 and 32 %, and more with more scenes in the mean; another network is not far off
     assert share_below(every, HALF_NORMAL) > 0.9

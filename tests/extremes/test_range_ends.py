@@ -192,6 +192,10 @@ NETWORKS: dict[str, ModelConfig] = {
         LEAST, normal_octaves=16, rope_max_freq=1000.0, register_eps=1.0, num_registers=64
     ),
     "most frequencies": dataclasses.replace(LEAST, width=18 * 64, rope_num_freqs=64),
+    "most projected frequencies": dataclasses.replace(
+        LEAST, width=2 * (9 + 128), projected_freqs=64, num_registers=1
+    ),
+    "most rays of demodulated pixels": dataclasses.replace(LEAST, demodulated=True, hit_rays=8),
     "narrowest dpt": tiny_config("dpt", dpt_features=2, dpt_channels=(1, 1, 1, 1)),
 }
 

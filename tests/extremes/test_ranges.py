@@ -16,11 +16,14 @@ from infra.setup.settings_page import FILE, ROOTS, reachable, settings_page
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene, SceneObject
+from storage.records.scene_maps import MAP_ARRAYS, MAX_TEXTURES
+from storage.records.texture import CONSTANT
 from storage.settings.described import checked
 from storage.settings.ranges import Columns, Declared, Within, declared_ranges
 from tests.conftest import ROOT
 from tests.extremes.range_examples import EXAMPLES, FIELDS, End, at_end
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
+from tests.textured_by_hand import textured_scene
 
 ENDS: tuple[End, End] = ("low", "high")
 every_end = pytest.mark.parametrize("end", ENDS)
@@ -182,6 +185,7 @@ every_float_array = pytest.mark.parametrize(
 PLACES = {
     "vertex_positions": (1, 2), "vertex_normals": (0, 0), "faces": (1, 2), "material_index": 1,
     "object_index": 1, "c2w": (1, 0, 3), "fov_deg": 1,
+    "uv": (1, 0), "material_textures": (FLOOR, 1),
     "diffuse": (FLOOR, 1), "specular": (FLOOR, 4), "roughness": (FLOOR, 6), "emission": (LIGHT, 8),
 }  # fmt: skip
 """One number of each array, and of each part of the materials."""
@@ -189,7 +193,7 @@ PLACES = {
 
 def _with(field: Declared, number: Any) -> Scene:
     """Return a dark floor under a light, with one number of an array replaced."""
-    scene = tiny_scene()
+    scene = textured_scene() if field.name in MAP_ARRAYS else tiny_scene()
     scene.materials[FLOOR] = 0
     if field.name == "vertex_normals":
         scene.vertex_normals[0] = 0
@@ -220,7 +224,10 @@ def test_an_array_of_a_scene_may_reach_the_end(field: Declared, end: End) -> Non
         return
     # What rows there are is a law between arrays; the range is that of the type.
     array = getattr(scene, field.name)
-    assert number == {"low": 0, "high": np.iinfo(array.dtype).max}[end]
+    ends = (0, np.iinfo(array.dtype).max)
+    if field.name == "material_textures":  # -1 stands for no texture
+        ends = (CONSTANT, MAX_TEXTURES - 1)
+    assert number == dict(zip(("low", "high"), ends, strict=True))[end]
     assert not field.outside(array).any()
     if end == "low":
         return

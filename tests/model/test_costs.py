@@ -1,24 +1,35 @@
 """The formulas count what torch counts, and the named sizes are the sizes that they claim."""
 
+import dataclasses
+
 import pytest
 import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from model.config import SIZES
+from model.config import SIZES, ModelConfig
 from model.costs import Workload, costs, flops
 from model.precision import set_precision
 from model.renderformer import RenderFormer, count_parameters
 from model.scene_tensors import batch_scenes
 from tests.model.kit import FAMILIES, awake, random_scene, tiny_config
 
+REPAIRED = tiny_config(patch_px=4, projected_freqs=1, demodulated=True, hit_rays=1)
 
-@pytest.mark.parametrize("family", FAMILIES)
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        *map(tiny_config, FAMILIES),
+        REPAIRED,
+        dataclasses.replace(REPAIRED, window_bundles=2),
+        tiny_config("dpt", demodulated=True, hit_rays=1),
+    ],
+)
 @pytest.mark.parametrize(("triangles", "views", "resolution"), [(5, 1, 16), (9, 3, 48)])
 def test_flops_are_those_that_torch_counts(
-    family: str, triangles: int, views: int, resolution: int
+    config: ModelConfig, triangles: int, views: int, resolution: int
 ) -> None:
-    config = tiny_config(family)
     batch = batch_scenes([random_scene(triangles, views, dtype=torch.float32)])
     model = awake(config, torch.float32)
     # the math kernel, whose two products torch counts; it has no count for a CPU's fused one

@@ -19,6 +19,7 @@ from model.scene_tensors import batch_scenes, scene_tensors
 from model.weights import RANGE_KEY, TrainedRange, encode_weights, trained_range
 from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from tests.model.kit import awake, tiny_config
@@ -214,3 +215,12 @@ def test_pictures_are_as_wide_as_those_that_it_was_trained_on() -> None:
     assert known.render(tiny_scene()).shape == (2, 16, 16, 3)
     with pytest.raises(TrilightError, match="resolution is None, and the network does not say"):
         NeuralRenderer(network()).render(tiny_scene())
+
+
+def test_a_sky_that_is_left_out_is_said() -> None:
+    renderer = NeuralRenderer(network())
+    scene = tiny_scene()
+    environment = Environment(radiance_rgb=np.ones((2, 4, 3), np.float32))
+    below_sky = renderer.prepare(dataclasses.replace(scene, environment=environment))
+    assert any("has an environment" in note for note in below_sky.notes)
+    assert not any("environment" in note for note in renderer.prepare(scene).notes)

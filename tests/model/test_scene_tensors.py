@@ -1,9 +1,14 @@
 """Laws of the way in: numbers arrive where they belong, and nothing is written to the scene."""
 
+import dataclasses
+
 import numpy as np
+import pytest
 import torch
 
 from model.scene_tensors import batch_scenes, scene_tensors, tensors_of
+from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.material import EMISSION, material_width
 from storage.records.scene import ARRAY_FIELDS
 from tests.model.kit import random_scene
@@ -56,3 +61,10 @@ def test_batches_are_padded_with_zeros_to_the_longest_and_no_further() -> None:
 def test_equal_lengths_need_no_mask() -> None:
     batch = batch_scenes([random_scene(4, seed=1), random_scene(4, seed=2)])
     assert batch.is_triangle_BT is None
+
+
+def test_a_scene_below_a_sky_is_refused() -> None:
+    """Without its light the picture would be that of another scene."""
+    environment = Environment(radiance_rgb=np.ones((2, 4, 3), np.float32))
+    with pytest.raises(TrilightError, match="it has an environment.*skies.share=0"):
+        scene_tensors(dataclasses.replace(toy_scene(0), environment=environment))

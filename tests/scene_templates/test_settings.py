@@ -116,7 +116,7 @@ RANGES = [
 @pytest.mark.parametrize("wrong", [[], [0.5], [1, 2, 3], [True, True], ["a", "b"]], ids=str)
 def test_a_range_that_is_named_is_two_numbers(wrong: list[Any]) -> None:
     """A single number would silently take the other end from a default further down."""
-    assert len(RANGES) == 10
+    assert len(RANGES) == 12
     for name in RANGES:
         with pytest.raises(TrilightError, match=name.split(".")[1]):
             changed(DEFAULTS, {name: wrong})

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from model.hits.textures import SurfaceTextures
 from model.scene_tensors import SceneTensors
 from storage.records.material import laid_out
 from train.data.scenes import TrainingScene
@@ -110,6 +111,7 @@ def mirrored(scene: TrainingScene) -> TrainingScene:
         normals_T33=_tensor((old.normals_T33.numpy() * sides_3)[:, ::-1]),
         # the reflection before and after: row and column of x change their signs
         c2w_V44=_tensor(sides_4[:, None] * old.c2w_V44.numpy() * sides_4),
+        textures=_turned(old, np.tile(np.array([2, 1, 0]), (old.num_triangles, 1))),
     )
     target_VRR3 = _tensor(scene.target_VRR3.numpy()[:, :, ::-1])
     return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3, lights_VLRR3=None)
@@ -122,9 +124,12 @@ def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
         if column.is_colour:
             numbers[part] = numbers[part][order]
     material_TM = _tensor(scene.tensors.material_TM.numpy()[:, numbers])
+    textures = scene.tensors.textures
+    if textures is not None:
+        textures = textures.with_channels(order)
     return dataclasses.replace(
         scene,
-        tensors=dataclasses.replace(scene.tensors, material_TM=material_TM),
+        tensors=dataclasses.replace(scene.tensors, material_TM=material_TM, textures=textures),
         target_VRR3=_tensor(scene.target_VRR3.numpy()[..., order]),
         lights_VLRR3=None,
     )
@@ -142,6 +147,7 @@ def with_vertices_turned(scene: TrainingScene, turn_T: np.ndarray) -> TrainingSc
         old,
         triangles_T33=_take_vertices(old.triangles_T33, order_T3),
         normals_T33=_take_vertices(old.normals_T33, order_T3),
+        textures=_turned(old, order_T3),
     )
     return dataclasses.replace(scene, tensors=tensors)
 
@@ -166,6 +172,11 @@ def with_views(scene: TrainingScene, views: np.ndarray) -> TrainingScene:
 
 def _take_vertices(values_T33: Tensor, order_T3: NDArray[np.int64]) -> Tensor:
     return _tensor(np.take_along_axis(values_T33.numpy(), order_T3[..., None], axis=1))
+
+
+def _turned(tensors: SceneTensors, order_T3: NDArray[np.int64]) -> SurfaceTextures | None:
+    textures = tensors.textures
+    return None if textures is None else textures.with_vertices(order_T3)
 
 
 def _tensor(values: NDArray[np.float32]) -> Tensor:

@@ -62,7 +62,7 @@ class StreamSettings:
     augmentation: "AugmentationSettings | None" = None
     """Symmetries that are drawn at each visit; none by default."""
     network: "ModelConfig | None" = None
-    """The network that is trained: for one with the view stage `hits`, views are traced here."""
+    """The network that is trained: what it wants traced of its views, is traced here."""
 
     @property
     def order(self) -> OrderSettings:
@@ -172,11 +172,16 @@ class _SceneMaker:
         seen = with_views(scene, np.sort(views))
         if settings.augmentation:
             seen = augmented(seen, settings.augmentation, rng)
-        if settings.network is None or settings.network.view_stage != "hits":
+        if settings.network is None or not settings.network.hit_rays:
             return seen
-        from model.hits.tracing import with_traced  # brings the checker of settings along
+        # these bring the checker of settings along
+        from model.demodulated import with_albedo
+        from model.hits.tracing import with_traced
 
         # after the symmetries, which therefore need not know what is traced
+        if settings.network.demodulated:
+            tensors = with_albedo(seen.tensors, settings.resolution, settings.network.hit_rays)
+            return dataclasses.replace(seen, tensors=tensors)
         noise = int(rng.integers(2**31))
         tensors = with_traced(seen.tensors, settings.resolution, settings.network, noise)
         withheld = settings.augmentation.withheld_inputs if settings.augmentation else 0.0

@@ -31,6 +31,7 @@ from train.evaluation.judged_view import GROUPED, NETWORK, JudgedView, facts_of
 from train.evaluation.metrics import noise_floors, picture_scores
 from train.evaluation.order import SceneCount, Width
 from train.evaluation.rivals import Rivals
+from train.evaluation.same_time import CAPTION, TRACER, TracedBeside
 from train.evaluation.sheet import SheetView
 from train.loss.lpips import Lpips
 
@@ -57,6 +58,8 @@ class Contest:
     """Likewise. None where its weights are not at hand: LPIPS is then n/a."""
     most_scenes: SceneCount
     """Maximum number of scenes that are judged, from the start of the split."""
+    traced: SkipValidation[TracedBeside | None] = None
+    """Who traces pictures in the network's own time, if somebody does."""
 
     def samples(self) -> Iterator[Sample]:
         """Yield the samples; one that is damaged ends it, since it would be another set."""
@@ -97,7 +100,9 @@ def judged_views(contest: Contest, scene_done: Callable[[], None]) -> list[Judge
             _judged(contest, sample, judged, view, contestants)
             for view in range(len(judged.target_VRR3))
         ]
-        rows += found if before is None else _with_swapped(found, contest.network, judged, before)
+        if before is not None and contest.network.config.scene_tokens:
+            found = _with_swapped(found, contest.network, judged, before)
+        rows += found
         before = judged.scene.tensors
         scene_done()
     if not rows:
@@ -116,6 +121,9 @@ def _judged(
     pictures = {name: pictures_VRR3[view] for name, pictures_VRR3 in contestants.items()}
     if contest.rivals is not None:
         pictures |= contest.rivals.pictures(target)
+    if contest.traced is not None:
+        traced = contest.traced.judged(sample, view)
+        pictures |= {} if traced is None else {TRACER: traced}
     return JudgedView(
         **facts_of(sample),
         view=view,
@@ -154,7 +162,13 @@ def sheet_views(contest: Contest, chosen: Sequence[JudgedView]) -> list[SheetVie
             scene = training_scene(sample, contest.resolution)
             pictures = predict(contest.network, scene)
             for row in rows:
-                found[row.key, row.view] = _sheet_view(row, scene, pictures[row.view])
+                shown = _sheet_view(row, scene, pictures[row.view])
+                if contest.traced is not None:
+                    traced = contest.traced.shown(sample, row.view)
+                    black = np.zeros_like(shown.target_rgb)
+                    beside = {CAPTION: black if traced is None else traced}
+                    shown = dataclasses.replace(shown, beside_rgb=beside)
+                found[row.key, row.view] = shown
     return [found[row.key, row.view] for row in chosen]
 
 
@@ -194,10 +208,10 @@ def grouped_pictures(
     """Return what `trilight render` shows of a scene, its groups of lights added up.
 
     Returns:
-        Linear radiance [V, R, R, 3] of at least 0, or None where one group holds every light, so
-        that one pass is the same.
+        Linear radiance [V, R, R, 3] of at least 0, or None where one pass takes every light.
     """
-    if len(light_groups(scene, MAX_LIGHTS)) == 1:
+    by_hits = network.config.view_stage == "hits"
+    if by_hits or len(light_groups(scene, MAX_LIGHTS)) == 1:
         return None
     renderer = NeuralRenderer(network)
     prepared = renderer.prepare(scene)
@@ -226,6 +240,8 @@ def withheld_pictures(
         return {}
     found = {}
     for index, name in enumerate(INPUTS):
+        if name == "tokens" and not network.config.scene_tokens:
+            continue
         kept_VI = torch.ones_like(traced.given_VI)
         kept_VI[:, index] = 0
         tensors = dataclasses.replace(scene.tensors, traced=traced.without(kept_VI))

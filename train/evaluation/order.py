@@ -10,6 +10,8 @@ Width = Annotated[int, Within(1, 8192, unit="pixels")]
 """Pixels across a picture."""
 SceneCount = Annotated[int, Within(1, 10**9, unit="scenes")]
 """Maximum number of scenes to evaluate."""
+TracedViews = Annotated[int, Within(0, 10**6, unit="views")]
+"""Maximum number of views that the path tracer is judged on too."""
 
 
 @checked()
@@ -31,6 +33,9 @@ class EvaluationOrder:
     else the dataset's."""
     most_scenes: SceneCount = 10**6
     """Maximum number of scenes to evaluate, taken from the start of the split."""
+    tracer_views: TracedViews = 64
+    """Maximum number of views to judge the path tracer on as well, denoised, with the samples that
+    take it the network's own time; 0 leaves it out."""
     lpips: str | None = None
     """Folder of the LPIPS weights, or hub to download them; by default the value of TRILIGHT_LPIPS,
     and without either LPIPS is n/a."""

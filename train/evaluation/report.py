@@ -15,16 +15,22 @@ from train.evaluation.judged_view import (
     summary,
 )
 from train.evaluation.metrics import METRICS
+from train.evaluation.same_time import TRACER, sentences
 
 NOT_AVAILABLE = "n/a"
 
 
-def record(views: Sequence[JudgedView], about: Mapping[str, Any]) -> dict[str, Any]:
+def record(
+    views: Sequence[JudgedView],
+    about: Mapping[str, Any],
+    traced: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """Return everything that was measured, as JSON values.
 
     Args:
         views: the rows.
         about: network, data, split, resolution, as they are to be told.
+        traced: the path tracer in the network's time (evaluation.same_time), if that was measured.
     """
     return {
         "about": dict(about),
@@ -34,6 +40,7 @@ def record(views: Sequence[JudgedView], about: Mapping[str, Any]) -> dict[str, A
             for name in views[0].scores
             if all(name in view.scores for view in views)
         },
+        "path tracer": traced,
         "swapped scenes": loss_by_swapping(views),
         "light passes": passes_compared(views),
         "published": published_beside(views, about),
@@ -50,6 +57,7 @@ def markdown(found: Mapping[str, Any]) -> str:
     lines += _contestants(found["contestants"])
     network = found["contestants"][NETWORK]
     lines += ["", *_against_noise(network)]
+    lines += _same_time(found["path tracer"])
     lines += _swapped(found["swapped scenes"])
     lines += _published(found["published"]) + _light_passes(found["light passes"])
     for split, parts in found["groups"].items():
@@ -85,6 +93,17 @@ def _against_noise(network: Mapping[str, Any]) -> list[str]:
         f"{network['near_floor']:.1%} of {network['views']} views are within {NEAR_DB:g} dB of "
         "their floor.",
     ]
+
+
+def _same_time(traced: Mapping[str, Any] | None) -> list[str]:
+    if traced is None:
+        return []
+    lines = ["", "## Beside the path tracer, in the network's own time", ""]
+    lines += [_escaped(" ".join(sentences(traced)))]
+    if "tracer" not in traced:
+        return lines
+    both = {name: traced[part] for name, part in ((NETWORK, "network"), (TRACER, "tracer"))}
+    return [*lines, "", *_contestants(both)]
 
 
 def _swapped(loss: Mapping[str, Any] | None) -> list[str]:

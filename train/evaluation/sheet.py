@@ -2,8 +2,8 @@
 
 import dataclasses
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,8 @@ class SheetView:
     """[R, R, 3] linear radiance."""
     noise: float
     """Root mean square noise of the target's log10(1 + radiance)."""
+    beside_rgb: Mapping[str, NDArray] = field(default_factory=dict)
+    """[R, R, 3] linear radiance that others show, by name; of the same ones in all of a sheet."""
 
 
 def drawn_sheet(views: Sequence[SheetView], title: Sequence[str]) -> Image.Image:
@@ -104,6 +106,7 @@ def _block(view: SheetView) -> Image.Image:
     pictures = {
         "target": preview_srgb8(view.target_rgb),
         "prediction": preview_srgb8(view.predicted_rgb),
+        **{name: preview_srgb8(picture) for name, picture in view.beside_rgb.items()},
         f"error (white: {ERROR_WHITE})": error_picture(view.predicted_rgb, view.target_rgb),
         f"... / noise (white: {NOISE_WHITE:.0f})": noise_picture(view),
     }

@@ -275,5 +275,10 @@ def network_of_run(path: Path) -> FoundNetwork | None:
     if not is_checkpoint(read_metadata(path)):
         return None
     checkpoint = read_checkpoint(path)
-    trained = TrainedRange(resolution=int(checkpoint.header["settings"]["resolution"]))
-    return FoundNetwork(path=path, trained=trained, open=checkpoint.network)
+    settings = checkpoint.header["settings"]
+    return FoundNetwork(
+        path=path,
+        trained=TrainedRange(resolution=int(settings["resolution"])),
+        any_width=settings["model"].get("view_stage") == "hits",
+        open=checkpoint.network,
+    )

@@ -150,10 +150,10 @@ def _set_up(workshop: Workshop) -> Any:
     """Return the network, and a render child of scenes that no network learnt from."""
     from model.neural_renderer import NeuralRenderer
 
-    renderer = NeuralRenderer.load(workshop.asked.checkpoint, device="cpu")
+    renderer = NeuralRenderer.load(workshop.asked.network, device="cpu")
     build = build_within(renderer.trained.max_triangles)
     child = workshop.render_child(build, BENCHMARK)
-    name = Path(workshop.asked.checkpoint).name
+    name = Path(workshop.asked.network).name
     workshop.note(f"scenes of at most {build.scenes.max_triangles} triangles")
     workshop.note(f"network {name}, {renderer.digest[:8]}")
     return renderer, child, build

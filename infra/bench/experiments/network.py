@@ -60,7 +60,7 @@ def _measure_trained(workshop: Workshop, points: Sequence[Point], turn: str) -> 
         renderer = workshop.kept(
             ("trained", point.name),
             lambda name=point.name: NeuralRenderer.load(  # type: ignore[misc]
-                workshop.asked.checkpoint, device="cpu", precision=name
+                workshop.asked.network, device="cpu", precision=name
             ),
         )
         px = min(renderer.trained.resolution or 64, workshop.effort.resolution)

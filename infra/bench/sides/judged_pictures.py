@@ -41,7 +41,7 @@ _SEED = 20_261_124
 """Seed of scenes and samples that are judged here; no build and no run uses it."""
 
 
-_LEAST = 1e-10
+LEAST_ERROR = 1e-10
 """Squared errors below this, or below 0 by chance, count as this: 100 dB."""
 
 
@@ -145,7 +145,7 @@ def true_error_db(
     noise_sq = np.square(0.5 * (reference.a_rgb - reference.b_rgb))
     variance = np.square(weight) * (np.square(picture - mean) + noise_sq) * noise_sq
     spread = float(np.sqrt(variance.sum()))
-    error = max(error, _LEAST)
+    error = max(error, LEAST_ERROR)
     return -10 * np.log10(error), 10 * np.log10(1 + spread / error)
 
 
@@ -158,7 +158,7 @@ def difference_db(ours: Reference, theirs: Reference, curve: Curve) -> float:
     means = (0.5 * (one.a_rgb + one.b_rgb) for one in (ours, theirs))
     weight = np.square(secant_slope(curve, *means))
     product = (ours.a_rgb - theirs.a_rgb) * (ours.b_rgb - theirs.b_rgb)
-    return float(-10 * np.log10(max((weight * product).mean(), _LEAST)))
+    return float(-10 * np.log10(max((weight * product).mean(), LEAST_ERROR)))
 
 
 def shrunk(reference: Reference, resolution: int) -> Reference:

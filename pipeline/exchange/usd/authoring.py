@@ -97,13 +97,14 @@ def usd_value(kind: str, value: Any) -> Any:
 @functools.cache
 def _converter(kind: str) -> Callable[[Any], Any]:
     """Return what makes USD's value of ours; asked once a type, since scenes have 10^5 values."""
-    from pxr import Gf, Vt
+    from pxr import Gf, Sdf, Vt
 
     known: dict[str, Callable[[Any], Any]] = {
         "token[]": Vt.TokenArray,
         "int[]": Vt.IntArray.FromNumpy,
         "float[]": Vt.FloatArray.FromNumpy,
         "color3f": Gf.Vec3f,
+        "asset": Sdf.AssetPath,
         "float2": Gf.Vec2f,
         "matrix4d": Gf.Matrix4d,
     }

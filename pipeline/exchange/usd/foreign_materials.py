@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd.foreign_meshes import TriangleSoup, per_corner
-from pipeline.exchange.usd.foreign_textures import Texture, read_texture
+from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
 from pipeline.exchange.usd.names import added_column
 from pipeline.exchange.usd.stage import OpenedUsd
 from storage.records.material import (
@@ -202,7 +202,7 @@ def _value(
 
 
 def _textured(
-    texture: Texture, name: str, surface: MeshToShade, time: Any, opened: OpenedUsd
+    texture: ForeignTexture, name: str, surface: MeshToShade, time: Any, opened: OpenedUsd
 ) -> NDArray[np.float32] | None:
     from pxr import UsdGeom
 

@@ -15,7 +15,7 @@ MAX_PLACED = 100_000
 MAX_NESTED = 150
 """Maximum nesting of prims, through prototypes too."""
 
-_READ = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight")
+_READ = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight", "DomeLight")
 _SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "SkelRoot", "")
 
 

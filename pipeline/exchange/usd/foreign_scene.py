@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.usd.dome import foreign_dome
 from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all, cameras
 from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
 from pipeline.exchange.usd.foreign_materials import MeshToShade, material_rows
@@ -16,6 +17,7 @@ from pipeline.exchange.usd.stage import OpenedUsd
 from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.shading import ShadedMesh, flat_shaded
 from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.material import EMISSION, ROUGHNESS, default_rows, distinct_rows
 from storage.records.scene import ObjectKind, Scene, SceneObject
 
@@ -36,7 +38,7 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
     names: set[str] = set()
     triangles = 0
     for each in placed:
-        if each.prim.GetTypeName() == "Camera":
+        if each.prim.GetTypeName() in ("Camera", "DomeLight"):
             continue
         found = _pieces(each, time, opened, licence, names)
         triangles += sum(len(piece.mesh.faces) for piece in found)
@@ -45,19 +47,25 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
         pieces += found
         if len(pieces) > MAX_ROWS:
             raise TrilightError(f"more than {MAX_ROWS} objects.")
-    if not any(piece.entry.kind == "emitter" for piece in pieces):
+    sky = _environment(placed, time, opened, licence)
+    is_lit = sky is not None and sky.radiance_rgb.any()
+    if not is_lit and not any(piece.entry.kind == "emitter" for piece in pieces):
         raise TrilightError(
             "no light that can be carried over; expected an emissive material, or a rectangle, "
-            "disk, sphere or mesh light."
+            "disk, sphere, mesh or dome light."
         )
     materials = sum(len(piece.materials) for piece in pieces)
     if materials > MAX_ROWS:
         raise TrilightError(f"{materials} materials; expected at most {MAX_ROWS}.")
-    return _scene(pieces, placed, time, opened)
+    return _scene(pieces, placed, time, opened, sky)
 
 
 def _scene(
-    pieces: Sequence[ScenePiece], placed: Sequence[Placed], time: Any, opened: OpenedUsd
+    pieces: Sequence[ScenePiece],
+    placed: Sequence[Placed],
+    time: Any,
+    opened: OpenedUsd,
+    sky: Environment | None,
 ) -> Scene:
     arrays = joined(pieces)
     seen = [each for each in placed if each.prim.GetTypeName() == "Camera"]
@@ -72,9 +80,24 @@ def _scene(
         fov_deg=fov_deg,
         objects=tuple(piece.entry for piece in pieces),
         provenance={"template": "usd", "file": opened.path.name, "time_code": code},
+        environment=sky,
     )
     scene.check()
     return scene
+
+
+def _environment(
+    placed: Sequence[Placed], time: Any, opened: OpenedUsd, licence: str
+) -> Environment | None:
+    """Return that of the first dome that can be read; others are noted."""
+    domes = [each for each in placed if each.prim.GetTypeName() == "DomeLight"]
+    sky = None
+    for each in domes:
+        if sky is not None:
+            opened.lost.append(f"{each.prim.GetPath()}: a second dome; one lights a scene here")
+            continue
+        sky = foreign_dome(each.prim, each.to_world, time, opened, licence)
+    return sky
 
 
 def _pieces(

@@ -25,7 +25,7 @@ _STEPS = 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Texture:
+class ForeignTexture:
     """A picture as a material uses it."""
 
     linear: NDArray[np.float32]  # [H, W, C] linear values, row 0 on top
@@ -61,7 +61,7 @@ class Texture:
         return np.repeat(whole[..., ["rgba".index(self.output)]], 3, axis=-1)
 
 
-def read_texture(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Texture | None:
+def read_texture(shader: Any, output: str, time: Any, opened: OpenedUsd) -> ForeignTexture | None:
     """Return the texture of a UsdUVTexture shader, or None, with a note, if unreadable.
 
     Raises:
@@ -81,7 +81,7 @@ def read_texture(shader: Any, output: str, time: Any, opened: OpenedUsd) -> Text
         return None
     space = _get(shader, "sourceColorSpace", time, "auto")
     linear = _linear(pixels) if space != "raw" and pixels.shape[2] >= 3 else pixels
-    return Texture(
+    return ForeignTexture(
         linear=linear,
         wrap=(
             str(_get(shader, "wrapS", time, "repeat")),
@@ -128,7 +128,7 @@ def _pixels(resolved: str) -> NDArray[np.float32] | None:
     from PIL import Image
 
     name = Path(resolved).name
-    data = _bytes(resolved, name)
+    data = asset_bytes(resolved)
     if data is None:
         return None
     try:
@@ -146,8 +146,9 @@ def _pixels(resolved: str) -> NDArray[np.float32] | None:
     return values if values.ndim == 3 else values[..., None]
 
 
-def _bytes(resolved: str, name: str) -> bytes | None:
+def asset_bytes(resolved: str) -> bytes | None:
     """Return the bytes of a plain file, or of a member of an archive; None where there are none."""
+    name = Path(resolved).name
     outer, _, member = resolved.partition("[")
     try:
         if member:

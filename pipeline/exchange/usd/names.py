@@ -4,6 +4,7 @@
     /Scene/Materials/material_<m> one per material row: UsdPreviewSurface and OpenPBR
     /Scene/Objects/<name>         one Mesh per object, with a GeomSubset per material
     /Scene/Cameras/camera_<c>     one per camera
+    /Scene/Environment            a DomeLight, where there is an environment
 
 A shard is `/Scenes` with a variant set `scene`: one variant per sample, named by its key, each with
 a `/Scenes/Scene` as above. Everything under the namespace `trilight:` is exact; the rest of a prim
@@ -36,6 +37,14 @@ OBJECT_TEXTS = {
     "source_url": NAMESPACE + "sourceUrl",
 }
 """Attributes of a mesh: row of its object, rows of vertices and faces, fields of SceneObject."""
+
+ENVIRONMENT_TEXTS = {
+    "name": NAMESPACE + "name",
+    "licence": NAMESPACE + "licence",
+    "attribution": NAMESPACE + "attribution",
+    "source_url": NAMESPACE + "sourceUrl",
+}
+"""Attributes of a dome: fields of MapSource."""
 
 MATERIAL_ATTRIBUTES = {
     "diffuse": NAMESPACE + "diffuseAlbedo",

@@ -62,7 +62,7 @@ def _read(path: Path, key: str | None, folder: Path | None, licence: str) -> Usd
     if shard is not None:
         return _of_shard(opened, shard, key or shard[0])
     if key is None:
-        scene = read_exact(opened.root)
+        scene = read_exact(opened.root, opened=opened)
         if scene is not None:
             return UsdScene(key="", scene=scene, lost=(), exact=True)
     stage = opened.compose()
@@ -87,7 +87,7 @@ def _of_shard(opened: OpenedUsd, keys: list[str], key: str) -> UsdScene:
     name = opened.path.name
     if key not in keys:
         raise TrilightError(f"{name}: no scene {key}; expected one of {keys[0]} to {keys[-1]}.")
-    scene = read_exact(opened.root, key)
+    scene = read_exact(opened.root, key, opened)
     if scene is None:
         raise TrilightError(
             f"{name}: scene {key} has been changed since Trilight wrote it; save it as a file of "
@@ -100,7 +100,7 @@ def _keys(opened: OpenedUsd) -> list[str]:
     shard = scene_keys(opened.root)
     if shard is not None:
         return shard
-    if read_exact(opened.root) is not None:
+    if read_exact(opened.root, opened=opened) is not None:
         return [""]
     return list(_frames(opened.compose())) or [""]
 

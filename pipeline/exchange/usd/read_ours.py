@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import as_expected
-from pipeline.exchange.usd.write import camera_attributes
+from pipeline.exchange.usd.dome import dome_as_written, dome_attributes
+from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.exchange.usd.write import ENVIRONMENT, camera_attributes
 from pipeline.exchange.usd.write_materials import OPENPBR, PREVIEW, material_tables
 from pipeline.exchange.usd.write_meshes import MESH, SUBSET, object_attributes
 from storage.conventions import require_readable
 from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.material import (
     PUBLISHED_COLUMNS,
     UndeclaredColumn,
@@ -66,8 +69,13 @@ def is_marked(layer: Any, key: str | None = None) -> bool:
     return _root_of(layer, key) is not None
 
 
-def read_exact(layer: Any, key: str | None = None) -> Scene | None:
+def read_exact(layer: Any, key: str | None = None, opened: OpenedUsd | None = None) -> Scene | None:
     """Return the scene of a layer, or that under `key` of a shard; None where it is not as written.
+
+    Args:
+        layer: of one scene, or of a shard.
+        key: which of a shard.
+        opened: the way to the file of an environment; without it, a scene that has one is not read.
 
     Raises:
         TrilightError: it was written by a Trilight that this one cannot read, has a material column
@@ -79,7 +87,7 @@ def read_exact(layer: Any, key: str | None = None) -> Scene | None:
     name = layer.GetDisplayName()
     require_readable(root.attributes[names.VERSION].default, name)
     try:
-        scene = _scene(root)
+        scene = _scene(root, opened)
     except UndeclaredColumn as error:
         raise TrilightError(f"{name}: {error}") from error
     except (_Changed, LookupError, TypeError, ValueError, AttributeError):
@@ -102,10 +110,13 @@ def _root_of(layer: Any, key: str | None) -> Any:
     return root if root and all(mark in root.attributes for mark in marks) else None
 
 
-def _scene(root: Any) -> Scene:
-    folders = _children(root, {"Materials", "Objects", "Cameras"})
+def _scene(root: Any, opened: OpenedUsd | None) -> Scene:
+    sky = _environment(root, opened)
+    names_of = {"Materials", "Objects", "Cameras"}
+    folders = _children(root, names_of if sky is None else {*names_of, ENVIRONMENT})
     for folder in folders:
-        _plain(folder, set())
+        if folder.name != ENVIRONMENT:
+            _plain(folder, set())
     materials = _materials(folders["Materials"])
     prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
     objects = tuple(_object(prim) for prim in prims)
@@ -124,6 +135,7 @@ def _scene(root: Any) -> Scene:
         fov_deg=fov_deg,
         objects=objects,
         provenance=scene_provenance(json.loads(root.attributes[names.PROVENANCE].default)),
+        environment=sky,
     )
     for row, prim in enumerate(prims):
         _require(as_expected(prim, object_attributes(scene, row)))
@@ -133,6 +145,18 @@ def _scene(root: Any) -> Scene:
             _require(as_expected(prim, MESH))
         _plain(prim, expected)
     return scene
+
+
+def _environment(root: Any, opened: OpenedUsd | None) -> Environment | None:
+    prim = root.nameChildren.get(ENVIRONMENT)
+    if prim is None:
+        return None
+    _require(opened is not None and prim.typeName == "DomeLight")
+    assert opened is not None
+    sky = dome_as_written(prim, root.layer, opened)
+    _require(as_expected(prim, dome_attributes(sky)))
+    _plain(prim, set(dome_attributes(sky)))
+    return sky
 
 
 def _materials(folder: Any) -> NDArray[np.float32]:

@@ -1,6 +1,7 @@
 """`Scene` to USD: `.usda`, `.usdc` or `.usdz`, one scene or the scenes of a whole shard.
 
-Z up, metres, a default prim, nothing that names a file. Equal scenes give equal bytes.
+Z up, metres, a default prim; an environment map is a file beside it, or in the archive. Equal
+scenes give equal bytes.
 `pipeline.exchange.usd.names` lists the paths; `pipeline.exchange.usd.read_ours` reads it back. A
 camera has a pose and a lens, in tenths of a metre, on a square film of 36 mm. A `.usdz` file is a
 zip archive of plainly stored members that begin at multiples of 64 bytes.
@@ -10,7 +11,7 @@ import io
 import math
 import tempfile
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
+from pipeline.exchange.usd.dome import add_dome
 from pipeline.exchange.usd.names import (
     DIGEST,
     FOV_DEG,
@@ -43,7 +45,12 @@ from storage.records.scene_file import scene_digest
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
 
-CARRIED = frozenset({*ARRAY_FIELDS, "provenance"} | {f"objects.{field}" for field in OBJECT_TEXTS})
+ENVIRONMENT = "Environment"
+"""Name of the prim of an environment."""
+
+CARRIED = frozenset(
+    {*ARRAY_FIELDS, "provenance", "environment"} | {f"objects.{field}" for field in OBJECT_TEXTS}
+)
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
 
@@ -55,8 +62,7 @@ def write_usd(path: Path, scene: Scene) -> None:
             the file cannot be written.
     """
     layer = _new_layer(path, ROOT)
-    _add_scene(layer, ROOT, scene)
-    _save(path, layer)
+    _save(path, layer, _add_scene(layer, ROOT, scene))
 
 
 def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
@@ -70,16 +76,16 @@ def write_usd_shard(path: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     layer = _new_layer(path, SHARD_ROOT)
     root = add_prim(layer, SHARD_ROOT, "Xform")
     root.variantSetNameList.Prepend(VARIANT_SET)
-    keys = []
+    keys, files = [], dict[str, bytes]()
     for key, scene in scenes:
         variant = f"{SHARD_ROOT}{{{VARIANT_SET}={key}}}"
         Sdf.CreatePrimInLayer(layer, variant)
-        _add_scene(layer, variant + ROOT.removeprefix("/"), scene)
+        files |= _add_scene(layer, variant + ROOT.removeprefix("/"), scene)
         keys.append(key)
     if not keys:
         raise TrilightError(f"{path.name}: no scenes to write; expected at least one.")
     root.variantSelections[VARIANT_SET] = keys[0]
-    _save(path, layer)
+    _save(path, layer, files)
 
 
 def root_attributes(scene: Scene) -> Attributes:
@@ -97,7 +103,8 @@ def root_attributes(scene: Scene) -> Attributes:
     }
 
 
-def _add_scene(layer: Any, path: str, scene: Scene) -> None:
+def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
+    """Write a scene, and return the files that it names."""
     from pxr import Sdf
 
     scene.check()
@@ -108,6 +115,9 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> None:
         add_materials(layer, f"{path}/Materials", scene.materials)
         add_objects(layer, f"{path}/Objects", scene, f"{path}/Materials")
         add_cameras(layer, f"{path}/Cameras", scene)
+        if scene.environment is None:
+            return {}
+        return add_dome(layer, f"{path}/{ENVIRONMENT}", scene.environment)
 
 
 def _require_text(*texts: str) -> None:
@@ -128,14 +138,19 @@ def _new_layer(path: Path, root: str) -> Any:
     return layer
 
 
-def _save(path: Path, layer: Any) -> None:
+def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
     suffix = ".usda" if path.suffix.lower() == ".usda" else ".usdc"
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / f"scene{suffix}"
         if not layer.Export(str(plain)):
             raise TrilightError(f"{path.name}: USD could not write the scene.")
         data = plain.read_bytes()
-    write_atomically(path, packaged(data) if path.suffix.lower() == ".usdz" else data)
+    if path.suffix.lower() == ".usdz":
+        write_atomically(path, packaged(data, files))
+        return
+    for name, content in files.items():
+        write_atomically(path.parent / name, content)
+    write_atomically(path, data)  # last: what it names is there
 
 
 APERTURE = 0.36
@@ -176,14 +191,16 @@ _PADDING_ID = 0x1986
 """Identifier of the extra field that aligns a member's bytes; readers skip it."""
 
 
-def packaged(layer: bytes) -> bytes:
-    """Return the `.usdz` of one `.usdc` layer; no clock and no host is in it."""
-    entry = zipfile.ZipInfo(LAYER_NAME, date_time=(1980, 1, 1, 0, 0, 0))
-    begin = _HEADER_BYTES + len(LAYER_NAME)
-    padding = -(begin + 4) % ALIGNMENT
-    entry.extra = _PADDING_ID.to_bytes(2, "little") + padding.to_bytes(2, "little") + bytes(padding)
-    entry.external_attr = 0o644 << 16
+def packaged(layer: bytes, files: Mapping[str, bytes] | None = None) -> bytes:
+    """Return the `.usdz` of one `.usdc` layer and files that it names; no clock is in it."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(entry, layer)
+        for name, data in {LAYER_NAME: layer, **(files or {})}.items():
+            entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+            begin = stream.tell() + _HEADER_BYTES + len(name)
+            padding = -(begin + 4) % ALIGNMENT
+            entry.extra = _PADDING_ID.to_bytes(2, "little") + padding.to_bytes(2, "little")
+            entry.extra += bytes(padding)
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, data)
     return stream.getvalue()

@@ -1,7 +1,4 @@
-"""The passes, declared once: name, channels, unit, frame, how they are averaged, how computed.
-
-Scenes have no texture coordinates yet; the pass `uv` comes with them.
-"""
+"""The passes, declared once: name, channels, unit, frame, how they are averaged, how computed."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -66,6 +63,9 @@ class Pass:
 
 MOTION = "motion_px"
 """The pass that needs another moment of the scene, or another camera."""
+
+UV = "uv"
+"""The pass that only textured scenes have."""
 
 _WITHOUT_LAYER = ("Z", "A")
 _XYZ = ("x", "y", "z")
@@ -181,6 +181,14 @@ PASSES = (
         averaging="surfaces",
         frame="camera",
         of=lambda rays: rays.hits.shading_normal @ rays.c2w[:3, :3],
+    ),
+    Pass(
+        name=UV,
+        means="Texture coordinates of the point that is seen, u to the right and v up; undefined "
+        "where the scene has none.",
+        channels=("u", "v"),
+        averaging="centre ray",
+        of=lambda rays: rays.hits.uv,
     ),
     Pass(
         name=MOTION,

@@ -4,7 +4,7 @@ The rays of a pixel stand on a regular grid over its area, the same for every pi
 arguments give equal numbers. Ids and barycentrics are those of one more ray, through the centre.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from storage.conventions import camera_rays
 from storage.errors import TrilightError
 from storage.records.first_hits import SeenFrom, require_row
-from storage.records.passes.declared import MOTION, Pass, declared_passes
+from storage.records.passes.declared import MOTION, UV, Pass, declared_passes
 from storage.records.passes.motion import require_same_triangles
 from storage.records.passes.rays import Later, PassRays
 from storage.records.scene import Scene
@@ -41,7 +41,7 @@ def view_passes(
 
     Args:
         scene: passes `Scene.check`.
-        names: of the passes; all by default, `motion_px` only where it has a meaning.
+        names: of the passes; all by default, `motion_px` and `uv` only where they have a meaning.
         view: row of `scene.c2w`.
         resolution: width and height of the pictures in pixels.
         rays_a_side: passes that are averaged take this number of rays along each side of a pixel,
@@ -63,7 +63,8 @@ def view_passes(
     _require_whole("resolution", resolution, 2**16)
     _require_whole("rays_a_side", rays_a_side, MOST_A_SIDE)
     later = _later(scene, view, then, then_view)
-    chosen = _chosen(names, has_motion=later is not None)
+    without = {UV: scene.uv is None, MOTION: later is None}
+    chosen = _chosen(names, without={name for name, lacks in without.items() if lacks})
     if all(each.averaging == "centre ray" for each in chosen):
         rays_a_side = 1
     origin = scene.c2w[view, :3, 3].astype(np.float64)
@@ -134,10 +135,10 @@ def _beside(pixels: NDArray, values: NDArray) -> NDArray:
     return pixels if values.ndim == 2 else pixels[..., None]
 
 
-def _chosen(names: Sequence[str] | None, *, has_motion: bool) -> list[Pass]:
+def _chosen(names: Sequence[str] | None, *, without: Collection[str]) -> list[Pass]:
     known = {each.name: each for each in declared_passes()}
     if names is None:
-        return [each for each in known.values() if has_motion or each.name != MOTION]
+        return [each for each in known.values() if each.name not in without]
     for name in names:
         if name not in known:
             raise TrilightError(f"there is no pass {name!r:.60}; expected of {', '.join(known)}.")

@@ -1,10 +1,13 @@
 """Laws of the harness: turns, spread, front, a store that survives a kill, table and figure."""
 
+import dataclasses
 import json
 import math
+import re
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,12 +16,13 @@ from PIL import Image
 from infra.bench import run as running
 from infra.bench.curve import COST_NOISE, PricedLevel, at_error, on_front, rows, spread
 from infra.bench.effort import Asked
-from infra.bench.experiment import Experiment
+from infra.bench.experiment import Column, Experiment, Point, points_of
 from infra.bench.machine import machine, revision
 from infra.bench.run import newest_run, run
 from infra.bench.store import Run, Store
 from infra.bench.table import markdown, printed, shown
 from storage.errors import TrilightError
+from storage.intervals import mean_interval
 from tests.infra.bench.bench_kit import FIGURES, TINY, calls, experiment
 
 
@@ -70,6 +74,17 @@ def test_a_turn_that_fails_for_one_point_counts_for_none(tmp_path: Path) -> None
     assert found.left_out == {"bad": "no_scene: it has no light"}
     with pytest.raises(TrilightError, match="no turn could be measured: no_scene: it has no light"):
         measured(tmp_path / "none", experiment("bad"))
+
+
+def test_results_name_a_dataset_and_not_where_it_lies(tmp_path: Path) -> None:
+    named = [
+        measured(tmp_path, experiment("a"), f"/srv/someone/{folder}/set").plan["asked"]["data"]
+        for folder in ("here", "there")
+    ]
+    assert all(re.fullmatch(r"set \([0-9a-f]{8}\)", name) for name in named)
+    assert len(set(named)) == 2 and all(
+        "someone" not in path.read_text() for path in tmp_path.glob("*.jsonl")
+    )
 
 
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
@@ -134,6 +149,60 @@ def test_the_table_has_every_point_and_the_figure_is_a_picture(tmp_path: Path) -
     assert list(printed(one, found))[1][1] == "1.25 (1.00 to 1.50)"
     with Image.open(tmp_path / "made-up-quick.png") as picture:
         assert picture.width > 300 and len(set(picture.convert("L").tobytes())) > 20
+
+
+def paired(*turns: str) -> Experiment:
+    """Return the experiment beside its rival, with both costs in the figure."""
+    one = experiment(*turns)
+    return dataclasses.replace(
+        one,
+        columns=(
+            Column(name="again", figure="core_s"),
+            Column(name="more than the rival, dB", figure="db", over="pair"),
+        ),
+        also_cost=("again",),
+        kind=lambda name: "cheap ones" if name == "cheap" else "others",
+        rival=lambda asked: "default",
+    )
+
+
+def test_pairs_are_taken_turn_by_turn_with_their_interval(tmp_path: Path) -> None:
+    one = paired("a", "b", "c")
+    found = measured(tmp_path, one)
+    for turn, db in (("a", 28.0), ("b", 30.0), ("c", 35.0)):
+        found.turns[turn]["cheap"] = {"core_s": 1.0, "db": db}
+    cheap, default, waste = rows(one, found)
+    name = one.columns[1].name
+    assert cheap.values[name] == pytest.approx((28 + 30 + 35) / 3 - 40)
+    assert cheap.intervals[name] == mean_interval([-12.0, -10.0, -5.0], ["a", "b", "c"])
+    assert name not in default.values and not default.intervals, "the rival is not its own rival"
+    assert waste.intervals[name] == (-5.0, -5.0)
+    cells = [line.split(" | ")[5] for line in [*markdown(one, found)][2:]]
+    assert cells == ["-9.0 (-12.0 to -5.0)", "", "-5.0 (-5.0 to -5.0)"]
+
+
+def test_a_figure_of_kinds_shows_every_cost(tmp_path: Path) -> None:
+    measured(tmp_path, paired("a", "c"))
+    with Image.open(tmp_path / "made-up-quick.png") as picture:
+        red = np.asarray(picture.convert("RGB")).astype(int)
+        assert picture.width > 800 and (red[..., 0] - red[..., 2] > 100).sum() > 50
+
+
+def test_points_of_what_is_asked_for_come_first_and_names_are_of_one_thing(tmp_path: Path) -> None:
+    asked = Asked(checkpoint=("runs/x/model.safetensors", "builtin:", "y"))
+    assert asked.network == "runs/x/model.safetensors"
+    assert asked.network_names == ("x", "builtin:", "y"), "and no path of this machine"
+    one = dataclasses.replace(
+        experiment("a"),
+        asked_points=lambda asked: [Point(name=name) for name in asked.network_names],
+    )
+    assert [point.name for point in points_of(one, TINY, asked)] == [
+        *asked.network_names,
+        *FIGURES,
+    ]
+    twice = Asked(checkpoint=("a/x", "b/x"))
+    with pytest.raises(TrilightError, match="'x' is there twice"):
+        run(one, TINY, twice, folder=tmp_path)
 
 
 POINTS = st.lists(

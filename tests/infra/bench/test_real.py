@@ -58,3 +58,23 @@ def test_our_renderer_beside_plain_mitsuba(tmp_path: Path) -> None:
     db = {name: row.values["psnr_log_db, dB"] for name, row in found.items()}
     assert db["mitsuba 512"] > db["mitsuba 64"] > 20  # a picture of something else has below 20
     assert found["trilight 46 dB"].values["other side at equal error, times"] > 0
+
+
+@pytest.mark.slow
+def test_rungs_come_nearer_with_samples_and_with_what_is_traced(tmp_path: Path) -> None:
+    found = measured("rungs-64", tmp_path)
+    db = {name: row.values["psnr_log_db, dB"] for name, row in found.items()}
+    assert db["16 samples, fast"] > db["1 sample, fast"]
+    cost = {name: row.values["a further view, core-s"] for name, row in found.items()}
+    assert cost["direct light, no network"] < cost["all traced light, no network"]
+    assert all(
+        row.values["a scene's first view, core-s"] > cost[name] for name, row in found.items()
+    )
+    assert not found["network builtin:"].intervals and len(found) == 10
+
+
+@pytest.mark.slow
+def test_films_of_more_samples_flicker_less(tmp_path: Path) -> None:
+    found = measured("flicker-64", tmp_path)
+    calm = {name: row.values["flicker, dB"] for name, row in found.items()}
+    assert 15 < calm["1 sample, fast"] < calm["16 samples, fast"] < 60

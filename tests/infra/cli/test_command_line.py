@@ -169,4 +169,4 @@ def test_an_option_that_two_classes_have_is_refused() -> None:
 
 def test_the_command_of_a_page_has_its_options() -> None:
     assert isinstance(ALL["doctor"], Command)
-    assert [option.names for option in ALL["doctor"].options] == [("--json",)]
+    assert [option.names for option in ALL["doctor"].options] == [("--measure",), ("--json",)]

@@ -24,7 +24,7 @@ def test_a_preview_says_that_its_error_is_unknown(tmp_path: Path) -> None:
     words = ["render", str(source), "--out", str(out), "--resolution", "16", "--spp", "3"]
     printed = unwrapped(trilight(words, env=WIDE).output)
     assert "samples per pixel 3, one fast denoise noise floor unknown" in printed
-    assert "leave --spp out for a picture with a noise floor" in printed
+    assert "--noise-floor 40 measures it and samples on to it" in printed
     assert f"Look at {out.with_suffix('.png')}; measure with {out}" in printed
     header = OpenEXR.File(io.BytesIO(out.read_bytes()), header_only=True).header()
     assert header["trilight.spp"] == 3

@@ -17,6 +17,7 @@ from infra.rendering.places import PicturePlaces, place
 from infra.rendering.plan import RenderPlan, shots
 from infra.rendering.run import FinishedShot, carry_out
 from infra.rendering.video import write_video
+from infra.rendering.ways import Choice
 from pipeline.exchange.open_scene import SceneSource
 from storage.conventions import preview_srgb8
 from storage.errors import TrilightError
@@ -44,7 +45,7 @@ class FlatEngine:
 
     def open(self, scene: Scene, name: str) -> OpenedScene:
         self.opened += 1
-        return OpenedScene(notes=(f"{name} was opened",), render=self._render)
+        return OpenedScene(notes=(f"{name} was opened",), render=self._render, seconds=0.0)
 
     def _render(self, camera: ShotCamera, name: str) -> Rendered:
         self.rendered += 1
@@ -57,6 +58,9 @@ class FlatEngine:
 
 class Nobody:
     """Hears how far a render is, and says nothing."""
+
+    def chosen(self, choice: Choice) -> None:
+        pass
 
     def pictures(self, done: int, total: int) -> None:
         pass

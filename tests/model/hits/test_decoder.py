@@ -34,6 +34,7 @@ def hits_config(**changes: Any) -> ModelConfig:
         hit_anchors=8,
         gather_rays=16,
         pixel_width=16,
+        filter_width=8,
     )
     return dataclasses.replace(config, **changes)
 
@@ -70,7 +71,7 @@ def test_anchors_around_a_part_are_those_beside_it() -> None:
 
 def test_before_any_training_what_was_traced_is_passed_on() -> None:
     """Every gain is 1 and what is learned is a twentieth of the scene's mean light."""
-    model = RenderFormer(hits_config())
+    model = RenderFormer(hits_config(filter_width=0))
     model.initialise(torch.Generator().manual_seed(0))
     scene = corner()
     inputs = traced(scene, PX)

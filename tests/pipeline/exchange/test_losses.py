@@ -16,6 +16,7 @@ from storage.records.material import PUBLISHED_COLUMNS, columns_in_use, laid_out
 from storage.records.scene import Scene, SceneObject
 from tests.columns_kit import COAT, TINT, WAVES, declared
 from tests.scenes_by_hand import FLOOR, LIGHT, tiny_scene
+from tests.textured_by_hand import sky, textured_scene
 
 EXACT = ("usda", "usdc", "usdz", "safetensors")
 
@@ -134,6 +135,53 @@ def test_what_emitters_reflect_is_lost_in_the_published_arrays(tmp_path: Path) -
     scene = dataclasses.replace(base, materials=materials)
     notes = write_scene(tmp_path / "a.h5", scene)
     assert "what 1 emitting materials reflect" in notes
+
+
+@pytest.mark.parametrize("form", ["json", "h5", "usda", "usdc", "usdz"])
+def test_textures_and_a_sky_are_said_to_be_lost_where_they_are(tmp_path: Path, form: str) -> None:
+    """What comes back has the means of the textures, and is whole."""
+    path = tmp_path / f"a.{form}"
+    scene = textured_scene(environment=sky())
+    before = set(write_scene(tmp_path / f"b.{form}", tiny_scene()))
+    ((lost), *more) = (note for note in write_scene(path, scene) if note not in before)
+    keeps_sky = form.startswith("usd")
+    assert lost.endswith("textures" if keeps_sky else "textures, environment") and not more
+    back = load_source(scene_source(str(path))).scene
+    back.check()
+    assert not back.textures and (back.environment is not None) == keeps_sky
+    means = [texture.mean for texture in scene.textures]
+    row = back.materials[back.material_index[0]]
+    assert np.allclose(row[[0, 1, 2, 6]], np.concatenate(means), atol=1e-3)  # H5 holds halves
+
+
+def test_our_own_file_carries_textures_and_a_sky(tmp_path: Path) -> None:
+    path, scene = tmp_path / "a.safetensors", textured_scene(environment=sky())
+    assert write_scene(path, scene) == ()
+    back = load_source(scene_source(str(path)))
+    assert back.notes == () and back.scene.textures[0].sha256 == scene.textures[0].sha256
+
+
+@pytest.mark.parametrize("form", ["json", "h5"])
+def test_a_scene_that_only_its_sky_lights_is_not_written_dark(tmp_path: Path, form: str) -> None:
+    plain = tiny_scene()
+    materials = plain.materials.copy()
+    materials[LIGHT, 7:] = 0
+    objects = (plain.objects[0], SceneObject(name="other", kind="shell"))
+    scene = tiny_scene(materials=materials, objects=objects, environment=sky())
+    scene.check()
+    with pytest.raises(TrilightError, match="only light is its environment.*safetensors"):
+        write_scene(tmp_path / f"a.{form}", scene)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_smaller_budget_says_that_textures_go() -> None:
+    from pipeline.exchange.scene_budget import within_budget
+
+    scene = textured_scene(environment=sky())
+    reduced, notes = within_budget(scene, 3)
+    assert not reduced.textures and reduced.environment is scene.environment
+    assert any("textures became their means" in note for note in notes)
+    assert not any("textures" in note for note in within_budget(tiny_scene(), 3)[1])
 
 
 def test_the_names_of_members_are_those_of_a_scene() -> None:

@@ -14,7 +14,6 @@ import pytest
 from pipeline.renders import ggx, plugin_scene
 from pipeline.renders.ggx import AlbedoLookup, KernelLobes
 from pipeline.renders.plugin_tracer import PluginTracer
-from storage.records import multiscatter
 from storage.records.scene import Scene
 
 _PLUGIN = "kernel_bsdf"
@@ -24,14 +23,9 @@ _COLOURS, _NUMBERS = ("diffuse", "specular", "again"), ("alpha", "weight")
 def exact_twin(scene: Scene, monkeypatch: pytest.MonkeyPatch, **depths: int) -> PluginTracer:
     """Return Mitsuba's integrator, emitters and geometry around the kernel's BRDF (LLVM only)."""
     _register()
-    children = {name: plugin_scene._face(name) for name in (*_COLOURS, *_NUMBERS)}
-    monkeypatch.setattr(plugin_scene, "_MATERIAL", {"type": _PLUGIN, **children})
+    monkeypatch.setattr(plugin_scene, "_blend", lambda textures: {"type": _PLUGIN, **textures})
     monkeypatch.setattr(plugin_scene, "_two_sided", mi.load_dict)
-    monkeypatch.setattr(
-        plugin_scene,
-        "scattered_again",
-        lambda specular, alpha, _: multiscatter.scattered_again(specular, alpha, "correlated"),
-    )
+    monkeypatch.setattr(plugin_scene, "_SMITH", "correlated")
     return PluginTracer(scene, **depths)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from storage.conventions import look_at_c2w
+from storage.records.environment import Environment
 from storage.records.scene import ObjectKind, Scene, SceneObject
 
 
@@ -104,6 +105,7 @@ def join(
     eye: ArrayLike = (0.0, -2.0, 0.5),
     target: ArrayLike = (0.0, 0.0, 0.0),
     fov_deg: float = 40.0,
+    sky: Environment | None = None,
 ) -> Scene:
     """Return the scene of `parts` with one camera; every part has its own material row."""
     counts = [len(part.triangles) for part in parts]
@@ -124,6 +126,7 @@ def join(
             SceneObject(name=f"{part.kind}{row}", kind=part.kind) for row, part in enumerate(parts)
         ),
         provenance={},
+        environment=sky,
     )
     scene.check()
     return scene

@@ -15,6 +15,7 @@ from storage.records.scene import Scene
 from storage.records.scene_facts import lights, surfaces
 from tests.pipeline.scenes.small_pool import first_scene, small_pool
 from tests.scenes_by_hand import tiny_scene
+from tests.textured_by_hand import sky, textured_scene
 
 SETTINGS = named_build("smoke").scenes
 SEEDED = {"seed": 7, "index": 3}
@@ -113,3 +114,32 @@ def test_laws_are_those_of_composition(scene: Scene) -> None:
     inside = with_new_lights(scene, near, 8, **SEEDED, attempt=0)
     with pytest.raises(Rejected, match="emitter_inside"):
         require_laws(inside, SETTINGS)
+
+
+def test_textures_go_with_the_materials_and_stay_with_the_triangles() -> None:
+    """New materials are plain; new lamps stand behind triangles that keep their coordinates."""
+    scene = textured_scene(environment=sky())
+    plain = with_new_materials(scene, SETTINGS.materials, **SEEDED, attempt=0)
+    plain.check()
+    assert not plain.textures and plain.uv is None and plain.environment is scene.environment
+    lit = with_new_lights(scene, SETTINGS.lights, 3, **SEEDED, attempt=0)
+    lit.check()
+    assert lit.num_triangles > scene.num_triangles and lit.environment is scene.environment
+    assert lit.uv is not None and scene.uv is not None and lit.material_textures is not None
+    assert np.array_equal(lit.uv[:6], scene.uv[:6]) and not lit.uv[6:].any()
+    assert lit.textures == scene.textures
+    assert lit.material_textures.tolist() == [
+        [0, -1, 1],
+        *[[-1, -1, -1]] * (len(lit.materials) - 1),
+    ]
+
+
+def test_a_texture_of_lamps_alone_goes_with_them() -> None:
+    scene = textured_scene()
+    assert scene.material_textures is not None
+    index = scene.material_textures[::-1].copy()
+    on_the_lamp = dataclasses.replace(scene, material_textures=index)
+    on_the_lamp.check()
+    lit = with_new_lights(on_the_lamp, SETTINGS.lights, 1, **SEEDED, attempt=0)
+    lit.check()
+    assert not lit.textures and lit.uv is None and lit.material_textures is None

@@ -78,5 +78,5 @@ def test_manifests_of_version_2_are_read_and_others_refused(tmp_path: Path) -> N
     older = open_dataset(str(edit_manifest(dataset, schema_version=2))).manifest
     assert (older.num_samples, older.schema_version) == (5, 2)
     edit_manifest(dataset, schema_version=1)
-    with pytest.raises(TrilightError, match=r"manifest.*version 1; this Trilight reads 2 and 3"):
+    with pytest.raises(TrilightError, match=r"manifest.*version 1; this Trilight reads 2, 3 and 4"):
         open_dataset(str(tmp_path))

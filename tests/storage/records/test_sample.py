@@ -45,7 +45,9 @@ def test_another_schema_version_is_refused(version: object) -> None:
     members = encode_sample(tiny_sample())
     record = json.loads(members["json"])
     members["json"] = json.dumps({**record, "schema_version": version}).encode()
-    with pytest.raises(TrilightError, match=r"version .*; this Trilight reads 2 and 3.*generate"):
+    with pytest.raises(
+        TrilightError, match=r"version .*; this Trilight reads 2, 3 and 4.*generate"
+    ):
         decode_sample("000000000", members)
 
 

@@ -1,5 +1,6 @@
 """Laws of the stream: batch i is the same scenes for ever, and errors arrive where they belong."""
 
+import dataclasses
 import itertools
 import threading
 from collections.abc import Iterator
@@ -9,10 +10,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from model.demodulated import with_albedo
 from model.scene_tensors import tensors_of
 from storage.dataset.dataset import Dataset
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
+from tests.model.kit import tiny_config
 from tests.train.toy import write_toy_dataset
 from train.data.order import RankShare
 from train.data.scenes import TrainingScene
@@ -186,6 +189,23 @@ def test_views_are_drawn_without_repetition(data: TrainingData) -> None:
         poses = scene.tensors.c2w_V44.numpy()
         assert poses.shape[0] == 2
         assert abs(poses[0] - poses[1]).max() > 0
+
+
+def test_albedo_is_that_of_the_scene_after_its_symmetries(data: TrainingData) -> None:
+    """Mirrored, turned and recoloured, as the network would ask for it itself."""
+    augmentation = AugmentationSettings(rotation="uniform", mirror=True, channels=True)
+    network = tiny_config(demodulated=True, hit_rays=2)
+    settings = dataclasses.replace(SETTINGS, augmentation=augmentation, network=network)
+    plain = dataclasses.replace(settings, network=tiny_config())
+    pairs = zip(
+        take(data, 0, 1, settings=settings)[0], take(data, 0, 1, settings=plain)[0], strict=True
+    )
+    for scene, other in pairs:
+        expected = with_albedo(other.tensors, 16, 2).albedo_VRR6
+        assert expected is not None and scene.tensors.albedo_VRR6 is not None
+        assert torch.equal(scene.tensors.albedo_VRR6, expected) and expected.max() > 0
+        assert same(other, dataclasses.replace(scene, tensors=other.tensors))
+        assert other.tensors.albedo_VRR6 is None
 
 
 def test_a_damaged_shard_is_named_when_it_is_reached(tmp_path: Path) -> None:

@@ -38,6 +38,7 @@ from train.evaluation.judged_view import NETWORK, JudgedView, by_group, facts_of
 from train.evaluation.metrics import METRICS, hdr_flip, picture_scores
 from train.evaluation.report import markdown, record
 from train.evaluation.rivals import MEDIAN, NEAREST, Rivals, median_picture
+from train.evaluation.same_time import TRACER
 from train.loop.state import new_state
 from train.loss.lpips import Lpips
 
@@ -274,6 +275,7 @@ def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) 
     weights.write_bytes(encode_weights(new_state(tiny_run()).model))
     data = ["--data", str(dataset.folder.root)]
     command = ["evaluate", str(weights), *data, "--split", "validation", "--out", str(out)]
+    command += ["--tracer-views", "0"]
     done = trilight([*command, "--json", "--resolution", "16"])
     assert done.exit_code == 0, done.output
     found = json.loads((out / "evaluation.json").read_text())
@@ -291,3 +293,30 @@ def test_the_command_writes_report_and_sheets(dataset: Dataset, tmp_path: Path) 
     assert "no such file or folder" in str(missing.exception)
     empty = trilight(["evaluate", str(weights), *data])
     assert "the test split holds no scene" in str(empty.exception)
+
+
+def test_without_a_path_tracer_the_report_says_why(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TRILIGHT_VARIANT", "none_such")
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(encode_weights(new_state(tiny_run()).model))
+    data = ["--data", str(dataset.folder.root), "--split", "validation", "--most-scenes", "1"]
+    told = trilight(["evaluate", str(weights), *data, "--out", str(tmp_path / "out")]).output
+    assert "The path tracer in that time is not shown: TRILIGHT_VARIANT is" in told
+    assert "is not shown: TRILIGHT" in (tmp_path / "out" / "evaluation.md").read_text()
+
+
+@pytest.mark.slow
+def test_the_command_shows_the_path_tracer_in_the_networks_time(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    weights, out = tmp_path / "model.safetensors", tmp_path / "out"
+    weights.write_bytes(encode_weights(new_state(tiny_run()).model))
+    data = ["--data", str(dataset.folder.root), "--split", "validation"]
+    told = trilight(["evaluate", str(weights), *data, "--out", str(out)]).output
+    found = json.loads((out / "evaluation.json").read_text())
+    assert TRACER in found["contestants"] and found["path tracer"]["views"] == 6
+    assert found["path tracer"]["network_further_s"] > 0 and "and the path tracer" in told
+    with Image.open(out / "worst.png") as sheet:
+        assert sheet.width > 1500, "five pictures a view, two views a line"

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from infra.bench.curve import mean_interval
 from infra.bench.sides.judged_pictures import (
     Reference,
     difference_db,
@@ -51,14 +50,3 @@ def test_two_renderers_without_noise() -> None:
     assert difference_db(one, other, log10_radiance) == pytest.approx(exact, abs=0.5)
     same = Reference(a_rgb=_noisy(rng, 0.05), b_rgb=_noisy(rng, 0.05))
     assert difference_db(one, same, log10_radiance) > exact + 8
-
-
-def test_the_interval_of_a_mean_goes_by_clusters() -> None:
-    """Ten scenes of which each has the same figure 8 times know no more than ten figures."""
-    figures = [float(scene < 3) for scene in range(10) for _ in range(8)]
-    clusters = [f"scene {scene}" for scene in range(10) for _ in range(8)]
-    low, high = mean_interval(figures, clusters)
-    alone_low, alone_high = mean_interval(figures, [str(n) for n in range(80)])
-    assert low < alone_low < 0.3 < alone_high < high
-    assert low == pytest.approx(0.3 - 1.96 * np.sqrt(0.3 * 0.7 / 10), abs=0.06)
-    assert mean_interval([0.5] * 4, ["a", "a", "b", "b"]) == (0.5, 0.5)

@@ -1,0 +1,146 @@
+"""The environment of a scene as a DomeLight of USD, with its map in a file beside the stage.
+
+A dome has the middle of its picture towards +Z, a quarter from the left towards +X and the top
+towards +Y, whatever the axis of the stage; ours are a cyclic permutation of those. Both directions
+turn by it here, so that a scene comes back bit for bit and other programs show what we render. The
+file is an OpenEXR of float32, because half floats end below the radiance of suns.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
+from pipeline.exchange.usd.foreign_textures import asset_bytes
+from pipeline.exchange.usd.names import ENVIRONMENT_TEXTS, VISIBLE_TO_CAMERA
+from pipeline.exchange.usd.stage import OpenedUsd
+from storage.errors import TrilightError
+from storage.records.environment import Environment
+from storage.records.exr import MAX_RESOLUTION, decode_exr, encode_channels
+from storage.records.texture import MapSource
+
+TO_OUR_AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""From the axes of a dome to those of a map: X becomes Y, Y becomes Z, Z becomes X."""
+
+_PATH = "inputs:texture:file"
+
+
+def add_dome(layer: Any, path: str, sky: Environment) -> dict[str, bytes]:
+    """Write the prim of an environment, and return the file that it names, by its name.
+
+    Raises:
+        TrilightError: the map is larger than OpenEXR files that are read.
+    """
+    if max(sky.radiance_rgb.shape) > MAX_RESOLUTION:
+        raise TrilightError(
+            f"environment: {sky.radiance_rgb.shape[1]} texels wide; expected at most "
+            f"{MAX_RESOLUTION} in USD. Write it as .safetensors, or make it smaller."
+        )
+    add_attributes(add_prim(layer, path, "DomeLight"), dome_attributes(sky))
+    return {map_file(sky): encode_channels({"RGB": sky.radiance_rgb})}
+
+
+def map_file(sky: Environment) -> str:
+    """Return the name of the file of a map: equal maps have one file."""
+    return f"sky-{sky.sha256[:16]}.exr"
+
+
+def dome_attributes(sky: Environment) -> Attributes:
+    """Return the attributes of the prim of an environment."""
+    to_world = np.eye(4)
+    to_world[:3, :3] = sky.rotation.astype(np.float64) @ TO_OUR_AXES
+    texts = {
+        name: ("string", getattr(sky.source, field)) for field, name in ENVIRONMENT_TEXTS.items()
+    }
+    return {
+        "xformOp:transform": ("matrix4d", to_world.T.tolist()),  # USD multiplies from the left
+        "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
+        _PATH: ("asset", f"./{map_file(sky)}"),
+        "inputs:texture:format": ("token", "latlong"),
+        "inputs:intensity": ("float", 1.0),
+        VISIBLE_TO_CAMERA: ("bool", sky.is_seen),
+        **texts,
+    }
+
+
+def dome_as_written(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
+    """Return the environment of a prim that `add_dome` wrote; raises LookupError without a file."""
+    found = opened.inside(layer, prim.attributes[_PATH].default.path)
+    data = None if found is None else asset_bytes(found)
+    if data is None:
+        raise LookupError(_PATH)
+    matrix = np.array(prim.attributes["xformOp:transform"].default).T
+    texts = {field: prim.attributes[name].default for field, name in ENVIRONMENT_TEXTS.items()}
+    return Environment(
+        radiance_rgb=decode_exr(data),
+        rotation=(matrix[:3, :3] @ TO_OUR_AXES.T).astype(np.float32),
+        is_seen=bool(prim.attributes[VISIBLE_TO_CAMERA].default),
+        source=MapSource(**texts),
+    )
+
+
+def foreign_dome(
+    prim: Any, to_world: NDArray[np.float64], time: Any, opened: OpenedUsd, licence: str
+) -> Environment | None:
+    """Return the environment of any DomeLight, or None, with a note, where it cannot be read.
+
+    Args:
+        prim: the light.
+        to_world: [4, 4] into our world.
+        time: of the values.
+        opened: the file; what is lost is noted there.
+        licence: of a map that states none.
+
+    Raises:
+        TrilightError: its file is outside of the folder or on the network.
+    """
+    from pxr import UsdLux
+
+    light, place = UsdLux.DomeLight(prim), str(prim.GetPath())
+    radiance = _picture(light, time, opened)
+    if radiance is None:
+        return None
+    strength = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
+    tinted = radiance * strength * np.array(light.GetColorAttr().Get(time), np.float64)
+    left, _, right = np.linalg.svd(to_world[:3, :3])
+    turn = left @ right
+    if np.linalg.det(turn) < 0:
+        opened.lost.append(f"{place}: a mirrored dome; its light was left out")
+        return None
+    seen = prim.GetAttribute(VISIBLE_TO_CAMERA)
+    sky = Environment(
+        radiance_rgb=tinted.astype(np.float32),
+        rotation=(turn @ TO_OUR_AXES.T).astype(np.float32),
+        is_seen=bool(seen and seen.Get(time)),
+        source=MapSource(name=prim.GetName(), licence=licence),
+    )
+    try:
+        sky.check()
+    except TrilightError as error:
+        opened.lost.append(f"{place}: {error}; its light was left out")
+        return None
+    return sky
+
+
+def _picture(light: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | None:
+    """Return the map [H, 2 H, 3] of a dome: even where it names no file."""
+    place, attribute = str(light.GetPath()), light.GetTextureFileAttr()
+    asset = attribute.Get(time) if attribute else None
+    if asset is None or not asset.path:
+        return np.ones((1, 2, 3))
+    layout = light.GetTextureFormatAttr().Get(time)
+    if layout not in (None, "automatic", "latlong"):
+        opened.lost.append(f"{place}: a picture of format {layout}; expected latlong")
+        return None
+    specs = attribute.GetPropertyStack(time)
+    found = opened.inside(specs[0].layer if specs else opened.root, asset.path)
+    data = None if found is None else asset_bytes(found)
+    if data is None:
+        opened.lost.append(f"{place}: map {asset.path!r:.100} is missing")
+        return None
+    try:
+        return decode_exr(data).astype(np.float64)
+    except TrilightError as error:
+        opened.lost.append(f"{place}: map {asset.path!r:.100} is not read ({error})")
+        return None

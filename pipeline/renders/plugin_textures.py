@@ -1,0 +1,132 @@
+"""Textured materials as stock Mitsuba plugins: `bitmap` textures, and two of our own beside them.
+
+A texture goes into a `bitmap` as it is: Mitsuba has v = 0 at the first row of a bitmap that a mesh
+of arrays is given, which is the bottom row here. Values are linear, hence `raw`. Share and widths
+of the lobes are no bilinear functions of the textures: the share is a constant here (any will do),
+the GGX width is squared after the lookup, and multiple scattering is found from both.
+"""
+
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.records.lobes import MIN_ALPHA
+from storage.records.material import laid_out
+from storage.records.multiscatter import ROUGHNESS_STEPS, Smith, mean_albedo
+from storage.records.scene import Scene
+from storage.records.texture import CONSTANT, TEXTURED
+
+_WIDTH, _AGAIN = "squared_roughness", "scattered_again"
+
+
+def textured_slots(scene: Scene, row: int, smith: Smith) -> dict[str, Any]:
+    """Return the textures of a material row by their names in `plugin_scene`.
+
+    Args:
+        scene: that has textures.
+        row: of its materials.
+        smith: of the specular lobe.
+    """
+    _register()
+    diffuse, specular, roughness = (_texels(scene, row, name) for name in TEXTURED)
+    most, mirrored = diffuse.max(), specular.max()
+    weight = mirrored / (most + mirrored) if most + mirrored > 0 else 0.0
+    alpha = {"type": _WIDTH, "roughness": _bitmap(roughness)}
+    return {
+        "diffuse": _bitmap(diffuse / (1 - weight) if weight < 1 else diffuse),
+        "specular": _bitmap(specular / weight if weight > 0 else specular),
+        "alpha": alpha,
+        "weight": _bitmap(np.full((1, 1, 1), weight)),
+        "again": {"type": _AGAIN, "smith": smith, "specular": _bitmap(specular), "alpha": alpha},
+    }
+
+
+def textured_albedo(scene: Scene, row: int) -> dict[str, Any]:
+    """Return a BSDF whose reflectance is the sum of both albedos of a material row."""
+    parts = (_bitmap(2 * _texels(scene, row, name)) for name in ("diffuse", "specular"))
+    first, second = ({"type": "diffuse", "reflectance": part} for part in parts)
+    return {"type": "blendbsdf", "weight": 0.5, "first": first, "second": second}
+
+
+def _texels(scene: Scene, row: int, name: str) -> NDArray[np.float64]:
+    """Return the linear values [H, W, C] of a column, of one texel where it is a constant."""
+    assert scene.material_textures is not None
+    place = scene.material_textures[row, TEXTURED.index(name)]
+    if place == CONSTANT:
+        part = next(part for column, part in laid_out() if column.name == name)
+        return scene.materials[row, part].reshape(1, 1, -1).astype(np.float64)
+    texture = scene.textures[place]
+    return texture.linear(texture.texels).astype(np.float64)
+
+
+def _bitmap(texels: NDArray[np.float64]) -> dict[str, Any]:
+    values = np.ascontiguousarray(texels, np.float32)
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(values),
+        "raw": True,
+        "filter_type": "bilinear",
+        "wrap_mode": "repeat",
+    }
+
+
+@cache
+def _register() -> None:
+    """Make both textures known to Mitsuba; a variant must be set, and stays for the process."""
+    _register_width()
+    _register_again()
+
+
+def _register_width() -> None:
+    class SquaredRoughness(mi.Texture):
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self._roughness = properties.get_texture("roughness")
+
+        def eval_1(self, si: Any, active: Any = True) -> Any:
+            return dr.maximum(dr.square(self._roughness.eval_1(si, active)), MIN_ALPHA)
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            return mi.Color3f(self.eval_1(si, active))
+
+        def mean(self) -> Any:
+            return dr.square(self._roughness.mean())
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+    mi.register_texture(_WIDTH, SquaredRoughness)
+
+
+def _register_again() -> None:
+    class ScatteredAgain(mi.Texture):
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self._specular = properties.get_texture("specular")
+            self._alpha = properties.get_texture("alpha")
+            widths = np.square(np.linspace(0, 1, ROUGHNESS_STEPS))
+            means = mean_albedo(widths, properties["smith"])
+            linear: Any = mi.Texture1f
+            self._means = linear(
+                mi.TensorXf(means.astype(np.float32)[:, None]), wrap_mode=dr.WrapMode.Clamp
+            )
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            roughness = dr.sqrt(self._alpha.eval_1(si, active))
+            # The centre of texel k of n lies at (k + 0.5) / n.
+            place = (roughness * (ROUGHNESS_STEPS - 1) + 0.5) / ROUGHNESS_STEPS
+            mean = self._means.eval(mi.Point1f(place))[0]
+            specular = self._specular.eval(si, active)
+            return specular * mean / (1 - specular * (1 - mean))
+
+        def mean(self) -> Any:
+            return self._specular.mean()
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+    mi.register_texture(_AGAIN, ScatteredAgain)

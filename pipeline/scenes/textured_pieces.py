@@ -1,0 +1,122 @@
+"""Procedural textures for the pieces of a scene: 8-bit maps, and texture coordinates by projection.
+
+A piece gets one material in the place of those that were drawn for it. Its texture is projected
+along the six directions of a cube: each triangle gets it from the side that it faces most, not
+mirrored, at its stated width, with v up on the sides. Floors and walls stand in the axes of the
+world, so that each is one flat chart; the cube of an object turns with it.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.scenes.pieces import ScenePiece, Skin
+from scene_templates.layout import Layout
+from scene_templates.surfaces.maps import SurfaceMaps
+from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
+from storage.conventions import linear_from_srgb8, srgb8
+from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR, default_rows
+from storage.records.texture import MapSource, Texture
+from storage.seeds import rng_for
+
+_RIGHT = np.array([[0, 1, 0], [0, -1, 0], [-1, 0, 0], [1, 0, 0], [1, 0, 0], [-1, 0, 0]], np.float64)
+_UP = np.array([[0, 0, 1]] * 4 + [[0, 1, 0]] * 2, np.float64)
+"""[6, 3] where u and v go on the sides +x, -x, +y, -y, +z and -z: right x up is the side's normal.
+"""
+
+
+def with_drawn_textures(
+    pieces: Sequence[ScenePiece],
+    layout: Layout,
+    settings: TextureSettings,
+    *,
+    seed: int,
+    scene_index: int,
+    attempt: int,
+) -> list[ScenePiece]:
+    """Return the pieces with textures where they are drawn; emitters have none.
+
+    Each piece has a random stream of its own, so that textures change no other draw of the scene.
+
+    Args:
+        pieces: floor and walls, objects and emitters, as those of `layout`.
+        layout: how objects are turned.
+        settings: the share and the ranges.
+        seed: of the dataset.
+        scene_index: which scene.
+        attempt: how many times this scene was rejected before.
+    """
+    if settings.share == 0:
+        return list(pieces)
+    frames = [np.eye(3)] * len(layout.shell)
+    frames += [placement.pose.rotation for placement in layout.objects]
+    origins = [np.zeros(3)] * len(layout.shell)
+    origins += [placement.pose.centre for placement in layout.objects]
+    found, textured = list(pieces), 0
+    for row, (frame, origin) in enumerate(zip(frames, origins, strict=True)):
+        rng = rng_for(seed, "texture", scene_index, attempt, row)
+        look = draw_look(rng, settings) if textured < MOST_TEXTURED else None
+        if look is not None:
+            found[row] = _textured(pieces[row], look, frame, origin)
+            textured += 1
+    return found
+
+
+def _textured(
+    piece: ScenePiece, look: TexturedLook, frame: NDArray[np.float64], origin: NDArray[np.float64]
+) -> ScenePiece:
+    textures = _textures(look.maps)
+    materials = default_rows(1)
+    for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), textures, strict=True):
+        materials[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
+    corners = piece.mesh.positions[piece.mesh.faces].astype(np.float64)
+    uv = look.uv(cube_places(_turned_back(corners - origin, frame)))
+    return dataclasses.replace(
+        piece,
+        materials=materials,
+        material_index=np.zeros(len(piece.mesh.faces), np.int64),
+        skin=Skin(uv=uv.astype(np.float32).reshape(-1, 2), textures=textures),
+    )
+
+
+def cube_places(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where a cube's sides show the corners [T, 3, 3] of triangles: right and up, [T, 3, 2].
+
+    A triangle as steep to two sides belongs to the first of x, y and z.
+    """
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axis = np.abs(normal).argmax(axis=1)
+    side = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0)
+    axes = np.stack([_RIGHT[side], _UP[side]], axis=1)[:, None]  # [T, 1, 2, 3]
+    return np.asarray((corners[:, :, None] * axes).sum(axis=-1))
+
+
+def _turned_back(points: NDArray[np.float64], frame: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points [T, 3, 3] in the axes of an object, whose rotation is `frame`."""
+    x, y, z = (points[..., row, None] * frame[row] for row in range(3))
+    return x + y + z
+
+
+def _textures(maps: SurfaceMaps) -> tuple[Texture, Texture, Texture]:
+    """Return diffuse (sRGB), specular and roughness in 8 bits, the bottom row first."""
+    diffuse = srgb8(maps.diffuse_rgb)
+    specular, roughness = (
+        np.round(values.astype(np.float64) * 255).astype(np.uint8)
+        for values in (maps.specular_rgb, maps.roughness)
+    )
+    # Both are rounded: where they would add up to more than 1, the specular one gives way.
+    over = linear_from_srgb8()[diffuse] + specular / 255 > 1
+    specular = np.where(over, specular - 1, specular).astype(np.uint8)
+
+    def texture(texels: NDArray[np.uint8], name: str, *, is_srgb: bool = False) -> Texture:
+        upwards = np.ascontiguousarray(texels[::-1])
+        source = MapSource(name=f"{maps.family} {name}")
+        return Texture(texels=upwards, is_srgb=is_srgb, source=source)
+
+    return (
+        texture(diffuse, "diffuse", is_srgb=True),
+        texture(specular, "specular"),
+        texture(roughness, "roughness"),
+    )

@@ -1,0 +1,94 @@
+"""`scene_sky`: whether a scene has a sky, and which.
+
+Its draws have a random stream of their own, so that a build with skies has the objects, materials,
+lights and cameras that it has without them.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_templates.exact import cosine, sine
+from scene_templates.skies.draw import draw_sky
+from scene_templates.skies.settings import SkySettings
+from storage.records.environment import Environment
+from storage.records.texture import MapSource
+from storage.seeds import rng_for
+
+LEAST_DISTANCE = 0.5
+"""Emitters count as this far from the middle of the room at least, half of its width."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneSky:
+    """The sky of a scene."""
+
+    environment: Environment
+    origin: dict[str, Any]
+    """For the provenance of the scene: family, over_lamps and azimuth_deg."""
+
+
+def scene_sky(
+    settings: SkySettings,
+    emitters: NDArray[np.float64],
+    radiance_rgb: NDArray[np.float64],
+    *,
+    seed: int,
+    scene_index: int,
+    attempt: int,
+) -> SceneSky | None:
+    """Return the sky of a scene, or None where it has none.
+
+    Args:
+        settings: the ranges to draw from.
+        emitters: [N, 3, 3] corners of the emitting triangles, around the middle of the room.
+        radiance_rgb: [N, 3] their radiance.
+        seed, scene_index: whether there is a sky goes by these.
+        attempt: which one goes by this too: how many times the scene was rejected before.
+    """
+    if not settings.share or rng_for(seed, "has sky", scene_index).random() >= settings.share:
+        return None
+    rng = rng_for(seed, "sky", scene_index, attempt)
+    drawn = draw_sky(rng, settings.maps)
+    low, high = (math.log(bound) for bound in settings.over_lamps_log)
+    over_lamps = math.exp(rng.uniform(low, high))
+    turn = float(rng.uniform(0, 2 * math.pi))
+    is_seen = bool(rng.random() < settings.seen_share)
+    mean = _mean_radiance(drawn.radiance_rgb)
+    wanted = over_lamps * lamp_irradiance(emitters, radiance_rgb) / math.pi
+    environment = Environment(
+        radiance_rgb=(drawn.radiance_rgb * np.float32(wanted / mean)).astype(np.float32),
+        rotation=_about_z(turn),
+        is_seen=is_seen,
+        source=MapSource(name=drawn.family),
+    )
+    origin = {
+        "family": drawn.family,
+        "over_lamps": over_lamps,
+        "azimuth_deg": math.degrees(turn),
+    }
+    return SceneSky(environment=environment, origin=origin)
+
+
+def lamp_irradiance(emitters: NDArray[np.float64], radiance_rgb: NDArray[np.float64]) -> float:
+    """Return the sum over triangles of area x mean radiance / distance^2 from the origin."""
+    edges = emitters[:, 1:] - emitters[:, :1]
+    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    distance_sq = np.square(emitters.mean(axis=1)).sum(axis=1)
+    far = np.maximum(distance_sq, LEAST_DISTANCE**2)
+    return float((area * radiance_rgb.mean(axis=1) / far).sum())
+
+
+def _mean_radiance(radiance_rgb: NDArray[np.float32]) -> float:
+    """Return the mean of a map [H, 2 H, 3] over the sphere and the channels."""
+    grey = radiance_rgb.astype(np.float64).mean(axis=(1, 2))
+    edges = np.cos(np.pi * np.arange(len(grey) + 1) / len(grey))
+    return float((grey * (edges[:-1] - edges[1:])).sum() / 2)
+
+
+def _about_z(turn: float) -> NDArray[np.float32]:
+    c, s = float(cosine(turn)), float(sine(turn))
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]], np.float32)

@@ -1,0 +1,126 @@
+"""Skies outdoors: sun and sky, clouds, a night with few lamps.
+
+Each function takes the draws of one sky and its texels, and returns its radiance [H, 2H, 3] up to a
+factor, which `draw_sky` chooses.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_templates.exact import Numbers, eased, mixed
+from scene_templates.skies.colour import planckian_rgb
+from scene_templates.skies.draws import SkyDraws
+from scene_templates.skies.texels import SkyTexels
+
+LOW_SUN_MIRED, HIGH_SUN_MIRED = 420.0, 172.0
+"""2,400 K on the horizon and 5,800 K above: the light of a low sun has crossed more air."""
+
+
+def sun_and_sky(draws: SkyDraws, texels: SkyTexels) -> Numbers:
+    """A clear or hazy sky, bluest above and bright at the horizon, with a sun and its glow.
+
+    The sun is a spot of a few texels at most. Its irradiance on a plane that faces it is the stated
+    multiple of what the rest of the upper half sends onto a horizontal plane, wherever a texel of
+    it is above the horizon.
+    """
+    towards = draws.direction("sun", *draws.sun_elevation_deg)
+    ratio = draws.uniform("irradiance of the sun over that of the sky", *draws.sun_to_sky)
+    zenith = draws.blue("zenith")
+    horizon = draws.light("horizon", mired=(120, 170))
+    brightening = draws.uniform("horizon over zenith", 1.5, 5.0)
+    haze = draws.uniform("share of the glow around the sun", 0.02, 0.3)
+    sharpness = draws.uniform("sharpness of the glow", 4.0, 60.0)
+    sun = planckian_rgb(_sun_mired(float(towards[2])))
+    low = 1 - np.clip(texels.z, 0, 1)
+    near = low * low * low
+    sky = mixed(zenith, brightening * horizon, near[..., None]) + np.zeros(
+        (1, 2 * texels.height, 1)
+    )
+    glow = texels.lobe(towards, sharpness)[..., None] * sun
+    sky = sky * (1 - haze) + glow * (haze * _mean(texels.flux(sky)))
+    from_sky = _mean(texels.irradiance(_above(sky, texels)))
+    disk = _spot_above(texels, towards)[..., None] * sun * (ratio * from_sky)
+    return _with_ground(draws, texels, sky + disk)
+
+
+def _spot_above(texels: SkyTexels, towards: NDArray) -> Numbers:
+    """Return a spot [H, 2H] whose part above the horizon has unit flux, or none if it has set."""
+    spot = texels.spot(towards)
+    seen = float(texels.flux(spot * _above_share(texels)))
+    return spot / seen if seen > 0 else np.zeros_like(spot)
+
+
+def _sun_mired(height: float) -> float:
+    s = min(max(height, 0.0), 1.0)
+    return LOW_SUN_MIRED + (HIGH_SUN_MIRED - LOW_SUN_MIRED) * s * (2 - s)
+
+
+def clouds(draws: SkyDraws, texels: SkyTexels) -> Numbers:
+    """Clouds of noise, from a few to all over, before a sky that darkens towards the horizon.
+
+    Where all is covered, the mean follows the standard overcast sky of the CIE, which is three
+    times as bright above as at the horizon.
+    """
+    cover = draws.uniform("level of the clouds", -0.6, 0.8)
+    softness = draws.uniform("softness of their edges", 0.4, 1.4)
+    cells = draws.uniform("cells of the clouds along a radius", 1.0, 2.5)
+    shading = draws.uniform("darkening within the clouds", 0.2, 0.7)
+    bright = draws.uniform("clouds over blue sky", 1.5, 5.0)
+    cloud = draws.light("cloud", mired=(125, 180))
+    blue = draws.blue("blue sky")
+    towards = draws.direction("brightest place", 10, 80)
+    shape = texels.noise(draws.stream(), cells, octaves=5)
+    thickness = texels.noise(draws.stream(), 2 * cells, octaves=4)
+    share = eased(0.5 + (shape + cover) / softness)
+    lit = 1 - shading * eased(0.5 + thickness)
+    overcast = (1 + 2 * np.clip(texels.z, 0, 1)) / 3
+    sky = mixed(blue, bright * cloud * lit[..., None], share[..., None]) * overcast[..., None]
+    glow = texels.lobe(towards, 3.0)[..., None] * np.pi
+    return _with_ground(draws, texels, sky * (0.6 + glow))
+
+
+def night(draws: SkyDraws, texels: SkyTexels) -> Numbers:
+    """An almost dark sky, and one to six small warm lamps, each with its glow."""
+    count = draws.whole("lamps", 1, 6)
+    dark = draws.uniform("share of the sky", 0.005, 0.1)
+    tint = draws.light("sky", mired=(40, 120))
+    low = 1 - texels.z * texels.z
+    sky = (0.3 + low * low)[..., None] * tint + np.zeros((1, 2 * texels.height, 1))
+    lamps = np.zeros_like(sky)
+    for _ in range(count):
+        towards = draws.direction("lamp", -10, 60)
+        power = draws.uniform("power of a lamp", 0.1, 1.0)
+        colour = draws.light("lamp", mired=(220, 480))
+        halo = draws.uniform("share of its glow", 0.02, 0.3)
+        shape = mixed(texels.spot(towards), texels.lobe(towards, 200.0), halo)
+        lamps = lamps + (power * shape)[..., None] * colour
+    return shared_flux(texels, sky, lamps, dark)
+
+
+def _with_ground(draws: SkyDraws, texels: SkyTexels, sky: Numbers) -> Numbers:
+    """Return a sky above ground that reflects, as a Lambert surface, what the sky sends onto it."""
+    albedo = draws.uniform("albedo of the ground", 0.05, 0.5)
+    tint = draws.colour("tint of the ground", (0.75, 0.7, 0.5), (1.0, 1.0, 0.9))
+    ground = albedo * tint * texels.irradiance(_above(sky, texels)) / np.pi
+    return mixed(ground, sky, _above_share(texels)[..., None])
+
+
+def _above(sky: Numbers, texels: SkyTexels) -> Numbers:
+    result: Numbers = sky * _above_share(texels)[..., None]
+    return result
+
+
+def _above_share(texels: SkyTexels) -> Numbers:
+    """[H, 1] how much of each row is above the horizon."""
+    return np.clip(texels.height / 2 - np.arange(texels.height)[:, None], 0, 1)
+
+
+def _mean(rgb: Numbers) -> float:
+    return float((rgb[0] + rgb[1] + rgb[2]) / 3)
+
+
+def shared_flux(texels: SkyTexels, one: Numbers, other: Numbers, share: float) -> Numbers:
+    """Return the sum of two maps of which the first has `share` of the flux."""
+    first, second = _mean(texels.flux(one)), _mean(texels.flux(other))
+    result: Numbers = one * (share / first) + other * ((1 - share) / second)
+    return result

@@ -1,0 +1,25 @@
+"""`SkySettings`: which scenes are lit from all around, and how strongly."""
+
+from dataclasses import field
+from typing import Annotated
+
+from scene_templates.checks import Range
+from scene_templates.skies.draw import SkyMapSettings
+from storage.settings.described import checked
+from storage.settings.ranges import Share, Within
+
+
+@checked("scene settings")
+class SkySettings:
+    """Share and strength of the skies of scenes."""
+
+    share: Share = 0.0
+    """Share of the scenes that have a sky beside their emitters."""
+    over_lamps_log: Annotated[Range, Within(1e-6, 1e6)] = (0.05, 5.0)
+    """Range, log-uniform, of the irradiance that a sky of constant radiance, the mean of the map,
+    has on a surface, over that of all emitters at the middle of the room on surfaces that face
+    them. It takes the place of `maps.mean_radiance`."""
+    seen_share: Share = 0.0
+    """Share of the skies that cameras see behind everything."""
+    maps: SkyMapSettings = field(default_factory=SkyMapSettings)
+    """What the maps are drawn from."""

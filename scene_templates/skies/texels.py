@@ -1,0 +1,191 @@
+"""The texels of a latitude-longitude map of the sphere, and shapes and noise on it.
+
+Orientation is that of Trilight's environment maps and of Blender: +Z is up, the first row is the
+top, the middle of the picture is +X, a quarter from its left edge is +Y, its edges are -X. Texel
+(i, j) of H rows and 2 H columns is centred on u = (j + 0.5) / 2H and v = 1 - (i + 0.5) / H, and
+looks at azimuth (0.5 - u) 2 pi, from +X towards +Y, and elevation (v - 0.5) pi.
+"""
+
+import functools
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_templates.exact import Numbers, cosine, dot, ramp, sine
+
+TEXELS_PER_CELL = 4
+"""Fewest texels, at the equator, across a cell of noise; finer octaves are left out."""
+
+LATTICE = 32
+"""Cells after which noise in space repeats; the coarse octaves do not reach it."""
+
+NOISE_SCALE = 2.0
+"""Brings one octave of noise to a standard deviation of about 0.4."""
+
+SPOT_RADIUS = 1.5
+"""Radius of a spot in rows: the nearest texel centre is always inside."""
+
+
+@dataclass(frozen=True)
+class SkyTexels:
+    """The texels of a map with `height` rows and twice as many columns."""
+
+    height: int
+    """Rows; a row is pi / height high."""
+
+    @property
+    def directions(self) -> Numbers:
+        """[H, 2H, 3] unit vectors at the centres; read-only."""
+        return _directions(self.height)
+
+    @property
+    def z(self) -> Numbers:
+        """[H, 1] sine of the elevation."""
+        return self.directions[:, :1, 2]
+
+    @property
+    def solid_angle(self) -> Numbers:
+        """[H, 1] steradians of each texel of a row; those of all texels sum to 4 pi."""
+        return _solid_angle(self.height)
+
+    def flux(self, radiance: NDArray) -> Numbers:
+        """Return the integral over the sphere of a map [H, 2H] or [H, 2H, 3]."""
+        weight = self.solid_angle if radiance.ndim == 2 else self.solid_angle[..., None]
+        return _sum(radiance * weight)
+
+    def irradiance(self, radiance: NDArray) -> Numbers:
+        """Return what a map [H, 2H, 3] sends onto a horizontal plane from above, [3]."""
+        weight = self.solid_angle * np.maximum(self.z, 0)
+        return _sum(radiance * weight[..., None])
+
+    def lobe(self, towards: NDArray, sharpness: float) -> Numbers:
+        """Return a round glow of unit flux [H, 2H]: 1 / (1 + sharpness (1 - cos angle))^2.
+
+        Half of its light comes from where sharpness (1 - cos angle) is below about 1.
+        """
+        below = 1 + sharpness * (1 - dot(self.directions, towards))
+        return self.of_unit_flux(1 / (below * below), towards)
+
+    def spot(self, towards: NDArray, radius_rows: float = SPOT_RADIUS) -> Numbers:
+        """Return a spot of unit flux [H, 2H], brightest in the middle, 0 beyond its radius."""
+        reach = 1 - float(cosine(min(1.0, radius_rows / self.height) * np.pi))
+        inside = 1 - (1 - dot(self.directions, towards)) / reach
+        found = np.maximum(inside, 0)
+        return found / self.flux(found)
+
+    def pane(
+        self,
+        towards: NDArray,
+        half_sizes: tuple[float, float],
+        *,
+        roll_rad: float = 0.0,
+        panes: tuple[int, int] = (1, 1),
+        bars: float = 0.0,
+    ) -> Numbers:
+        """Return how much of each texel [H, 2H] a rectangle covers.
+
+        Args:
+            towards: [3] its middle.
+            half_sizes: half of its width and height, at distance 1.
+            roll_rad: by which it is turned about its middle.
+            panes: how many columns and rows of panes it is divided into.
+            bars: width of the bars between and around them, as a share of a pane.
+        """
+        right, up = _axes(towards, roll_rad)
+        ahead = dot(self.directions, towards)
+        depth = np.maximum(ahead, 1e-9)
+        covered = (ahead > 0).astype(np.float64)
+        for axis, half, count in zip((right, up), half_sizes, panes, strict=True):
+            across = (dot(self.directions, axis) / depth / half + 1) / 2 * count
+            place = np.clip(np.floor(across), 0, count - 1)
+            edge = 0.5 - np.abs(across - place - 0.5) - bars / 2
+            covered = covered * ramp(edge * 2 * half / count * self.height / np.pi)
+        return covered
+
+    def noise(self, rng: np.random.Generator, cells: float, *, octaves: int = 1) -> Numbers:
+        """Return noise [H, 2H] of mean 0, the same everywhere on the sphere: no seam and no poles.
+
+        It is gradient noise in space, looked up on the sphere; each octave has half the amplitude.
+
+        Args:
+            rng: a stream of its own.
+            cells: of the first octave along a radius.
+            octaves: how many, as far as texels can show them.
+        """
+        total, gain = np.zeros((self.height, 2 * self.height)), NOISE_SCALE
+        for _ in range(octaves):
+            if TEXELS_PER_CELL * np.pi * cells > self.height:
+                break
+            total = total + gain * _noise_in_space(self.directions * cells, rng)
+            cells, gain = 2 * cells, gain / 2
+        return total
+
+    def of_unit_flux(self, shape: NDArray, towards: NDArray) -> Numbers:
+        """Return a shape [H, 2H] with unit flux; a spot where it fell between all texels."""
+        flux = float(self.flux(shape))
+        return shape / flux if flux > 0 else self.spot(towards)
+
+
+@functools.lru_cache(maxsize=2)
+def _directions(height: int) -> Numbers:
+    elevation = (0.5 - (np.arange(height)[:, None] + 0.5) / height) * np.pi
+    azimuth = (0.5 - (np.arange(2 * height)[None, :] + 0.5) / (2 * height)) * 2 * np.pi
+    flat = np.zeros((height, 2 * height))
+    across = cosine(elevation)
+    found = np.stack(
+        [across * cosine(azimuth), across * sine(azimuth), sine(elevation) + flat], axis=-1
+    )
+    found.setflags(write=False)
+    return found
+
+
+@functools.lru_cache(maxsize=2)
+def _solid_angle(height: int) -> Numbers:
+    edges = sine((0.5 - np.arange(height + 1) / height) * np.pi)
+    found: Numbers = ((edges[:-1] - edges[1:]) * np.pi / height)[:, None]
+    found.setflags(write=False)
+    return found
+
+
+def _sum(values: NDArray) -> Numbers:
+    """Return the sum over rows and columns, by rows first: the same order on every processor."""
+    result: Numbers = np.add.accumulate(np.add.accumulate(values, axis=1)[:, -1], axis=0)[-1]
+    return result
+
+
+def _axes(towards: NDArray, roll_rad: float) -> tuple[Numbers, Numbers]:
+    """Return two unit vectors across a direction; without a roll, the first one is level."""
+    x, y, z = towards
+    level = np.array([-y, x, 0.0]) if abs(z) < 0.999 else np.array([0.0, 1.0, 0.0])
+    upright = np.array(
+        [
+            y * level[2] - z * level[1],
+            z * level[0] - x * level[2],
+            x * level[1] - y * level[0],
+        ]
+    )
+    level, upright = (axis / np.sqrt(dot(axis, axis)) for axis in (level, upright))
+    turn_cos, turn_sin = float(cosine(roll_rad)), float(sine(roll_rad))
+    return turn_cos * level + turn_sin * upright, turn_cos * upright - turn_sin * level
+
+
+def _noise_in_space(points: NDArray, rng: np.random.Generator) -> Numbers:
+    """Return gradient noise at points [..., 3], of a lattice that repeats after LATTICE cells."""
+    slopes = 2 * rng.random((3, LATTICE**3)) - 1
+    axes = [np.ascontiguousarray(points[..., axis]) for axis in range(3)]
+    corners = [np.floor(axis) for axis in axes]
+    insides = [axis - corner for axis, corner in zip(axes, corners, strict=True)]
+    fades = [x * x * x * (x * (6 * x - 15) + 10) for x in insides]
+    total = np.zeros(points.shape[:-1])
+    for steps in itertools.product((0, 1), repeat=3):
+        place = np.zeros(total.shape, np.int64)
+        weight, height = np.ones_like(total), np.zeros_like(total)
+        for corner, step, fade in zip(corners, steps, fades, strict=True):
+            place = place * LATTICE + (corner.astype(np.int64) + step) % LATTICE
+            weight = weight * (fade if step else 1 - fade)
+        for slope, inside, step in zip(slopes, insides, steps, strict=True):
+            height = height + slope[place] * (inside - step)
+        total = total + height * weight
+    return total

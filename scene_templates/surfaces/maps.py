@@ -1,0 +1,122 @@
+"""`SurfaceMaps`: what a textured surface is, and `Finish`, what its parts are mixed from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scene_templates.exact import Numbers, mixed
+
+MOST_ALBEDO = 0.95
+"""Greatest channel of a base colour and greatest specular share: no surface is whiter, and the sum
+of both albedos stays below 1 by far more than float32 rounds."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceMaps:
+    """A square surface that repeats in both directions; linear colour, rows from the top.
+
+    Row 0 is the top, where v = 1 (scene_templates.surfaces.texels).
+    """
+
+    family: str
+    """Name of the family that it was drawn from."""
+    diffuse_rgb: NDArray[np.float32]
+    """[N, N, 3] diffuse albedo; with the specular one at most 1 in each channel."""
+    specular_rgb: NDArray[np.float32]
+    """[N, N, 3] specular albedo."""
+    roughness: NDArray[np.float32]
+    """[N, N, 1] roughness; the GGX width is its square."""
+    parameters: Mapping[str, tuple[Any, ...]]
+    """What was drawn, by the names of docs/reference/surfaces-and-skies.md."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Finish:
+    """Albedos and roughness of one thing that a surface is made of, everywhere or per texel."""
+
+    diffuse_rgb: Numbers
+    """[3] or [N, N, 3]."""
+    specular_rgb: Numbers
+    """[3] or [N, N, 3]."""
+    roughness: Numbers
+    """[] or [N, N]."""
+
+    def toned(self, tone: ArrayLike) -> "Finish":
+        """Return it with its diffuse albedo times a number in [0, 1], one or [N, N]."""
+        factor = np.clip(np.asarray(tone, np.float64), 0, 1)
+        return Finish(
+            diffuse_rgb=self.diffuse_rgb * factor[..., None],
+            specular_rgb=self.specular_rgb,
+            roughness=self.roughness,
+        )
+
+    def dimmed(self, tone: ArrayLike) -> "Finish":
+        """Return it with both albedos times a number in [0, 1], one or [N, N]."""
+        factor = np.clip(np.asarray(tone, np.float64), 0, 1)
+        return Finish(
+            diffuse_rgb=self.diffuse_rgb * factor[..., None],
+            specular_rgb=self.specular_rgb * factor[..., None],
+            roughness=self.roughness,
+        )
+
+    def rougher(self, by: ArrayLike) -> "Finish":
+        """Return it with a number, one or [N, N], added to the roughness."""
+        return Finish(
+            diffuse_rgb=self.diffuse_rgb,
+            specular_rgb=self.specular_rgb,
+            roughness=self.roughness + np.asarray(by, np.float64),
+        )
+
+    def covered(self, other: "Finish", share: ArrayLike) -> "Finish":
+        """Return it with `share` of its area, one or [N, N], covered by another one.
+
+        Albedos are area means; of the roughness, it is the mean of the GGX widths that counts.
+        """
+        part = np.asarray(share, np.float64)
+        own, others = np.clip(self.roughness, 0, 1), np.clip(other.roughness, 0, 1)
+        return Finish(
+            diffuse_rgb=mixed(self.diffuse_rgb, other.diffuse_rgb, part[..., None]),
+            specular_rgb=mixed(self.specular_rgb, other.specular_rgb, part[..., None]),
+            roughness=np.sqrt(mixed(own * own, others * others, part)),
+        )
+
+
+def finish(base_rgb: ArrayLike, *, specular_share: float, roughness: float, metal: bool) -> Finish:
+    """Return the finish of a base colour.
+
+    Args:
+        base_rgb: [3] in [0, MOST_ALBEDO].
+        specular_share: of the light, what is reflected by the specular lobe.
+        roughness: of that lobe.
+        metal: whether the colour is that of the specular lobe; otherwise that is grey.
+    """
+    base = np.clip(np.asarray(base_rgb, np.float64), 0, MOST_ALBEDO)
+    share = min(specular_share, MOST_ALBEDO)
+    return Finish(
+        diffuse_rgb=(1 - share) * base,
+        specular_rgb=share * (base if metal else np.ones(3)),
+        roughness=np.asarray(roughness, np.float64),
+    )
+
+
+def surface_maps(
+    family: str,
+    made_of: Finish,
+    *,
+    size: int,
+    roughness_clip: tuple[float, float],
+    parameters: Mapping[str, tuple[Any, ...]],
+) -> SurfaceMaps:
+    """Return the maps of a finish, rounded once."""
+    whole = np.zeros((size, size, 1))
+    roughness = np.clip(made_of.roughness[..., None] + whole, *roughness_clip)
+    return SurfaceMaps(
+        family=family,
+        diffuse_rgb=(made_of.diffuse_rgb + whole).astype(np.float32),
+        specular_rgb=(made_of.specular_rgb + whole).astype(np.float32),
+        roughness=roughness.astype(np.float32),
+        parameters=parameters,
+    )

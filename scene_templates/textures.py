@@ -1,0 +1,67 @@
+"""`draw_look`: which surfaces are textured, with what, and how a texture lies on them."""
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scene_templates.checks import Range
+from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
+from scene_templates.surfaces.maps import SurfaceMaps
+from storage.settings.described import checked
+from storage.settings.ranges import Share, Within
+
+MOST_TEXTURED = 64
+"""Most objects, floors and walls of a scene that have a texture: three maps of each are stored."""
+
+
+@checked("scene settings")
+class TextureSettings:
+    """How many surfaces are textured, and how."""
+
+    share: Share = 0.0
+    """Share of the objects, floors and walls that have a procedural texture in the place of their
+    drawn colours and roughness. Of more than 64, the first ones are."""
+    tile_m: Annotated[Range, Within(0.05, 100, unit="m")] = (0.4, 1.6)
+    """Range of the width of a texture on a surface, in metres; it repeats after that."""
+    surfaces: SurfaceMapSettings = field(default_factory=SurfaceMapSettings)
+    """Families and size of the textures."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TexturedLook:
+    """A texture, and how it lies on a surface."""
+
+    maps: SurfaceMaps
+    """What repeats."""
+    tile_m: float
+    """Its width."""
+    quarter_turns: int
+    """0 to 3, counter-clockwise."""
+    shift_uv: tuple[float, float]
+    """Texture coordinates of the surface's own origin, each uniform in [0, 1)."""
+
+    def uv(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return texture coordinates of places [..., 2] on a flat side: to the right and up."""
+        x, y = places_m[..., 0] / self.tile_m, places_m[..., 1] / self.tile_m
+        for _ in range(self.quarter_turns):
+            x, y = y, -x  # the picture turns counter-clockwise where coordinates turn clockwise
+        return np.stack([x + self.shift_uv[0], y + self.shift_uv[1]], axis=-1)
+
+
+def draw_look(rng: np.random.Generator, settings: TextureSettings) -> TexturedLook | None:
+    """Return the texture of a surface, or None where it has none.
+
+    Whether it has one is drawn first: another `share` changes no texture that is there still.
+    """
+    if rng.random() >= settings.share:
+        return None
+    tile_m, turns = rng.uniform(*settings.tile_m), int(rng.integers(4))
+    shift_u, shift_v = rng.random(2)
+    return TexturedLook(
+        maps=draw_surface(rng, settings.surfaces),
+        tile_m=float(tile_m),
+        quarter_turns=turns,
+        shift_uv=(float(shift_u), float(shift_v)),
+    )

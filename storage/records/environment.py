@@ -1,0 +1,73 @@
+"""`Environment`: light that comes from far away, from all directions, as a picture of them.
+
+Its map is latitude-longitude, linear radiance, with the axes of storage.conventions. A scene may
+turn it. A map that is absent costs nothing, and is another thing than a black one that is seen.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from storage.records.scene_laws import broken_law, require_law
+from storage.records.texture import MAX_SIDE, MapSource, content_digest
+
+MAX_RADIANCE = 1e9
+"""Greatest radiance of a map. A sun of 1e6 is usual; sums over the largest map stay finite."""
+
+ROTATION_TOLERANCE = 1e-4
+"""How far a float32 rotation may be from orthonormal, as that of a camera."""
+
+
+def _unturned() -> NDArray[np.float32]:
+    return np.eye(3, dtype=np.float32)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Environment:
+    """A latitude-longitude map of radiance from infinitely far away."""
+
+    radiance_rgb: NDArray[np.float32]
+    """[H, 2H, 3] linear radiance; row 0 is the top (+Z of the map)."""
+    rotation: NDArray[np.float32] = field(default_factory=_unturned)
+    """[3, 3] from the axes of the map to those of the world."""
+    is_seen: bool = False
+    """Whether cameras see it; it lights the scene in any case."""
+    source: MapSource = field(default_factory=MapSource)
+    """What the map is called, and whose it is."""
+
+    @cached_property
+    def sha256(self) -> str:
+        """Digest of the map alone: the same map, turned, is the same content."""
+        return content_digest("environment", self.radiance_rgb)
+
+    def to_map(self, directions: ArrayLike) -> NDArray[np.float64]:
+        """Return directions [..., 3] of the world in the axes of the map."""
+        turned: NDArray[np.float64] = np.asarray(directions, np.float64) @ self.rotation
+        return turned
+
+    def check(self) -> None:
+        """Raise TrilightError at the first broken law."""
+        radiance, name = self.radiance_rgb, "environment.radiance_rgb"
+        if radiance.dtype != np.float32:
+            broken_law(f"{name} has dtype {radiance.dtype}", "float32")
+        if radiance.ndim != 3 or radiance.shape[1:] != (2 * radiance.shape[0], 3):
+            broken_law(f"{name} has shape {radiance.shape}", "(height, twice the height, 3)")
+        if not 1 <= radiance.shape[0] <= MAX_SIDE // 2:
+            broken_law(f"{name} has shape {radiance.shape}", f"sides of 1 to {MAX_SIDE} texels")
+        if not (radiance.min() >= 0 and radiance.max() <= MAX_RADIANCE):  # or NaN
+            lawful = (radiance >= 0) & (radiance <= MAX_RADIANCE)
+            require_law(lawful, name, radiance, f"finite values from 0 to {MAX_RADIANCE:g}")
+        rotation = self.rotation
+        if rotation.dtype != np.float32 or rotation.shape != (3, 3):
+            broken_law(
+                f"environment.rotation is {rotation.dtype} {rotation.shape}", "float32 (3, 3)"
+            )
+        turn = rotation.astype(np.float64)
+        apart = abs(turn @ turn.T - np.eye(3)).max()
+        if not (apart <= ROTATION_TOLERANCE and np.linalg.det(turn) > 0):
+            broken_law(
+                f"environment.rotation is {rotation.tolist()}",
+                "an orthonormal rotation without mirroring",
+            )

@@ -1,0 +1,160 @@
+"""Textures and environment maps as bytes.
+
+A map is packed alone, as one gzip stream of a safetensors file with one array: equal content gives
+equal bytes, whatever it is called. Float32 values that half floats hold exactly are stored so.
+
+In a shard every map stands once, as a member `__map-<sha256>__` before the first sample that uses
+it. WebDataset skips names of this form, and other readers names without a point: strangers see
+samples as before. Nothing in a header decides how much memory is taken.
+"""
+
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from storage.errors import TrilightError
+from storage.records.environment import Environment
+from storage.records.map_references import (
+    described_environment,
+    described_texture,
+    environment_entries,
+    map_member,
+    texture_entries,
+    wrong_map,
+)
+from storage.records.safe_read import read_safetensors, safetensors_header
+from storage.records.scene import Scene
+from storage.records.texture import MAX_MAPS_BYTES, Texture
+
+_ARRAY = "values"
+_FORM = "form"
+_SRGB, _LINEAR, _ENVIRONMENT = "srgb", "linear", "environment"
+_DTYPES = {"U8": np.uint8, "F16": np.float16, "F32": np.float32}
+_MOST_HEADER = 1 << 10
+_GZIP = 31
+
+
+def packed_maps(scene: Scene) -> dict[str, bytes]:
+    """Return the bytes of a scene's maps by the names of their members."""
+    packed = {map_member(texture.sha256): pack_texture(texture) for texture in scene.textures}
+    if scene.environment is not None:
+        packed[map_member(scene.environment.sha256)] = pack_environment(scene.environment)
+    return packed
+
+
+def pack_texture(texture: Texture) -> bytes:
+    """Return the bytes of a texture."""
+    return _packed(stored_values(texture.texels), _SRGB if texture.is_srgb else _LINEAR)
+
+
+def pack_environment(environment: Environment) -> bytes:
+    """Return the bytes of an environment's map, however it is turned."""
+    return _packed(stored_values(environment.radiance_rgb), _ENVIRONMENT)
+
+
+def stored_values(values: NDArray) -> NDArray:
+    """Return values as they are stored: float32 as half floats where these hold all of them."""
+    if values.dtype != np.float32:
+        return values
+    with np.errstate(over="ignore"):
+        halves = values.astype(np.float16)
+    return halves if np.array_equal(halves.astype(np.float32), values) else values
+
+
+def held_values(stored: NDArray) -> NDArray:
+    """Return values as they are held in memory: the inverse of `stored_values`."""
+    return stored.astype(np.float32) if stored.dtype == np.float16 else stored
+
+
+def unpacked_maps(maps: Any, members: Mapping[str, bytes]) -> dict[str, Any]:
+    """Return the fields `textures` and `environment` of a scene.
+
+    Args:
+        maps: what `maps_record` gave, from outside.
+        members: bytes of the maps by the names of their members; others are ignored.
+
+    Raises:
+        TrilightError: not of that form, a map is missing or damaged, all of them take more than
+            MAX_MAPS_BYTES, or one has another content than its name says.
+    """
+    entries, skies = texture_entries(maps), environment_entries(maps)
+    packed: dict[str, bytes] = {}
+    for entry in (*entries, *skies):
+        if (name := map_member(entry["sha256"])) not in members:
+            raise TrilightError(
+                f"scene: map {entry['sha256']} is missing; expected a member {name} before the "
+                "sample. Run `trilight verify`."
+            )
+        packed[name] = members[name]
+    total = sum(_Packed(data, name).num_bytes_held for name, data in packed.items())
+    if total > MAX_MAPS_BYTES:
+        wrong_map("maps", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
+    fields: dict[str, Any] = {}
+    if entries:
+        fields["textures"] = tuple(_texture(entry, packed) for entry in entries)
+    for entry in skies:
+        fields["environment"] = _environment(entry, packed)
+    return fields
+
+
+def _texture(entry: Mapping[str, Any], packed: Mapping[str, bytes]) -> Texture:
+    found = _Packed(packed[map_member(entry["sha256"])], f"map {entry['sha256']}")
+    if found.form not in (_SRGB, _LINEAR):
+        wrong_map(found.name, found.form, "a texture")
+    return described_texture(entry, found.values(), is_srgb=found.form == _SRGB)
+
+
+def _environment(entry: Mapping[str, Any], packed: Mapping[str, bytes]) -> Environment:
+    found = _Packed(packed[map_member(entry["sha256"])], f"map {entry['sha256']}")
+    if found.form != _ENVIRONMENT:
+        wrong_map(found.name, found.form, "an environment map")
+    return described_environment(entry, found.values())
+
+
+def _packed(values: NDArray, form: str) -> bytes:
+    packer = zlib.compressobj(level=6, wbits=_GZIP)
+    data = save({_ARRAY: np.ascontiguousarray(values)}, {_FORM: form})
+    return packer.compress(data) + packer.flush()
+
+
+class _Packed:
+    """A packed map of which only the header was read: it says how many bytes there will be."""
+
+    def __init__(self, data: bytes, name: str) -> None:
+        self.name, self._data = name, data
+        header = safetensors_header(self._unpacked(8 + _MOST_HEADER), _MOST_HEADER, name=name)
+        entry, metadata = header.get(_ARRAY), header.get("__metadata__")
+        if set(header) != {_ARRAY, "__metadata__"} or not isinstance(entry, Mapping):
+            wrong_map(name, sorted(header), f"one array {_ARRAY}")
+        shape, dtype = entry.get("shape"), entry.get("dtype")
+        if (
+            not isinstance(shape, list)
+            or len(shape) != 3
+            or not all(type(side) is int and 0 < side <= MAX_MAPS_BYTES for side in shape)
+            or dtype not in _DTYPES
+        ):
+            wrong_map(name, [dtype, shape], "a picture of 8 bits or floats")
+        self.form = str(metadata.get(_FORM)) if isinstance(metadata, Mapping) else ""
+        count = shape[0] * shape[1] * shape[2]
+        self.num_bytes_held = count * (1 if dtype == "U8" else 4)
+        self._num_bytes = count * np.dtype(_DTYPES[dtype]).itemsize
+
+    def values(self) -> NDArray:
+        """Return the array as it is held in memory."""
+        data = self._unpacked(8 + _MOST_HEADER + self._num_bytes, whole=True)
+        arrays, _ = read_safetensors(data, _MOST_HEADER, name=self.name)
+        return held_values(arrays[_ARRAY])
+
+    def _unpacked(self, most: int, *, whole: bool = False) -> bytes:
+        unpacker = zlib.decompressobj(wbits=_GZIP)
+        try:
+            data = unpacker.decompress(self._data, most)
+        except zlib.error as error:
+            raise TrilightError(f"{self.name}: damaged ({error}).") from error
+        if whole and (not unpacker.eof or unpacker.unused_data):
+            raise TrilightError(f"{self.name}: cut short, or goes on after its end.")
+        return data

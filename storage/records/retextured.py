@@ -1,0 +1,131 @@
+"""Scenes with other textures: without constant ones, without any, or of other triangles."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.records.material import laid_out
+from storage.records.texture import CONSTANT, TEXTURED, Texture
+
+if TYPE_CHECKING:
+    from storage.records.scene import Scene
+
+NEW = -1
+"""In `chosen_maps`: a triangle or a material that the scene does not have."""
+
+AnyScene = TypeVar("AnyScene", bound="Scene")
+
+
+def without_constant_textures(scene: AnyScene) -> AnyScene:
+    """Return the same scene with every texture of one colour as the constant that it is.
+
+    Textures that are then used by no material go, and the texture coordinates with the last one: a
+    scene of constant textures has the bytes of the scene without them.
+    """
+    constants = {
+        row: texture.constant
+        for row, texture in enumerate(scene.textures)
+        if texture.constant is not None
+    }
+    if not constants or scene.material_textures is None:
+        return scene
+    materials, index = scene.materials.copy(), scene.material_textures.copy()
+    places = {column.name: part for column, part in laid_out()}
+    for place, name in enumerate(TEXTURED):
+        for row, value in constants.items():
+            chosen = np.flatnonzero(index[:, place] == row)
+            if len(chosen):  # else it is one of another width
+                materials[chosen, places[name]] = value
+                index[chosen, place] = CONSTANT
+    uv, textures, rows = _used(scene.uv, scene.textures, index)
+    return dataclasses.replace(
+        scene, materials=materials, uv=uv, textures=textures, material_textures=rows
+    )
+
+
+def with_textures(
+    scene: AnyScene,
+    uv: NDArray[np.float32],
+    textures: tuple[Texture, ...],
+    material_textures: NDArray[np.int32],
+) -> AnyScene:
+    """Return the same scene with textures, whose columns hold their means.
+
+    Args:
+        scene: any; its own textures go.
+        uv: [3T, 2] of each corner of each triangle.
+        textures: each used, and each content once.
+        material_textures: [M, 3] rows of `textures`, or CONSTANT, in the order of TEXTURED.
+    """
+    return dataclasses.replace(
+        scene,
+        materials=_with_means(scene.materials, textures, material_textures),
+        uv=uv,
+        textures=textures,
+        material_textures=material_textures,
+    )
+
+
+def chosen_maps(
+    scene: "Scene", triangles: NDArray[np.integer], materials: NDArray[np.integer]
+) -> dict[str, Any]:
+    """Return the fields that textures take in a scene of other triangles and materials.
+
+    Args:
+        scene: what they are taken from.
+        triangles: [T] rows of its triangles, or NEW.
+        materials: [M] rows of its materials, or NEW for one that has no textures.
+    """
+    if scene.uv is None or scene.material_textures is None:
+        return {}
+    corners = np.append(scene.uv.reshape(-1, 3, 2), np.zeros((1, 3, 2), np.float32), axis=0)
+    plain = np.full((1, len(TEXTURED)), CONSTANT, np.int32)
+    index = np.append(scene.material_textures, plain, axis=0)
+    uv, textures, index_of = _used(
+        corners[triangles].reshape(-1, 2), scene.textures, index[materials]
+    )
+    return {"uv": uv, "textures": textures, "material_textures": index_of}
+
+
+Textured = tuple[NDArray[np.float32] | None, tuple[Texture, ...], NDArray[np.int32] | None]
+
+
+def _used(
+    uv: NDArray[np.float32] | None, textures: tuple[Texture, ...], index: NDArray[np.int32]
+) -> Textured:
+    """Return coordinates, textures and their rows without textures that no material uses."""
+    kept = np.setdiff1d(index, CONSTANT)
+    if not len(kept):
+        return None, (), None
+    renumbered = np.full(len(textures) + 1, CONSTANT, np.int32)  # the last one is that of CONSTANT
+    renumbered[kept] = np.arange(len(kept))
+    return uv, tuple(textures[row] for row in kept), renumbered[index]
+
+
+def _with_means(
+    materials: NDArray[np.float32],
+    textures: tuple[Texture, ...],
+    material_textures: NDArray[np.int32],
+) -> NDArray[np.float32]:
+    rows, places = materials.copy(), {column.name: part for column, part in laid_out()}
+    for place, name in enumerate(TEXTURED):
+        for row in np.flatnonzero(material_textures[:, place] != CONSTANT):
+            rows[row, places[name]] = textures[material_textures[row, place]].mean
+    return rows
+
+
+def without_maps(scene: AnyScene, *, textures: bool = True, environment: bool = True) -> AnyScene:
+    """Return the same scene without its textures, or its environment, or both.
+
+    In the place of a texture stands its mean.
+    """
+    if environment:
+        scene = dataclasses.replace(scene, environment=None)
+    if not textures or scene.material_textures is None:
+        return scene
+    materials = _with_means(scene.materials, scene.textures, scene.material_textures)
+    return dataclasses.replace(
+        scene, materials=materials, uv=None, material_textures=None, textures=()
+    )

@@ -1,0 +1,22 @@
+"""How a broken law of a scene is told: the field, the value found, what was expected, where."""
+
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import TrilightError
+
+
+def require_law(law: NDArray[np.bool_], name: str, values: NDArray, expected: str) -> None:
+    """Raise TrilightError for the first index at which `law` is false."""
+    if law.all():
+        return
+    index = tuple(int(i) for i in np.argwhere(~law)[0])
+    found = " ".join(np.array2string(values[index], threshold=16).split())
+    broken_law(f"{name}{list(index)} is {found}", expected)
+
+
+def broken_law(found: str, expected: str) -> NoReturn:
+    """Raise TrilightError for what was found."""
+    raise TrilightError(f"scene: {found}; expected {expected}.")

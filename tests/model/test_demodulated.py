@@ -1,0 +1,147 @@
+"""Laws of demodulated pictures: what reflects nothing is black, and the rest in proportion."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from model.config import ModelConfig
+from model.demodulated import composed, with_albedo
+from model.neural_renderer import NeuralRenderer
+from model.renderformer import RenderFormer, radiance
+from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
+from storage.records.first_hits import first_hits
+from storage.records.material import DIFFUSE, SPECULAR
+from storage.records.scene import Scene
+from tests.model.hits.kit import corner
+from tests.model.kit import RESOLUTION, awake, random_scene, render, tiny_config
+
+DEMODULATED = tiny_config(demodulated=True, hit_rays=2)
+KINDS = {
+    "linear": DEMODULATED,
+    "4 pixels, projected": dataclasses.replace(DEMODULATED, patch_px=4, projected_freqs=1),
+    "windows": dataclasses.replace(DEMODULATED, window_bundles=2),
+    "dpt": dataclasses.replace(tiny_config("dpt"), demodulated=True, hit_rays=1),
+}
+
+
+def picture(model: RenderFormer, scene: Scene, resolution: int = RESOLUTION) -> torch.Tensor:
+    return render(model, scene_tensors(scene), resolution=resolution)[0, 0]
+
+
+def with_albedos(scene: Scene, diffuse: float, specular: float) -> Scene:
+    materials = scene.materials.copy()
+    materials[:, DIFFUSE] *= diffuse
+    materials[:, SPECULAR] *= specular
+    return dataclasses.replace(scene, materials=materials)
+
+
+def test_one_ray_a_pixel_sees_the_albedo_that_the_pixel_sees_first() -> None:
+    scene = corner()
+    seen = with_albedo(scene_tensors(scene), 32, 1).albedo_VRR6
+    assert seen is not None
+    found = first_hits(scene, view=0, resolution=32)
+    materials = np.append(scene.materials[scene.material_index], np.zeros((1, 10)), axis=0)
+    expected = materials[np.where(found.met, found.triangle, -1)]
+    expected = np.concatenate([expected[..., DIFFUSE], expected[..., SPECULAR]], axis=-1)
+    differs = (np.abs(seen[0].numpy() - expected) > 1e-6).any(axis=-1)
+    # rays of single precision pass some edges on the other side
+    assert differs.mean() < 0.005 and found.met.any() and not found.met.all()
+
+
+def test_rays_of_a_pixel_are_averaged() -> None:
+    """Four rays of a pixel are those of four pixels of a picture twice as wide."""
+    tensors = scene_tensors(corner())
+    coarse, fine = with_albedo(tensors, 16, 2).albedo_VRR6, with_albedo(tensors, 32, 1).albedo_VRR6
+    assert coarse is not None and fine is not None
+    mean = fine.unflatten(2, (16, 2)).unflatten(1, (16, 2)).mean(dim=(2, 4))
+    # rays through one place, rounded otherwise, may pass an edge on the other side
+    assert ((coarse - mean).abs() > 1e-5).any(dim=-1).double().mean() < 0.01
+
+
+@pytest.mark.parametrize("config", KINDS.values(), ids=KINDS.keys())
+def test_what_reflects_nothing_and_the_background_are_black(config: ModelConfig) -> None:
+    model, scene = awake(config, torch.float32), corner()
+    assert (picture(model, with_albedos(scene, 0, 0)) == 0).all()
+    shown = picture(model, scene)
+    tensors = with_albedo(scene_tensors(scene), RESOLUTION, config.hit_rays)
+    assert tensors.albedo_VRR6 is not None
+    is_black = (tensors.albedo_VRR6[0] == 0).all(dim=-1)
+    assert (shown[is_black] == 0).all() and 0 < is_black.double().mean() < 1
+    assert (shown[~is_black] > 0).all()
+
+
+def test_pictures_are_in_proportion_to_albedo_and_add_up() -> None:
+    generator = torch.Generator().manual_seed(0)
+    light = torch.randn(1, 1, 4, 4, 6, generator=generator, dtype=torch.float64)
+    albedo = torch.rand(1, 1, 4, 4, 6, generator=generator, dtype=torch.float64)
+    diffuse, specular = albedo.clone(), albedo.clone()
+    diffuse[..., 3:], specular[..., :3] = 0, 0
+
+    def linear(albedo: torch.Tensor) -> torch.Tensor:
+        return radiance(composed(light, albedo))
+
+    # numbers of size 1 through a logarithm and back, in float64
+    torch.testing.assert_close(linear(0.25 * albedo), 0.25 * linear(albedo), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        linear(diffuse) + linear(specular), linear(albedo), rtol=1e-12, atol=0
+    )
+
+
+@pytest.mark.parametrize("size", [-1e30, -50.0, 50.0, 1e30])
+def test_gradients_are_finite_whatever_a_head_says(size: float) -> None:
+    light = torch.full((1, 1, 2, 2, 6), size, requires_grad=True)
+    albedo = torch.zeros(1, 1, 2, 2, 6)
+    albedo[..., 0, :] = 0.5
+    shown = composed(light, albedo)
+    shown.sum().backward()
+    assert torch.isfinite(shown).all() and (shown >= 0).all()
+    assert light.grad is not None and torch.isfinite(light.grad).all()
+
+
+@pytest.mark.parametrize("config", KINDS.values(), ids=KINDS.keys())
+def test_albedo_that_a_loader_brings_gives_the_picture_that_the_network_asks_for(
+    config: ModelConfig,
+) -> None:
+    model = awake(config)
+    scenes = [random_scene(7, seed=1), random_scene(15, seed=2)]
+
+    def brought(scene: SceneTensors) -> SceneTensors:
+        return with_albedo(scene, RESOLUTION, config.hit_rays)
+
+    asked, given = render(model, *scenes), render(model, *map(brought, scenes))
+    assert torch.equal(asked, given)
+    for index, scene in enumerate(scenes):
+        # float64 sums in another order
+        torch.testing.assert_close(render(model, scene)[0], asked[index], rtol=0, atol=1e-11)
+
+
+def test_every_weight_learns() -> None:
+    model = awake(KINDS["4 pixels, projected"], torch.float32)
+    model(batch_scenes([scene_tensors(corner())]), RESOLUTION).mean().backward()
+    for name, weight in model.named_parameters():
+        assert weight.grad is not None and weight.grad.abs().max() > 0, name
+
+
+def test_it_begins_with_equal_light_everywhere() -> None:
+    model = RenderFormer(DEMODULATED)
+    model.initialise(torch.Generator().manual_seed(0))
+    shown, half = picture(model, corner()), picture(model, with_albedos(corner(), 0.5, 0.5))
+    assert shown.max() > 0.1
+    # float32 through a logarithm and back
+    torch.testing.assert_close(radiance(half), 0.5 * radiance(shown), rtol=1e-4, atol=1e-6)
+
+
+def test_a_renderer_shows_what_the_network_computes() -> None:
+    scene = corner()
+    model = awake(KINDS["4 pixels, projected"], torch.float32)
+    shown = NeuralRenderer(model).render(scene, RESOLUTION)[0]
+    expected = radiance(picture(model, scene).double()).numpy()
+    np.testing.assert_allclose(shown, expected, rtol=1e-5, atol=1e-6)  # rounded to float32
+    renderer = NeuralRenderer(model)
+    prepared = renderer.prepare(scene)
+    skipped = renderer.view(
+        prepared, scene.c2w[0], float(scene.fov_deg[0]), RESOLUTION, skip_empty_bundles=True
+    )
+    assert (skipped[expected.max(axis=-1) == 0] == 0).all() and skipped.max() > 0

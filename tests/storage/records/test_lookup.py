@@ -1,0 +1,147 @@
+"""Look-ups against obvious twins: loops over texels, and the six directions of a map."""
+
+import math
+
+import numpy as np
+import pytest
+
+from storage.conventions import latlong_direction, latlong_uv, srgb8
+from storage.records.environment import Environment
+from storage.records.lookup import environment_values, texture_values, textured_rows
+from storage.records.material import DIFFUSE, ROUGHNESS
+from storage.records.texture import Texture
+from tests.scenes_by_hand import FLOOR, LIGHT
+from tests.textured_by_hand import colour_texture, number_texture, sky, textured_scene
+
+SIX = {"+X": (1, 0, 0), "-X": (-1, 0, 0), "+Y": (0, 1, 0), "-Y": (0, -1, 0), "+Z": (0, 0, 1),
+       "-Z": (0, 0, -1)}  # fmt: skip
+
+
+def test_six_directions_stand_where_the_conventions_say() -> None:
+    """The table of Blender: centre +X, a quarter +Y, three quarters -Y, the border -X, top +Z."""
+    expected = {"+X": (0.5, 0.5), "+Y": (0.25, 0.5), "-Y": (0.75, 0.5)}
+    for name, place in expected.items():
+        assert latlong_uv(SIX[name]) == pytest.approx(place, abs=1e-15)
+    assert latlong_uv(SIX["-X"])[0] % 1 == pytest.approx(0, abs=1e-15)
+    assert latlong_uv(SIX["+Z"])[1] == 1 and latlong_uv(SIX["-Z"])[1] == 0
+
+
+def test_six_coloured_poles_shine_from_their_directions() -> None:
+    """A map of 8 x 16 with one colour about each axis; turning by 90 degrees or a mirror fails."""
+    radiance = np.zeros((8, 16, 3), np.float32)
+    colours = {"+X": 1, "-X": 2, "+Y": 3, "-Y": 4, "+Z": 5, "-Z": 6}
+    radiance[0], radiance[-1] = colours["+Z"], colours["-Z"]
+    for name, columns in {"+X": (7, 8), "+Y": (3, 4), "-Y": (11, 12), "-X": (15, 0)}.items():
+        radiance[3:5, columns] = colours[name]
+    environment = Environment(radiance_rgb=radiance)
+    for name, direction in SIX.items():
+        assert environment_values(environment, direction) == pytest.approx([colours[name]] * 3)
+    cycled = Environment(radiance_rgb=radiance, rotation=sky().rotation)  # X to Y, Y to Z, Z to X
+    for name, direction in SIX.items():
+        turned = np.roll(direction, 1)
+        assert environment_values(cycled, turned) == pytest.approx([colours[name]] * 3)
+
+
+def test_directions_and_places_are_inverse() -> None:
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(1000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    near_poles = [(1e-9, 2e-9, 1), (-3e-12, 1e-12, -1)]
+    for each in (directions, np.array(near_poles)):
+        back = latlong_direction(latlong_uv(each))
+        assert np.abs(back - each).max() < 1e-14  # a few roundings of double precision
+    relative = latlong_direction(latlong_uv(near_poles))[:, :2] / np.array(near_poles)[:, :2]
+    # v itself is known to 1e-16 near 1, which is 3e-16 radians of the 2e-9 between these and +Z
+    assert relative[0] == pytest.approx(1, abs=1e-6)
+
+
+def _texel(texture: Texture, row: int, column: int) -> np.ndarray:
+    height, width, _ = texture.texels.shape
+    return texture.linear(texture.texels[row % height, column % width]).astype(np.float64)
+
+
+def _slow(texture: Texture, u: float, v: float) -> np.ndarray:
+    """Return the sum over all texels, each weighted by its tents in u and v."""
+    height, width, channels = texture.texels.shape
+    total = np.zeros(channels)
+    for row in range(-height, 3 * height):
+        for column in range(-width, 3 * width):
+            across = max(0.0, 1 - abs((v % 1) * height - (row + 0.5)))
+            along = max(0.0, 1 - abs((u % 1) * width - (column + 0.5)))
+            total += across * along * _texel(texture, row, column)
+    return total
+
+
+@pytest.mark.parametrize("texture", [colour_texture(), number_texture()])
+def test_a_texture_is_the_sum_of_its_tents(texture: Texture) -> None:
+    places = [(0, 0), (0.5, 0.5), (1, 1), (-0.25, 1.25), (0.999, 0.001), (7.3, -12.8)]
+    for u, v in places:
+        # a few roundings of numbers below 10
+        assert texture_values(texture, (u, v)) == pytest.approx(_slow(texture, u, v), abs=1e-13)
+
+
+def test_row_0_is_the_bottom_and_column_0_the_left() -> None:
+    texture = Texture(texels=np.array([[[0], [0.25]], [[0.5], [0.75]]], np.float32))
+    corners = {(0.25, 0.25): 0, (0.75, 0.25): 1, (0.25, 0.75): 2, (0.75, 0.75): 3}
+    for place, value in corners.items():
+        assert texture_values(texture, place) == value / 4
+        further = np.add(place, (5, -3))
+        assert texture_values(texture, further) == value / 4
+
+
+def test_eight_bits_are_decoded_before_they_are_mixed() -> None:
+    """Halfway between black and white sRGB is 0.5, and not what the code 127 stands for."""
+    texels = np.array([[[0], [255]]], np.uint8)
+    for is_srgb in (True, False):
+        assert texture_values(Texture(texels=texels, is_srgb=is_srgb), (0.5, 0)) == 0.5
+    every = np.arange(256, dtype=np.uint8).reshape(1, 256, 1)
+    linear = Texture(texels=every, is_srgb=True).linear(every)
+    assert (srgb8(linear) == every).all()
+    assert linear[0, 188, 0] == pytest.approx(0.502886, abs=1e-6)  # IEC 61966-2-1
+    assert Texture(texels=every).linear(every)[0, 51, 0] == np.float32(0.2)
+
+
+def test_a_map_goes_round_and_ends_at_the_poles() -> None:
+    environment = sky(rotation=np.eye(3, dtype=np.float32))
+    radiance = environment.radiance_rgb.astype(np.float64)
+    height, width = radiance.shape[:2]
+    border = latlong_direction((0, 0.5))
+    expected = (radiance[1, 0] + radiance[1, -1]) / 2
+    assert environment_values(environment, border) == pytest.approx(expected, abs=1e-12)
+    for row in range(height):
+        for column in range(width):
+            place = (column + 0.5) / width, 1 - (row + 0.5) / height
+            found = environment_values(environment, 3 * latlong_direction(place))
+            # a sun of 1e6 beside it counts by the rounding of its place, a few 1e-16
+            assert found == pytest.approx(radiance[row, column], abs=1e-8)
+    assert environment_values(environment, (0, 0, 1)) == pytest.approx(
+        (radiance[0, 2] + radiance[0, 3]) / 2, abs=1e-8
+    )
+
+
+def test_mean_greatest_and_constant() -> None:
+    for texture in (colour_texture(), number_texture()):
+        linear = texture.linear(texture.texels).astype(np.float64)
+        assert texture.mean == pytest.approx(linear.mean(axis=(0, 1)), rel=1e-6)  # of float32
+        assert (texture.greatest == linear.max(axis=(0, 1))).all()
+        assert texture.constant is None
+    assert Texture(texels=np.full((3, 2, 1), 255, np.uint8)).constant == np.ones(1)
+
+
+def test_rows_of_materials_take_what_is_textured() -> None:
+    scene = textured_scene()
+    uv = np.random.default_rng(1).normal(size=(8, 2)) * 3
+    index = np.array([FLOOR, LIGHT] * 4)
+    rows = textured_rows(scene, index, uv)
+    assert (rows[1::2] == scene.materials[LIGHT]).all()
+    for row, place in zip(rows[::2], uv[::2], strict=True):
+        assert (row[DIFFUSE] == texture_values(scene.textures[0], place).astype(np.float32)).all()
+        assert row[ROUGHNESS] == np.float32(texture_values(scene.textures[1], place)[0])
+        assert (row[3:6] == scene.materials[FLOOR, 3:6]).all()
+
+
+def test_far_coordinates_lose_no_digits() -> None:
+    """1023 + 1/8 is exact in float32, and means 1/8."""
+    far = texture_values(colour_texture(), np.array([1023.125, -1023.875], np.float32))
+    assert (far == texture_values(colour_texture(), (0.125, 0.125))).all()
+    assert math.isfinite(far.sum())

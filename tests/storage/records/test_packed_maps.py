@@ -1,0 +1,290 @@
+"""Maps as bytes: the same again, once each, and nothing that a hostile file claims is believed."""
+
+import dataclasses
+import gzip
+import json
+import tracemalloc
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load, save
+
+from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
+from storage.errors import TrilightError
+from storage.records.map_references import MAP_NAME, map_member
+from storage.records.packed_maps import pack_environment, pack_texture
+from storage.records.profiles import PROFILES, Profile
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.scene import Scene
+from storage.records.scene_file import decode_scene_file, encode_scene
+from storage.records.texture import MAX_MAPS_BYTES, Texture
+from tests.scenes_by_hand import tiny_sample, tiny_scene
+from tests.textured_by_hand import (
+    colour_texture,
+    number_texture,
+    sky,
+    textured_sample,
+    textured_scene,
+)
+
+KEY = "000000000"
+Members = dict[str, bytes]
+
+
+def require_same(found: Scene, scene: Scene) -> None:
+    """Every bit of every map, and what it is called."""
+    for name in ("uv", "material_textures"):
+        one, other = getattr(found, name), getattr(scene, name)
+        assert (one is None) == (other is None) and np.array_equal(one, other)
+    assert [each.source for each in found.textures] == [each.source for each in scene.textures]
+    for one, other in zip(found.textures, scene.textures, strict=True):
+        assert one.texels.dtype == other.texels.dtype and one.is_srgb == other.is_srgb
+        assert one.texels.tobytes() == other.texels.tobytes() and one.sha256 == other.sha256
+    one, other = found.environment, scene.environment
+    assert (one is None) == (other is None)
+    if one is not None and other is not None:
+        assert one.radiance_rgb.tobytes() == other.radiance_rgb.tobytes()
+        assert one.rotation.tobytes() == other.rotation.tobytes()
+        assert (one.is_seen, one.source) == (other.is_seen, other.source)
+
+
+SCENES = {
+    "textured": textured_scene(),
+    "sky": tiny_scene(environment=sky(is_seen=True)),
+    "both": textured_scene(environment=sky()),
+    "halves": textured_scene(
+        0, colour_texture(), Texture(texels=np.array([[[0.5]], [[0.25]]], np.float32))
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("name", SCENES)
+def test_a_sample_comes_back(name: str, profile: Profile) -> None:
+    sample = dataclasses.replace(tiny_sample(), scene=SCENES[name])
+    members = encode_sample(sample, profile)
+    assert members == encode_sample(sample, profile)
+    assert json.loads(members["json"])["schema_version"] == MAPS_VERSION == 4
+    back = decode_sample(KEY, members)
+    back.check()
+    require_same(back.scene, sample.scene)
+    assert encode_sample(dataclasses.replace(back, kept_members={}), "lossless") == encode_sample(
+        dataclasses.replace(back, scene=sample.scene), "lossless"
+    )
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_file_comes_back(name: str) -> None:
+    data = encode_scene(SCENES[name])
+    back = decode_scene_file(data, "a.safetensors")
+    require_same(back, SCENES[name])
+    assert encode_scene(back) == data
+
+
+def test_scenes_without_maps_are_what_they_were() -> None:
+    """No member, array, or entry more than before there were maps."""
+    members = encode_sample(tiny_sample())
+    assert set(members) == {"scene.safetensors", "json", "0.exr", "1.exr"}
+    assert set(json.loads(members["json"])) == {"schema_version", "objects", "provenance", "views"}
+    assert json.loads(members["json"])["schema_version"] == SCHEMA_VERSION
+    assert len(load(members["scene.safetensors"])) == 8
+    assert len(load(encode_scene(tiny_scene()))) == 8
+
+
+def test_equal_content_has_equal_bytes_whatever_it_is_called() -> None:
+    texture = colour_texture()
+    other = dataclasses.replace(texture, source=number_texture().source)
+    assert pack_texture(texture) == pack_texture(other) and texture.sha256 == other.sha256
+    turned = sky(rotation=np.eye(3, dtype=np.float32), is_seen=True)
+    assert pack_environment(sky()) == pack_environment(turned)
+    assert sky().sha256 == turned.sha256
+    read_as_linear = dataclasses.replace(texture, is_srgb=False)
+    assert read_as_linear.sha256 != texture.sha256
+
+
+def test_floats_are_stored_in_halves_only_where_nothing_is_lost() -> None:
+    def dtype(data: bytes) -> str:
+        return str(load(gzip.decompress(data))["values"].dtype)
+
+    halves = np.array([[[0.5], [0.25]]], np.float32)
+    assert dtype(pack_texture(Texture(texels=halves))) == "float16"
+    assert dtype(pack_texture(number_texture())) == "float32"
+    assert dtype(pack_environment(sky())) == "float32"  # its sun of 1e6 is beyond half floats
+    dim = sky(radiance_rgb=np.full((1, 2, 3), 7, np.float32))
+    assert dtype(pack_environment(dim)) == "float16"
+
+
+def _names(members: Members) -> list[str]:
+    return [name for name in members if MAP_NAME.fullmatch(name)]
+
+
+def _record(change: Callable[[dict[str, Any]], None]) -> Callable[[Members], None]:
+    def changed(members: Members) -> None:
+        record = json.loads(members["json"])
+        change(record["maps"])
+        members["json"] = json.dumps(record).encode()
+
+    return changed
+
+
+def _texture_bytes(change: Callable[[bytes], bytes]) -> Callable[[Members], None]:
+    def changed(members: Members) -> None:
+        name = map_member(colour_texture().sha256)
+        members[name] = change(members[name])
+
+    return changed
+
+
+def _other_values(data: bytes) -> bytes:
+    arrays = load(gzip.decompress(data))
+    return gzip.compress(save({"values": arrays["values"] ^ 1}, {"form": "srgb"}))
+
+
+def _claiming(shape: Any, dtype: str = "U8") -> Callable[[bytes], bytes]:
+    def changed(_: bytes) -> bytes:
+        header = {
+            "__metadata__": {"form": "srgb"},
+            "values": {"dtype": dtype, "shape": shape, "data_offsets": [0, 1]},
+        }
+        text = json.dumps(header).encode()
+        return gzip.compress(len(text).to_bytes(8, "little") + text + b"\0")
+
+    return changed
+
+
+def _drop_maps(members: Members) -> None:
+    record = json.loads(members["json"])
+    del record["maps"]
+    record["schema_version"] = 3
+    members["json"] = json.dumps(record).encode()
+
+
+HOSTILE: dict[str, tuple[Callable[[Members], object], str]] = {
+    "missing": (lambda m: m.pop(_names(m)[0]), "is missing; expected a member __map-"),
+    "of other content": (_texture_bytes(_other_values), "has the content"),
+    "noise": (_texture_bytes(lambda _: b"noise"), "damaged"),
+    "empty": (_texture_bytes(lambda _: b""), "no safetensors file"),
+    "cut short": (_texture_bytes(lambda data: data[:-9]), "cut short"),
+    "with more behind": (_texture_bytes(lambda data: data + b"x"), "goes on"),
+    "huge": (_texture_bytes(_claiming([16384, 16384, 3])), f"at most {MAX_MAPS_BYTES}"),
+    "huger": (_texture_bytes(_claiming([2**40, 2**40, 3])), "a picture of 8 bits or floats"),
+    "negative": (_texture_bytes(_claiming([-1, -1, 3])), "a picture"),
+    "flat": (_texture_bytes(_claiming([4, 6])), "a picture"),
+    "lying": (_texture_bytes(_claiming([4, 6, 3])), "unreadable"),
+    "in doubles": (_texture_bytes(_claiming([4, 6, 3], "F64")), "a picture"),
+    "a texture as a sky": (
+        _record(lambda maps: maps["environment"].update(sha256=colour_texture().sha256)),
+        "expected an environment map",
+    ),
+    "a sky as a texture": (
+        _record(lambda maps: maps["textures"][0].update(sha256=sky().sha256)),
+        "expected a texture",
+    ),
+    "a path as a name": (
+        _record(lambda maps: maps["textures"][0].update(sha256="../" * 20)), "64 hexadecimal"
+    ),
+    "no name": (_record(lambda maps: maps["textures"][0].pop("sha256")), "exactly the fields"),
+    "a number as a name": (
+        _record(lambda maps: maps["textures"][0].update(name=3)), "expected text"
+    ),
+    "textures of another kind": (_record(lambda maps: maps.update(textures=3)), "a list"),
+    "an entry more": (_record(lambda maps: maps.update(more=1)), "textures, environment, or both"),
+    "a rotation of words": (
+        _record(lambda maps: maps["environment"].update(rotation=[["a"] * 3] * 3)), "three rows"
+    ),
+    "half a rotation": (
+        _record(lambda maps: maps["environment"].update(rotation=[[1, 0, 0]])), "three rows"
+    ),
+    "a number as truth": (
+        _record(lambda maps: maps["environment"].update(is_seen=1)), "true or false"
+    ),
+    "another rotation than that of the arrays": (
+        _record(lambda maps: maps["environment"].update(rotation=np.eye(3).tolist())),
+        "do not speak of the same",
+    ),
+    "no maps in the record": (_drop_maps, "do not speak of the same"),
+    "maps of version 3": (
+        lambda m: m.update(json=m["json"].replace(b'"schema_version":4', b'"schema_version":3')),
+        "expected 4 exactly where there are any",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_sample_is_one_line(name: str) -> None:
+    change, message = HOSTILE[name]
+    members = encode_sample(textured_sample())
+    change(members)
+    tracemalloc.start()
+    try:
+        with pytest.raises(TrilightError, match=message) as caught:
+            decode_sample(KEY, members)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert str(caught.value).startswith("sample 000000000: ") and "\n" not in str(caught.value)
+    assert peak < 8 << 20  # a few buffers; the texture is of 72 bytes
+
+
+def test_maps_are_counted_before_they_are_unpacked() -> None:
+    """Two maps of 432 MB each, which one alone may take: refused by what their headers say."""
+    assert MAX_MAPS_BYTES / 2 < 12000 * 12000 * 3 < MAX_MAPS_BYTES
+    members = encode_sample(tiny_sample())
+    record = json.loads(members["json"])
+    rights = {"name": "", "licence": "", "attribution": "", "source_url": ""}
+    packed = _claiming([12000, 12000, 3])(b"")
+    record["schema_version"] = MAPS_VERSION
+    record["maps"] = {"textures": [{"sha256": digit * 64, **rights} for digit in "01"]}
+    members |= {map_member(digit * 64): packed for digit in "01"}
+    members["json"] = json.dumps(record).encode()
+    tracemalloc.start()
+    try:
+        with pytest.raises(TrilightError, match=f"expected at most {MAX_MAPS_BYTES}"):
+            decode_sample(KEY, members)
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+
+
+SCENE_FILES: dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]] = {
+    "an array less": (lambda arrays, _: arrays.pop("texture.1"), "texture.1 is missing"),
+    "an array more": (
+        lambda arrays, _: arrays.update({"texture": np.zeros(1, np.uint8)}), "expected: 'texture'"
+    ),
+    "texels in doubles": (
+        lambda arrays, _: arrays.update({"texture.0": np.zeros((1, 1, 3))}), "expected U8 or F16"
+    ),
+    "other texels": (
+        lambda arrays, _: arrays.update({"texture.0": arrays["texture.0"] ^ 1}), "has the content"
+    ),
+    "radiance of NaN": (
+        lambda arrays, _: arrays.update(
+            environment=np.full((1, 2, 3), np.nan, np.float32)
+        ),
+        "is nan",
+    ),
+    "sRGB said of one alone": (
+        lambda _, record: record.update(is_srgb=[True]), "for each texture"
+    ),
+    "no word of maps": (lambda _, record: record.pop("maps"), "exactly where there are any"),
+    "no word of maps, and an older version": (
+        lambda _, record: (record.pop("maps"), record.update(schema_version=3)),
+        "textures is missing",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SCENE_FILES)
+def test_a_hostile_scene_file_is_one_line(name: str) -> None:
+    change, message = SCENE_FILES[name]
+    data = encode_scene(textured_scene(environment=sky()))
+    length = int.from_bytes(data[:8], "little")
+    record = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["trilight_scene"])
+    arrays = dict(load(data))
+    change(arrays, record)
+    changed = save(arrays, {"trilight_scene": json.dumps(record)})
+    with pytest.raises(TrilightError, match=message) as caught:
+        decode_scene_file(changed, "a.safetensors")
+    assert str(caught.value).startswith("a.safetensors: ") and "\n" not in str(caught.value)
