@@ -32,7 +32,7 @@ _ROWS = 32
 """Rows of a picture that are mixed at a time while rendering: they stay in the processor's cache.
 """
 
-_LEAST_TRUST = 30.0
+_MOST_DOUBT = 30.0
 """A ray that is not trusted at all counts e^-30: its pixel, all alone, still shows it."""
 
 
@@ -95,7 +95,7 @@ def _mixed(alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> 
     """Return light and albedo [V, 6, R, R], mixed with the same weights."""
     height = both_V6RR.shape[2]
     frame = (step, step, step, step)
-    trust = torch.exp(-softplus(-alike_VCRR[:, _ALIKE:]).clamp(max=_LEAST_TRUST))
+    trust = torch.exp(-softplus(-alike_VCRR[:, _ALIKE:]).clamp(max=_MOST_DOUBT))
     around = pad(torch.cat([alike_VCRR[:, :_ALIKE], trust, both_V6RR], dim=1), frame)
     rows = height if torch.is_grad_enabled() else _ROWS
     return torch.cat(

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from model.hits.light_filter import (
     _ALIKE,
-    _LEAST_TRUST,
+    _MOST_DOUBT,
     STEPS_PX,
     TAPS,
     LightFilter,
@@ -128,4 +128,4 @@ def test_extremes_stay_finite(factor: float) -> None:
     assert mixed.isfinite().all()
     assert not mixed[:, :8].any(), "no specular albedo: nothing is mirrored"
     assert (factor == 0) == (not mixed.any())
-    assert _LEAST_TRUST < 80, "e^-80 is near the smallest float"
+    assert _MOST_DOUBT < 80, "e^-80 is near the smallest float"
