@@ -4,20 +4,25 @@
     python -m infra.setup.builtin_network RUN --data SET --evaluation EVALUATION --command "..."
 
 With `--also OTHER`, evaluations of it on other sets, such as benchmark-v1, stand on the card too.
+How it flickers comes from the newest results of `trilight bench flicker-64`, if they are of it.
 
 Only data of objects that ask for nothing (CC0) may be behind it, and only a small file is shipped.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import cyclopts
+import numpy as np
 from cyclopts import Parameter
 
+from infra.bench.experiments.rungs import network_name, samples_name
+from infra.bench.run import RESULTS, store_of
 from model.open import BUILTIN_NETWORKS
 from model.weights import decode_weights, network_digest
+from pipeline.renders.settings import Filtered
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.digests import sha256_hex
@@ -43,6 +48,9 @@ _HEADS = {
     ),
 }
 """What each network that comes along is for, by its name."""
+
+WORST = 5
+"""Views that the card names as its worst."""
 
 ALLOWED_LICENCES = {"CC0-1.0"}
 
@@ -70,7 +78,14 @@ def main(
     lines += _card(dataset, about, judged, summary, weights, command)
     for each in others:
         lines += ["", *_scores(each)]
-    lines += ["", "```json", json.dumps(about["settings"], indent=1, sort_keys=True), "```", ""]
+    lines += [
+        *_flicker(network_digest(decode_weights(weights))),
+        "",
+        "```json",
+        json.dumps(about["settings"], indent=1, sort_keys=True),
+        "```",
+        "",
+    ]
     write_atomically(place, weights)
     write_atomically(place.with_name("README.md"), "\n".join(lines).encode())
 
@@ -140,10 +155,10 @@ def _scores(judged: Mapping[str, Any]) -> list[str]:
     contestants = {NETWORK: everybody[NETWORK]} | everybody  # the file has them by their names
     traced = judged["path tracer"] or {}
     lines = [
-        f"Scores on `{about['data']}`, build {about['build']}, split {about['split']} "
-        f"({about['scenes']} scenes, "
+        f"Scores on {about['scenes']} scenes of split {about['split']} of build {about['build']}, "
         f"{len(judged['views'])} views of {about['resolution']} pixels, objects that it has not "
-        "seen; medians, in brackets the worse 5 %):",
+        f"seen (`{about['data']}`, dataset digest {about['data digest'][:8]}); medians, in "
+        "brackets the worse 5 %:",
         "",
         f"| | {' | '.join(judged['metrics'])} |",
         f"|{'---|' * (len(judged['metrics']) + 1)}",
@@ -160,7 +175,42 @@ def _scores(judged: Mapping[str, Any]) -> list[str]:
             f"With the triangles of another scene it loses {swapped['median_db']:.2f} dB of "
             f"psnr_log_db in the median and {swapped['mean_db']:.2f} dB on average.",
         ]
-    return lines
+    return [*lines, "", _worst(judged["views"])]
+
+
+def _worst(views: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on the views that it misses most."""
+    by_error = sorted(views, key=lambda view: view["scores"][NETWORK]["psnr_log_db"])
+    each = [
+        f"{view['key']} ({view['scores'][NETWORK]['psnr_log_db']:.1f} dB, {view['template']}, "
+        f"{view['num_lights']} lights, mean roughness {view['roughness']:.2f})"
+        for view in by_error[:WORST]
+    ]
+    return f"Worst views, by scene: {'; '.join(each)}."
+
+
+def _flicker(network: str) -> list[str]:
+    """Return what the newest results of films say of the network; nothing where they are not."""
+    found = [
+        run
+        for effort in ("careful", "quick")
+        if (run := store_of(RESULTS, "flicker-64", effort).newest()) is not None
+    ]
+    if not found or not any(network[:8] in note for note in found[0].notes):
+        return []
+    run = found[0]
+
+    def median(point: str) -> float:
+        return float(np.median([figures[point]["flicker_db"] for figures in run.turns.values()]))
+
+    samples: list[tuple[int, Filtered]] = [(1, "fast"), (4, "fast"), (16, "fast")]
+    rivals = ", ".join(f"{median(name):.1f} by {name}" for name in map(samples_name, samples))
+    return [
+        "",
+        f"Flicker of orbits of 24 frames, {len(run.turns)} scenes of `trilight bench flicker-64` "
+        f"({run.date}), median in dB, more is calmer: {median(network_name('builtin:')):.1f}; "
+        f"the path tracer has {rivals}.",
+    ]
 
 
 def _shown(figures: Mapping[str, Any]) -> str:

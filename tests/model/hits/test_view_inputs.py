@@ -97,7 +97,9 @@ def test_equal_arguments_equal_numbers_and_another_seed_another_noise() -> None:
     assert not np.array_equal(one.pixels, other.pixels)
 
 
-@pytest.mark.parametrize("resolution", [8, 24, 100, 256])
+@pytest.mark.parametrize(
+    "resolution", [8, 24, 100, 256, pytest.param(1024, marks=pytest.mark.slow)]
+)
 def test_any_width_shows_the_same_scene(resolution: int) -> None:
     """Means of a picture and of one with 16 rays a pixel; 64 pixels see a highlight by chance."""
     tolerance = 0.03 if resolution > 8 else 0.2
@@ -105,6 +107,23 @@ def test_any_width_shows_the_same_scene(resolution: int) -> None:
     many = traced(corner(), 64, rays_a_side=4)
     assert few.pixels.shape == (resolution, resolution, NUM_CHANNELS)
     assert direct(few).mean() == pytest.approx(direct(many).mean(), rel=tolerance)
+
+
+def test_edges_near_those_of_256_rays_as_rays_grow() -> None:
+    """Evenly spread rays miss an edge by their distance: twice as many a side, less than half.
+
+    0.6 instead of 0.5, since an edge along the rays' rows sees no more of them for a while.
+    """
+
+    def shown(rays_a_side: int) -> np.ndarray:
+        pixels = traced(corner(), 48, rays_a_side=rays_a_side, gather_rays=0).pixels
+        return pixels[..., Channel.COVERAGE] * pixels[..., Channel.DIFFUSE]
+
+    truth = shown(16)
+    missed = [float(np.abs(shown(rays) - truth).mean()) for rays in (1, 2, 4)]
+    assert missed[1] < 0.6 * missed[0]
+    assert missed[2] < 0.6 * missed[1]
+    assert missed[1] < 0.004  # measured 0.0023: 38.8 dB, 2 x 2 rays of 256
 
 
 def _small_lamp(column: int, row: int, height: float) -> np.ndarray:
