@@ -134,7 +134,7 @@ def documented_run(flow: str = "", **replaced: object) -> list[str]:
         flow: another flow, of those that the page names below.
         replaced: values of its parameters that a test has smaller, or elsewhere; others are added.
     """
-    _, line, _ = documented_serving()
+    _, line, _, _ = documented_serving()
     command, *words = shlex.split(line)
     assert command == "prefect"
     places = [at for at, word in enumerate(words) if word == "-p"]

@@ -54,8 +54,9 @@ def _verified(out: Path) -> str:
 
 def test_the_readme_serves_runs_and_stops_as_is_done_here() -> None:
     """`served` runs what `make serve` and `make stop` run; the line between is run below."""
-    serve, run, stop = documented_serving()
+    serve, run, submit, stop = documented_serving()
     assert run.startswith("prefect deployment run generate-scenes/local ")
+    assert submit.startswith("trilight submit generate-scenes smoke --scenes 64 --out ")
     for line, last in ((serve, START), (stop, STOP)):
         # under `make test` a make that is called says in which folder it works
         make = ["make", "--dry-run", "--no-print-directory", "--old-file", "setup"]
@@ -75,6 +76,7 @@ def test_four_ways_one_digest(tmp_path: Path) -> None:
     with postgres() as database, served(tmp_path, database.url, workers=2) as environment:
         call(documented_run(**SMALL, out=tmp_path / "one"), environment, RUN_S)
         digests["one worker"] = _verified(tmp_path / "one")
+        _submits(tmp_path / "one", environment, digests["one worker"])
         several = documented_run("build-dataset", **SMALL, out=tmp_path / "two", flow_runs=2)
         call(several, environment, RUN_S)
         digests["two workers"] = _verified(tmp_path / "two")
@@ -86,6 +88,14 @@ def test_four_ways_one_digest(tmp_path: Path) -> None:
         digests["dask"] = _verified(tmp_path / "dask")
     assert len(_makers(tmp_path / "dask")) >= 2
     assert len(set(digests.values())) == 1, digests
+
+
+def _submits(out: Path, environment: dict[str, str], digest: str) -> None:
+    """Ask for what is there already: the run finds it whole, and its summary arrives here."""
+    words = ("submit", "generate-scenes", "smoke", *OPTIONS, "--scenes", str(MANY), "--json")
+    text = call(["-m", "trilight", *words, "--out", str(out)], environment, RUN_S)
+    told = json.loads(text)
+    assert (told["state"], told["summary"]["dataset digest"]) == ("Completed", digest)
 
 
 def _makers(out: Path) -> set[int]:
