@@ -35,6 +35,8 @@ class PreparedAsset:
     """Digest of that file."""
     geometry_sha256: str
     """Digest of its cleaned geometry."""
+    without_own: str = ""
+    """Reason code of why it goes without materials of its own, where they were asked for."""
 
 
 def prepare_assets(
@@ -98,11 +100,13 @@ def _prepare_once(
                 raise outcome
             store.keep(key, outcome)
     data = path.read_bytes()
+    asset = decode_asset(data)
     return PreparedAsset(
         record=record,
         path=path,
         asset_sha256=sha256_hex(data),
-        geometry_sha256=decode_asset(data).geometry_sha256,
+        geometry_sha256=asset.geometry_sha256,
+        without_own="" if asset.materials is None else asset.materials.reason,
     )
 
 
