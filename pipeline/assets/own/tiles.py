@@ -47,8 +47,8 @@ def tile_weights(cells: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     column, row = np.meshgrid(np.arange(cells + 2), np.arange(cells + 2), indexing="xy")
     mine = column + row <= cells + 1
     places = np.stack([column[mine], row[mine]], axis=1)
-    across = np.minimum(places, cells).astype(np.float64)
-    across /= np.maximum(across.sum(axis=1, keepdims=True), cells)
+    inside = np.minimum(places, cells)
+    across = inside / np.maximum(inside.sum(axis=1, keepdims=True), cells)
     return places, np.concatenate([1 - across.sum(axis=1, keepdims=True), across], axis=1)
 
 
