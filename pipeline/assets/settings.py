@@ -48,12 +48,12 @@ class OwnMaterialSettings:
     `scenes.materials.source=object`."""
     texels: Annotated[int, Within(1, 8192, unit="texels")] = 256
     """Texels along the longest side of an object's bounding box."""
-    size: Annotated[int, Within(16, 8192, unit="texels")] = 512
+    size: Annotated[int, Within(16, 2048, unit="texels")] = 512
     """Greatest width and height of a level's texture. A level of much surface gets fewer texels
     until it fits; more than that has only one of more triangles than such a texture has room for.
     """
     max_pixels: Annotated[int, Within(1, 268_435_456, unit="pixels")] = 67_108_864
-    """Most pixels of a picture in a source, as many as 8192 x 8192."""
+    """Most pixels of all pictures of an object, as many as one of 8192 x 8192 has."""
     max_colour_error: Annotated[float, PART] = 0.05
     """Largest accepted mean difference of linear colour between a level and its source."""
     max_missed: Annotated[float, PART] = 0.1

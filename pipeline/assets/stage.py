@@ -166,7 +166,7 @@ def _by_any_method(
                 raise
             death = failure
             continue
-        asset = attempt.asset
+        asset = _remembering(asset, attempt.asset)
         if attempt.method in waiting:  # it stood in for what is not safe for this mesh
             waiting = waiting[waiting.index(attempt.method) + 1 :]
         levels += asset.levels
@@ -182,6 +182,13 @@ def _by_any_method(
         assert first_miss is not None
         raise Rejected(*first_miss)
     return dataclasses.replace(asset, levels=_rising(levels))
+
+
+def _remembering(before: Asset | None, now: Asset) -> Asset:
+    """Return what an attempt found, and why an earlier one kept no materials of its own."""
+    if before is None or before.materials is None or not before.materials.reason:
+        return now
+    return dataclasses.replace(now, materials=before.materials)
 
 
 def _rising(levels: list[Level]) -> tuple[Level, ...]:

@@ -22,6 +22,22 @@ Wrap = Literal["repeat", "clamp", "mirror"]
 FORMATS = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "TIFF")
 """What is decoded; a file of another format is refused by its content."""
 
+_STRIP = 256  # rows, an even number
+
+
+class Decoder:
+    """Decodes the pictures of one object, all together within a number of pixels."""
+
+    def __init__(self, max_pixels: int) -> None:
+        """Begin with that many."""
+        self._left = max_pixels
+
+    def __call__(self, data: bytes, name: str) -> NDArray:
+        """Return `decoded`, within what is left."""
+        values = decoded(data, name, self._left)
+        self._left -= values.shape[0] * values.shape[1]
+        return values
+
 
 def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
     """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 of greys of 16 bits.
@@ -39,7 +55,7 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
                     raise Rejected(
                         "texture_too_large",
                         f"{name!r:.80} is {image.width} x {image.height}; at most {max_pixels} "
-                        "pixels are read. Make it smaller, or raise own_materials.max_pixels",
+                        "pixels are left for it. Make it smaller, or raise own_materials.max_pixels",
                     )
                 return np.ascontiguousarray(_values(image)[::-1])
     except (Rejected, MemoryError):
@@ -80,9 +96,12 @@ class Picture:
         """Return the picture halved `number` times, in linear values from the first halving on."""
         if number == 0:
             return self.values
+        if not self._levels:
+            rows = range(0, len(self.values), _STRIP)  # a large picture in floats is too much
+            strips = [_halved(self.linear(self.values[row : row + _STRIP])) for row in rows]
+            self._levels.append(np.concatenate(strips))
         while len(self._levels) < number:
-            finer = self._levels[-1] if self._levels else self.linear(self.values)
-            self._levels.append(_halved(finer))
+            self._levels.append(_halved(self._levels[-1]))
         return self._levels[number - 1]
 
     @property
@@ -95,11 +114,11 @@ class Picture:
         if texels.dtype == np.float32:
             return texels
         if texels.dtype == np.uint16:
-            deep: NDArray[np.float32] = (texels / 65535).astype(np.float32)
+            deep: NDArray[np.float32] = np.divide(texels, 65535, dtype=np.float32)
             if self.is_srgb:
                 deep[..., :3] = _from_srgb(deep[..., :3])
             return deep
-        found: NDArray[np.float32] = (texels / 255).astype(np.float32)
+        found: NDArray[np.float32] = np.divide(texels, 255, dtype=np.float32)
         if self.is_srgb:
             found[..., :3] = linear_from_srgb8()[texels[..., :3]]
         return found

@@ -14,7 +14,7 @@ from pipeline.assets.own.measure import skin_quality
 from pipeline.assets.own.nearest import NearestPlaces
 from pipeline.assets.own.obj_materials import bare_obj, obj_materials
 from pipeline.assets.own.parts import TexturedParts, load_parts
-from pipeline.assets.own.picture import decoded
+from pipeline.assets.own.picture import Decoder
 from pipeline.assets.own.source_material import SourceMaterial
 from pipeline.assets.own.source_surface import SourceSurface, source_surface
 from pipeline.assets.reading.gltf_tree import read_tree
@@ -86,7 +86,7 @@ def skin_maker(
             texture_too_large, texture_unreadable, no_texture_coordinates or
             texture_coordinates_not_finite.
     """
-    parts = _parts(source, lambda data, name: decoded(data, name, settings.max_pixels))
+    parts = _parts(source, Decoder(settings.max_pixels))
     lost = sorted({word for material in parts.materials for word in material.lost})
     surface = source_surface(mesh, parts)
     return SkinMaker(surface, settings), OwnMaterials(lost=tuple(lost))

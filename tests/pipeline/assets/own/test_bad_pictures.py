@@ -1,5 +1,6 @@
 """Pictures and coordinates as people really have them: read, or lost with a reason."""
 
+import dataclasses
 import json
 import struct
 import zlib
@@ -10,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.assets.own.picture import Picture
+from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from storage.conventions import linear_from_srgb8
 from tests.pipeline.assets.meshes_by_hand import prepare as prepare_asset
 from tests.pipeline.assets.meshes_by_hand import reason_of, write_glb
@@ -60,6 +63,31 @@ def test_bad_pictures_are_lost_with_a_reason(tmp_path: Path, name: str) -> None:
     path = textured_glb(tmp_path / "a.glb", data)
     assert lost(path) == reason
     assert reason_of(path, REFUSE) == reason
+
+
+def test_many_pictures_count_together(tmp_path: Path) -> None:
+    tree, buffer = textured_tree(WHOLE)
+    metal = tree["materials"][0]["pbrMetallicRoughness"]
+    metal["metallicRoughnessTexture"] = {"index": 1}
+    tree["textures"].append({"source": 1})
+    tree["images"].append(dict(tree["images"][0]))
+    path = write_glb(tmp_path / "a.glb", tree, buffer)
+    enough = OwnMaterialSettings(keep=True, texels=16, max_pixels=2 * 64 * 64, max_colour_error=1.0)
+    materials = prepare_asset(path, AssetSettings(own_materials=enough)).materials
+    assert materials is not None and materials.reason == ""
+    less = dataclasses.replace(enough, max_pixels=2 * 64 * 64 - 1)
+    assert lost(path, AssetSettings(own_materials=less)) == "texture_too_large"
+
+
+def test_a_halved_picture_is_its_mean_in_linear_light() -> None:
+    """Of an odd number of rows and more than one strip of them."""
+    codes = np.random.default_rng(1).integers(0, 256, (301, 6, 4)).astype(np.uint8)
+    picture = Picture(values=codes, is_srgb=True)
+    linear = picture.linear(codes).astype(np.float64)
+    wanted = linear[:300].reshape(150, 2, 3, 2, 4).mean(axis=(1, 3))
+    assert np.abs(picture.level(1)[:150] - wanted).max() < 1e-6
+    assert picture.level(1).shape == (151, 3, 4)
+    assert np.abs(picture.level(1)[150] - linear[300].reshape(3, 2, 4).mean(axis=1)).max() < 1e-6
 
 
 OUTSIDE = [
