@@ -55,7 +55,7 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
                     raise Rejected(
                         "texture_too_large",
                         f"{name!r:.80} is {image.width} x {image.height}; at most {max_pixels} "
-                        "pixels are left for it. Make it smaller, or raise own_materials.max_pixels",
+                        "pixels are left. Make it smaller, or raise own_materials.max_pixels",
                     )
                 return np.ascontiguousarray(_values(image)[::-1])
     except (Rejected, MemoryError):
