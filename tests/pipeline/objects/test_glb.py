@@ -1,6 +1,7 @@
 """A textured mesh as GLB comes back as what it was, by our reading and by another library's."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -57,7 +58,7 @@ def test_metal_comes_back_as_the_same_light(tmp_path: Path) -> None:
 def test_another_library_reads_it(tmp_path: Path) -> None:
     asset = prepare(textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS)), KEEP)
     path = _written(tmp_path / "b.glb", asset.levels[0])
-    mesh = trimesh.load_mesh(path, process=False)
+    mesh: Any = trimesh.load_mesh(path, process=False)
     colours = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
     for triangle, uv in zip(mesh.triangles, mesh.visual.uv[mesh.faces], strict=True):
         centre, (u, v) = triangle.mean(axis=0), uv.mean(axis=0)  # +Y is up, and v is up here
