@@ -77,7 +77,7 @@ class Atlas:
             at = np.broadcast_to(self.corner[tile] + FLAT / 2, (3, 2)).astype(np.float64)
         else:
             corners = np.array([[0, 0], [cells, 0], [0, cells]])
-            at = self.texels(tile, corners) + 0.5
+            at = self.texels(tile, corners).astype(np.float64) + 0.5
         return at / np.array([self.width, self.height])
 
 
