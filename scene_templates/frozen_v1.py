@@ -56,6 +56,8 @@ SCENES_V1 = SceneSettings(
         triangle_colours_share=0.5,
         coloured_specular_share=0.0,
         smooth_angle_deg=30.0,
+        source="drawn",
+        own_share=1.0,
     ),
     textures=TextureSettings(share=0.0, tile_m=(0.4, 1.6), surfaces=SurfaceMapSettings()),
     lights=LightSettings(

@@ -6,9 +6,10 @@ albedo everywhere.
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import pydantic
 
 from scene_templates.checks import Range, require
 from scene_templates.layout import SurfaceLook
@@ -42,6 +43,18 @@ class MaterialSettings:
     untinted value. An option: the published scenes have none, and so no metal but grey ones."""
     smooth_angle_deg: Annotated[float, Within(0, 180, unit="degrees")] = 30.0
     """Angle between faces above which an edge separates shading groups."""
+    source: Literal["drawn", "object"] = "drawn"
+    """Where the materials of objects come from: `object` keeps those of their files, as textures;
+    an object without any, and floors and walls, get drawn ones in either case."""
+    own_share: Share = 1.0
+    """Share of the objects that keep their own materials where `source` is `object`."""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out the source where materials are drawn: digests of earlier builds stay."""
+        record: dict[str, Any] = as_usual(self)
+        absent = ("source", "own_share") if self.source == "drawn" else ()
+        return {name: value for name, value in record.items() if name not in absent}
 
     def __post_init__(self) -> None:
         low, bias = self.roughness_log[0], self.roughness_bias

@@ -18,7 +18,7 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import Shown, command
-from pipeline.assets.settings import AssetSettings, Profile
+from pipeline.assets.settings import AssetSettings, OwnMaterialSettings, Profile
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason
@@ -27,7 +27,7 @@ from storage.settings.described import checked, described
 from storage.settings.ranges import Within
 
 if TYPE_CHECKING:
-    from pipeline.making.make_assets import AssetReport
+    from pipeline.making.make_assets import AssetFolder, AssetReport
 
 _BUDGET = 1400
 """The finest level of the builds with 1536 triangles a scene."""
@@ -53,6 +53,9 @@ class Meshes:
     profile: Profile = "faithful"
     """Method: faithful puts triangles where the shape needs them, uniform makes them about equally
     large."""
+    own_materials: bool = False
+    """Keep the materials and textures of the objects: those that have any become GLB files in their
+    own colours."""
     licence: str | None = None
     """Licence of object files that state none; by default such files count as your own work."""
     allow_licences: tuple[str, ...] = ()
@@ -86,12 +89,20 @@ def assets(asked: Meshes, shown: Shown) -> None:
     if shown.json:
         print_json(report.as_json())
         return
+    _tell(report, asked, settings, folder)
+
+
+def _tell(
+    report: "AssetReport", asked: Meshes, settings: AssetSettings, folder: "AssetFolder"
+) -> None:
+    """Print what became of the objects, and what to look at and do next."""
     _print_table(report)
     decimated = [row for row in report.rows if row.method != "source"]
     rows = [
         ("accepted", f"{len(report.rows)}, of which {report.num_repaired} repaired"),
         ("decimated", f"{len(decimated)}; the others are within the budget as they are"),
         *_epsilon_rows(report, settings),
+        *_material_rows(report, settings),
         ("rejected", f"{len(report.failures)}"),
         *(("", f"{count} x {reason}") for _, reason, count in count_by_reason(report.failures)),
         ("meshes, catalogue", f"{folder.meshes}, {folder.catalogue}"),
@@ -99,7 +110,14 @@ def assets(asked: Meshes, shown: Shown) -> None:
     print_rows("Assets finished", rows)
     look_at(f"Look at {folder.page}")
     if report.rows:
-        next_step(generate_from_meshes(report.geometry_sha256, out, asked.allow_licences))
+        next_step(
+            generate_from_meshes(
+                report.geometry_sha256,
+                asked.out,
+                asked.allow_licences,
+                own_materials=asked.own_materials,
+            )
+        )
 
 
 def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:
@@ -114,12 +132,22 @@ def _epsilon_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[
     ]
 
 
+def _material_rows(report: "AssetReport", settings: AssetSettings) -> list[tuple[str, str]]:
+    if not settings.own_materials.keep:
+        return []
+    kept = sum(row.colours is not None for row in report.rows)
+    found = [row.materials.reason for row in report.rows if row.materials and row.materials.reason]
+    reasons = [f"{found.count(reason)} x {reason}" for reason in sorted(set(found))]
+    return [("in their own materials", ", ".join([f"{kept} of {len(report.rows)}", *reasons]))]
+
+
 def _settings(asked: Meshes) -> AssetSettings:
     usual = _EPSILON_BUDGET if asked.epsilon else _BUDGET
     return AssetSettings(
         profile=asked.profile,
         budgets=(usual if asked.budget is None else asked.budget,),
         epsilon=_share(asked.epsilon) if asked.epsilon else None,
+        own_materials=OwnMaterialSettings(keep=asked.own_materials),
     )
 
 

@@ -10,7 +10,11 @@ _BUILD = "smoke"
 
 
 def generate_from_meshes(
-    geometry_sha256: Sequence[str], folder: Path, allow_licences: Sequence[str]
+    geometry_sha256: Sequence[str],
+    folder: Path,
+    allow_licences: Sequence[str],
+    *,
+    own_materials: bool = False,
 ) -> list[str]:
     """Return the words of a `generate` for which there are objects in every split that it needs.
 
@@ -21,12 +25,15 @@ def generate_from_meshes(
         geometry_sha256: digests of the meshes, by which objects are dealt to splits.
         folder: where they are.
         allow_licences: those that were allowed beside the usual ones.
+        own_materials: whether meshes keep their own.
     """
     splits = named_build(_BUILD).splits
     there = {split_of_object(digest, splits) for digest in geometry_sha256}
     words = ["generate", _BUILD, "--objects", str(folder), "--out", f"{folder}-{_BUILD}"]
     shards = shards_for(BUILDS[_BUILD].num_scenes, splits)
     enough = next((i for i in range(shards) if split_of_shard(i, splits) not in there), shards)
+    if own_materials:
+        words += ["--set", "scenes.materials.source=object"]
     if enough == 0:
         words += ["--set", "splits.one_split=true"]
     elif enough < shards:

@@ -13,6 +13,7 @@ from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.decimation.by_name import decimate, safe_method
 from pipeline.assets.decimation.smallest import smallest_passing
 from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.own.levels import with_own_materials
 from pipeline.assets.quality.gate import check_level
 from pipeline.assets.quality.measure import MeasuredSource
 from pipeline.assets.quality.triangles import count_edges
@@ -47,7 +48,7 @@ def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAtte
     Raises:
         Rejected: the object is unusable by any method; the reason codes are those of the steps.
 
-    What it does not do: close holes, remove inner parts, or keep textures.
+    What it does not do: close holes, or remove inner parts.
     """
     source = read_source(path, settings)
     raw = load_mesh(source)
@@ -58,6 +59,7 @@ def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAtte
     measured = MeasuredSource(mesh)
     used = safe_method(mesh, method)
     levels, missed = _levels(measured, settings, used)
+    levels, missed, materials = with_own_materials(levels, missed, source, mesh, settings)
     return AssetAttempt(
         method=used,
         asset=Asset(
@@ -66,6 +68,7 @@ def prepare_asset(path: Path, settings: AssetSettings, method: str) -> AssetAtte
             recipe=RECIPE,
             source=_facts(raw, cleaned, measured, front_share),
             levels=levels,
+            materials=materials,
         ),
         missed=missed,
     )

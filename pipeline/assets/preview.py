@@ -9,10 +9,14 @@ from pipeline.assets.cleaning.clean import clean, normalise
 from pipeline.assets.cleaning.orient import orient_outward
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.outside_rays import first_faces
+from pipeline.assets.own.nearest import barycentric
 from pipeline.assets.reading.load import load_mesh
 from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.settings import AssetSettings
+from storage.conventions import srgb8
 from storage.records.asset import Level
+from storage.records.lookup import texture_values
+from storage.records.skin import LevelSkin
 
 _TOWARDS_CAMERA = np.array([0.62, -0.62, 0.48])
 _BACKGROUND = 1.0
@@ -33,11 +37,33 @@ def preview_source(path: Path, settings: AssetSettings, width_px: int) -> NDArra
 
 
 def preview_level(level: Level, width_px: int) -> NDArray[np.uint8]:
-    """Return a grey picture [W, W] of a level of an asset."""
+    """Return a picture of a level of an asset: grey [W, W], or [W, W, 3] where it has colours."""
     mesh = TriangleMesh(
         positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
     )
-    return preview(mesh, width_px)
+    grey = preview(mesh, width_px)
+    return grey if level.skin is None else _coloured(mesh, level.skin, width_px)
+
+
+def _coloured(mesh: TriangleMesh, skin: LevelSkin, width_px: int) -> NDArray[np.uint8]:
+    """Return a picture [W, W, 3] of a mesh in its own colours, without lines."""
+    wide = width_px * _SUPERSAMPLE
+    origins, directions, _ = _camera_rays(wide)
+    face = first_faces(mesh, origins.astype(np.float32), directions.astype(np.float32))
+    hit = face >= 0
+    colour = np.full((len(face), 3), _BACKGROUND)
+    corners, normals = mesh.corners[face[hit]], mesh.double_area_vectors[face[hit]]
+    facing = np.einsum("ij,ij->i", normals, -directions[hit])
+    facing /= np.linalg.norm(normals, axis=1)
+    away = np.einsum("ij,ij->i", normals, origins[hit] - corners[:, 0])
+    steep = np.einsum("ij,ij->i", normals, -directions[hit])
+    distance = away / np.where(np.abs(steep) > 1e-12, steep, 1e-12)
+    points = origins[hit] + distance[:, None] * directions[hit]
+    uv = np.einsum("nc,ncd->nd", barycentric(corners, points), skin.uv[face[hit]])
+    diffuse, specular = (texture_values(texture, uv) for texture in skin.textures[:2])
+    colour[hit] = (diffuse + specular) * (0.25 + 0.75 * np.abs(facing))[:, None]
+    blocks = colour.reshape(width_px, _SUPERSAMPLE, width_px, _SUPERSAMPLE, 3).mean(axis=(1, 3))
+    return srgb8(blocks)
 
 
 def preview(mesh: TriangleMesh, width_px: int) -> NDArray[np.uint8]:

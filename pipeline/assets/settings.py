@@ -1,7 +1,9 @@
 """Settings of the mesh stage."""
 
 import dataclasses
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
+
+import pydantic
 
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -38,6 +40,31 @@ class GateSettings:
 
 
 @checked()
+class OwnMaterialSettings:
+    """Whether objects keep the materials of their files, and what is refused of those."""
+
+    keep: bool = False
+    """Whether they do, as textures that are baked onto each level. Implied by
+    `scenes.materials.source=object`."""
+    texels: Annotated[int, Within(1, 8192, unit="texels")] = 256
+    """Texels along the longest side of an object's bounding box."""
+    size: Annotated[int, Within(16, 2048, unit="texels")] = 512
+    """Greatest width and height of a level's texture. A level of much surface gets fewer texels
+    until it fits; more than that has only one of more triangles than such a texture has room for.
+    """
+    max_pixels: Annotated[int, Within(1, 268_435_456, unit="pixels")] = 67_108_864
+    """Most pixels of all pictures of an object, as many as one of 8192 x 8192 has."""
+    max_colour_error: Annotated[float, PART] = 0.05
+    """Largest accepted mean difference of linear colour between a level and its source."""
+    max_missed: Annotated[float, PART] = 0.1
+    """Largest accepted share of texels for which the source has no surface nearby that faces the
+    same way."""
+    if_lost: Literal["drawn", "reject"] = "drawn"
+    """What becomes of an object whose materials are missing, unreadable or too far off: `drawn`
+    accepts it, to be given drawn ones, with the reason in its record; `reject` refuses it."""
+
+
+@checked()
 class AssetSettings:
     """How finely objects are kept, and what is refused. Importing it loads no mesh library."""
 
@@ -64,6 +91,16 @@ class AssetSettings:
     """Most triangles of an accepted source, instances counted."""
     max_instances: Annotated[int, Within(1, 1_000_000, unit="nodes")] = 10_000
     """Most nodes of a glTF scene that place a mesh."""
+    own_materials: OwnMaterialSettings = dataclasses.field(default_factory=OwnMaterialSettings)
+    """What becomes of the materials that files have."""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `own_materials` that nobody keeps: digests of earlier builds stay."""
+        record: dict[str, Any] = as_usual(self)
+        if not self.own_materials.keep:
+            record.pop("own_materials", None)
+        return record
 
     def __post_init__(self) -> None:
         """Raise TrilightError for values that contradict each other or their meaning."""

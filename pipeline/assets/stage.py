@@ -35,6 +35,8 @@ class PreparedAsset:
     """Digest of that file."""
     geometry_sha256: str
     """Digest of its cleaned geometry."""
+    without_own: str = ""
+    """Reason code of why it goes without materials of its own, where they were asked for."""
 
 
 def prepare_assets(
@@ -98,11 +100,13 @@ def _prepare_once(
                 raise outcome
             store.keep(key, outcome)
     data = path.read_bytes()
+    asset = decode_asset(data)
     return PreparedAsset(
         record=record,
         path=path,
         asset_sha256=sha256_hex(data),
-        geometry_sha256=decode_asset(data).geometry_sha256,
+        geometry_sha256=asset.geometry_sha256,
+        without_own="" if asset.materials is None else asset.materials.reason,
     )
 
 
@@ -162,7 +166,7 @@ def _by_any_method(
                 raise
             death = failure
             continue
-        asset = attempt.asset
+        asset = _remembering(asset, attempt.asset)
         if attempt.method in waiting:  # it stood in for what is not safe for this mesh
             waiting = waiting[waiting.index(attempt.method) + 1 :]
         levels += asset.levels
@@ -178,6 +182,13 @@ def _by_any_method(
         assert first_miss is not None
         raise Rejected(*first_miss)
     return dataclasses.replace(asset, levels=_rising(levels))
+
+
+def _remembering(before: Asset | None, now: Asset) -> Asset:
+    """Return what an attempt found, and why an earlier one kept no materials of its own."""
+    if before is None or before.materials is None or not before.materials.reason:
+        return now
+    return dataclasses.replace(now, materials=before.materials)
 
 
 def _rising(levels: list[Level]) -> tuple[Level, ...]:

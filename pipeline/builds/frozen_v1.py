@@ -4,7 +4,7 @@ See scene_templates.frozen_v1. A build that networks are trained on may move on;
 not, so they are built from nothing that does.
 """
 
-from pipeline.assets.settings import AssetSettings, GateSettings
+from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
 from pipeline.builds.settings import BuildSettings
 from pipeline.renders.settings import RenderSettings
 from scene_templates.frozen_v1 import SCENES_V1
@@ -50,6 +50,15 @@ BUILD_V1 = BuildSettings(
         max_source_bytes=200_000_000,
         max_source_faces=1_500_000,
         max_instances=10_000,
+        own_materials=OwnMaterialSettings(
+            keep=False,
+            texels=256,
+            size=512,
+            max_pixels=67_108_864,
+            max_colour_error=0.05,
+            max_missed=0.1,
+            if_lost="drawn",
+        ),
     ),
     scenes=SCENES_V1,
     renders=RenderSettings(

@@ -45,13 +45,25 @@ class BuildSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `revisit` out where there is none: digests of earlier builds stay."""
+        """Leave `revisit` out where there is none: digests of earlier builds stay.
+
+        The mesh stage is recorded as it is run, with what scenes ask of it.
+        """
         record: dict[str, Any] = as_usual(self)
+        if self.mesh_settings.own_materials.keep:
+            record["assets"] = settings_record(self.mesh_settings)
         return {name: value for name, value in record.items() if name != "revisit" or value}
 
     def __post_init__(self) -> None:
         if not self.allowed_licences:
             raise TrilightError("allowed_licences is empty; expected at least one licence.")
+
+    @property
+    def mesh_settings(self) -> AssetSettings:
+        """Settings of the mesh stage: objects keep their materials where scenes ask for those."""
+        own = self.assets.own_materials
+        keep = own.keep or self.scenes.materials.source == "object"
+        return dataclasses.replace(self.assets, own_materials=dataclasses.replace(own, keep=keep))
 
     def as_json(self) -> dict[str, Any]:
         """Return the settings as JSON values."""

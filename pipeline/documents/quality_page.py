@@ -30,7 +30,7 @@ class Pair:
     source: NDArray[np.uint8]
     """[W, W] grey: the cleaned source."""
     result: NDArray[np.uint8]
-    """[W, W] grey: the level."""
+    """[W, W] grey, or [W, W, 3] in its own materials: the level."""
 
 
 def encode_quality_page(
@@ -72,7 +72,23 @@ def _summary(rows: Sequence[AssetRow], failures: Sequence[Failure]) -> Markup:
         f"outward), {closed} watertight; {len(failures)} rejected.",
         Markup("<br>"),
         f"Licences: {shown or 'none'}.",
+        *_own_materials(rows),
     )
+
+
+def _own_materials(rows: Sequence[AssetRow]) -> list[str | Markup]:
+    """Return how many objects have their own materials, and why others do not."""
+    asked = [row.materials for row in rows if row.materials is not None]
+    if not asked:
+        return []
+    kept = sum(row.colours is not None for row in rows)
+    reasons = Counter(found.reason for found in asked if found.reason)
+    lost = Counter(word for found in asked for word in found.lost)
+    why = ", ".join(f"{name} ({count})" for name, count in reasons.most_common())
+    unseen = ", ".join(f"{name} ({count})" for name, count in lost.most_common())
+    text = f"In their own materials: {kept} of {len(rows)}"
+    text += f"; the others: {why}." if why else "."
+    return [Markup("<br>"), text + (f" Not shown of those: {unseen}." if unseen else "")]
 
 
 def _histograms(rows: Sequence[AssetRow], budget: int) -> Markup:
@@ -103,6 +119,11 @@ def _pair(pair: Pair) -> Markup:
         f"{quality.error_p99:.2%}, largest {quality.error_max:.2%}, normals "
         f"{quality.normal_error_deg:.1f}°, outline {quality.silhouette_iou:.1%}"
     )
+    if row.colours is not None:
+        facts += (
+            f"; colours {row.colours.colour_error:.4f} on average, "
+            f"{row.colours.torn_seams:.1%} of the seams torn"
+        )
     return element(
         "div",
         image(png_uri(pair.source), "source"),

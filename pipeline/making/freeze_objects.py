@@ -1,6 +1,7 @@
 """The objects of a dataset, frozen: what its scenes draw from, the same for all its makers."""
 
 import logging
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,6 +66,7 @@ def freeze_objects(
     if frozen is None:
         _require_enough(locked, settings, publication, shown)
         _warn_of(shown, passing)
+        _tell_of_materials(shown, prepared)
         publication.lock_objects(locked)
     else:
         _require_same_objects(shown, frozen, locked)
@@ -128,6 +130,21 @@ def _warn_of(source: str, passing: list[Failure]) -> None:
             "tries them again.",
             source,
             len(passing),
+            counts,
+        )
+
+
+def _tell_of_materials(source: str, prepared: list[PreparedAsset]) -> None:
+    """Say which objects get drawn materials although their own were asked for."""
+    reasons = Counter(asset.without_own for asset in prepared if asset.without_own)
+    if reasons:
+        counts = ", ".join(f"{count} x {why}" for why, count in reasons.most_common())
+        log.warning(
+            "objects %r: %d of %d have no materials of their own at every level (%s) and get drawn "
+            "ones there. `trilight assets --own-materials` says what was found in each.",
+            source,
+            sum(reasons.values()),
+            len(prepared),
             counts,
         )
 

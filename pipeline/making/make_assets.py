@@ -21,6 +21,7 @@ from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
 from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.making.prepare_isolated import asset_child, prepare_isolated
+from pipeline.objects.glb import encode_glb
 from pipeline.objects.ply import encode_ply
 from pipeline.objects.sources import find_objects
 from storage.atomic import write_atomically
@@ -29,6 +30,7 @@ from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.asset import AssetRow, Level, decode_asset
 from storage.records.objects import Failure, write_failures
+from storage.settings.described import settings_record
 
 _PICTURES = 4
 """Objects in each of the groups worst, median and best."""
@@ -179,10 +181,10 @@ def _geometry_sha256(level: Level) -> str:
 
 
 def _row(prepared: PreparedAsset, level: Level) -> AssetRow:
-    record = prepared.record
+    record, asset = prepared.record, decode_asset(prepared.path.read_bytes())
     return AssetRow(
         uid=record.uid,
-        path=f"meshes/{_file_name(record.uid)}",
+        path=f"meshes/{_file_name(record.uid, '.ply' if level.skin is None else '.glb')}",
         title=record.title,
         licence=record.licence,
         licence_source=record.licence_source,
@@ -191,23 +193,32 @@ def _row(prepared: PreparedAsset, level: Level) -> AssetRow:
         num_faces=len(level.faces),
         method=level.record.method,
         quality=level.record.quality,
-        source=decode_asset(prepared.path.read_bytes()).source,
+        source=asset.source,
+        materials=asset.materials,
+        colours=None if level.skin is None else level.skin.quality,
     )
 
 
-def _file_name(uid: str) -> str:
+def _file_name(uid: str, suffix: str) -> str:
     """Return a name that is safe everywhere: a uid is text from outside."""
     readable = re.sub(r"[^A-Za-z0-9]+", "-", uid).strip("-")[-60:]
-    return f"{readable}-{hashlib.sha256(uid.encode()).hexdigest()[:8]}.ply"
+    return f"{readable}-{hashlib.sha256(uid.encode()).hexdigest()[:8]}{suffix}"
+
+
+def _encoded(level: Level) -> bytes:
+    """Return the file of a mesh: PLY, or GLB where it has its own materials."""
+    if level.skin is None:
+        return encode_ply(level.positions, level.faces)
+    return encode_glb(level.positions, level.faces, level.skin.uv, level.skin.textures)
 
 
 def _write(
     folder: AssetFolder, settings: AssetSettings, report: AssetReport, levels: list[Level]
 ) -> None:
     for row, level in zip(report.rows, levels, strict=True):
-        write_atomically(folder.root / row.path, encode_ply(level.positions, level.faces))
+        write_atomically(folder.root / row.path, _encoded(level))
     wanted = {folder.root / row.path for row in report.rows}
-    for path in folder.meshes.glob("*.ply"):
+    for path in (*folder.meshes.glob("*.ply"), *folder.meshes.glob("*.glb")):
         if path not in wanted:
             path.unlink()
     lines = [canonical_json(row.as_json()) + b"\n" for row in report.rows]
@@ -219,7 +230,7 @@ def _write(
         "repaired": report.num_repaired,
         "rejected": len(report.failures),
         "recipe": RECIPE,
-        "settings": dataclasses.asdict(settings),
+        "settings": settings_record(settings),
     }
     write_atomically(folder.summary, json.dumps(summary, indent=1, sort_keys=True).encode())
 
@@ -232,7 +243,7 @@ def _pairs(
 ) -> dict[str, list[Pair]]:
     """Return pictures of source and result for the worst, the median and the best objects."""
     changed = sorted(
-        (index for index, row in enumerate(rows) if row.method != "source"),
+        (i for i, row in enumerate(rows) if row.method != "source" or row.colours is not None),
         key=lambda index: (-rows[index].quality.error_p99, rows[index].uid),
     )
     middle = max(0, len(changed) // 2 - _PICTURES // 2)

@@ -146,7 +146,7 @@ def accept_objects(
     wanted = [record for record in found.records if frozen is None or record.uid in frozen]
     announce_objects(folder, len(wanted))
     prepared, rejected = prepare_isolated(
-        wanted, settings.assets, workers=workers, done=lambda: count_object(folder)
+        wanted, settings.mesh_settings, workers=workers, done=lambda: count_object(folder)
     )
     return freeze_objects(source, found, prepared, rejected, settings, publication)
 

@@ -12,7 +12,16 @@ import numpy as np
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
 from pipeline.scenes.drawn_columns import with_drawn_columns
 from pipeline.scenes.laws import require_laws
-from pipeline.scenes.pieces import ScenePiece, emitter_piece, joined, object_piece, shell_piece
+from pipeline.scenes.own_materials import own_skins
+from pipeline.scenes.pieces import (
+    ScenePiece,
+    Skin,
+    dressed,
+    emitter_piece,
+    joined,
+    object_piece,
+    shell_piece,
+)
 from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.posing import posed
 from pipeline.scenes.shapes import MeshShape
@@ -72,9 +81,9 @@ def compose_scene(
     ]
     layout = layout_rand(rng, settings, plan, shapes)
     name = {"seed": seed, "scene_index": scene_index, "attempt": attempt}
-    pieces = with_drawn_textures(
-        scene_pieces(layout, chosen, shapes, settings, rng), layout, settings.textures, **name
-    )
+    skins = own_skins(chosen, levels, settings.materials, **name)
+    pieces = scene_pieces(layout, chosen, shapes, settings, rng, skins)
+    pieces = with_drawn_textures(pieces, layout, settings.textures, **name)
     arrays = joined(pieces)
     arrays["materials"] = with_drawn_columns(arrays["materials"], **name)
     scene = Scene(
@@ -146,8 +155,11 @@ def scene_pieces(
     shapes: Sequence[MeshShape],
     settings: SceneSettings,
     rng: np.random.Generator,
+    skins: Sequence[Skin | None] | None = None,
 ) -> list[ScenePiece]:
     """Return floor and walls, objects and emitters of a layout, the objects as `shapes`.
+
+    Where an object has one of `skins`, that is what it looks like.
 
     Raises:
         Rejected: "no_faces" where no triangle of an object has an area.
@@ -157,13 +169,14 @@ def scene_pieces(
     emitters = [emitter_piece(emitter, row) for row, emitter in enumerate(layout.emitters)]
     taken = [piece.entry.name for piece in [*shell, *emitters]]
     objects = []
-    for pooled, shape, placement in zip(chosen, shapes, layout.objects, strict=True):
+    looks = [None] * len(chosen) if skins is None else skins
+    for pooled, shape, placement, skin in zip(chosen, shapes, layout.objects, looks, strict=True):
         entry = _entry(pooled, taken)
         taken.append(entry.name)
         positions = posed(shape.points, placement.pose)
-        objects.append(
-            object_piece(entry, positions, shape.faces, placement.surface, rng, angle_deg)
-        )
+        surface = placement.surface
+        piece = object_piece(entry, positions, shape.faces, surface, rng, angle_deg)
+        objects.append(piece if skin is None else dressed(piece, positions, shape.faces, skin))
     pieces = [*shell, *objects, *emitters]
     return pieces if settings.fill_to is None else filled(pieces, settings.fill_to)
 

@@ -1,5 +1,6 @@
 """Pieces of a scene - floor, walls, objects, emitters - and how they join into its arrays."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.posing import without_slivers
+from pipeline.scenes.posing import not_slivers, without_slivers
 from pipeline.scenes.shading import ShadedMesh, flat_shaded, smooth_shaded
 from scene_templates.layout import Emitter, ShellPart, SurfaceLook
 from storage.errors import Rejected
@@ -66,6 +67,28 @@ def object_piece(
     if len(faces) == 0:
         raise Rejected("no_faces", f"{entry.uid}: no triangle of the level has an area")
     return _surfaced(entry, _shaded(positions, faces, surface, smooth_angle_deg), surface, rng)
+
+
+def dressed(
+    piece: ScenePiece, positions: NDArray[np.float32], faces: NDArray[np.uint32], skin: Skin
+) -> ScenePiece:
+    """Return the piece of `object_piece` in a skin of all its faces, slivers included."""
+    kept = not_slivers(positions, faces)
+    uv = skin.uv.reshape(-1, 3, 2)[kept].reshape(-1, 2)
+    return with_skin(piece, dataclasses.replace(skin, uv=uv))
+
+
+def with_skin(piece: ScenePiece, skin: Skin) -> ScenePiece:
+    """Return a piece with textures in the place of its material; its row has their means."""
+    materials = default_rows(1)
+    for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), skin.textures, strict=True):
+        materials[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
+    return dataclasses.replace(
+        piece,
+        materials=materials,
+        material_index=np.zeros(len(piece.mesh.faces), np.int64),
+        skin=skin,
+    )
 
 
 def emitter_piece(emitter: Emitter, row: int) -> ScenePiece:

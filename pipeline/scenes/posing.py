@@ -37,10 +37,16 @@ def posed(points: NDArray[np.float64], pose: Pose) -> NDArray[np.float32]:
     return (pose.radius * rotated(points, pose.rotation) + pose.centre).astype(np.float32)
 
 
+def not_slivers(positions: NDArray[np.float32], faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
+    """Return which faces [F] still have an area after rounding to float32."""
+    corners = positions.astype(np.float64)[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    has_area: NDArray[np.bool_] = np.sqrt(np.sum(np.square(cross), axis=1)) > SMALLEST_DOUBLE_AREA
+    return has_area
+
+
 def without_slivers(
     positions: NDArray[np.float32], faces: NDArray[np.uint32]
 ) -> NDArray[np.uint32]:
     """Return the faces that still have an area after rounding to float32."""
-    corners = positions.astype(np.float64)[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return faces[np.sqrt(np.sum(np.square(cross), axis=1)) > SMALLEST_DOUBLE_AREA]
+    return faces[not_slivers(positions, faces)]

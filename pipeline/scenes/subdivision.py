@@ -10,6 +10,7 @@ import heapq
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import ScenePiece
 from pipeline.scenes.shading import ShadedMesh
@@ -42,9 +43,29 @@ def subdivided(piece: ScenePiece, num_faces: int) -> ScenePiece:
     work = _Work(piece.mesh)
     while work.halve_longest(num_faces):
         pass
+    mesh, origin = work.mesh(), np.array(work.origin)
+    skin = piece.skin
+    if skin is not None:
+        whole = skin.uv.reshape(-1, 3, 2)
+        uv = _carried(piece.mesh, mesh, origin, whole).astype(np.float32)
+        skin = dataclasses.replace(skin, uv=uv.reshape(-1, 2))
     return dataclasses.replace(
-        piece, mesh=work.mesh(), material_index=piece.material_index[np.array(work.origin)]
+        piece, mesh=mesh, material_index=piece.material_index[origin], skin=skin
     )
+
+
+def _carried(
+    before: ShadedMesh, after: ShadedMesh, origin: NDArray[np.int64], uv: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Return coordinates [T, 3, 2] of parts of flat triangles whose corners had `uv` [F, 3, 2]."""
+    whole = before.positions[before.faces].astype(np.float64)[origin]
+    parts = after.positions[after.faces].astype(np.float64)
+    sides = whole[:, 1:] - whole[:, :1]  # [T, 2, 3]
+    steps = np.einsum("tpx,tsx->tps", parts - whole[:, :1], sides)
+    gram = np.einsum("tax,tbx->tab", sides, sides)
+    across = np.linalg.solve(gram, steps.transpose(0, 2, 1)).transpose(0, 2, 1)  # [T, 3, 2]
+    weights = np.concatenate([1 - across.sum(axis=2, keepdims=True), across], axis=2)
+    return np.einsum("tpc,tcu->tpu", np.clip(weights, 0, 1), uv[origin].astype(np.float64))
 
 
 class _Work:

@@ -6,18 +6,16 @@ mirrored, at its stated width, with v up on the sides. Floors and walls stand in
 world, so that each is one flat chart; the cube of an object turns with it.
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scenes.pieces import ScenePiece, Skin
+from pipeline.scenes.pieces import ScenePiece, Skin, with_skin
 from scene_templates.layout import Layout
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
 from storage.conventions import linear_from_srgb8, srgb8
-from storage.records.material import DIFFUSE, ROUGHNESS, SPECULAR, default_rows
 from storage.records.texture import MapSource, Texture
 from storage.seeds import rng_for
 
@@ -58,7 +56,7 @@ def with_drawn_textures(
     for row, (frame, origin) in enumerate(zip(frames, origins, strict=True)):
         rng = rng_for(seed, "texture", scene_index, attempt, row)
         look = draw_look(rng, settings) if textured < MOST_TEXTURED else None
-        if look is not None:
+        if look is not None and pieces[row].skin is None:  # its own materials come first
             found[row] = _textured(pieces[row], look, frame, origin)
             textured += 1
     return found
@@ -67,18 +65,10 @@ def with_drawn_textures(
 def _textured(
     piece: ScenePiece, look: TexturedLook, frame: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> ScenePiece:
-    textures = _textures(look.maps)
-    materials = default_rows(1)
-    for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), textures, strict=True):
-        materials[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
     corners = piece.mesh.positions[piece.mesh.faces].astype(np.float64)
     uv = look.uv(cube_places(_turned_back(corners - origin, frame)))
-    return dataclasses.replace(
-        piece,
-        materials=materials,
-        material_index=np.zeros(len(piece.mesh.faces), np.int64),
-        skin=Skin(uv=uv.astype(np.float32).reshape(-1, 2), textures=textures),
-    )
+    skin = Skin(uv=uv.astype(np.float32).reshape(-1, 2), textures=_textures(look.maps))
+    return with_skin(piece, skin)
 
 
 def cube_places(corners: NDArray[np.float64]) -> NDArray[np.float64]:

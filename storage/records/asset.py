@@ -2,7 +2,8 @@
 
 The file holds, per level, `positions_<budget>` f32 [V, 3] and `faces_<budget>` u32 [F, 3], and in
 its metadata what is known of the source and of each level. Positions are in the unit box: the
-bounding box of the cleaned source is centred on the origin and its longest side is 1.
+bounding box of the cleaned source is centred on the origin and its longest side is 1. Where objects
+keep their own materials it holds their skins too (storage.records.skin); otherwise not a byte more.
 
 `AssetRow` is what `trilight assets` reports of one object. The rows of the accepted objects are a
 catalogue (`objects.jsonl`), so that the output folder is itself a source of objects.
@@ -21,6 +22,14 @@ from safetensors.numpy import save
 from storage.errors import TrilightError
 from storage.records.objects import NamedObject
 from storage.records.safe_read import read_safetensors
+from storage.records.skin import (
+    LevelSkin,
+    OwnMaterials,
+    SkinQuality,
+    as_record,
+    read_skin,
+    skin_arrays,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +114,8 @@ class Level:
     """[V, 3] in the unit box."""
     faces: NDArray[np.uint32]
     """[F, 3], counter-clockwise from outside where the source has an outside."""
+    skin: LevelSkin | None = None
+    """Its look in the source's own materials; None where they are not kept."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,6 +132,8 @@ class Asset:
     """What the file held."""
     levels: tuple[Level, ...]
     """From the largest budget to the smallest."""
+    materials: OwnMaterials | None = None
+    """What became of the source's own materials; None where nobody asked for them."""
 
     def finest_within(self, num_triangles: int) -> Level | None:
         """Return the finest level of at most `num_triangles` faces, or None."""
@@ -134,13 +147,22 @@ def encode_asset(asset: Asset) -> bytes:
     for level in asset.levels:
         arrays[f"positions_{level.record.budget}"] = np.ascontiguousarray(level.positions)
         arrays[f"faces_{level.record.budget}"] = np.ascontiguousarray(level.faces)
-    header = {
+        if level.skin is not None:
+            arrays |= skin_arrays(level.skin, str(level.record.budget))
+    header: dict[str, Any] = {
         "geometry_sha256": asset.geometry_sha256,
         "source_sha256": asset.source_sha256,
         "recipe": asset.recipe,
         "source": dataclasses.asdict(asset.source),
         "levels": [dataclasses.asdict(level.record) for level in asset.levels],
     }
+    if asset.materials is not None:
+        header["materials"] = as_record(asset.materials)
+        header["skins"] = {
+            str(level.record.budget): as_record(level.skin.quality)
+            for level in asset.levels
+            if level.skin is not None
+        }
     return save(arrays, metadata={"asset": json.dumps(header, sort_keys=True)})
 
 
@@ -167,15 +189,25 @@ def _asset(arrays: Mapping[str, NDArray], metadata: Mapping[str, str]) -> Asset:
         LevelRecord(**{**row, "quality": LevelQuality(**row["quality"])})
         for row in header.pop("levels")
     ]
-    levels = tuple(
-        Level(
+    skins = header.pop("skins", {})
+    levels = []
+    for record in records:
+        name = str(record.budget)
+        level = Level(
             record=record,
-            positions=arrays[f"positions_{record.budget}"],
-            faces=arrays[f"faces_{record.budget}"],
+            positions=arrays[f"positions_{name}"],
+            faces=arrays[f"faces_{name}"],
+            skin=read_skin(arrays, skins[name], name) if name in skins else None,
         )
-        for record in records
+        levels.append(level)
+    if (materials := header.pop("materials", None)) is not None:
+        materials = OwnMaterials(**{**materials, "lost": tuple(materials["lost"])})
+    return Asset(
+        levels=tuple(levels),
+        source=SourceFacts(**header.pop("source")),
+        materials=materials,
+        **header,
     )
-    return Asset(levels=levels, source=SourceFacts(**header.pop("source")), **header)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,10 +224,17 @@ class AssetRow(NamedObject):
     """How it compares with the source."""
     source: SourceFacts
     """What the file held."""
+    materials: OwnMaterials | None = None
+    """What became of its own materials; None where nobody asked for them."""
+    colours: SkinQuality | None = None
+    """How the colours of the mesh compare with the source's; None where it has none of its own."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the row as JSON values, with the two judgements that readers ask for."""
         row = dataclasses.asdict(self)
+        for name in ("materials", "colours"):
+            if row[name] is None:
+                del row[name]
         row["repaired"] = self.source.repaired
         row["source"]["watertight"] = self.source.watertight
         return row

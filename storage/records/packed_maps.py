@@ -51,6 +51,20 @@ def pack_texture(texture: Texture) -> bytes:
     return _packed(stored_values(texture.texels), _SRGB if texture.is_srgb else _LINEAR)
 
 
+def unpacked_texture(data: bytes, name: str) -> Texture:
+    """Return the texture of `pack_texture`, called `name` in messages.
+
+    Raises:
+        TrilightError: no texture, damaged, or larger than MAX_MAPS_BYTES.
+    """
+    found = _Packed(data, name)
+    if found.form not in (_SRGB, _LINEAR) or found.num_bytes_held > MAX_MAPS_BYTES:
+        wrong_map(name, found.form, f"a texture of at most {MAX_MAPS_BYTES} bytes")
+    texture = Texture(texels=found.values(), is_srgb=found.form == _SRGB)
+    texture.check(name)
+    return texture
+
+
 def pack_environment(environment: Environment) -> bytes:
     """Return the bytes of an environment's map, however it is turned."""
     return _packed(stored_values(environment.radiance_rgb), _ENVIRONMENT)

@@ -72,6 +72,11 @@ def geometry_sha256(mesh: TriangleMesh) -> str:
     return hashlib.sha256(corners.astype("<i8").tobytes()).hexdigest()
 
 
+def cell_keys(positions: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return one integer per position [V, 3] of the unit box: equal ones are welded."""
+    return _keys(np.rint(positions * GRID).astype(np.int64))
+
+
 def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return one integer per row that orders rows lexicographically."""
     shifted = cells + _OFFSET

@@ -7,11 +7,12 @@ so that no file can make it open another one.
 import hashlib
 import stat
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.assets.reading.gltf_tree import buffer_paths, check_tree, read_tree
 from pipeline.assets.reading.headers import check_header
+from pipeline.assets.reading.material_files import MaterialFiles, gltf_files, obj_files
 from pipeline.assets.settings import AssetSettings
 from storage.errors import Rejected
 
@@ -31,7 +32,10 @@ class SourceFile:
     buffers: Mapping[str, bytes]
     """Buffers of a glTF by the URI that names them; empty for other formats."""
     sha256: str
-    """Digest of the file and of its buffers in the order of their names."""
+    """Digest of the file and of its buffers in the order of their names; and of the files of its
+    materials, where those are kept."""
+    materials: MaterialFiles = field(default_factory=MaterialFiles)
+    """Files that its materials name; empty where nobody keeps them."""
 
 
 def read_source(path: Path, settings: AssetSettings) -> SourceFile:
@@ -49,6 +53,7 @@ def read_source(path: Path, settings: AssetSettings) -> SourceFile:
     data = _read_regular(path, settings.max_source_bytes)
     check_header(data, suffix, settings.max_source_faces)
     buffers: dict[str, bytes] = {}
+    materials, keep = MaterialFiles(), settings.own_materials.keep
     if suffix in (".glb", ".gltf"):
         tree = read_tree(data, suffix)
         check_tree(tree, settings)
@@ -56,10 +61,22 @@ def read_source(path: Path, settings: AssetSettings) -> SourceFile:
         for uri, target in buffer_paths(tree, path.parent).items():
             buffers[uri] = _read_regular(target, left)
             left -= len(buffers[uri])
+        if keep:
+            materials = gltf_files(tree, path.parent, left, _read_regular)
+    elif suffix == ".obj" and keep:
+        left = settings.max_source_bytes - len(data)
+        materials = obj_files(data, path.parent, left, _read_regular)
     digest = hashlib.sha256(data)
-    for uri in sorted(buffers):
-        digest.update(buffers[uri])
-    return SourceFile(kind=suffix[1:], data=data, buffers=buffers, sha256=digest.hexdigest())
+    for files in (buffers, materials.data):
+        for uri in sorted(files):
+            digest.update(files[uri])
+    return SourceFile(
+        kind=suffix[1:],
+        data=data,
+        buffers=buffers,
+        sha256=digest.hexdigest(),
+        materials=materials,
+    )
 
 
 def _read_regular(path: Path, max_bytes: int) -> bytes:

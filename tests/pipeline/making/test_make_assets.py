@@ -14,7 +14,7 @@ import pytest
 import trimesh
 
 from infra.cli import assets
-from pipeline.assets.settings import AssetSettings
+from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
 from pipeline.making.make_assets import AssetFolder, AssetReport, make_assets
 from pipeline.objects.licences import DEFAULT_ALLOWED
 from pipeline.objects.sources import find_objects
@@ -265,3 +265,26 @@ def test_epsilons_are_shares_or_percent(text: str, share: float) -> None:
     # One division in double precision.
     assert settings.epsilon == pytest.approx(share, rel=1e-15)
     assert settings.budgets == (4096,)
+
+
+def test_own_materials_make_textured_meshes_and_pictures(source: Path, tmp_path: Path) -> None:
+    settings = AssetSettings(budgets=(100_000,), own_materials=OwnMaterialSettings(keep=True))
+    folder, out = tmp_path / "few", tmp_path / "out"
+    shutil.copytree(source / "kaykit_dungeon", folder)
+    shutil.copy(source / "classic" / "suzanne.obj", folder)
+    report = run(folder, out, settings)
+    textured = [row for row in report.rows if row.colours is not None]
+    assert len(textured) == 3 and all(row.path.endswith(".glb") for row in textured)
+    (plain,) = (row for row in report.rows if row.colours is None)
+    assert plain.materials is not None and plain.materials.reason == "no_materials"
+    assert plain.path.endswith(".ply")
+    page = (out / "quality.html").read_text()
+    assert "In their own materials: 3 of 4; the others: no_materials (1)." in page
+    again = run(out, tmp_path / "again", settings)
+    assert again.geometry_sha256 == report.geometry_sha256
+    assert sum(row.colours is not None for row in again.rows) == 3
+    assert run(folder, out, WHOLE).rows[0].as_json().keys() == report.rows[0].as_json().keys() - {
+        "materials",
+        "colours",
+    }
+    assert not list((out / "meshes").glob("*.glb"))

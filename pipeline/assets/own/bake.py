@@ -1,0 +1,210 @@
+"""The skin of a level: an atlas of its triangles, coloured by the places that they show."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.own.nearest import NearestPlaces
+from pipeline.assets.own.source_surface import SourceSurface
+from pipeline.assets.own.tiles import FLAT, Atlas, atlas, cells_of, tile_weights, turned
+from pipeline.assets.settings import OwnMaterialSettings
+from storage.conventions import linear_from_srgb8, srgb8
+from storage.records.texture import Texture
+
+_INSET = 0.02
+"""How far texels on an edge show places within their own triangle, as a share of the way to its
+centre: on the edge itself, the neighbour would be as near. At most a quarter of a cell."""
+
+_SHRINK = 0.9
+_BLOCK = 1 << 18
+
+DIFFUSE, SPECULAR, ROUGHNESS = slice(0, 3), slice(3, 6), slice(6, 7)
+"""Of the columns of a texel, as `source_material.columns` gives them."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Baked:
+    """What was baked, before it is measured."""
+
+    uv: NDArray[np.float32]
+    """[F, 3, 2] v up."""
+    textures: tuple[Texture, Texture, Texture]
+    """Diffuse, specular and roughness."""
+    missed: float
+    """Share of the texels that no surface nearby was found for."""
+    density: float
+    """Texels for each unit of length."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Texels:
+    """The texels of all tiles, one tile after another."""
+
+    start: NDArray[np.int64]  # [F + 1] first texel of each
+    columns: NDArray[np.float64]  # [P, 7]
+    codes: NDArray[np.uint8]  # [P, 7] as they would be stored in 8 bits
+    missed: float
+
+
+def bake(
+    level: TriangleMesh,
+    source: SourceSurface,
+    nearest: NearestPlaces,
+    settings: OwnMaterialSettings,
+    reach: float,
+) -> Baked:
+    """Return the colours of a level.
+
+    Args:
+        level: in the unit box.
+        source: what it was made from.
+        nearest: the places of that.
+        settings: texels and greatest size.
+        reach: how far the source may be away, in the unit box.
+    """
+    order = turned(level.corners)
+    corners = np.take_along_axis(level.corners, order[..., None], axis=1)
+    cells, density = _cells(corners, settings)
+    texels = _coloured(corners, cells, source, nearest, reach, density)
+    tile_of, first_of = _tiles(cells, texels)
+    plan = atlas(np.where(_is_flat(texels), 0, cells)[first_of])
+    uv = np.zeros((len(corners), 3, 2))
+    for face, tile in enumerate(tile_of):
+        uv[face, order[face]] = plan.uv(int(tile))
+    return Baked(
+        uv=uv.astype(np.float32),
+        textures=_textures(plan, first_of, texels),
+        missed=texels.missed,
+        density=density,
+    )
+
+
+def _cells(
+    corners: NDArray[np.float64], settings: OwnMaterialSettings
+) -> tuple[NDArray[np.int64], float]:
+    """Return the cells of each tile, and the density at which the atlas is within its size."""
+    density = float(settings.texels)
+    while True:
+        cells = cells_of(corners, density)
+        plan = atlas(cells)
+        if max(plan.width, plan.height) <= settings.size or (cells == 1).all():
+            return cells, density
+        density *= _SHRINK
+
+
+def _coloured(
+    corners: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    source: SourceSurface,
+    nearest: NearestPlaces,
+    reach: float,
+    density: float,
+) -> _Texels:
+    weights_of = {int(side): _inset(tile_weights(int(side))[1], side) for side in np.unique(cells)}
+    counts = np.array([len(weights_of[int(side)]) for side in cells])
+    start = np.concatenate([[0], np.cumsum(counts)])
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    points = np.concatenate(
+        [weights_of[int(side)] @ corner for side, corner in zip(cells, corners, strict=True)]
+    )
+    normals = np.repeat(normal, counts, axis=0)
+    columns, missed = np.zeros((len(points), 7)), 0
+    for first in range(0, len(points), _BLOCK):
+        part = slice(first, first + _BLOCK)
+        places = nearest.of(points[part], normals[part], reach)
+        columns[part] = source.columns(places.faces, places.weights, 1 / density)
+        missed += int(places.is_missed.sum())
+    codes = np.concatenate(
+        [
+            srgb8(columns[:, DIFFUSE]),
+            np.round(columns[:, 3:] * 255).astype(np.uint8),
+        ],
+        axis=1,
+    )
+    return _Texels(start=start, columns=columns, codes=codes, missed=missed / len(points))
+
+
+def _inset(weights: NDArray[np.float64], cells: np.integer) -> NDArray[np.float64]:
+    part = min(_INSET, 0.25 / int(cells))
+    return (1 - part) * weights + part / 3
+
+
+def _is_flat(texels: _Texels) -> NDArray[np.bool_]:
+    """Return whether [F] all texels of a tile are stored as the same numbers."""
+    starts = texels.start[:-1]
+    low = np.minimum.reduceat(texels.codes, starts, axis=0)
+    high = np.maximum.reduceat(texels.codes, starts, axis=0)
+    flat: NDArray[np.bool_] = (low == high).all(axis=1)
+    return flat
+
+
+def _tiles(
+    cells: NDArray[np.int64], texels: _Texels
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the tile [F] of each triangle, and the first triangle [K] of each tile.
+
+    Triangles of one and the same colour share a tile.
+    """
+    flat, count = _is_flat(texels), len(cells)
+    codes = texels.codes[texels.start[:-1]].astype(np.int64)
+    number = np.where(flat, 0, 1 + np.arange(count))
+    names = np.column_stack([number, np.where(flat[:, None], codes, 0)])
+    _, first, tile = np.unique(names, axis=0, return_index=True, return_inverse=True)
+    return tile.ravel(), first
+
+
+def _textures(
+    plan: Atlas, first_of: NDArray[np.int64], texels: _Texels
+) -> tuple[Texture, Texture, Texture]:
+    """Return the maps in 8 bits; what is the same everywhere is one texel in float32."""
+    constants = [_constant(texels, part) for part in _PARTS]
+    values = np.zeros((plan.height, plan.width, 7))
+    values[:] = texels.columns[0]  # where no tile is, so that nothing there counts for a mean
+    for tile, face in enumerate(first_of):
+        mine = slice(texels.start[face], texels.start[face + 1])
+        column, row = plan.corner[tile]
+        cells = int(plan.cells[tile])
+        if cells == 0:
+            square = slice(row, row + FLAT), slice(column, column + FLAT)
+            values[square] = texels.columns[mine].mean(axis=0)
+        else:
+            at = plan.texels(tile, tile_weights(cells)[0])
+            values[at[:, 1], at[:, 0]] = texels.columns[mine]
+    stored = [srgb8(values[..., DIFFUSE])]
+    stored += [np.round(values[..., part] * 255).astype(np.uint8) for part in _PARTS[1:]]
+    if constants[0] is None:
+        shown = stored[1] / 255 if constants[1] is None else constants[1]
+        stored[0] = _lowered(stored[0], shown)
+    elif constants[1] is None:
+        over = np.minimum(constants[0] + stored[1] / 255, 1) - constants[0]
+        stored[1] = np.floor(over * 255 + 1e-6).astype(np.uint8)
+    first, second, third = (
+        Texture(texels=np.ascontiguousarray(coded), is_srgb=part is DIFFUSE)
+        if constant is None
+        else Texture(texels=constant[None, None])
+        for part, coded, constant in zip(_PARTS, stored, constants, strict=True)
+    )
+    return first, second, third
+
+
+_PARTS = (DIFFUSE, SPECULAR, ROUGHNESS)
+
+
+def _constant(texels: _Texels, part: slice) -> NDArray[np.float32] | None:
+    """Return what all texels say, where 8 bits could tell none of them from another."""
+    columns, codes = texels.columns[:, part], texels.codes[:, part]
+    if not (codes == codes[0]).all():
+        return None
+    same = (columns == columns[0]).all()
+    return (columns[0] if same else columns.mean(axis=0)).astype(np.float32)
+
+
+def _lowered(diffuse: NDArray[np.uint8], specular: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return sRGB codes that add up to at most 1 with the specular albedo after rounding."""
+    table = linear_from_srgb8()
+    room = 1 + 1e-6 - np.broadcast_to(specular, diffuse.shape)
+    highest = np.maximum(np.searchsorted(table, room, side="right") - 1, 0)
+    return np.minimum(diffuse, highest).astype(np.uint8)

@@ -1,0 +1,65 @@
+"""The levels of an asset with their own materials, where settings keep those."""
+
+from collections.abc import Mapping
+
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.own.skin import SkinMaker, skin_maker
+from pipeline.assets.reading.source_file import SourceFile
+from pipeline.assets.settings import AssetSettings
+from storage.errors import Rejected
+from storage.records.asset import Level
+from storage.records.skin import OwnMaterials
+
+Missed = dict[int, tuple[str, str]]
+
+
+def with_own_materials(
+    levels: tuple[Level, ...],
+    missed: Mapping[int, tuple[str, str]],
+    source: SourceFile,
+    mesh: TriangleMesh,
+    settings: AssetSettings,
+) -> tuple[tuple[Level, ...], Missed, OwnMaterials | None]:
+    """Return levels with skins, reasons of those that are missing, and what is known of materials.
+
+    Args:
+        levels: without skins.
+        missed: reason and message by budget.
+        source: the file.
+        mesh: its clean, oriented mesh.
+        settings: whether materials are kept, and what becomes of an object whose own are lost.
+
+    Raises:
+        Rejected: as `skin_maker`, where such objects are refused.
+    """
+    asked = settings.own_materials
+    if not asked.keep:
+        return levels, dict(missed), None
+    try:
+        maker, materials = skin_maker(source, mesh, asked)
+    except Rejected as lost:
+        if asked.if_lost == "reject":
+            raise
+        return levels, dict(missed), OwnMaterials(reason=lost.reason, message=lost.message)
+    return _skinned(levels, missed, maker, materials, refuse=asked.if_lost == "reject")
+
+
+def _skinned(
+    levels: tuple[Level, ...],
+    missed: Mapping[int, tuple[str, str]],
+    maker: SkinMaker,
+    materials: OwnMaterials,
+    *,
+    refuse: bool,
+) -> tuple[tuple[Level, ...], Missed, OwnMaterials]:
+    found, reasons = list[Level](), dict(missed)
+    for level in levels:
+        try:
+            found.append(maker.skinned(level))
+        except Rejected as lost:
+            if refuse:
+                reasons[level.record.budget] = (lost.reason, lost.message)
+                continue
+            found.append(level)
+            materials = OwnMaterials(reason=lost.reason, message=lost.message, lost=materials.lost)
+    return tuple(found), reasons, materials

@@ -1,0 +1,88 @@
+"""How far the colours of a level are from those of its source, and whether its seams tear."""
+
+import igl
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.own.bake import DIFFUSE, Baked
+from pipeline.assets.own.nearest import NearestPlaces, barycentric
+from pipeline.assets.own.source_surface import SourceSurface
+from pipeline.assets.quality.distance import sample_surface
+from storage.records.lookup import texture_values
+from storage.records.skin import SkinQuality
+from storage.seeds import rng_for
+
+_NUM_POINTS = 4096
+_ALONG = (0.2, 0.5, 0.8)
+_TORN_TEXELS = 2.0
+
+
+def skin_quality(
+    level: TriangleMesh,
+    baked: Baked,
+    source: SourceSurface,
+    nearest: NearestPlaces,
+    reach: float,
+) -> SkinQuality:
+    """Return the measures of a baked level; arguments as those of `bake`."""
+    error = _colour_errors(level, baked, source)
+    return SkinQuality(
+        colour_error=_rounded(error.mean()),
+        colour_error_p95=_rounded(np.percentile(error, 95)),
+        missed_cells=_rounded(baked.missed),
+        torn_seams=_rounded(_torn_seams(level, nearest, source, reach, 1 / baked.density)),
+        texels_per_length=_rounded(baked.density),
+    )
+
+
+def _colour_errors(level: TriangleMesh, baked: Baked, source: SourceSurface) -> NDArray[np.float64]:
+    """Return the difference [N] at points spread evenly over the source."""
+    drawn = rng_for(0, "own-materials").random((_NUM_POINTS, 3))
+    points = sample_surface(source.mesh, drawn)
+    weights = barycentric(source.mesh.corners[points.faces], points.positions)
+    there = source.columns(points.faces, weights, 1 / baked.density)[:, DIFFUSE]
+    _, faces, places = igl.point_mesh_squared_distance(
+        points.positions, level.positions, level.faces
+    )
+    faces = np.asarray(faces, np.int64).ravel()
+    uv = np.einsum("nc,ncd->nd", barycentric(level.corners[faces], places), baked.uv[faces])
+    here = texture_values(baked.textures[0], uv)
+    error: NDArray[np.float64] = np.abs(here - there).mean(axis=1)
+    return error
+
+
+def _torn_seams(
+    level: TriangleMesh,
+    nearest: NearestPlaces,
+    source: SourceSurface,
+    reach: float,
+    texel: float,
+) -> float:
+    """Return the share of the length of edges of two faces whose sides show distant places."""
+    directed = np.stack([level.faces, np.roll(level.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    ends = np.sort(directed, axis=1)
+    edges, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    edge = edge.ravel()
+    order = np.argsort(edge, kind="stable")
+    sides = order[count[edge[order]] == 2].reshape(-1, 2) // 3
+    if not len(sides):
+        return 0.0
+    inner = level.positions[edges[count == 2]]
+    normal = level.double_area_vectors
+    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    along = np.array(_ALONG)[:, None, None]
+    points = ((1 - along) * inner[:, 0] + along * inner[:, 1]).reshape(-1, 3)
+    shown = []
+    for side in sides.T:
+        places = nearest.of(points, np.tile(normal[side], (len(_ALONG), 1)), reach)
+        corners = source.mesh.corners[places.faces]
+        shown.append(np.einsum("nc,ncd->nd", places.weights, corners))
+    apart = np.linalg.norm(shown[0] - shown[1], axis=1).reshape(len(_ALONG), -1)
+    length = np.linalg.norm(inner[:, 1] - inner[:, 0], axis=1)
+    torn = (apart > _TORN_TEXELS * texel).mean(axis=0)
+    return float((torn * length).sum() / length.sum())
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")

@@ -1,0 +1,179 @@
+"""Pictures from outside: decoded within limits, and looked up with the wrap of their format.
+
+What a slot says of a picture counts, not what the picture says of itself: base colours are
+sRGB-encoded and roughness is linear, whatever profile or gamma the file names.
+"""
+
+import io
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from storage.conventions import linear_from_srgb8
+from storage.errors import Rejected
+
+Wrap = Literal["repeat", "clamp", "mirror"]
+
+FORMATS = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "TIFF")
+"""What is decoded; a file of another format is refused by its content."""
+
+_STRIP = 256  # rows, an even number
+
+
+class Decoder:
+    """Decodes the pictures of one object, all together within a number of pixels."""
+
+    def __init__(self, max_pixels: int) -> None:
+        """Begin with that many."""
+        self._left = max_pixels
+
+    def __call__(self, data: bytes, name: str) -> NDArray:
+        """Return `decoded`, within what is left."""
+        values = decoded(data, name, self._left)
+        self._left -= values.shape[0] * values.shape[1]
+        return values
+
+
+def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
+    """Return a picture [H, W, 4], row 0 at the bottom: uint8, or uint16 of greys of 16 bits.
+
+    Palettes, greys, transparency and CMYK become RGBA; colours of 16 bits are read to 8.
+
+    Raises:
+        Rejected: texture_too_large or texture_unreadable.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # ours is stricter
+            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+                if image.width * image.height > max_pixels:
+                    raise Rejected(
+                        "texture_too_large",
+                        f"{name!r:.80} is {image.width} x {image.height}; at most {max_pixels} "
+                        "pixels are left. Make it smaller, or raise own_materials.max_pixels",
+                    )
+                return np.ascontiguousarray(_values(image)[::-1])
+    except (Rejected, MemoryError):
+        raise
+    except Image.DecompressionBombError as error:
+        raise Rejected("texture_too_large", f"{name!r:.80}: {error!s:.120}") from error
+    except Exception as error:  # decoders of other people's files fail in every way
+        raise Rejected(
+            "texture_unreadable", f"{name!r:.80}: {type(error).__name__}: {error!s:.120}"
+        ) from error
+
+
+def _values(image: Image.Image) -> NDArray:
+    if image.mode.startswith("I"):
+        grey = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
+        return np.stack([grey, grey, grey, np.full_like(grey, 65535)], axis=-1)
+    return np.asarray(image.convert("RGBA"))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Picture:
+    """Values in [0, 1] over texture coordinates, u to the right and v up."""
+
+    values: NDArray
+    """[H, W, 4] as `decoded` returns them."""
+    is_srgb: bool
+    """Whether red, green and blue are sRGB-encoded; alpha never is."""
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    """Along u and along v."""
+    is_nearest: bool = False
+    """Whether texels are flat squares instead of being interpolated."""
+
+    @cached_property
+    def _levels(self) -> list[NDArray[np.float32]]:
+        return []
+
+    def level(self, number: int) -> NDArray:
+        """Return the picture halved `number` times, in linear values from the first halving on."""
+        if number == 0:
+            return self.values
+        if not self._levels:
+            rows = range(0, len(self.values), _STRIP)  # a large picture in floats is too much
+            strips = [_halved(self.linear(self.values[row : row + _STRIP])) for row in rows]
+            self._levels.append(np.concatenate(strips))
+        while len(self._levels) < number:
+            self._levels.append(_halved(self._levels[-1]))
+        return self._levels[number - 1]
+
+    @property
+    def most_halvings(self) -> int:
+        """Until one texel is left."""
+        return max(self.values.shape[:2]).bit_length() - 1
+
+    def linear(self, texels: NDArray) -> NDArray[np.float32]:
+        """Return linear values of texels [..., 4] of the picture or of a level."""
+        if texels.dtype == np.float32:
+            return texels
+        if texels.dtype == np.uint16:
+            deep: NDArray[np.float32] = np.divide(texels, 65535, dtype=np.float32)
+            if self.is_srgb:
+                deep[..., :3] = _from_srgb(deep[..., :3])
+            return deep
+        found: NDArray[np.float32] = np.divide(texels, 255, dtype=np.float32)
+        if self.is_srgb:
+            found[..., :3] = linear_from_srgb8()[texels[..., :3]]
+        return found
+
+    def at(self, uv: NDArray[np.float64], halvings: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return linear values [N, 4] at coordinates [N, 2] of the picture halved so often."""
+        found = np.zeros((len(uv), 4), np.float32)
+        for number in np.unique(halvings):
+            chosen = halvings == number
+            found[chosen] = self._at(uv[chosen], self.level(int(number)))
+        return found
+
+    def _at(self, uv: NDArray[np.float64], texels: NDArray) -> NDArray[np.float32]:
+        height, width = texels.shape[:2]
+        x = _wrapped(uv[:, 0], self.wrap[0]) * width - 0.5
+        y = _wrapped(uv[:, 1], self.wrap[1]) * height - 0.5
+        if self.is_nearest:
+            x, y = np.floor(x + 0.5), np.floor(y + 0.5)
+        column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+        along, across = (x - column)[:, None], (y - row)[:, None]
+
+        def texel(up: int, right: int) -> NDArray[np.float32]:
+            rows = _within(row + up, height, self.wrap[1])
+            return self.linear(texels[rows, _within(column + right, width, self.wrap[0])])
+
+        low = (1 - along) * texel(0, 0) + along * texel(0, 1)
+        high = (1 - along) * texel(1, 0) + along * texel(1, 1)
+        return ((1 - across) * low + across * high).astype(np.float32)
+
+
+def _from_srgb(coded: NDArray[np.floating]) -> NDArray[np.float32]:
+    linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
+
+
+def _halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return means of two by two texels; the last one stands alone where their number is odd."""
+    for axis in (0, 1):
+        count = values.shape[axis]
+        if count > 1:
+            starts = np.arange(0, count, 2)
+            sums = np.add.reduceat(values, starts, axis=axis)
+            sizes = np.minimum(count - starts, 2).astype(np.float32)
+            values = sums / np.expand_dims(sizes, tuple(k for k in range(3) if k != axis))
+    return values
+
+
+def _wrapped(at: NDArray[np.float64], wrap: Wrap) -> NDArray[np.float64]:
+    if wrap == "clamp":
+        return np.clip(at, 0, 1)
+    if wrap == "mirror":
+        mirrored: NDArray[np.float64] = 1 - np.abs(np.mod(at, 2) - 1)
+        return mirrored
+    return at - np.floor(at)
+
+
+def _within(index: NDArray[np.int64], count: int, wrap: Wrap) -> NDArray[np.int64]:
+    return index % count if wrap == "repeat" else np.clip(index, 0, count - 1)

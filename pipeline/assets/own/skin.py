@@ -1,0 +1,117 @@
+"""`SkinMaker`: own materials of one object, from its file to the skins of its levels."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.own.bake import bake
+from pipeline.assets.own.gltf_materials import GltfMaterials, bare_gltf, data_uri_bytes
+from pipeline.assets.own.measure import skin_quality
+from pipeline.assets.own.nearest import NearestPlaces
+from pipeline.assets.own.obj_materials import bare_obj, obj_materials
+from pipeline.assets.own.parts import TexturedParts, load_parts
+from pipeline.assets.own.picture import Decoder
+from pipeline.assets.own.source_material import SourceMaterial
+from pipeline.assets.own.source_surface import SourceSurface, source_surface
+from pipeline.assets.reading.gltf_tree import read_tree
+from pipeline.assets.reading.source_file import SourceFile
+from pipeline.assets.settings import OwnMaterialSettings
+from storage.errors import Rejected
+from storage.records.asset import Level
+from storage.records.packed_maps import pack_texture
+from storage.records.skin import LevelSkin, OwnMaterials, SkinQuality
+
+_LEAST_REACH = 1e-3
+"""How far rays look for the source at least, in the unit box; otherwise as far as the level is off.
+"""
+
+
+class SkinMaker:
+    """Makes the skins of the levels of one source."""
+
+    def __init__(self, surface: SourceSurface, settings: OwnMaterialSettings) -> None:
+        """Take a source with its colours."""
+        self._surface, self._settings = surface, settings
+        self._nearest = NearestPlaces(surface.mesh)
+
+    def skinned(self, level: Level) -> Level:
+        """Return a level with its skin.
+
+        Raises:
+            Rejected: colours_changed or colours_missed where it is over a bound.
+        """
+        mesh = TriangleMesh(
+            positions=level.positions.astype(np.float64), faces=level.faces.astype(np.int64)
+        )
+        off = level.record.quality.error_max * self._surface.mesh.diagonal
+        reach = max(_LEAST_REACH, 1.5 * off)
+        baked = bake(mesh, self._surface, self._nearest, self._settings, reach)
+        quality = skin_quality(mesh, baked, self._surface, self._nearest, reach)
+        self._require_near(quality, level.record.budget)
+        first, second, third = map(pack_texture, baked.textures)
+        skin = LevelSkin(uv=baked.uv, packed=(first, second, third), quality=quality)
+        return dataclasses.replace(level, skin=skin)
+
+    def _require_near(self, quality: SkinQuality, budget: int) -> None:
+        if quality.colour_error > self._settings.max_colour_error:
+            raise Rejected(
+                "colours_changed",
+                f"colours are off by {quality.colour_error:.3f} on average at {budget} faces; "
+                f"expected <= {self._settings.max_colour_error}",
+            )
+        if quality.missed_cells > self._settings.max_missed:
+            raise Rejected(
+                "colours_missed",
+                f"{quality.missed_cells:.1%} of the texels have no surface of the source near at "
+                f"{budget} faces; expected <= {self._settings.max_missed:.1%}",
+            )
+
+
+def skin_maker(
+    source: SourceFile, mesh: TriangleMesh, settings: OwnMaterialSettings
+) -> tuple[SkinMaker, OwnMaterials]:
+    """Return what makes the skins of a source, and what of its materials is lost.
+
+    Args:
+        source: the file with the pictures beside it.
+        mesh: its clean, oriented mesh.
+        settings: sizes and bounds.
+
+    Raises:
+        Rejected: no_materials, materials_unreadable, texture_missing, texture_outside,
+            texture_too_large, texture_unreadable, no_texture_coordinates or
+            texture_coordinates_not_finite.
+    """
+    parts = _parts(source, Decoder(settings.max_pixels))
+    lost = sorted({word for material in parts.materials for word in material.lost})
+    surface = source_surface(mesh, parts)
+    return SkinMaker(surface, settings), OwnMaterials(lost=tuple(lost))
+
+
+def _parts(source: SourceFile, decode: Callable[[bytes, str], NDArray]) -> TexturedParts:
+    if source.kind == "obj":
+        materials = obj_materials(source.data, source.materials, decode)
+        data, files = bare_obj(source.data)
+        return load_parts(data, source.kind, files, materials, SourceMaterial())
+    if source.kind not in ("glb", "gltf"):
+        raise Rejected("no_materials", f"a .{source.kind} file has no materials that are read")
+    tree = read_tree(source.data, f".{source.kind}")
+    if not tree.get("materials"):
+        raise Rejected("no_materials", "the glTF has no materials")
+    reader = GltfMaterials(tree, lambda row: _buffer(source, tree, row), source.materials, decode)
+    data = bare_gltf(source.data, tree, f".{source.kind}")
+    default = SourceMaterial(metallic=1.0)  # what glTF says of a mesh without a material
+    return load_parts(data, source.kind, source.buffers, reader.by_name(), default)
+
+
+def _buffer(source: SourceFile, tree: dict[str, Any], row: int) -> bytes:
+    uri = tree["buffers"][row].get("uri")
+    if uri is None:  # the second chunk of a GLB
+        start = 20 + int.from_bytes(source.data[12:16], "little")
+        length = int.from_bytes(source.data[start : start + 4], "little")
+        return source.data[start + 8 : start + 8 + length]
+    return data_uri_bytes(uri) if uri.startswith("data:") else source.buffers[uri]

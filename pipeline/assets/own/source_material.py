@@ -1,0 +1,108 @@
+"""What a file says of a surface, and what that is in Trilight's columns.
+
+Files speak of Schlick's Fresnel term, F0 + (1 - F0)(1 - cos)^5; our specular lobe reflects the same
+share at every angle. Its albedo is the mean of Schlick's term over cosine-weighted directions,
+F0 + (1 - F0)/21, and the diffuse part gets what is left: base (1 - metal)(1 - F).
+docs/explanation/material.md states what that costs at grazing angles.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.own.picture import Picture
+
+RGB = tuple[float, float, float]
+
+WHITE: RGB = (1.0, 1.0, 1.0)
+
+LEAST_ROUGHNESS = 0.01
+"""As of drawn materials (scene_templates.materials)."""
+
+_SCHLICK_MEAN = 1 / 21
+"""Mean of (1 - cos)^5 over cosine-weighted directions: 2 B(2, 6)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Slot:
+    """A picture where a material has it."""
+
+    picture: Picture
+    """What is shown."""
+    uv_set: int = 0
+    """Which of the mesh's coordinates it lies on."""
+    turn: NDArray[np.float64] = field(default_factory=lambda: np.eye(2))
+    """[2, 2] applied to those coordinates first,"""
+    shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    """[2] and then added; both with v up."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SourceMaterial:
+    """A material in the metallic-roughness or the specular workflow; factors are linear."""
+
+    base_rgb: RGB = WHITE
+    base: Slot | None = None
+    """sRGB-encoded; times `base_rgb`."""
+    metallic: float = 0.0
+    roughness: float = 1.0
+    metallic_roughness: Slot | None = None
+    """Linear: roughness in green and metal in blue, times the factors."""
+    f0: float = 0.04
+    """What a dielectric reflects head-on, before the two below."""
+    specular_rgb: RGB = WHITE
+    specular_colour: Slot | None = None
+    """sRGB-encoded; times `specular_rgb`."""
+    specular_strength: float = 1.0
+    specular_strength_map: Slot | None = None
+    """Linear, in alpha; times `specular_strength`."""
+    glossiness: Slot | None = None
+    """Linear, in alpha: roughness is 1 - (1 - roughness) x alpha. Of the specular workflow."""
+    lost: tuple[str, ...] = ()
+    """What else it says."""
+
+    @property
+    def slots(self) -> tuple[Slot, ...]:
+        """The pictures that it has."""
+        found = (
+            self.base,
+            self.metallic_roughness,
+            self.specular_colour,
+            self.specular_strength_map,
+            self.glossiness,
+        )
+        return tuple(slot for slot in found if slot is not None)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seen:
+    """What the pictures of a material show at N places; None where it has no such picture."""
+
+    base: NDArray[np.float32] | None
+    metallic_roughness: NDArray[np.float32] | None
+    specular_colour: NDArray[np.float32] | None
+    specular_strength: NDArray[np.float32] | None
+    glossiness: NDArray[np.float32] | None
+
+
+def columns(material: SourceMaterial, seen: Seen, count: int) -> NDArray[np.float64]:
+    """Return diffuse rgb, specular rgb and roughness [N, 7] of `count` places."""
+
+    def times(factor: object, found: NDArray[np.float32] | None, part: slice) -> NDArray:
+        whole = np.broadcast_to(np.asarray(factor, np.float64), (count, part.stop - part.start))
+        return whole if found is None else whole * found[:, part]
+
+    base = np.clip(times(material.base_rgb, seen.base, slice(0, 3)), 0, 1)
+    rough = times(material.roughness, seen.metallic_roughness, slice(1, 2))
+    metal = np.clip(times(material.metallic, seen.metallic_roughness, slice(2, 3)), 0, 1)
+    if seen.glossiness is not None:
+        rough = 1 - (1 - material.roughness) * seen.glossiness[:, 3:4]
+    colour = times(material.specular_rgb, seen.specular_colour, slice(0, 3))
+    strength = times(material.specular_strength, seen.specular_strength, slice(3, 4))
+    dielectric = np.minimum(material.f0 * colour, 1) * strength
+    f0 = np.clip((1 - metal) * dielectric + metal * base, 0, 1)
+    none = f0.max(axis=1, keepdims=True) == 0  # a material without any lobe stays without one
+    specular = np.where(none, 0, f0 + (1 - f0) * _SCHLICK_MEAN)
+    diffuse = base * (1 - metal) * (1 - specular)
+    return np.concatenate([diffuse, specular, np.clip(rough, LEAST_ROUGHNESS, 1)], axis=1)

@@ -1,0 +1,127 @@
+"""An atlas that has a place for every triangle, whatever their number and neighbours.
+
+A triangle of n cells a side takes one half of a square of n + 3 texels: its corners lie in the
+centres of texels, and whatever a bilinear look-up within it can touch belongs to it alone. The
+other half is another triangle's, turned by half a turn. Triangles of one colour take four texels
+that they share with all others of that colour.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIDES = tuple(sorted({*(1 << k for k in range(14)), *(3 << k for k in range(12))}))
+"""Numbers of cells that tiles have: 1, 2, 3, 4, 6, 8, 12, ...; few, so that most find a partner."""
+
+_GUTTER = 3
+FLAT = 2
+"""Width of the square of one colour."""
+
+
+def cells_of(corners: NDArray[np.float64], density: float) -> NDArray[np.int64]:
+    """Return the cells a side [F] of triangles with corners [F, 3, 3], the longest edge last.
+
+    Args:
+        corners: the first corner of each lies opposite the longest edge (`turned`).
+        density: cells for each unit of length.
+    """
+    legs = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=2).max(axis=1)
+    wanted = np.ceil(legs * density - 1e-9).astype(np.int64)
+    place = np.searchsorted(SIDES, np.clip(wanted, 1, SIDES[-1]))
+    return np.asarray(SIDES, np.int64)[place]
+
+
+def turned(corners: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the order [F, 3] of corners [F, 3, 3] that begins opposite the longest edge."""
+    opposite = np.linalg.norm(np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1), axis=2)
+    return (opposite.argmax(axis=1)[:, None] + np.arange(3)) % 3
+
+
+def tile_weights(cells: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the texels [P, 2] (column, row) of a tile and their barycentric coordinates [P, 3].
+
+    Texels beyond the longest edge show its nearest point.
+    """
+    column, row = np.meshgrid(np.arange(cells + 2), np.arange(cells + 2), indexing="xy")
+    mine = column + row <= cells + 1
+    places = np.stack([column[mine], row[mine]], axis=1)
+    inside = np.minimum(places, cells)
+    across = inside / np.maximum(inside.sum(axis=1, keepdims=True), cells)
+    return places, np.concatenate([1 - across.sum(axis=1, keepdims=True), across], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Atlas:
+    """Where tiles lie."""
+
+    width: int
+    height: int
+    corner: NDArray[np.int64]
+    """[K, 2] first texel (column, row) of each tile's square."""
+    is_turned: NDArray[np.bool_]
+    """[K] whether it is the half beyond the diagonal."""
+    cells: NDArray[np.int64]
+    """[K] cells a side; 0 for one colour."""
+
+    def texels(self, tile: int, places: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the texels [P, 2] of the atlas that a tile's own texels [P, 2] are."""
+        last = self.cells[tile] + _GUTTER - 1
+        return self.corner[tile] + (last - places if self.is_turned[tile] else places)
+
+    def uv(self, tile: int) -> NDArray[np.float64]:
+        """Return the texture coordinates [3, 2] of a tile's corners, v up."""
+        cells = int(self.cells[tile])
+        if cells == 0:
+            at = np.broadcast_to(self.corner[tile] + FLAT / 2, (3, 2)).astype(np.float64)
+        else:
+            corners = np.array([[0, 0], [cells, 0], [0, cells]])
+            at = self.texels(tile, corners).astype(np.float64) + 0.5
+        return at / np.array([self.width, self.height])
+
+
+def atlas(cells: NDArray[np.int64]) -> Atlas:
+    """Lay out tiles of so many cells a side [K], as nearly square as rows of squares allow."""
+    order = np.argsort(-cells, kind="stable")
+    squares, square_of, is_turned = _squares(cells, order)
+    area = sum(side * side for side in squares)
+    width = max([int(np.ceil(np.sqrt(area))), *squares[:1]])
+    corners, height = _rows(squares, width)
+    return Atlas(
+        width=width,
+        height=height,
+        corner=corners[square_of],
+        is_turned=is_turned,
+        cells=cells,
+    )
+
+
+def _squares(
+    cells: NDArray[np.int64], order: NDArray[np.int64]
+) -> tuple[list[int], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the widths of squares, and which one and which half each tile takes."""
+    squares: list[int] = []
+    square_of, is_turned = np.zeros(len(cells), np.int64), np.zeros(len(cells), np.bool_)
+    half_free = 0  # cells of the tile that would fit into the last square
+    for tile in order:
+        count = int(cells[tile])
+        if count and count == half_free:
+            is_turned[tile], half_free = True, 0
+        else:
+            squares.append(count + _GUTTER if count else FLAT)
+            half_free = count
+        square_of[tile] = len(squares) - 1
+    return squares, square_of, is_turned
+
+
+def _rows(squares: Sequence[int], width: int) -> tuple[NDArray[np.int64], int]:
+    """Return the first texel of each square, the largest first, in rows; and the height."""
+    corners = np.zeros((len(squares), 2), np.int64)
+    x = y = tallest = 0
+    for number, side in enumerate(squares):
+        if x + side > width:
+            x, y, tallest = 0, y + tallest, 0
+        corners[number] = x, y
+        x, tallest = x + side, max(tallest, side)
+    return corners, y + tallest

@@ -1,0 +1,62 @@
+"""Objects that keep their own materials: which ones, and their skins for a scene."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from pipeline.scenes.pieces import Skin
+from pipeline.scenes.pool import PooledAsset
+from scene_templates.materials import MaterialSettings
+from storage.records.asset import Level
+from storage.records.objects import LockedObject
+from storage.records.skin import LevelSkin
+from storage.records.texture import TEXTURED, MapSource
+from storage.seeds import rng_for
+
+
+def own_skins(
+    chosen: Sequence[PooledAsset],
+    levels: Sequence[Level],
+    settings: MaterialSettings,
+    *,
+    seed: int,
+    scene_index: int,
+    attempt: int,
+) -> list[Skin | None]:
+    """Return the skin of each object, or None where its materials are drawn.
+
+    Each object has a random stream of its own, so that skins change no other draw of the scene, and
+    another share changes no skin that is there still.
+
+    Args:
+        chosen: the objects of a scene.
+        levels: the level that each is shown by.
+        settings: whether objects keep their own materials, and how many.
+        seed: of the dataset.
+        scene_index: which scene.
+        attempt: how many times this scene was rejected before.
+    """
+    if settings.source != "object":
+        return [None] * len(chosen)
+    skins: list[Skin | None] = []
+    for row, (entry, level) in enumerate(zip(chosen, levels, strict=True)):
+        rng = rng_for(seed, "own materials", scene_index, attempt, row)
+        keeps = rng.random() < settings.own_share and level.skin is not None
+        skins.append(_skin(level.skin, entry.locked) if keeps and level.skin else None)
+    return skins
+
+
+def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
+    """Return a skin whose textures have the rights of the object that they are of."""
+    first, second, third = (
+        dataclasses.replace(
+            texture,
+            source=MapSource(
+                name=f"{locked.uid} {column}",
+                licence=locked.licence,
+                attribution=locked.attribution,
+                source_url=locked.source_url,
+            ),
+        )
+        for texture, column in zip(skin.textures, TEXTURED, strict=True)
+    )
+    return Skin(uv=skin.uv.reshape(-1, 2), textures=(first, second, third))

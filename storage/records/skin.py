@@ -1,0 +1,101 @@
+"""`LevelSkin`: what a level of an asset looks like in its own colours, and how well that is known.
+
+The textures are an atlas of the level's own triangles, baked from the source (pipeline.assets.own),
+so that they need no charts and survive any change of the triangles. Each is packed as in a shard
+(storage.records.packed_maps), since a run holds many objects and shows few of them at a time.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.records.packed_maps import unpacked_texture
+from storage.records.texture import TEXTURED, Texture
+
+SkinTextures = tuple[Texture, Texture, Texture]
+"""Diffuse, specular and roughness; one texel in float32 where one is the same everywhere."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkinQuality:
+    """How far the colours of a level are from those of its source."""
+
+    colour_error: float
+    """Mean difference of the linear diffuse colour between points spread evenly over the source and
+    the nearest points of the level, over all channels."""
+    colour_error_p95: float
+    """95th percentile of it."""
+    missed_cells: float
+    """Share of the texels for which the source has no surface nearby that faces the same way: they
+    show its nearest point."""
+    torn_seams: float
+    """Share of the length of inner edges whose two sides show places of the source that are more
+    than two texels apart."""
+    texels_per_length: float
+    """Texels along the longest side of the object's bounding box."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnMaterials:
+    """What became of the materials of a source."""
+
+    reason: str = ""
+    """Stable code of why the object goes without them; empty where it has them."""
+    message: str = ""
+    """One sentence for a person."""
+    lost: tuple[str, ...] = ()
+    """What the source says of its surfaces and nothing here can show, such as `emission`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LevelSkin:
+    """The look of one level."""
+
+    uv: NDArray[np.float32]
+    """[F, 3, 2] texture coordinates of each corner of each face, within [0, 1], v up."""
+    packed: tuple[bytes, bytes, bytes]
+    """Bytes of the textures."""
+    quality: SkinQuality
+    """Measured against the source."""
+
+    @cached_property
+    def textures(self) -> SkinTextures:
+        """Diffuse, specular and roughness, unpacked."""
+        first, second, third = map(unpacked_texture, self.packed, TEXTURED)
+        return first, second, third
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes as they are stored."""
+        return self.uv.nbytes + sum(map(len, self.packed))
+
+
+def skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
+    """Return the arrays of a skin for the file of its asset; `name` ends the name of each."""
+    maps = {
+        f"{column}_{name}": np.frombuffer(data, np.uint8)
+        for column, data in zip(TEXTURED, skin.packed, strict=True)
+    }
+    return {f"uv_{name}": np.ascontiguousarray(skin.uv), **maps}
+
+
+def read_skin(arrays: Mapping[str, NDArray], quality: Mapping[str, Any], name: str) -> LevelSkin:
+    """Return the skin of `skin_arrays`; raises KeyError or TypeError where there is none."""
+    first, second, third = (arrays[f"{column}_{name}"].tobytes() for column in TEXTURED)
+    return LevelSkin(
+        uv=arrays[f"uv_{name}"],
+        packed=(first, second, third),
+        quality=SkinQuality(**quality),
+    )
+
+
+def as_record(found: SkinQuality | OwnMaterials) -> dict[str, Any]:
+    """Return it as JSON values."""
+    record: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(found)))
+    return record

@@ -1,0 +1,207 @@
+"""Pictures and coordinates as people really have them: read, or lost with a reason."""
+
+import dataclasses
+import json
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.assets.own.picture import Picture
+from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
+from storage.conventions import linear_from_srgb8
+from tests.pipeline.assets.meshes_by_hand import prepare as prepare_asset
+from tests.pipeline.assets.meshes_by_hand import reason_of, write_glb
+from tests.pipeline.assets.own.textured_kit import (
+    CORNERS,
+    KEEP,
+    REFUSE,
+    UV_UP,
+    lost,
+    picture_bytes,
+    seen_at,
+    textured_glb,
+    textured_gltf,
+    textured_obj,
+    textured_tree,
+)
+
+F = 0.04 + 0.96 / 21
+TOLERANCE = 0.02
+"""JPEG and a palette of few colours are off by a few of 255 steps, near white a hundredth each."""
+
+
+def _png_that_claims(width: int, height: int) -> bytes:
+    """Return a PNG whose header promises far more than its few bytes hold."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        body = kind + data
+        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"0" * 99))
+
+
+WHOLE = picture_bytes(np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))
+UNREADABLE: dict[str, tuple[str, bytes]] = {
+    "cut off": ("texture_unreadable", WHOLE[: len(WHOLE) // 2]),
+    "no picture": ("texture_unreadable", b"GIF? no"),
+    "nothing": ("texture_unreadable", b""),
+    "16k": ("texture_too_large", _png_that_claims(16384, 16384)),
+    "a bomb": ("texture_too_large", _png_that_claims(200_000, 200_000)),
+    "a lie": ("texture_unreadable", _png_that_claims(4096, 4096)),
+}
+
+
+@pytest.mark.parametrize("name", UNREADABLE)
+def test_bad_pictures_are_lost_with_a_reason(tmp_path: Path, name: str) -> None:
+    reason, data = UNREADABLE[name]
+    path = textured_glb(tmp_path / "a.glb", data)
+    assert lost(path) == reason
+    assert reason_of(path, REFUSE) == reason
+
+
+def test_many_pictures_count_together(tmp_path: Path) -> None:
+    tree, buffer = textured_tree(WHOLE)
+    metal = tree["materials"][0]["pbrMetallicRoughness"]
+    metal["metallicRoughnessTexture"] = {"index": 1}
+    tree["textures"].append({"source": 1})
+    tree["images"].append(dict(tree["images"][0]))
+    path = write_glb(tmp_path / "a.glb", tree, buffer)
+    enough = OwnMaterialSettings(keep=True, texels=16, max_pixels=2 * 64 * 64, max_colour_error=1.0)
+    materials = prepare_asset(path, AssetSettings(own_materials=enough)).materials
+    assert materials is not None and materials.reason == ""
+    less = dataclasses.replace(enough, max_pixels=2 * 64 * 64 - 1)
+    assert lost(path, AssetSettings(own_materials=less)) == "texture_too_large"
+
+
+def test_a_halved_picture_is_its_mean_in_linear_light() -> None:
+    """Of an odd number of rows and more than one strip of them."""
+    codes = np.random.default_rng(1).integers(0, 256, (301, 6, 4)).astype(np.uint8)
+    picture = Picture(values=codes, is_srgb=True)
+    linear = picture.linear(codes).astype(np.float64)
+    wanted = linear[:300].reshape(150, 2, 3, 2, 4).mean(axis=(1, 3))
+    assert np.abs(picture.level(1)[:150] - wanted).max() < 1e-6
+    assert picture.level(1).shape == (151, 3, 4)
+    assert np.abs(picture.level(1)[150] - linear[300].reshape(3, 2, 4).mean(axis=1)).max() < 1e-6
+
+
+OUTSIDE = [
+    "../secret.png",
+    "a/../../secret.png",
+    "%2e%2e/secret.png",
+    "/etc/hostname",
+    "file:///etc/hostname",
+    "http://127.0.0.1:1/a.png",
+    "//host/a.png",
+    "link.png",
+]
+
+
+@pytest.mark.parametrize("uri", OUTSIDE)
+def test_pictures_do_not_lead_out(tmp_path: Path, uri: str) -> None:
+    (tmp_path / "secret.png").write_bytes(picture_bytes(CORNERS))
+    folder = tmp_path / "objects"
+    folder.mkdir()
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    assert lost(textured_gltf(folder / "a.gltf", uri)) == "texture_outside"
+
+
+def test_an_mtl_does_not_lead_out_either(tmp_path: Path) -> None:
+    (tmp_path / "secret.png").write_bytes(picture_bytes(CORNERS))
+    for name in ("../secret.png", "..\\secret.png", "/etc/hostname"):
+        path = textured_obj(tmp_path / "o" / "a.obj", b"", mtl=f"map_Kd {name}\n")
+        assert lost(path) == "texture_outside"
+
+
+def test_missing_pictures_and_libraries(tmp_path: Path) -> None:
+    assert lost(textured_gltf(tmp_path / "a.gltf", "gone.png")) == "texture_missing"
+    path = textured_obj(tmp_path / "o" / "a.obj", b"", mtl="map_Kd gone.png\n")
+    assert lost(path) == "texture_missing"
+    (tmp_path / "o" / "a.mtl").unlink()
+    assert lost(path) == "texture_missing"
+
+
+def test_an_mtl_that_makes_no_sense(tmp_path: Path) -> None:
+    for mtl in ("Kd red green\n", "Kd nan 0 0\n", "Kd 1 2\n"):
+        path = textured_obj(tmp_path / "o" / "a.obj", b"", mtl=mtl)
+        assert lost(path) == "materials_unreadable"
+    path.write_text(path.read_text().replace("usemtl it is", "usemtl another"))
+    assert lost(path) == "materials_unreadable"
+
+
+def test_coordinates_that_are_absent_or_no_numbers(tmp_path: Path) -> None:
+    picture = picture_bytes(CORNERS)
+    assert lost(textured_glb(tmp_path / "a.glb", picture, None)) == "no_texture_coordinates"
+    broken = np.where(UV_UP == 1, np.inf, UV_UP)
+    path = textured_glb(tmp_path / "b.glb", picture, broken)
+    assert lost(path) == "texture_coordinates_not_finite"
+
+
+def test_materials_that_are_malformed(tmp_path: Path) -> None:
+    changes: list[Callable[[dict[str, Any]], None]] = [
+        lambda tree: tree.update(textures=[{"source": 7}]),
+        lambda tree: tree.update(textures=[]),
+        lambda tree: tree.update(images=["picture"]),
+        lambda tree: tree.update(materials=[{"pbrMetallicRoughness": {"baseColorFactor": [1]}}]),
+        lambda tree: tree.update(materials=[7]),
+    ]
+    for change in changes:
+        tree, buffer = textured_tree(picture_bytes(CORNERS))
+        change(tree)
+        assert lost(write_glb(tmp_path / "a.glb", tree, buffer)) == "materials_unreadable"
+
+
+def test_folded_coordinates_show_one_colour(tmp_path: Path) -> None:
+    """All corners at one place of a picture, as palettes are used: that colour everywhere."""
+    folded = np.full((4, 2), [0.75, 0.25])
+    asset = prepare_asset(textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), folded), KEEP)
+    skin = asset.levels[0].skin
+    assert skin is not None and skin.textures[0].texels.shape == (1, 1, 3)
+    assert np.allclose(skin.textures[0].texels[0, 0], [0, 1 - F, 0], atol=1e-6)
+
+
+GREY = np.array([[40, 200], [120, 250]], np.uint8)
+DEEP = GREY.astype(np.uint16) * 257
+FORMS: dict[str, bytes] = {
+    "grey": picture_bytes(GREY),
+    "16 bits": picture_bytes(DEEP),
+    "alpha": picture_bytes(GREY, mode="LA"),
+    "palette": picture_bytes(GREY, mode="P"),
+    "RGBA": picture_bytes(GREY, mode="RGBA"),
+    "CMYK": picture_bytes(np.kron(GREY, np.ones((16, 16), np.uint8)), "JPEG", "CMYK"),
+    "WebP": picture_bytes(np.kron(GREY, np.ones((16, 16), np.uint8)), "WEBP", "RGB"),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_forms_of_pictures(tmp_path: Path, form: str) -> None:
+    asset = prepare_asset(textured_glb(tmp_path / "a.glb", FORMS[form]), KEEP)
+    places = {(-0.25, 0.25): 40, (0.25, 0.25): 200, (-0.25, -0.25): 120, (0.25, -0.25): 250}
+    for place, code in places.items():
+        wanted = linear_from_srgb8()[code] * (1 - F)
+        assert np.abs(seen_at(asset, *place) - wanted).max() < TOLERANCE, place
+
+
+def test_one_texel_is_a_constant(tmp_path: Path) -> None:
+    data = picture_bytes(np.array([[[10, 128, 200]]], np.uint8))
+    skin = prepare_asset(textured_glb(tmp_path / "a.glb", data), KEEP).levels[0].skin
+    assert skin is not None and [t.texels.shape[0] for t in skin.textures] == [1, 1, 1]
+    wanted = linear_from_srgb8()[[10, 128, 200]] * (1 - F)
+    assert np.allclose(skin.textures[0].texels[0, 0], wanted, atol=1e-6)
+
+
+def test_a_data_uri_holds_a_picture(tmp_path: Path) -> None:
+    import base64
+
+    text = "data:image/png;base64," + base64.b64encode(picture_bytes(CORNERS)).decode()
+    asset = prepare_asset(textured_gltf(tmp_path / "a.gltf", text), KEEP)
+    assert np.allclose(seen_at(asset, -0.25, -0.25), [1 - F, 0, 0], atol=TOLERANCE)
+    tree = json.loads((tmp_path / "a.gltf").read_text())
+    tree["images"][0]["uri"] = "data:image/png;base64,!"
+    (tmp_path / "a.gltf").write_text(json.dumps(tree))
+    assert lost(tmp_path / "a.gltf") in ("texture_unreadable", "materials_unreadable")

@@ -1,0 +1,259 @@
+"""An object's colours from its file to its asset: orientation, constants, exactness, workflows."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.assets.cleaning.clean import clean, normalise
+from pipeline.assets.cleaning.orient import orient_outward
+from pipeline.assets.own.skin import skin_maker
+from pipeline.assets.reading.load import load_mesh
+from pipeline.assets.reading.source_file import read_source
+from pipeline.assets.settings import AssetSettings, OwnMaterialSettings
+from storage.conventions import linear_from_srgb8
+from storage.errors import Rejected
+from storage.records.asset import Asset, decode_asset, encode_asset
+from tests.pipeline.assets.meshes_by_hand import (
+    geometry,
+    gltf_tree,
+    prepare,
+    sphere,
+    write_glb,
+    write_obj,
+)
+from tests.pipeline.assets.own.textured_kit import (
+    CORNERS,
+    KEEP,
+    OWN,
+    QUARTERS,
+    SQUARE,
+    UV_UP,
+    picture_bytes,
+    seen_at,
+    textured_glb,
+    textured_gltf,
+    textured_obj,
+    textured_tree,
+)
+
+F = 0.04 + 0.96 / 21
+"""Specular albedo of an ordinary dielectric: the mean of Schlick's term for F0 = 0.04."""
+STORED = 0.006
+"""Half a step of 8 bits in sRGB near white."""
+SLOPE = 0.04
+"""Colours of two texels change by 2 over the width, and texels are inset by a quarter of a cell of
+a sixteenth of it; a wrong corner is off by 0.9."""
+
+FILES: dict[str, Callable[[Path], Path]] = {
+    "glb": lambda folder: textured_glb(folder / "a.glb", picture_bytes(CORNERS)),
+    "gltf": lambda folder: textured_gltf(folder / "a.gltf", picture_bytes(CORNERS)),
+    "obj": lambda folder: textured_obj(folder / "o" / "a.obj", picture_bytes(CORNERS)),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_quad_keeps_its_corner_colours(tmp_path: Path, kind: str) -> None:
+    """A mirrored u or v, or a quarter turn, would swap them."""
+    asset = prepare(FILES[kind](tmp_path), KEEP)
+    for (right, up), colour in QUARTERS.items():
+        wanted = np.array(colour) / 255 * (1 - F)
+        assert np.abs(seen_at(asset, right, up) - wanted).max() < SLOPE, (right, up)
+
+
+def test_the_mean_of_colours_is_one_of_light_and_not_of_codes(tmp_path: Path) -> None:
+    grey = np.array([[[188, 188, 188]] * 2] * 2, np.uint8)
+    grey[0, 0] = 187  # else it is a constant
+    asset = prepare(textured_glb(tmp_path / "a.glb", picture_bytes(grey)), KEEP)
+    wanted = linear_from_srgb8()[188] * (1 - F)
+    assert np.abs(seen_at(asset, 0.25, -0.25) - wanted).max() < STORED
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (3, -2), (-7, 1)])
+def test_coordinates_beyond_the_picture_repeat_it(tmp_path: Path, shift: tuple[int, int]) -> None:
+    path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), UV_UP + shift)
+    asset = prepare(path, KEEP)
+    for (right, up), colour in QUARTERS.items():
+        assert np.abs(seen_at(asset, right, up) - np.array(colour) / 255 * (1 - F)).max() < SLOPE
+
+
+def test_a_texture_transform_moves_the_picture(tmp_path: Path) -> None:
+    """A quarter turn about the lower left and a shift back: by the formula of the extension."""
+    tree, buffer = textured_tree(picture_bytes(CORNERS))
+    slot = tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    slot["extensions"] = {
+        "KHR_texture_transform": {"rotation": np.pi / 2, "offset": [0.0, 1.0], "scale": [1, 1]}
+    }
+    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
+    for right, up in QUARTERS:
+        u, w = right + 0.5, 0.5 - up  # as glTF counts them, w down
+        moved_u, moved_w = w, 1 - u  # shift + [[cos, sin], [-sin, cos]] (u, w)
+        colour = QUARTERS[(moved_u - 0.5, 0.5 - moved_w)]
+        assert np.abs(seen_at(asset, right, up) - np.array(colour) / 255 * (1 - F)).max() < SLOPE
+
+
+def _plain(path: Path, base: list[float], **more: float) -> Asset:
+    tree, buffer = gltf_tree(sphere(rings=6, columns=9))
+    tree["meshes"][0]["primitives"][0]["material"] = 0
+    tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [*base, 1.0], **more}}]
+    return prepare(write_glb(path, tree, buffer), KEEP)
+
+
+def test_one_colour_is_a_constant_and_exact(tmp_path: Path) -> None:
+    base = [0.3, 0.62, 0.011]
+    asset = _plain(tmp_path / "a.glb", base, metallicFactor=0.0, roughnessFactor=0.37)
+    for level in asset.levels:
+        assert level.skin is not None
+        diffuse, specular, roughness = level.skin.textures
+        assert [texture.texels.shape[:2] for texture in level.skin.textures] == [(1, 1)] * 3
+        assert np.array_equal(diffuse.texels[0, 0], (np.array(base) * (1 - F)).astype(np.float32))
+        assert np.array_equal(specular.texels[0, 0], np.full(3, F, np.float32))
+        assert roughness.texels[0, 0, 0] == np.float32(0.37)
+
+
+def test_a_metal_has_no_diffuse_part(tmp_path: Path) -> None:
+    asset = _plain(tmp_path / "a.glb", [0.9, 0.5, 0.1], metallicFactor=1.0, roughnessFactor=0.2)
+    skin = asset.levels[0].skin
+    assert skin is not None and not skin.textures[0].texels.any()
+    base = np.array([0.9, 0.5, 0.1])
+    assert np.allclose(skin.textures[1].texels[0, 0], base + (1 - base) / 21, atol=1e-6)
+
+
+def test_metal_is_blue_and_roughness_green(tmp_path: Path) -> None:
+    """And both are linear, whatever the picture is flagged as: the slot decides."""
+    tree, buffer = textured_tree(picture_bytes(np.array([[[9, 51, 0], [9, 204, 255]]], np.uint8)))
+    metal = tree["materials"][0]["pbrMetallicRoughness"]
+    metal |= {"metallicRoughnessTexture": metal.pop("baseColorTexture"), "metallicFactor": 1}
+    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
+    assert abs(seen_at(asset, -0.25, 0, 2)[0] - 51 / 255) < STORED
+    assert abs(seen_at(asset, 0.25, 0, 2)[0] - 204 / 255) < STORED
+    assert np.abs(seen_at(asset, -0.25, 0) - (1 - F)).max() < STORED
+    assert np.abs(seen_at(asset, 0.25, 0)).max() < STORED
+
+
+def test_the_specular_extension_scales_f0(tmp_path: Path) -> None:
+    tree, buffer = gltf_tree(sphere(rings=6, columns=9))
+    tree["meshes"][0]["primitives"][0]["material"] = 0
+    specular = {"specularFactor": 0.5, "specularColorFactor": [2.0, 1.0, 0.0]}
+    tree["materials"] = [
+        {
+            "pbrMetallicRoughness": {"metallicFactor": 0},
+            "extensions": {"KHR_materials_specular": specular},
+        }
+    ]
+    skin = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP).levels[0].skin
+    assert skin is not None
+    f0 = np.array([0.04, 0.02, 0.0])
+    assert np.allclose(skin.textures[1].texels[0, 0], f0 + (1 - f0) / 21, atol=1e-6)
+
+
+def test_an_undecimated_level_shows_the_source_within_a_texel(tmp_path: Path) -> None:
+    """A ramp along u on a ball: colours change by its slope times a texel, and by 8 bits."""
+    ball = sphere(rings=9, columns=16)
+    ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    uv = ball.positions[:, [0, 2]] - ball.positions[:, [0, 2]].min(axis=0)
+    uv /= uv.max(axis=0)
+    path = textured_glb(tmp_path / "a.glb", picture_bytes(np.repeat(ramp, 2, axis=0)), uv, ball)
+    own = dataclasses.replace(OWN, texels=128)
+    asset = prepare(path, dataclasses.replace(KEEP, own_materials=own))
+    level = asset.levels[0]
+    assert level.record.method == "source" and level.skin is not None
+    quality = level.skin.quality
+    slope = 2.4  # of the sRGB curve at white, by which codes become light
+    assert quality.colour_error < slope / quality.texels_per_length
+    assert quality.missed_cells == 0 and quality.torn_seams == 0
+    coarse = prepare(path, dataclasses.replace(KEEP, budgets=(60,)))
+    assert coarse.levels[0].skin is not None
+    assert coarse.levels[0].skin.quality.colour_error > 2 * quality.colour_error
+
+
+def test_materials_change_no_triangle_and_nothing_where_nobody_asks(tmp_path: Path) -> None:
+    path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS))
+    own, plain = prepare(path, KEEP), prepare(path)
+    assert geometry(own) == geometry(plain) and own.geometry_sha256 == plain.geometry_sha256
+    stripped = dataclasses.replace(
+        own,
+        materials=None,
+        levels=tuple(dataclasses.replace(level, skin=None) for level in own.levels),
+    )
+    assert encode_asset(stripped) == encode_asset(plain)
+    assert b"skin" not in encode_asset(plain) and b"materials" not in encode_asset(plain)
+
+
+def test_a_skin_survives_the_file_of_its_asset(tmp_path: Path) -> None:
+    asset = prepare(textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS)), KEEP)
+    again = decode_asset(encode_asset(asset))
+    assert again.materials == asset.materials
+    ours, theirs = asset.levels[0].skin, again.levels[0].skin
+    assert ours is not None and theirs is not None and ours.quality == theirs.quality
+    assert np.array_equal(ours.uv, theirs.uv)
+    assert [t.sha256 for t in ours.textures] == [t.sha256 for t in theirs.textures]
+
+
+def test_two_materials_of_one_file_meet_in_one_atlas(tmp_path: Path) -> None:
+    """And the faces of a part without any get what glTF says of them."""
+    path = tmp_path / "o" / "a.obj"
+    textured_obj(path, b"", mtl="Kd 1 0 0\nillum 1\nnewmtl other\nKd 0 0 1\nillum 1\n")
+    path.write_text(path.read_text().replace("f 1/1 3/3", "usemtl other\nf 1/1 3/3"))
+    asset = prepare(path, KEEP)
+    assert np.allclose(seen_at(asset, 0.25, -0.25), [1, 0, 0], atol=STORED)
+    assert np.allclose(seen_at(asset, -0.25, 0.25), [0, 0, 1], atol=STORED)
+    assert np.allclose(seen_at(asset, -0.25, 0.25, 1), 0)
+
+
+def test_what_nothing_here_can_show_is_named(tmp_path: Path) -> None:
+    tree, buffer = textured_tree(picture_bytes(CORNERS))
+    tree["materials"][0] |= {"emissiveFactor": [1, 1, 1], "alphaMode": "BLEND"}
+    tree["materials"][0]["extensions"] = {"KHR_materials_clearcoat": {}}
+    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer), KEEP)
+    assert asset.materials is not None
+    assert asset.materials.lost == ("clearcoat", "emission", "transparency")
+
+
+def test_vertex_colours_tint_the_base(tmp_path: Path) -> None:
+    tree, buffer = textured_tree(picture_bytes(np.full((1, 1, 3), 255, np.uint8)))
+    data = np.array([[1, 0, 0, 1]] * 4, "<f4").tobytes()
+    view = {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)}
+    tree["bufferViews"].append(view)
+    tree["accessors"].append(
+        {
+            "bufferView": len(tree["bufferViews"]) - 1,
+            "componentType": 5126,
+            "count": 4,
+            "type": "VEC4",
+        }
+    )
+    tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = len(tree["accessors"]) - 1
+    tree["buffers"][0]["byteLength"] = len(buffer) + len(data)
+    asset = prepare(write_glb(tmp_path / "a.glb", tree, buffer + data), KEEP)
+    assert np.allclose(seen_at(asset, 0.1, 0.1), [1 - F, 0, 0], atol=1e-6)
+
+
+def test_a_level_over_its_bound_goes_without_or_is_refused(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    path = textured_glb(tmp_path / "a.glb", picture_bytes(noise))
+    strict = OwnMaterialSettings(keep=True, texels=4, max_colour_error=1e-3)
+    asset = prepare(path, AssetSettings(own_materials=strict))
+    assert asset.materials is not None and asset.materials.reason == "colours_changed"
+    assert all(level.skin is None for level in asset.levels)
+
+
+def test_a_level_that_lies_nowhere_near_its_source_is_told(tmp_path: Path) -> None:
+    """A level that was shrunk behind the back of its own measure."""
+    ball = sphere(rings=9, columns=16)
+    uv = ball.positions[:, [0, 2]]
+    path = textured_glb(tmp_path / "a.glb", picture_bytes(CORNERS), uv, ball)
+    source = read_source(path, KEEP)
+    mesh, _ = orient_outward(clean(normalise(load_mesh(source))))
+    maker, _ = skin_maker(source, mesh, dataclasses.replace(OWN, max_colour_error=1.0))
+    level = prepare(path, KEEP).levels[0]
+    assert maker.skinned(level).skin is not None
+    with pytest.raises(Rejected, match="colours_missed"):
+        maker.skinned(dataclasses.replace(level, positions=0.8 * level.positions))
+
+
+def test_a_file_that_has_no_materials_says_so(tmp_path: Path) -> None:
+    asset = prepare(write_obj(tmp_path / "a.obj", SQUARE), KEEP)
+    assert asset.materials is not None and asset.materials.reason == "no_materials"

@@ -1,0 +1,36 @@
+"""Own materials in the settings of a build: one word asks for them; others stay as they were."""
+
+from pipeline.builds.named import BUILDS, named_build
+from pipeline.builds.settings import BuildSettings
+from storage.settings.described import from_record
+
+OWN = {"scenes.materials.source": "object"}
+
+
+def test_one_word_asks_for_them() -> None:
+    build = named_build("smoke", changes=OWN)
+    assert build.mesh_settings.own_materials.keep
+    record = build.as_json()
+    assert record["assets"]["own_materials"]["keep"] is True
+    assert record["scenes"]["materials"]["source"] == "object"
+    again = from_record(BuildSettings, record)
+    assert again.digest == build.digest and again.mesh_settings == build.mesh_settings
+
+
+def test_sizes_and_shares_count_in_the_digest() -> None:
+    plain = named_build("smoke", changes=OWN)
+    for name, value in (
+        ("assets.own_materials.texels", 64),
+        ("assets.own_materials.if_lost", "reject"),
+        ("scenes.materials.own_share", 0.5),
+    ):
+        assert named_build("smoke", changes={**OWN, name: value}).digest != plain.digest, name
+
+
+def test_a_build_that_draws_its_materials_says_nothing_of_them() -> None:
+    for name in BUILDS:
+        record = BUILDS[name].settings().as_json()
+        assert "own_materials" not in record["assets"]
+        assert not {"source", "own_share"} & set(record["scenes"]["materials"])
+    smoke = named_build("smoke")
+    assert smoke.mesh_settings == smoke.assets
