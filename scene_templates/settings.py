@@ -90,7 +90,7 @@ class SceneSettings:
     materials: MaterialSettings = field(default_factory=MaterialSettings)
     """Materials of objects, floor and walls."""
     textures: TextureSettings = field(default_factory=TextureSettings)
-    """Procedural textures of objects, floor and walls."""
+    """Textures of objects, floor and walls."""
     lights: LightSettings = field(default_factory=LightSettings)
     """Emitters of the scenes."""
     cameras: CameraSettings = field(default_factory=CameraSettings)
@@ -105,8 +105,11 @@ class SceneSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `textures` and `skies` that no scene has: digests of earlier builds stay."""
+        """Leave out what no scene has of textures and skies: digests of earlier builds stay."""
         record: dict[str, Any] = as_usual(self)
+        for name in ("textures", "skies"):
+            if not record[name]["own_share"]:
+                del record[name]["own_share"]
         absent = {name for name in ("textures", "skies") if not record[name]["share"]}
         return {name: value for name, value in record.items() if name not in absent}
 
