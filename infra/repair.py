@@ -59,14 +59,16 @@ def repair(
     require_same_extensions(str(root), manifest.extensions, recorded("data"))
     changes, licence = _changes(manifest), _stated_licence(opened)
     asked = read_asked(opened) or ()
-    revisits = _revisited(opened, asked)
+    revisits, own = _revisited(opened, asked), _own_maps(opened, asked)
     order = DatasetOrder(
         build=manifest.build,
         objects=None if scenes_from or revisits else objects,
         out=str(root),
         scenes=None if scenes_from or revisits else manifest.num_scenes,
         licence=licence,
-        **_own_maps(opened, asked),
+        textures=own.get("textures"),
+        skies=own.get("skies"),
+        map_licence=own.get("map_licence"),
         scenes_from=scenes_from,
         revisits=revisits,
         views=manifest.num_views if scenes_from else None,

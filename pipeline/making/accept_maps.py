@@ -26,7 +26,7 @@ from storage.records.objects import SKY, TEXTURE, Failure, LockedObject
 
 log = logging.getLogger("trilight.maps")
 
-_LIMITS = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=300, calls_per_child=20)
+_LIMITS = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=300, calls_per_child=200)
 """The largest map, 8192 x 4096 in float32, takes 403 MB, and its means six times as much."""
 
 

@@ -43,11 +43,10 @@ def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32
     lawful = np.maximum(radiance, 0)
     whole, negative = flux(lawful), flux(lawful - radiance)
     if (negative > MOST_NEGATIVE * whole).any() and negative.any():
-        share = float(np.max(negative / np.maximum(whole, np.finfo(float).tiny)))
         raise Rejected(
             "negative_radiance",
-            f"negative values are {share:.3g} of the light; expected at most {MOST_NEGATIVE:g}: "
-            "set them to 0 in a picture editor",
+            f"negative values take more than {MOST_NEGATIVE:g} of the light of a channel; set them "
+            "to 0 in a picture editor",
         )
     _refuse(lawful > MAX_RADIANCE, "too_bright", f"is over {MAX_RADIANCE:g}; scale the map down")
     if not whole.sum() > 0:

@@ -67,6 +67,8 @@ def _texels(data: bytes, start: int, rows: int, columns: int) -> NDArray[np.uint
         if _SHORTEST <= columns <= _LONGEST and data[at : at + 4] == mark:
             at = _runs(data, at + 4, found[row])
             continue
+        if data[at : at + 2] == mark[:2] and data[at + 2 : at + 3] < b"\x80":
+            raise _damaged(f"row {row} is of another width")
         flat = np.frombuffer(data[at : at + 4 * columns], np.uint8)
         if len(flat) < 4 * columns:
             raise _damaged(f"row {row} is cut short")
