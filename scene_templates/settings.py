@@ -55,7 +55,8 @@ class ViewLaws:
     min_coverage: Share = 0.02
     """Minimum share of the camera rays that hit an object first, in scenes that have objects."""
     min_lit: Share = 0.05
-    """Minimum share of the visible surface points that some emitter lights on the visible side."""
+    """Minimum share of the visible surface points that some emitter lights on the visible side, or
+    the sky, looked for in eight directions."""
     max_shell_back: Share = 0.1
     """Maximum share of the camera rays that hit a floor or wall from behind."""
     min_depth: Annotated[float, OFFSET] = 0.01

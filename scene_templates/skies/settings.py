@@ -18,7 +18,7 @@ class SkySettings:
     own_share: Share = 0.0
     """Share of those skies that are of your own folder (`--skies`), each equally likely; the others
     are procedural, and so are all in a split to which none of the folder belongs."""
-    over_lamps_log: Annotated[Range, Within(1e-6, 1e6)] = (0.05, 5.0)
+    over_lamps_log: Annotated[Range, Within(1e-6, 1e6)] = (0.02, 1.0)
     """Range, log-uniform, of the irradiance that a sky of constant radiance, the mean of the map,
     has on a surface, over that of all emitters at the middle of the room on surfaces that face
     them. It takes the place of `maps.mean_radiance`."""
