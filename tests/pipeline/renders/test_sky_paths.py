@@ -59,9 +59,9 @@ def test_both_integrators_agree_within_their_noise(
     lit = ours.mean > 0.01 * ours.mean.max()
     score = (ours.mean - theirs.mean)[lit] / np.hypot(ours.error, theirs.error)[lit]
     # As in test_twin_tracers, but for the mean: channels and blocks share their luck with a few
-    # small lamps, and 115 scores of the night are worth 45 independent ones. In ten repeats of 16 passes
-    # their mean had a standard deviation of 0.15 with lamps and 0.21 without, and no bias: over 160
-    # passes it was 0.07 and 0.05, and all light together differed by 0.08 % and 0.09 %.
+    # small lamps, and 115 scores of the night are worth 45 independent ones. In ten repeats of 16
+    # passes their mean had a standard deviation of 0.15 with lamps and 0.21 without, and no bias:
+    # over 160 passes it was 0.07 and 0.05, and all light together differed by 0.08 and 0.09 %.
     assert 0.8 < np.sqrt(np.mean(score**2)) < 1.35
     assert len(score) > 90 and abs(score.mean()) < 0.5
 
