@@ -1,6 +1,8 @@
 """Folders of textures and maps to frozen rows: splits by content, and no map of test in train."""
 
+import csv
 import dataclasses
+import io
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
+from pipeline.documents.attribution import encode_attribution
 from pipeline.making.accept_maps import AcceptedMaps, MapFolders, accept_maps, map_folders
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.own_maps import own_maps
@@ -15,12 +18,15 @@ from pipeline.objects.maps.prepared import MapFiles, prepare_map
 from pipeline.scenes.compose import compose_scene
 from scene_templates.own_maps import OwnMap, drawn_own
 from storage.conventions import SPLITS
+from storage.dataset.manifest import Manifest
+from storage.dataset.verify import check_sample
 from storage.errors import Rejected, TrilightError
 from storage.records.objects import SKY, TEXTURE, decode_objects_lock, encode_objects_lock
 from storage.records.texture import MapSource
 from storage.seeds import rng_for
 from tests.pipeline.objects.maps.map_files import exr, noise, png, sun_map
 from tests.pipeline.scenes.small_pool import small_pool
+from tests.scenes_by_hand import tiny_sample
 
 SHARES = {
     "scenes.textures.share": 0.9,
@@ -116,6 +122,30 @@ def test_without_own_ones_a_scene_is_what_it_was(
     assert "maps" not in second.provenance
     record = dataclasses.asdict(settings.scenes)
     assert record["skies"]["own_share"] == 1.0
+
+
+def test_documents_name_them_and_a_stranger_in_a_scene_is_a_fault(accepted: AcceptedMaps) -> None:
+    rows = [locked for locked, _ in accepted.rows]
+    table = list(csv.DictReader(io.StringIO(encode_attribution(rows).decode())))
+    done = {row["uid"]: row["changes"] for row in table}
+    assert "laid on other surfaces" in done["texture:copy"] and "turned" in done["sky:copy"]
+    sample, locked = tiny_sample(), {row.uid: row for row in rows}
+    manifest = Manifest(
+        build="smoke",
+        settings={},
+        environment={},
+        num_scenes=1,
+        num_views=sample.scene.num_views,
+        objects_lock_sha256="",
+        shards=(),
+    )
+    trains = next(row.uid for row in rows if row.split == "train")
+    held = next(row.uid for row in rows if row.split == "test")
+    named = {**sample.scene.provenance, "maps": [trains, held, "sky:unknown"]}
+    shown = dataclasses.replace(sample, scene=sample.scene.with_provenance(named))
+    faults = "; ".join(check_sample(shown, "train", manifest, locked))
+    assert f"object {held!r} belongs to split test" in faults
+    assert "object 'sky:unknown' is not in objects.lock.jsonl" in faults and trains not in faults
 
 
 def test_share_alike_licences_never_meet() -> None:
