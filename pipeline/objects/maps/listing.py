@@ -68,7 +68,7 @@ def find_maps(
     Raises:
         TrilightError: the folder is missing or holds nothing, or its catalogue has a mistake.
     """
-    root, shown, plural = Path(folder), printable(folder), PLURALS[kind]
+    root, shown, plural = Path(os.path.realpath(folder)), printable(folder), PLURALS[kind]
     suffixes = " ".join(SUFFIXES[kind])
     if "://" in folder or not root.is_dir():
         raise TrilightError(
@@ -78,7 +78,7 @@ def find_maps(
     stated, catalogue = stated_licence(licence), _only_catalogue(root, plural)
     failures: list[Failure] = []
     if catalogue is None:
-        records = _scanned(kind, Path(os.path.realpath(root)), stated, failures)
+        records = _scanned(kind, root, stated, failures)
     else:
         require_unstated(licence, catalogue.name)
         records = [replace(row, uid=f"{kind}:{row.uid}") for row in read_catalogue(catalogue)]
@@ -89,7 +89,7 @@ def find_maps(
         )
     allowed, refused = refuse_licences(records, allowed_licences)
     return FoundMaps(
-        maps=tuple(_with_files(kind, sorted(allowed, key=attrgetter("uid")))),
+        maps=tuple(_with_files(kind, root, sorted(allowed, key=attrgetter("uid")))),
         failures=tuple(sorted([*failures, *refused], key=attrgetter("item"))),
     )
 
@@ -104,8 +104,11 @@ def _only_catalogue(root: Path, plural: str) -> Path | None:
     return found[0] if found else None
 
 
-def _with_files(kind: str, records: Sequence[ObjectRecord]) -> list[FoundMap]:
-    """Return records with their files; those beside a base colour that belong to it come too."""
+def _with_files(kind: str, root: Path, records: Sequence[ObjectRecord]) -> list[FoundMap]:
+    """Return records with their files; those beside a base colour that belong to it come too.
+
+    Links out of the folder do not.
+    """
     sets: dict[Path, dict[str, dict[str, Path]]] = {}
     found = []
     for record in records:
@@ -115,7 +118,11 @@ def _with_files(kind: str, records: Sequence[ObjectRecord]) -> list[FoundMap]:
             if path.parent not in sets:
                 sets[path.parent] = sets_of(path.parent)
             beside = sets[path.parent].get(named_part(path.stem)[0], {})
-            files = {part: at for part, at in beside.items() if part not in NO_TEXTURE} | files
+            files = {
+                part: at
+                for part, at in beside.items()
+                if part not in NO_TEXTURE and _is_below(root, at)
+            } | files
         found.append(FoundMap(record=record, files=files))
     return found
 
@@ -130,7 +137,7 @@ def _scanned(
     records: dict[str, ObjectRecord] = {}
     for name, (stem, part) in parts.items():
         uid, item = f"{kind}:{printable(stem)}", f"{kind}:{printable(name)}"
-        if not Path(os.path.realpath(root / name)).is_relative_to(root):
+        if not _is_below(root, root / name):
             message = "it is a link out of the folder; copy the file into it"
             failures.append(failure(item, "link_outside", message))
         elif part in NO_TEXTURE:
@@ -146,6 +153,11 @@ def _scanned(
         else:
             records[uid] = _record(uid, root / name, stated)
     return list(records.values())
+
+
+def _is_below(root: Path, path: Path) -> bool:
+    """Return whether a file is in a folder, wherever links lead; for links in a circle too."""
+    return Path(os.path.realpath(path)).is_relative_to(root)
 
 
 def _named(kind: str, stem: str) -> tuple[str, str]:

@@ -83,6 +83,11 @@ def test_links_out_of_the_folder_are_refused(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.png").symlink_to(outside)
     assert [one.reason for one in _find(tmp_path / "in").failures] == ["link_outside"]
+    png(tmp_path / "in" / "b.png", noise(1))
+    (tmp_path / "in" / "b_roughness.png").symlink_to(outside)
+    found = _find(tmp_path / "in")
+    assert [sorted(one.files) for one in found.maps] == [["base"]]
+    assert [one.reason for one in found.failures] == ["link_outside"] * 2
 
 
 def test_a_folder_that_is_not_there_or_empty_is_a_mistake(tmp_path: Path) -> None:
