@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pipeline.objects.maps.texture_set import texture_set
 from storage.conventions import linear_from_srgb8
 
 
-def _flat(value: float, channels: int = 1) -> np.ndarray:
+def _flat(value: float, channels: int = 1) -> NDArray[np.float32]:
     return np.full((4, 4, channels), value, np.float32)
 
 
@@ -34,7 +35,8 @@ def test_a_specular_map_gives_way_where_both_are_over_one() -> None:
 
 def test_means_are_of_linear_values_and_of_widths() -> None:
     """Black and white squares are half as bright together, which encoded ones are not."""
-    squares = (np.indices((8, 8)).sum(axis=0) % 2).astype(np.float32)[..., None]
+    squares: NDArray[np.float32] = np.zeros((8, 8, 1), np.float32)
+    squares[::2, 1::2] = squares[1::2, ::2] = 1
     made = texture_set({"base": squares, "specular": _flat(0.0), "roughness": squares}, 2)
     assert made.roughness is not None
     np.testing.assert_allclose(made.diffuse_rgb, 0.5, rtol=1e-6)
@@ -47,7 +49,8 @@ def test_means_are_of_linear_values_and_of_widths() -> None:
 def test_proportions_stay_and_parts_of_other_sizes_fit(
     shape: tuple[int, int], fitted: tuple[int, int]
 ) -> None:
-    made = texture_set({"base": np.ones((*shape, 3), np.float32), "roughness": _flat(0.3)}, 4)
+    base = np.full((*shape, 3), 1, np.float32)
+    made = texture_set({"base": base, "roughness": _flat(0.3)}, 4)
     assert made.diffuse_rgb.shape[:2] == fitted
     assert made.roughness is not None and made.roughness.shape == (*fitted, 1)
 
