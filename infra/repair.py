@@ -17,6 +17,7 @@ from storage.dataset.derived import derivation_of
 from storage.dataset.manifest import Manifest
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
+from storage.records.objects import OBJECT, SKY, TEXTURE
 from storage.remote.url import parse_url
 
 ASIDE = ".bad"
@@ -58,13 +59,16 @@ def repair(
     require_same_extensions(str(root), manifest.extensions, recorded("data"))
     changes, licence = _changes(manifest), _stated_licence(opened)
     asked = read_asked(opened) or ()
-    revisits = _revisited(opened, asked)
+    revisits, own = _revisited(opened, asked), _own_maps(opened, asked)
     order = DatasetOrder(
         build=manifest.build,
         objects=None if scenes_from or revisits else objects,
         out=str(root),
         scenes=None if scenes_from or revisits else manifest.num_scenes,
         licence=licence,
+        textures=own.get("textures"),
+        skies=own.get("skies"),
+        map_licence=own.get("map_licence"),
         scenes_from=scenes_from,
         revisits=revisits,
         views=manifest.num_views if scenes_from else None,
@@ -123,6 +127,26 @@ def _revisited(dataset: Dataset, asked: Sequence[str]) -> str | None:
     return place
 
 
+def _own_maps(dataset: Dataset, asked: Sequence[str]) -> dict[str, str | None]:
+    """Return the folders of textures and maps, as `logs/asked.json` has them.
+
+    Raises:
+        TrilightError: the dataset has such, and it does not say where they are.
+    """
+    kinds = {entry.kind for entry in dataset.objects_lock()}
+    options = {TEXTURE: "textures", SKY: "skies"}
+    given: dict[str, str | None] = {
+        name: value_of(asked, f"--{name}") for kind, name in options.items() if kind in kinds
+    }
+    if None in given.values():
+        raise TrilightError(
+            f"{dataset.shown}: its scenes have textures or maps of a folder, and logs/asked.json "
+            "does not say where that is. Delete the bad shards, and run the same `trilight "
+            "generate` again."
+        )
+    return given | ({"map_licence": value_of(asked, "--map-licence")} if given else {})
+
+
 def _changes(manifest: Manifest) -> dict[str, object]:
     """Return in what the settings of a dataset differ from those of its build's name."""
     build = named_build(manifest.build).as_json()
@@ -135,4 +159,11 @@ def _changes(manifest: Manifest) -> dict[str, object]:
 def _stated_licence(dataset: Dataset) -> str | None:
     """Return what `--licence` said when the objects were frozen; it holds for all of them."""
     locked = dataset.objects_lock()
-    return next((entry.licence for entry in locked if entry.licence_source == BY_USER), None)
+    return next(
+        (
+            entry.licence
+            for entry in locked
+            if entry.licence_source == BY_USER and entry.kind == OBJECT
+        ),
+        None,
+    )

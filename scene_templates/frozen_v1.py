@@ -59,7 +59,9 @@ SCENES_V1 = SceneSettings(
         source="drawn",
         own_share=1.0,
     ),
-    textures=TextureSettings(share=0.0, tile_m=(0.4, 1.6), surfaces=SurfaceMapSettings()),
+    textures=TextureSettings(
+        share=0.0, own_share=0.0, tile_m=(0.4, 1.6), surfaces=SurfaceMapSettings()
+    ),
     lights=LightSettings(
         count=(1, 8),
         total_emission=(2500.0, 5000.0),
@@ -80,6 +82,7 @@ SCENES_V1 = SceneSettings(
     ),
     skies=SkySettings(
         share=0.0,
+        own_share=0.0,
         over_lamps_log=(0.05, 5.0),
         seen_share=0.0,
         maps=SkyMapSettings(

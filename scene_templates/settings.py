@@ -55,7 +55,8 @@ class ViewLaws:
     min_coverage: Share = 0.02
     """Minimum share of the camera rays that hit an object first, in scenes that have objects."""
     min_lit: Share = 0.05
-    """Minimum share of the visible surface points that some emitter lights on the visible side."""
+    """Minimum share of the visible surface points that some emitter lights on the visible side, or
+    the sky, looked for in eight directions."""
     max_shell_back: Share = 0.1
     """Maximum share of the camera rays that hit a floor or wall from behind."""
     min_depth: Annotated[float, OFFSET] = 0.01
@@ -90,7 +91,7 @@ class SceneSettings:
     materials: MaterialSettings = field(default_factory=MaterialSettings)
     """Materials of objects, floor and walls."""
     textures: TextureSettings = field(default_factory=TextureSettings)
-    """Procedural textures of objects, floor and walls."""
+    """Textures of objects, floor and walls."""
     lights: LightSettings = field(default_factory=LightSettings)
     """Emitters of the scenes."""
     cameras: CameraSettings = field(default_factory=CameraSettings)
@@ -105,8 +106,11 @@ class SceneSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `textures` and `skies` that no scene has: digests of earlier builds stay."""
+        """Leave out what no scene has of textures and skies: digests of earlier builds stay."""
         record: dict[str, Any] = as_usual(self)
+        for name in ("textures", "skies"):
+            if not record[name]["own_share"]:
+                del record[name]["own_share"]
         absent = {name for name in ("textures", "skies") if not record[name]["share"]}
         return {name: value for name, value in record.items() if name not in absent}
 

@@ -1,5 +1,6 @@
 """`draw_look`: which surfaces are textured, with what, and how a texture lies on them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -7,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.checks import Range
+from scene_templates.own_maps import OwnMap, OwnTexture, drawn_own
 from scene_templates.surfaces.draw import SurfaceMapSettings, draw_surface
 from scene_templates.surfaces.maps import SurfaceMaps
 from storage.settings.described import checked
@@ -21,12 +23,16 @@ class TextureSettings:
     """How many surfaces are textured, and how."""
 
     share: Share = 0.0
-    """Share of the objects, floors and walls that have a procedural texture in the place of their
-    drawn colours and roughness. Of more than 64, the first ones are."""
+    """Share of the objects, floors and walls that have a texture in the place of their drawn
+    colours and roughness. Of more than 64, the first ones are."""
+    own_share: Share = 0.0
+    """Share of those textures that are of your own folder (`--textures`), each equally likely; the
+    others are procedural, and so are all in a split to which none of the folder belongs."""
     tile_m: Annotated[Range, Within(0.05, 100, unit="m")] = (0.4, 1.6)
     """Range of the width of a texture on a surface, in metres; it repeats after that."""
     surfaces: SurfaceMapSettings = field(default_factory=SurfaceMapSettings)
-    """Families and size of the textures."""
+    """Families of procedural textures. The size holds for your own too, as the most texels along a
+    side, and so does the range of roughness, which is uniform where no picture says it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,27 +47,49 @@ class TexturedLook:
     """0 to 3, counter-clockwise."""
     shift_uv: tuple[float, float]
     """Texture coordinates of the surface's own origin, each uniform in [0, 1)."""
+    uid: str = ""
+    """Of a user's own, as objects.lock.jsonl names it."""
 
     def uv(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return texture coordinates of places [..., 2] on a flat side: to the right and up."""
         x, y = places_m[..., 0] / self.tile_m, places_m[..., 1] / self.tile_m
         for _ in range(self.quarter_turns):
             x, y = y, -x  # the picture turns counter-clockwise where coordinates turn clockwise
+        rows, columns = self.maps.diffuse_rgb.shape[:2]
+        if rows != columns:  # texels are square on the surface
+            y = y * (columns / rows)
         return np.stack([x + self.shift_uv[0], y + self.shift_uv[1]], axis=-1)
 
 
-def draw_look(rng: np.random.Generator, settings: TextureSettings) -> TexturedLook | None:
+def draw_look(
+    rng: np.random.Generator,
+    settings: TextureSettings,
+    own: Sequence[OwnMap[OwnTexture]] = (),
+    licences: Sequence[str] = (),
+) -> TexturedLook | None:
     """Return the texture of a surface, or None where it has none.
 
     Whether it has one is drawn first: another `share` changes no texture that is there still.
+
+    Args:
+        rng: the stream of this surface.
+        settings: the shares and the ranges.
+        own: a user's own textures.
+        licences: of what is in the scene already.
     """
     if rng.random() >= settings.share:
         return None
     tile_m, turns = rng.uniform(*settings.tile_m), int(rng.integers(4))
     shift_u, shift_v = rng.random(2)
+    chosen = drawn_own(rng, own, settings.own_share, licences)
+    if chosen is None:
+        maps = draw_surface(rng, settings.surfaces)
+    else:
+        maps = chosen.load().maps(rng, chosen.source, settings.surfaces.roughness_clip)
     return TexturedLook(
-        maps=draw_surface(rng, settings.surfaces),
+        maps=maps,
         tile_m=float(tile_m),
         quarter_turns=turns,
         shift_uv=(float(shift_u), float(shift_v)),
+        uid=chosen.uid if chosen else "",
     )

@@ -1,4 +1,4 @@
-"""`attribution.csv`: whom to thank for each object, and what its licence asks for."""
+"""`attribution.csv`: whom to thank for objects, textures and maps, and what licences ask for."""
 
 import csv
 import io
@@ -6,9 +6,15 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 from storage.dataset.derived import derivation_of
+from storage.records.objects import OBJECT, SKY, TEXTURE
 
 _COLUMNS = ("uid", "title", "licence", "licence_source", "attribution", "source_url", "changes")
 _REMESHED = "cleaned, remeshed and given new materials"
+_OF_KIND = {
+    TEXTURE: "resampled, and laid on other surfaces",
+    SKY: "resampled, turned, and scaled in strength",
+}
+"""What is done to textures and maps."""
 AS_IN_FILE = "rendered as its scene file says"
 """What is done to the meshes of scene files."""
 _FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
@@ -38,7 +44,8 @@ def encode_attribution(objects: Iterable[HasRights], *, changes: str = _REMESHED
     writer.writerow(_COLUMNS)
     for entry in sorted(objects, key=lambda row: row.uid):
         rights = (entry.licence, entry.licence_source, entry.attribution, entry.source_url)
-        writer.writerow([_inert(cell) for cell in (entry.uid, entry.title, *rights, changes)])
+        done = _OF_KIND.get(getattr(entry, "kind", OBJECT), changes)
+        writer.writerow([_inert(cell) for cell in (entry.uid, entry.title, *rights, done)])
     # a lone surrogate, which JSON from outside may hold, has no UTF-8
     return stream.getvalue().encode(errors="replace")
 

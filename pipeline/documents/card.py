@@ -12,6 +12,7 @@ from pipeline.documents.rights import Rights, hub_licence, rights_markdown
 from storage.dataset.derived import Derivation, derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest
+from storage.records.objects import SKY, TEXTURE
 from storage.records.profiles import PACKED, PLAIN
 from storage.records.quantities import summary
 
@@ -172,12 +173,23 @@ def _contents(manifest: Manifest, found: Distributions) -> str:
     rows = [
         ("scenes by layout", shown or "none"),
         ("objects", f"{len(found.objects)}, of which {len(found.placements)} stand in scenes"),
+        *_own_maps(found),
         ("rejected on the way", f"{len(found.failures)}, each with its reason in failures.jsonl"),
     ]
     if triangles["count"]:
         spread = f"median {triangles['median']:.0f}, most {triangles['max']:.0f}"
         rows.insert(1, ("triangles of a scene", spread))
     return table(("", ""), rows)
+
+
+def _own_maps(found: Distributions) -> list[tuple[str, str]]:
+    """Return a row for textures and for maps that are not procedural, where there are such."""
+    rows = []
+    for kind, name in ((TEXTURE, "textures, not procedural"), (SKY, "skies, not procedural")):
+        uids = {entry.uid for entry in found.maps if entry.kind == kind}
+        if uids:
+            rows.append((name, f"{len(uids)}, of which {len(uids & set(found.map_uses))} are used"))
+    return rows
 
 
 def _made(manifest: Manifest) -> str:

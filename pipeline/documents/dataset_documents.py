@@ -28,8 +28,8 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
     """
     out, manifest = out or dataset.folder, dataset.manifest
     statistics, found = dataset_statistics(dataset), dataset_distributions(dataset)
-    rights = rights_of(found.objects)
-    write_atomically(out.attribution, attribution_of(found.objects, manifest.settings))
+    rights = rights_of(found.locked)
+    write_atomically(out.attribution, attribution_of(found.locked, manifest.settings))
     write_atomically(out.licences, encode_licences(rights))
     write_contact_sheet(dataset, statistics, out=out)
     write_report(dataset, found, out=out)

@@ -12,7 +12,7 @@ from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import Manifest
 from storage.errors import TrilightError
-from storage.records.objects import Failure, LockedObject
+from storage.records.objects import OBJECT, Failure, LockedObject, locked_uids
 from storage.records.quantities import QUANTITIES, summary
 from storage.records.sample import SceneRecord
 from storage.records.scene_facts import Values, scene_values, surfaces
@@ -28,12 +28,16 @@ class Distributions:
     """Scenes by (template, split)."""
     placements: Mapping[str, int]
     """How often each object stands in a scene, by uid; objects that stand in none are missing."""
+    map_uses: Mapping[str, int]
+    """In how many scenes each texture and map of a user's own is, likewise."""
     surfaces: Mapping[tuple[str, str], int]
     """Surfaces by (object or shell; all, smooth or many_colours)."""
     views_at_cap: Mapping[str, int]
     """Views whose sampling ended at the cap, by split."""
     objects: Sequence[LockedObject]
     """The objects that scenes may draw from."""
+    maps: Sequence[LockedObject]
+    """The textures and maps of a user's own that they may draw from."""
     failures: Sequence[Failure]
     """What was rejected."""
     targets: Mapping[str, float | None]
@@ -72,12 +76,17 @@ class Distributions:
         return dict(sorted(counts.items(), key=lambda entry: (-entry[1].total(), entry[0])))
 
     @property
+    def locked(self) -> list[LockedObject]:
+        """All rows of the lock, whose rights documents list."""
+        return [*self.objects, *self.maps]
+
+    @property
     def licences(self) -> Mapping[str, tuple[int, int, int]]:
-        """Per licence: objects, those of them that a scene uses, and their places in scenes."""
+        """Per licence: objects and maps, those that a scene uses, and their places in scenes."""
         rows: dict[str, tuple[int, int, int]] = {}
-        for entry in self.objects:
+        for entry in self.locked:
             count, used, places = rows.get(entry.licence, (0, 0, 0))
-            here = self.placements.get(entry.uid, 0)
+            here = self.placements.get(entry.uid, 0) + self.map_uses.get(entry.uid, 0)
             rows[entry.licence] = (count + 1, used + (here > 0), places + here)
         return dict(sorted(rows.items()))
 
@@ -129,12 +138,14 @@ class _Tally:
     values: dict[str, list[Mapping[str, Values]]] = field(default_factory=dict)
     scenes: Counter[tuple[str, str]] = field(default_factory=Counter)
     placements: Counter[str] = field(default_factory=Counter)
+    map_uses: Counter[str] = field(default_factory=Counter)
     surfaces: Counter[tuple[str, str]] = field(default_factory=Counter)
     views_at_cap: Counter[str] = field(default_factory=Counter)
 
     def add(self, record: SceneRecord, split: str) -> Mapping[str, Values]:
         """Count one scene and return its values."""
         self.scenes[str(record.scene.provenance["template"]), split] += 1
+        self.map_uses.update(locked_uids((), record.scene.provenance))
         self.views_at_cap[split] += sum(bool(view.at_cap) for view in record.views)
         for surface in surfaces(record.scene):
             self.surfaces[surface.kind, "all"] += 1
@@ -173,13 +184,16 @@ def dataset_distributions(
         if rows:
             tally.values.setdefault(shard.split, []).append(_concatenated(rows))
         shard_done(shard.name)
+    locked = dataset.objects_lock()
     return Distributions(
         values={split: _concatenated(chunks) for split, chunks in tally.values.items()},
         scenes=tally.scenes,
         placements=tally.placements,
+        map_uses=tally.map_uses,
         surfaces=tally.surfaces,
         views_at_cap=tally.views_at_cap,
-        objects=dataset.objects_lock(),
+        objects=[entry for entry in locked if entry.kind == OBJECT],
+        maps=[entry for entry in locked if entry.kind != OBJECT],
         failures=dataset.failures(),
         targets=_targets(dataset.manifest),
     )

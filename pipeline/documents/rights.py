@@ -31,7 +31,7 @@ class Rights:
     """What is known of the rights to a dataset's objects."""
 
     objects_by_licence: Mapping[str, int]
-    """How many objects are under each licence, sorted by its name."""
+    """How many objects, textures and maps are under each licence, sorted by its name."""
 
     @property
     def licences(self) -> list[str]:
@@ -98,8 +98,9 @@ def rights_markdown(rights: Rights) -> str:
 def encode_licences(rights: Rights) -> bytes:
     """Return the file LICENSE.md."""
     head = (
-        "# Licences of this dataset\n\nIts scenes are made of 3D objects, each under the licence "
-        "of its author. This is a summary; the licences themselves decide."
+        "# Licences of this dataset\n\nIts scenes are made of 3D objects, and perhaps of textures "
+        "and environment maps, each under the licence of its author. This is a summary; the "
+        "licences themselves decide."
     )
     return f"{head}\n\n{rights_markdown(rights)}\n".encode(errors="replace")
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
+from pipeline.making.own_maps import own_maps
 from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.making.view_progress import ViewProgress
@@ -14,10 +15,11 @@ from pipeline.renders.renderer import set_threads
 from pipeline.renders.variant import Variant, activate
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset
+from scene_templates.own_maps import OwnMaps
 from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected
 from storage.records.asset import decode_asset
-from storage.records.objects import Failure, LockedObject
+from storage.records.objects import OBJECT, Failure, LockedObject
 from storage.records.sample import Sample, sample_key
 
 MAX_ATTEMPTS = 16
@@ -61,6 +63,7 @@ class _ChildState:
 
     source: SceneRecipe
     pool: dict[str, Sequence[PooledAsset]]
+    own: dict[str, OwnMaps]
 
 
 _state = _ChildState()
@@ -73,7 +76,7 @@ def set_up_child(source: SceneRecipe) -> None:
     activate(source.variant)
     set_threads(source.threads)
     _state.source = source
-    _state.pool = {}
+    _state.pool, _state.own = {}, {}
 
 
 def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
@@ -117,6 +120,7 @@ def _scene(split: str, scene_index: int, attempt: int) -> BegunScene:
         seed=settings.seed,
         scene_index=scene_index,
         attempt=attempt,
+        own=maps_of(split),
     )
     return BegunScene(scene=scene)
 
@@ -128,6 +132,13 @@ def assets_of(split: str) -> Sequence[PooledAsset]:
         _state.pool[split] = [
             PooledAsset(locked=locked, asset=decode_asset(path.read_bytes()))
             for locked, path in sorted(source.objects, key=lambda pair: pair[0].uid)
-            if locked.split == split
+            if locked.split == split and locked.kind == OBJECT
         ]
     return _state.pool[split]
+
+
+def maps_of(split: str) -> OwnMaps:
+    """Return a user's own textures and maps of a split; each is read when a scene takes it."""
+    if split not in _state.own:
+        _state.own[split] = own_maps(_state.source.objects, split)
+    return _state.own[split]

@@ -56,6 +56,15 @@ class DatasetOrder:
     """Licences to allow in addition to the build's; by default there are none."""
     licence: str | None = None
     """Licence of object files that state none; by default such files count as your own work."""
+    textures: str | None = None
+    """Folder of your own textures: base colours, with their maps beside them; by default all
+    textures are procedural. The settings scenes.textures say how many are used."""
+    skies: str | None = None
+    """Folder of your own environment maps, .hdr or .exr; by default all skies are procedural. The
+    settings scenes.skies say how many are used."""
+    map_licence: str | None = None
+    """Licence of textures and maps of folders without a catalogue; by default such files count as
+    your own work."""
     workers: Annotated[int | None, Within(1, 1024, unit="processes")] = None
     """Number of render processes, which share the cores; by default one, or one for each graphics
     card."""
@@ -98,6 +107,7 @@ class DatasetOrder:
                 f"--revisits {self.revisits} was given with --objects, --scenes or --scenes-from; "
                 "expected none of them: the dataset says all."
             )
+        _refuse_maps(self)
         if self.scenes_from is None and self.views is not None:
             raise TrilightError(f"--views is {self.views}; expected it only with --scenes-from.")
         dataset_folder(self.place)
@@ -123,6 +133,20 @@ class DatasetOrder:
                 "to but not including the last."
             )
         return range(int(match[1]), int(match[2]))
+
+
+def _refuse_maps(order: DatasetOrder) -> None:
+    """Refuse folders of maps for scenes that are not composed, and a licence of none."""
+    for name, value in (("--textures", order.textures), ("--skies", order.skies)):
+        if value is not None and (order.scenes_from or order.revisits):
+            raise TrilightError(
+                f"{name} was given with --scenes-from or --revisits; expected it only where scenes "
+                "are composed. Leave it out."
+            )
+    if order.map_licence is not None and order.textures is None and order.skies is None:
+        raise TrilightError(
+            f"--map-licence is {order.map_licence!r}; expected it only with --textures or --skies."
+        )
 
 
 def generate_words(order: DatasetOrder) -> list[str]:

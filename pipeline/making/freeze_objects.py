@@ -9,6 +9,7 @@ from pipeline.assets.stage import PreparedAsset
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.isolation import is_passing
+from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.objects.sources import FoundObjects
@@ -42,6 +43,7 @@ def freeze_objects(
     rejected: list[Failure],
     settings: BuildSettings,
     publication: Publication,
+    maps: AcceptedMaps = NO_MAPS,
 ) -> AcceptedObjects:
     """Freeze the objects at the first time, and later require that they are the same.
 
@@ -51,6 +53,7 @@ def freeze_objects(
         prepared, rejected: what the mesh stage made of it, or later of what is frozen.
         settings: the build, which says how objects are dealt to splits.
         publication: the dataset.
+        maps: textures and maps of the user's own, which are frozen with the objects.
 
     Raises:
         TrilightError: no object is accepted, a split has none, or the objects are not those that
@@ -61,16 +64,17 @@ def freeze_objects(
     passing = [failure for failure in rejected if is_passing(failure.reason)]
     if frozen is not None:
         _require_tried(shown, passing)
-    publication.add_failures([*found.failures, *rejected])
-    locked = [_locked(asset, settings) for asset in prepared]
+    publication.add_failures([*found.failures, *rejected, *maps.failures])
+    objects = [_locked(asset, settings) for asset in prepared]
+    locked = [*objects, *(entry for entry, _ in maps.rows)]
     if frozen is None:
-        _require_enough(locked, settings, publication, shown)
+        _require_enough(objects, settings, publication, shown)
         _warn_of(shown, passing)
         _tell_of_materials(shown, prepared)
         publication.lock_objects(locked)
     else:
         _require_same_objects(shown, frozen, locked)
-    paths = [asset.path for asset in prepared]
+    paths = [asset.path for asset in prepared] + [path for _, path in maps.rows]
     return AcceptedObjects(
         objects=tuple(zip(locked, paths, strict=True)), num_found=found.num_found
     )

@@ -32,6 +32,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
+from pipeline.making.accept_maps import NO_FOLDERS, MapFolders, accept_maps, map_folders
 from pipeline.making.accept_revisited import accept_revisited
 from pipeline.making.accept_scene_files import accept_scene_files
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
@@ -101,6 +102,7 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
     folder = replace(folder, root=folder.root.resolve())
     settings, listed = settings_of(order, folder)  # refuses an order before anything is written
     with joined(folder):
+        own = map_folders(order, settings)
         publication = begun_publication(order, settings, folder)
         with folder.turn("objects"):  # one maker prepares, and the others find it done
             publication.refresh()
@@ -111,7 +113,7 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
             else:
                 source = object_source(settings, order.objects)
                 accepted = accept_objects(
-                    source, order.licence, settings, publication, cores_owned()
+                    source, order.licence, settings, publication, cores_owned(), own
                 )
             write_asked(folder, generate_words(order))
         yield Run(
@@ -129,8 +131,11 @@ def accept_objects(
     settings: BuildSettings,
     publication: Publication,
     workers: int,
+    own: MapFolders = NO_FOLDERS,
 ) -> AcceptedObjects:
     """Turn a source into frozen meshes: of all its objects, or of those that were frozen before.
+
+    Textures and maps of a user's own are frozen with them.
 
     Raises:
         TrilightError, EnvironmentFailure: as `find_objects` and `freeze_objects`.
@@ -148,7 +153,10 @@ def accept_objects(
     prepared, rejected = prepare_isolated(
         wanted, settings.mesh_settings, workers=workers, done=lambda: count_object(folder)
     )
-    return freeze_objects(source, found, prepared, rejected, settings, publication)
+    maps = accept_maps(own, settings, workers=workers)
+    if frozen is not None:
+        maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
+    return freeze_objects(source, found, prepared, rejected, settings, publication, maps)
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:

@@ -21,6 +21,7 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
+from storage.records.objects import OBJECT
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,7 +74,7 @@ class Run:
         return Outcome(
             digest=publication.manifest.dataset_digest,
             num_objects_found=self.accepted.num_found,
-            num_objects_used=len(self.accepted.objects),
+            num_objects_used=sum(row.kind == OBJECT for row, _ in self.accepted.objects),
             num_scenes_given_up=publication.num_given_up(),
             num_shards=len(publication.manifest.shards),
             num_shards_planned=publication.num_shards,

@@ -4,7 +4,7 @@ Scene k is a pure function of (settings, pool, seed, k, attempt).
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from pipeline.scenes.textured_pieces import with_drawn_textures
 from pipeline.scenes.views import with_first_cameras
 from scene_templates.layout import Layout
 from scene_templates.layout_rand import ScenePlan, layout_rand, scene_plan
+from scene_templates.own_maps import NO_OWN_MAPS, OwnMaps
 from scene_templates.settings import SceneSettings
 from scene_templates.skies.drawn_scene import scene_sky
 from storage.errors import TrilightError
@@ -46,6 +47,7 @@ def compose_scene(
     seed: int,
     scene_index: int,
     attempt: int,
+    own: OwnMaps = NO_OWN_MAPS,
 ) -> Scene:
     """Compose one scene.
 
@@ -55,11 +57,13 @@ def compose_scene(
         seed: of the dataset, from 0.
         scene_index: which scene, from 0.
         attempt: how many times this scene was rejected before.
+        own: a user's own textures and maps of the scene's split.
 
     Returns:
         A checked scene with `settings.num_views` cameras. Its provenance holds template, family,
         scene_index, attempt, seed and camera_attempts (per view, the proposal that passed), and
-        where the scene is an excursion its axis and value, and where it has a sky, what was drawn.
+        where the scene is an excursion its axis and value, and where it has a sky, what was drawn;
+        "maps" are the uids of a user's own textures and map, where it has any.
 
     Raises:
         Rejected: no_room, over_budget, no_faces, no_camera, emitter_inside or law_broken; equal
@@ -83,7 +87,7 @@ def compose_scene(
     name = {"seed": seed, "scene_index": scene_index, "attempt": attempt}
     skins = own_skins(chosen, levels, settings.materials, **name)
     pieces = scene_pieces(layout, chosen, shapes, settings, rng, skins)
-    pieces = with_drawn_textures(pieces, layout, settings.textures, **name)
+    pieces = with_drawn_textures(pieces, layout, settings.textures, **name, own=own.textures)
     arrays = joined(pieces)
     arrays["materials"] = with_drawn_columns(arrays["materials"], **name)
     scene = Scene(
@@ -93,28 +97,38 @@ def compose_scene(
         objects=tuple(piece.entry for piece in pieces),
         provenance=provenance,
     )
-    scene = _with_sky(scene, settings, seed, scene_index, attempt)
+    uids = {piece.skin.uid for piece in pieces if piece.skin and piece.skin.uid}
+    scene = _with_sky(scene, settings, name, own, uids)
     scene = with_first_cameras(without_constant_textures(scene), settings)
     require_laws(scene, settings)
     return scene
 
 
 def _with_sky(
-    scene: Scene, settings: SceneSettings, seed: int, scene_index: int, attempt: int
+    scene: Scene,
+    settings: SceneSettings,
+    name: Mapping[str, int],
+    own: OwnMaps,
+    uids: set[str],
 ) -> Scene:
+    """Return a scene with its sky, if any, and the uids of the user's own that it has."""
     emits = scene.triangle_emits
     sky = scene_sky(
         settings.skies,
         scene.vertex_positions[scene.faces[emits]].astype(np.float64),
         scene.materials[scene.material_index[emits], EMISSION].astype(np.float64),
-        seed=seed,
-        scene_index=scene_index,
-        attempt=attempt,
+        **name,
+        own=own.skies,
+        licences=scene.licences,
     )
-    if sky is None:
-        return scene
-    lit = dataclasses.replace(scene, environment=sky.environment)
-    return lit.with_provenance({**scene.provenance, "sky": sky.origin})
+    provenance = dict(scene.provenance)
+    if sky is not None:
+        scene = dataclasses.replace(scene, environment=sky.environment)
+        provenance["sky"] = sky.origin
+        uids = uids | ({sky.uid} if sky.uid else set())
+    if uids:
+        provenance["maps"] = sorted(uids)
+    return scene.with_provenance(provenance)
 
 
 def _provenance(

@@ -25,6 +25,8 @@ class Skin:
     """[3T, 2] of each corner of each triangle."""
     textures: tuple[Texture, Texture, Texture]
     """Diffuse, specular and roughness."""
+    uid: str = ""
+    """Of a user's own texture, as objects.lock.jsonl names it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

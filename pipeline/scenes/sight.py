@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.conventions import camera_rays
+from storage.conventions import camera_rays, latlong_direction
 from storage.records.scene import Scene
 from storage.records.surfaces import MISS, MetSurfaces, Surfaces
 
@@ -22,6 +22,10 @@ LIT_STEP = 2
 rays per hit."""
 
 
+SKY_RAYS = 8
+"""Directions by which light from all around is looked for: each stands for an eighth of it."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ViewFacts:
     """What one camera sees."""
@@ -31,7 +35,8 @@ class ViewFacts:
     shell_back: float
     """Share of the rays that meet a floor or wall first, from behind."""
     lit: float
-    """Share of the hit points that the centre of an emitter lights, on the side that is seen."""
+    """Share of the hit points that the centre of an emitter lights on the side that is seen, or
+    one of SKY_RAYS directions of a sky."""
     depth: float
     """Distance to the nearest thing: what a ray meets, or the bounding box of an object."""
 
@@ -44,6 +49,7 @@ class Sight:
         self._face_is_object = kinds == "object"
         self._surfaces = Surfaces(scene)
         self._lights = scene.vertex_positions[scene.faces[scene.triangle_emits]].mean(axis=1)
+        self._sky = _sky_directions(scene)
         self._boxes = _object_boxes(scene)
 
     def facts(self, c2w: NDArray[np.float32], fov_deg: float, grid: int) -> ViewFacts:
@@ -80,14 +86,38 @@ class Sight:
         normal *= np.where(np.sum(normal * toward[asked], axis=1, keepdims=True) > 0, -1, 1)
         point = start[asked] + hits.distance_m[asked, None] * toward[asked] + SHADOW_OFFSET * normal
         ray = self._lights[None] - point[:, None]
+        if len(self._sky):
+            away = np.broadcast_to(self._sky, (len(point), *self._sky.shape))
+            ray = np.concatenate([ray, away], axis=1)
         distance = np.sqrt(np.sum(np.square(ray), axis=-1))
         on_side = np.sum(ray * normal[:, None], axis=-1) > 0
         free = self._surfaces.is_free(
-            np.repeat(point, len(self._lights), axis=0).astype(np.float32),
+            np.repeat(point, ray.shape[1], axis=0).astype(np.float32),
             (ray / distance[..., None]).reshape(-1, 3).astype(np.float32),
             distance.reshape(-1).astype(np.float32),
         )
         return float((free.reshape(on_side.shape) & on_side).any(axis=1).mean())
+
+
+def _sky_directions(scene: Scene) -> NDArray[np.float32]:
+    """Return directions [K, 3] towards the light of a sky, as far as nothing of a scene reaches.
+
+    Texels are gone through from the top, by the light that comes through each; there is one
+    direction in the middle of each eighth of it. A black sky has none.
+    """
+    sky = scene.environment
+    if sky is None or not sky.radiance_rgb.any():
+        return np.zeros((0, 3), np.float32)
+    rows, columns = sky.radiance_rgb.shape[:2]
+    edges = np.cos(np.pi * np.arange(rows + 1) / rows)
+    flux = sky.radiance_rgb.mean(axis=-1, dtype=np.float64) * (edges[:-1] - edges[1:])[:, None]
+    below = np.cumsum(flux)
+    middle = (np.arange(SKY_RAYS) + 0.5) / SKY_RAYS * below[-1]
+    row, column = np.divmod(np.searchsorted(below, middle), columns)
+    uv = np.stack([(column + 0.5) / columns, 1 - (row + 0.5) / rows], axis=-1)
+    towards = latlong_direction(uv) @ sky.rotation.T.astype(np.float64)
+    far = float(np.ptp(scene.vertex_positions, axis=0).max()) * 4
+    return (towards * far).astype(np.float32)
 
 
 def _object_boxes(scene: Scene) -> NDArray[np.float64]:

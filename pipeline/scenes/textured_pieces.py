@@ -1,4 +1,4 @@
-"""Procedural textures for the pieces of a scene: 8-bit maps, and texture coordinates by projection.
+"""Textures for the pieces of a scene: 8-bit maps, and texture coordinates by projection.
 
 A piece gets one material in the place of those that were drawn for it. Its texture is projected
 along the six directions of a cube: each triangle gets it from the side that it faces most, not
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.scenes.pieces import ScenePiece, Skin, with_skin
 from scene_templates.layout import Layout
+from scene_templates.own_maps import OwnMap, OwnTexture
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
 from storage.conventions import linear_from_srgb8, srgb8
@@ -33,6 +34,7 @@ def with_drawn_textures(
     seed: int,
     scene_index: int,
     attempt: int,
+    own: Sequence[OwnMap[OwnTexture]] = (),
 ) -> list[ScenePiece]:
     """Return the pieces with textures where they are drawn; emitters have none.
 
@@ -45,9 +47,11 @@ def with_drawn_textures(
         seed: of the dataset.
         scene_index: which scene.
         attempt: how many times this scene was rejected before.
+        own: a user's own textures.
     """
     if settings.share == 0:
         return list(pieces)
+    licences = [piece.entry.licence for piece in pieces]
     frames = [np.eye(3)] * len(layout.shell)
     frames += [placement.pose.rotation for placement in layout.objects]
     origins = [np.zeros(3)] * len(layout.shell)
@@ -55,8 +59,9 @@ def with_drawn_textures(
     found, textured = list(pieces), 0
     for row, (frame, origin) in enumerate(zip(frames, origins, strict=True)):
         rng = rng_for(seed, "texture", scene_index, attempt, row)
-        look = draw_look(rng, settings) if textured < MOST_TEXTURED else None
+        look = draw_look(rng, settings, own, licences) if textured < MOST_TEXTURED else None
         if look is not None and pieces[row].skin is None:  # its own materials come first
+            licences.append(look.maps.source.licence)
             found[row] = _textured(pieces[row], look, frame, origin)
             textured += 1
     return found
@@ -67,7 +72,9 @@ def _textured(
 ) -> ScenePiece:
     corners = piece.mesh.positions[piece.mesh.faces].astype(np.float64)
     uv = look.uv(cube_places(_turned_back(corners - origin, frame)))
-    skin = Skin(uv=uv.astype(np.float32).reshape(-1, 2), textures=_textures(look.maps))
+    skin = Skin(
+        uv=uv.astype(np.float32).reshape(-1, 2), textures=_textures(look.maps), uid=look.uid
+    )
     return with_skin(piece, skin)
 
 
@@ -102,7 +109,7 @@ def _textures(maps: SurfaceMaps) -> tuple[Texture, Texture, Texture]:
 
     def texture(texels: NDArray[np.uint8], name: str, *, is_srgb: bool = False) -> Texture:
         upwards = np.ascontiguousarray(texels[::-1])
-        source = MapSource(name=f"{maps.family} {name}")
+        source = dataclasses.replace(maps.source, name=f"{maps.family} {name}")
         return Texture(texels=upwards, is_srgb=is_srgb, source=source)
 
     return (

@@ -14,7 +14,7 @@ from storage.dataset.progress import planned_shards
 from storage.dataset.shard import with_maps
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
-from storage.records.objects import LockedObject, read_objects_lock
+from storage.records.objects import LockedObject, locked_uids, read_objects_lock
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
 from storage.records.sample import decode_scene
 from storage.remote.safe_url import safe_url
@@ -38,7 +38,7 @@ class SceneFacts:
     key: str  # its key there
     template: str  # layout of the scene
     noise_floor_db: float  # noise floor of its worst view, as psnr_log_db
-    uids: tuple[str, ...]  # objects that stand in it
+    uids: tuple[str, ...]  # objects that stand in it, and a user's own textures and map
     arrays_sha256: str  # digest of its unpacked arrays: equal for equal scenes
     values: Mapping[str, Any]  # what was asked of it, by name (pipeline.shards.expression)
 
@@ -153,7 +153,10 @@ def _facts(
             template=str(record["provenance"]["template"]),
             noise_floor_db=min(float(view["noise_floor_db"]) for view in record["views"]),
             uids=tuple(
-                sorted({str(row["uid"]) for row in record["objects"] if row["kind"] == "object"})
+                locked_uids(
+                    ((str(row["kind"]), str(row["uid"])) for row in record["objects"]),
+                    record["provenance"],
+                )
             ),
             arrays_sha256=sha256_hex(unpack_arrays(members)),
             values=values,

@@ -1,10 +1,11 @@
 """`scene_sky`: whether a scene has a sky, and which.
 
-Its draws have a random stream of their own, so that a build with skies has the objects, materials,
-lights and cameras that it has without them.
+Its draws have a random stream of their own, so that a build with skies has the objects, materials
+and lights that it has without them, and the cameras too, but for views that only the sky lights.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_templates.exact import cosine, sine
+from scene_templates.own_maps import OwnMap, drawn_own
 from scene_templates.skies.draw import draw_sky
 from scene_templates.skies.settings import SkySettings
 from storage.records.environment import Environment
@@ -29,6 +31,8 @@ class SceneSky:
     environment: Environment
     origin: dict[str, Any]
     """For the provenance of the scene: family, over_lamps and azimuth_deg."""
+    uid: str = ""
+    """Of a user's own map, as objects.lock.jsonl names it."""
 
 
 def scene_sky(
@@ -39,6 +43,8 @@ def scene_sky(
     seed: int,
     scene_index: int,
     attempt: int,
+    own: Sequence[OwnMap[NDArray[np.float32]]] = (),
+    licences: Sequence[str] = (),
 ) -> SceneSky | None:
     """Return the sky of a scene, or None where it has none.
 
@@ -48,29 +54,38 @@ def scene_sky(
         radiance_rgb: [N, 3] their radiance.
         seed, scene_index: whether there is a sky goes by these.
         attempt: which one goes by this too: how many times the scene was rejected before.
+        own: a user's own maps.
+        licences: of what is in the scene already.
     """
     if not settings.share or rng_for(seed, "has sky", scene_index).random() >= settings.share:
         return None
     rng = rng_for(seed, "sky", scene_index, attempt)
-    drawn = draw_sky(rng, settings.maps)
+    place = rng_for(seed, "own sky", scene_index, attempt)
+    chosen = drawn_own(place, own, settings.own_share, licences)
+    if chosen is None:
+        drawn = draw_sky(rng, settings.maps)
+        family, radiance, source = drawn.family, drawn.radiance_rgb, MapSource(name=drawn.family)
+    else:
+        family, radiance, source = "own", chosen.load(), chosen.source
     low, high = (math.log(bound) for bound in settings.over_lamps_log)
     over_lamps = math.exp(rng.uniform(low, high))
     turn = float(rng.uniform(0, 2 * math.pi))
     is_seen = bool(rng.random() < settings.seen_share)
-    mean = _mean_radiance(drawn.radiance_rgb)
+    mean = _mean_radiance(radiance)
     wanted = over_lamps * lamp_irradiance(emitters, radiance_rgb) / math.pi
     environment = Environment(
-        radiance_rgb=(drawn.radiance_rgb * np.float32(wanted / mean)).astype(np.float32),
+        radiance_rgb=(radiance * np.float32(wanted / mean)).astype(np.float32),
         rotation=_about_z(turn),
         is_seen=is_seen,
-        source=MapSource(name=drawn.family),
+        source=source,
     )
     origin = {
-        "family": drawn.family,
+        "family": family,
         "over_lamps": over_lamps,
         "azimuth_deg": math.degrees(turn),
     }
-    return SceneSky(environment=environment, origin=origin)
+    uid = chosen.uid if chosen else ""
+    return SceneSky(environment=environment, origin=origin, uid=uid)
 
 
 def lamp_irradiance(emitters: NDArray[np.float64], radiance_rgb: NDArray[np.float64]) -> float:

@@ -15,11 +15,14 @@ class SkySettings:
 
     share: Share = 0.0
     """Share of the scenes that have a sky beside their emitters."""
-    over_lamps_log: Annotated[Range, Within(1e-6, 1e6)] = (0.05, 5.0)
+    own_share: Share = 0.0
+    """Share of those skies that are of your own folder (`--skies`), each equally likely; the others
+    are procedural, and so are all in a split to which none of the folder belongs."""
+    over_lamps_log: Annotated[Range, Within(1e-6, 1e6)] = (0.02, 1.0)
     """Range, log-uniform, of the irradiance that a sky of constant radiance, the mean of the map,
     has on a surface, over that of all emitters at the middle of the room on surfaces that face
     them. It takes the place of `maps.mean_radiance`."""
     seen_share: Share = 0.0
     """Share of the skies that cameras see behind everything."""
     maps: SkyMapSettings = field(default_factory=SkyMapSettings)
-    """What the maps are drawn from."""
+    """What procedural maps are drawn from. The height holds for your own too, as the most rows."""

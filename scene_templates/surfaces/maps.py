@@ -1,13 +1,14 @@
 """`SurfaceMaps`: what a textured surface is, and `Finish`, what its parts are mixed from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scene_templates.exact import Numbers, mixed
+from storage.records.texture import MapSource
 
 MOST_ALBEDO = 0.95
 """Greatest channel of a base colour and greatest specular share: no surface is whiter, and the sum
@@ -16,21 +17,23 @@ of both albedos stays below 1 by far more than float32 rounds."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SurfaceMaps:
-    """A square surface that repeats in both directions; linear colour, rows from the top.
+    """A surface that repeats in both directions; linear colour, rows from the top.
 
-    Row 0 is the top, where v = 1 (scene_templates.surfaces.texels).
+    Row 0 is the top, where v = 1 (scene_templates.surfaces.texels). What is drawn is square.
     """
 
     family: str
-    """Name of the family that it was drawn from."""
+    """Name of the family that it was drawn from, or title of a user's own."""
     diffuse_rgb: NDArray[np.float32]
-    """[N, N, 3] diffuse albedo; with the specular one at most 1 in each channel."""
+    """[H, W, 3] diffuse albedo; with the specular one at most 1 in each channel."""
     specular_rgb: NDArray[np.float32]
-    """[N, N, 3] specular albedo."""
+    """[H, W, 3] specular albedo."""
     roughness: NDArray[np.float32]
-    """[N, N, 1] roughness; the GGX width is its square."""
+    """[H, W, 1] roughness; the GGX width is its square."""
     parameters: Mapping[str, tuple[Any, ...]]
     """What was drawn, by the names of docs/reference/surfaces-and-skies.md."""
+    source: MapSource = field(default_factory=MapSource)
+    """Whose it is; what is drawn is ours."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -20,7 +20,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.licences import mixed_share_alike
 from storage.records.lights import sum_of_lights
-from storage.records.objects import LockedObject, decode_objects_lock
+from storage.records.objects import LockedObject, decode_objects_lock, locked_uids
 from storage.records.parts import part_names, sum_of_parts
 from storage.records.passes.stored import COVERAGE, decode_passes_exr, picture_passes
 from storage.records.sample import Sample, decode_sample
@@ -256,14 +256,13 @@ def check_sample(
     yield from _check_passes(sample, stored.get("passes") if isinstance(stored, Mapping) else ())
     if mixed := mixed_share_alike(sample.scene.licences):
         yield f"sample {sample.key}: {' and '.join(mixed)} meet; expected one share-alike licence"
-    for entry in sample.scene.objects:
-        if entry.kind != "object":
-            continue
-        lock = locked.get(entry.uid)
+    scene = sample.scene
+    for uid in locked_uids(((row.kind, row.uid) for row in scene.objects), scene.provenance):
+        lock = locked.get(uid)
         if lock is None:
-            yield f"sample {sample.key}: object {entry.uid!r} is not in objects.lock.jsonl"
+            yield f"sample {sample.key}: object {uid!r} is not in objects.lock.jsonl"
         elif lock.split != split:
-            yield f"sample {sample.key}: object {entry.uid!r} belongs to split {lock.split}"
+            yield f"sample {sample.key}: object {uid!r} belongs to split {lock.split}"
 
 
 def _check_lights(sample: Sample, *, apart: bool) -> Iterator[str]:

@@ -7,9 +7,10 @@
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from storage.atomic import write_atomically
 from storage.digests import canonical_json
@@ -42,14 +43,33 @@ class ObjectRecord(NamedObject):
     """The file, absolute, on this machine; never published."""
 
 
+OBJECT, TEXTURE, SKY = "object", "texture", "sky"
+"""Kinds of rows of a lock: objects, and what users bring for surfaces and for light."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LockedObject(NamedObject):
-    """One accepted object of a dataset, as `objects.lock.jsonl` freezes it."""
+    """One accepted object, texture or sky of a dataset, as `objects.lock.jsonl` freezes it."""
 
     asset_sha256: str
-    """Digest of the prepared asset file: the exact triangles that scenes use."""
+    """Digest of the prepared file: the exact triangles or texels that scenes use."""
     split: str
-    """train, validation or test, by a hash of the cleaned geometry: copies stay together."""
+    """train, validation or test, by a hash of the cleaned geometry, of a texture's base colour or
+    of a map: copies stay together."""
+    kind: str = OBJECT
+    """object, texture or sky; only the latter two are written."""
+
+
+def locked_uids(objects: Iterable[tuple[str, str]], provenance: Mapping[str, Any]) -> list[str]:
+    """Return the uids of all that a scene has of a lock, sorted: objects, textures and a map.
+
+    Args:
+        objects: kind and uid of each row of the scene's objects; floors and emitters are in none.
+        provenance: of the scene, perhaps from outside; what `maps` says counts where it is text.
+    """
+    maps = provenance.get("maps", ())
+    own = [uid for uid in maps if isinstance(uid, str)] if isinstance(maps, list | tuple) else []
+    return sorted({*(uid for kind, uid in objects if kind == OBJECT), *own})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,4 +158,10 @@ def count_by_reason(failures: Iterable[Failure]) -> list[tuple[str, str, int]]:
 
 
 def _lines(rows: Iterable[LockedObject | Failure]) -> bytes:
-    return b"".join(canonical_json(dataclasses.asdict(row)) + b"\n" for row in rows)
+    return b"".join(canonical_json(_record(row)) + b"\n" for row in rows)
+
+
+def _record(row: LockedObject | Failure) -> dict[str, Any]:
+    """Return a row as JSON values; locks of objects alone know no kinds, as before."""
+    record = dataclasses.asdict(row)
+    return {name: value for name, value in record.items() if (name, value) != ("kind", OBJECT)}

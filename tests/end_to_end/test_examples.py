@@ -18,9 +18,12 @@ from pipeline.exchange.convert import write_scene
 from pipeline.exchange.open_scene import load_source, scene_source
 from pipeline.executors.registry import EXECUTORS
 from pipeline.objects.sources import find_objects, look_at_source
+from scene_templates.skies.draw import draw_sky
+from scene_templates.textures import draw_look
 from storage.dataset.manifest import read_manifest
 from storage.errors import TrilightError
 from storage.records.scene_file import decode_scene_file, encode_scene
+from storage.seeds import rng_for
 from storage.settings.changes import changed
 from tests.end_to_end.conftest import Trilight
 from tests.extensions_kit import EXAMPLES, loaded, room_for_extensions
@@ -43,7 +46,7 @@ def copied(tmp_path: Path) -> Callable[[str], Path]:
 def test_there_is_one_of_each() -> None:
     assert FILES == [
         "build.py", "executor.py", "family.py", "material_column.py", "metric.py", "model_size.py",
-        "object_source.py", "run.py", "scene_format.py", "template.py",
+        "object_source.py", "run.py", "scene_format.py", "sky.py", "surface.py", "template.py",
     ]  # fmt: skip
 
 
@@ -69,6 +72,27 @@ def test_a_family_makes_scenes(copied: Callable[[str], Path]) -> None:
     with loaded(copied("family.py")):
         settings = named_build("smoke", changes={"scenes.families": "crowd"}).scenes
         assert 5 <= len(one_drawn(settings, 0).layout.objects) <= 8
+
+
+def test_a_surface_repeats_and_lies_in_scenes(copied: Callable[[str], Path]) -> None:
+    with loaded(copied("surface.py")):
+        changes = {"scenes.textures.surfaces.families": ["polka_dots"], "scenes.textures.share": 1}
+        settings = named_build("smoke", changes=changes).scenes.textures
+        look = draw_look(rng_for(0, "look"), settings)
+    assert look is not None and look.maps.family == "polka_dots"
+    diffuse = look.maps.diffuse_rgb
+    # dots in rows: half of the texels of a spacing are on the ground at least, and both paints show
+    assert 2 <= len(np.unique(diffuse.reshape(-1, 3), axis=0)) < diffuse[..., 0].size / 2
+    np.testing.assert_allclose(diffuse.mean(axis=0), diffuse.mean(axis=1), atol=1e-6)  # symmetric
+
+
+def test_a_sky_is_drawn(copied: Callable[[str], Path]) -> None:
+    with loaded(copied("sky.py")):
+        changes = {"scenes.skies.maps.families": ["ring"], "scenes.skies.maps.height": 16}
+        sky = draw_sky(rng_for(0, "sky"), named_build("smoke", changes=changes).scenes.skies.maps)
+    assert sky.family == "ring" and "height of the ring" in "".join(sky.parameters)
+    rows = sky.radiance_rgb.mean(axis=(1, 2))
+    assert np.unravel_index(rows.argmax(), rows.shape)[0] <= 8 and rows.min() > 0
 
 
 def test_a_material_column_is_drawn_and_stored(copied: Callable[[str], Path]) -> None:

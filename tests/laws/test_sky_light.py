@@ -11,6 +11,7 @@ from pipeline.renders.plugin_tracer import PluginTracer
 from scene_templates.rotations import uniform_rotation
 from storage.conventions import camera_rays
 from storage.records.lookup import environment_values
+from storage.records.passes.pictures import view_passes
 from tests.pipeline.renders.sampling import assert_agree, camera_of, render_blocks
 from tests.pipeline.renders.scene_kit import box, join, material, sphere
 from tests.pipeline.renders.test_sky_paths import open_scene
@@ -102,3 +103,12 @@ def test_a_seen_sky_stands_behind_everything(tracer: Any) -> None:
     assert np.abs(with_sky[empty] / expected[empty] - 1).max() < 0.01
     # The same samples of the same light; a few of these pixels have a silhouette through them.
     assert abs(with_sky[inside].mean() / without[inside].mean() - 1) < 0.02
+    # The pass `coverage` is the alpha of the hidden picture, whoever sees the sky: the map below it
+    # is the seen one. Silhouettes are met by 64 jittered rays here and by 64 even ones there.
+    alpha, same = (
+        view_passes(scene, ["coverage"], view=0, resolution=64, rays_a_side=8)["coverage"]
+        for scene in (hidden, seen)
+    )
+    np.testing.assert_array_equal(alpha, same)
+    below = without + (1 - alpha.reshape(64, 64, 1)) * expected
+    assert np.abs(below - with_sky).mean() < 0.01 * with_sky.mean()

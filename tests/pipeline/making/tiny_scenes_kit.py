@@ -34,7 +34,7 @@ def without_rendering(
     scenes: list[tuple[str, int]] = []
 
     def accept(
-        source: str, licence: str | None, settings: Any, publication: Publication, workers: int
+        source: str, licence: str | None, settings: Any, publication: Publication, *more: Any
     ) -> AcceptedObjects:
         if not publication.manifest.objects_lock_sha256:
             publication.lock_objects([_locked()])

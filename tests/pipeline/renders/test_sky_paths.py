@@ -58,8 +58,10 @@ def test_both_integrators_agree_within_their_noise(
     assert_agree(ours, theirs, slack=1e-3)
     lit = ours.mean > 0.01 * ours.mean.max()
     score = (ours.mean - theirs.mean)[lit] / np.hypot(ours.error, theirs.error)[lit]
-    # As in test_twin_tracers, but that channels share their samples, and so blocks lit by a few
-    # small lamps their luck: the mean was 0.41 of 16 passes and 0.13 of 64, so no bias.
+    # As in test_twin_tracers, but for the mean: channels and blocks share their luck with a few
+    # small lamps, and 115 scores of the night are worth 45 independent ones. In ten repeats of 16
+    # passes their mean had a standard deviation of 0.15 with lamps and 0.21 without, and no bias:
+    # over 160 passes it was 0.07 and 0.05, and all light together differed by 0.08 and 0.09 %.
     assert 0.8 < np.sqrt(np.mean(score**2)) < 1.35
     assert len(score) > 90 and abs(score.mean()) < 0.5
 

@@ -25,6 +25,7 @@ from storage.errors import Rejected
 from storage.records.scene import ARRAY_FIELDS, Scene
 from tests.pipeline.scenes.slow_rays import first_hits
 from tests.scenes_by_hand import tiny_scene
+from tests.sky_maps import constant, one_sun
 
 SETTINGS = SceneSettings(families=DEFAULT_FAMILIES)
 
@@ -116,6 +117,23 @@ def test_a_roof_takes_the_light_away() -> None:
         object_index=np.concatenate([scene.object_index, scene.object_index[:2]]),
     )
     assert Sight(covered).facts(_camera([0, 0, 1.0]), 30.0, 16).lit == 0.0
+    # Below the roof the light of an even sky still comes from the sides, and of black none does.
+    for sky, lit in ((constant(1.0), 1.0), (constant(0.0), 0.0)):
+        below = Sight(dataclasses.replace(covered, environment=sky))
+        assert below.facts(_camera([0, 0, 1.0]), 30.0, 16).lit == lit
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_sun_lights_the_side_that_it_shines_on(turned: bool) -> None:
+    """Through a lid over the lamp, so that only the sun is left; turned over, it shines below."""
+    over = np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]], np.float32)
+    sun = one_sun(1e6, rotation=over if turned else np.eye(3, dtype=np.float32))
+    scene = tiny_scene()
+    unlit = scene.vertex_positions.copy()
+    unlit[scene.faces[scene.triangle_emits].ravel()] *= np.array([1, 1, -1], np.float32)
+    alone = dataclasses.replace(scene, vertex_positions=unlit, environment=sun)
+    lit = Sight(alone).facts(_camera([0, 0, 1.0]), 30.0, 16).lit
+    assert lit == (0.0 if turned else 1.0)
 
 
 def test_emitters_are_hidden_from_the_camera() -> None:

@@ -1,0 +1,199 @@
+"""From folders of textures and of maps to frozen rows, and the files that scenes use.
+
+Each is decoded in a child with limits, once; what came of it is in the user's cache. A texture or
+map belongs to the split that the digest of its content says, by the rule of objects.
+"""
+
+import logging
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.builds.settings import BuildSettings
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries
+from pipeline.making.children import ChildPool
+from pipeline.making.dataset_order import DatasetOrder
+from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
+from pipeline.objects.maps.prepared import MapFiles, decode_prepared, outcome_name, prepare_map
+from storage.atomic import write_atomically
+from storage.cache import cache_folder
+from storage.conventions import SPLITS
+from storage.dataset.splits import split_of_object
+from storage.digests import sha256_hex
+from storage.errors import Rejected, TrilightError
+from storage.records.objects import SKY, TEXTURE, Failure, LockedObject
+
+log = logging.getLogger("trilight.maps")
+
+_LIMITS = ChildLimits(memory_bytes=8 << 30, wall_s=600, cpu_s=300, calls_per_child=200)
+"""The largest map, 8192 x 4096 in float32, takes 403 MB, and its means six times as much."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptedMaps:
+    """What users bring beside objects."""
+
+    rows: tuple[tuple[LockedObject, Path], ...] = ()
+    """Every texture and map with its prepared file."""
+    failures: tuple[Failure, ...] = ()
+    """Those that cannot be used."""
+
+
+NO_MAPS = AcceptedMaps()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapFolders:
+    """Where a user's own textures and maps are."""
+
+    folders: tuple[tuple[str, str], ...] = ()
+    """Kind and folder."""
+    licence: str | None = None
+    """Of folders without a catalogue, as the user states it."""
+
+
+NO_FOLDERS = MapFolders()
+
+
+def map_folders(order: DatasetOrder, settings: BuildSettings) -> MapFolders:
+    """Return the folders of an order.
+
+    Raises:
+        TrilightError: a folder is given that no scene would use, or one is missing that scenes
+            are to use.
+    """
+    scenes = settings.scenes
+    shares = {
+        TEXTURE: (order.textures, "textures", scenes.textures.share, scenes.textures.own_share),
+        SKY: (order.skies, "skies", scenes.skies.share, scenes.skies.own_share),
+    }
+    for folder, name, share, own_share in shares.values():
+        used = bool(share and own_share)
+        if folder is None and used:
+            raise TrilightError(
+                f"scenes.{name}.own_share is {own_share:g}, but --{name} is not given; expected a "
+                f"folder. Add --{name} FOLDER, or --set scenes.{name}.own_share=0."
+            )
+        if folder is not None and not used:
+            raise TrilightError(
+                f"--{name} is given, but scenes.{name}.share is {share:g} and own_share "
+                f"{own_share:g}; expected both above 0. Add --set scenes.{name}.share=0.5 "
+                f"--set scenes.{name}.own_share=1, or leave --{name} out."
+            )
+    return MapFolders(
+        folders=tuple((kind, entry[0]) for kind, entry in shares.items() if entry[0] is not None),
+        licence=order.map_licence,
+    )
+
+
+def accept_maps(asked: MapFolders, settings: BuildSettings, *, workers: int) -> AcceptedMaps:
+    """Prepare the textures and maps of folders.
+
+    Args:
+        asked: the folders.
+        settings: the build: sizes, licences and splits.
+        workers: files at a time.
+
+    Raises:
+        TrilightError: a folder is missing or empty, none of it can be used, or the cache cannot be
+            written.
+    """
+    rows: list[tuple[LockedObject, Path]] = []
+    failures: list[Failure] = []
+    for kind, folder in asked.folders:
+        found = find_maps(
+            kind, folder, licence=asked.licence, allowed_licences=settings.allowed_licences
+        )
+        outcomes = _prepared(kind, found.maps, settings, workers)
+        usable = [outcome for outcome in outcomes if not isinstance(outcome, Failure)]
+        lost = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
+        failures += [*found.failures, *lost]
+        if not usable:
+            first = (*lost, *found.failures)[0]
+            raise TrilightError(
+                f"{PLURALS[kind]}: none of {len(lost) + len(found.failures)} files can be used; "
+                f"the first is {first.item}: {first.reason} ({first.message}). Mend or replace it."
+            )
+        _tell_of(kind, [locked for locked, _ in usable], lost)
+        rows += usable
+    return AcceptedMaps(rows=tuple(rows), failures=tuple(failures))
+
+
+def _prepared(
+    kind: str, maps: Sequence[FoundMap], settings: BuildSettings, workers: int
+) -> list[tuple[LockedObject, Path] | Failure]:
+    scenes = settings.scenes
+    size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
+    pool = ChildPool(lambda _: IsolatedChild(limits=_LIMITS, setup=_nothing), workers)
+
+    def prepare(found: FoundMap) -> tuple[LockedObject, Path] | Failure:
+        try:
+            with pool.borrow() as child:
+                path = _outcome(MapFiles(kind=kind, files=found.files, size=size), child)
+            return _locked(kind, found, path, settings), path
+        except Rejected as rejection:
+            uid, reason = found.record.uid, rejection.reason
+            return Failure(stage="objects", item=uid, reason=reason, message=rejection.message)
+
+    try:
+        with ThreadPoolExecutor(workers) as threads:
+            return list(threads.map(prepare, maps))
+    finally:
+        pool.close()
+
+
+def _nothing() -> None:
+    """Set up a child that needs nothing."""
+
+
+def _outcome(asked: MapFiles, child: IsolatedChild) -> Path:
+    """Return the prepared file, made in a child unless it is there; raises Rejected."""
+    name = outcome_name(asked)
+    path = cache_folder("maps") / name[:2] / f"{name}.safetensors"
+    if not path.exists():
+        try:
+            data = call_with_retries(child, prepare_map, asked)
+        except ChildFailed as failure:
+            raise Rejected(failure.reason, failure.message) from failure
+        if outcome_name(asked) != name:
+            raise Rejected("unreadable_file", "it changed while it was being prepared")
+        write_atomically(path, data)
+    return path
+
+
+def _locked(kind: str, found: FoundMap, path: Path, settings: BuildSettings) -> LockedObject:
+    data, record = path.read_bytes(), found.record
+    return LockedObject(
+        uid=record.uid,
+        asset_sha256=sha256_hex(data),
+        split=split_of_object(decode_prepared(data, path.name).content_sha256, settings.splits),
+        licence=record.licence,
+        licence_source=record.licence_source,
+        title=record.title,
+        attribution=record.attribution,
+        source_url=record.source_url,
+        kind=kind,
+    )
+
+
+def _tell_of(kind: str, locked: Sequence[LockedObject], lost: Sequence[Failure]) -> None:
+    if lost:
+        first = lost[0]
+        log.warning(
+            "%s: %d cannot be used, such as %s (%s: %s); failures.jsonl names all",
+            PLURALS[kind],
+            len(lost),
+            first.item,
+            first.reason,
+            first.message,
+        )
+    without = [split for split in SPLITS if split not in {entry.split for entry in locked}]
+    if without and {entry.split for entry in locked} != {"test"}:
+        log.warning(
+            "%s: of %d, none belongs to %s, whose scenes get procedural ones; about 30 different "
+            "ones are enough for every split",
+            PLURALS[kind],
+            len(locked),
+            " and ".join(without),
+        )

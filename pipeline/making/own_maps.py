@@ -1,0 +1,60 @@
+"""The frozen textures and maps of a split, as scenes draw from them."""
+
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.objects.maps.prepared import decode_prepared
+from scene_templates.own_maps import OwnMap, OwnMaps, OwnTexture
+from storage.records.objects import SKY, TEXTURE, LockedObject
+from storage.records.texture import MapSource
+
+
+def own_maps(rows: Iterable[tuple[LockedObject, Path]], split: str) -> OwnMaps:
+    """Return what scenes of a split may take, sorted by uid; nothing is read yet.
+
+    Args:
+        rows: of a lock with the prepared files; objects among them are left out.
+        split: train, validation or test.
+    """
+    here = sorted(
+        ((locked, path) for locked, path in rows if locked.split == split),
+        key=lambda pair: pair[0].uid,
+    )
+    return OwnMaps(
+        textures=[
+            OwnMap(uid=locked.uid, source=_source(locked), load=partial(_texture, path))
+            for locked, path in here
+            if locked.kind == TEXTURE
+        ],
+        skies=[
+            OwnMap(uid=locked.uid, source=_source(locked), load=partial(_radiance, path))
+            for locked, path in here
+            if locked.kind == SKY
+        ],
+    )
+
+
+def _source(locked: LockedObject) -> MapSource:
+    return MapSource(
+        name=locked.title,
+        licence=locked.licence,
+        attribution=locked.attribution,
+        source_url=locked.source_url,
+    )
+
+
+def _texture(path: Path) -> OwnTexture:
+    arrays = decode_prepared(path.read_bytes(), path.name).arrays
+    return OwnTexture(
+        diffuse_rgb=arrays["diffuse"],
+        specular_rgb=arrays["specular"],
+        roughness=arrays.get("roughness"),
+    )
+
+
+def _radiance(path: Path) -> NDArray[np.float32]:
+    return decode_prepared(path.read_bytes(), path.name).arrays["radiance"]

@@ -1,0 +1,61 @@
+"""An environment map from outside: its laws, a stated repair, and its size.
+
+Radiance is linear. What is not a number, or infinite, stops a map: half floats end at 65,504, and a
+sun beyond was written as infinite and is gone. Small negative values, as conversions of colours
+leave them, become 0, where all together are a thousandth of the light at most.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.objects.maps.resample import flux, solid_angle_means
+from storage.errors import Rejected
+from storage.records.environment import MAX_RADIANCE
+
+MOST_NEGATIVE = 1e-3
+"""Greatest share of the light of a map that its negative values may take away."""
+
+
+def usable_map(radiance: NDArray[np.float32], height: int) -> NDArray[np.float32]:
+    """Return a map of at most `height` rows, by means over solid angle.
+
+    Args:
+        radiance: [H, W, 3] linear, the top row first.
+        height: rows that are wanted; a smaller map stays as it is.
+
+    Raises:
+        Rejected: not_two_to_one, not_a_number, infinite_radiance, negative_radiance,
+            too_bright, black_map.
+    """
+    rows, columns = radiance.shape[:2]
+    if columns != 2 * rows:
+        raise Rejected(
+            "not_two_to_one",
+            f"the picture is {columns} x {rows}; expected latitude-longitude, twice as wide as "
+            "high: convert cube maps and fisheyes, crop or scale others",
+        )
+    _refuse(np.isnan(radiance), "not_a_number", "is not a number; mend it in a picture editor")
+    _refuse(
+        np.isinf(radiance),
+        "infinite_radiance",
+        "is infinite; write the map in 32 bits, or as .hdr: half floats end at 65504",
+    )
+    lawful = np.maximum(radiance, 0)
+    whole, negative = flux(lawful), flux(lawful - radiance)
+    if (negative > MOST_NEGATIVE * whole).any() and negative.any():
+        raise Rejected(
+            "negative_radiance",
+            f"negative values take more than {MOST_NEGATIVE:g} of the light of a channel; set them "
+            "to 0 in a picture editor",
+        )
+    _refuse(lawful > MAX_RADIANCE, "too_bright", f"is over {MAX_RADIANCE:g}; scale the map down")
+    if not whole.sum() > 0:
+        raise Rejected("black_map", "the map is black; expected some light")
+    return lawful if rows <= height else solid_angle_means(lawful, height).astype(np.float32)
+
+
+def _refuse(wrong: NDArray[np.bool_], reason: str, message: str) -> None:
+    if wrong.any():
+        row, column, channel = (int(i) for i in np.argwhere(wrong)[0])
+        where = f"{'RGB'[channel]} of row {row}, column {column} (from the top left)"
+        raise Rejected(reason, f"{where} {message}")

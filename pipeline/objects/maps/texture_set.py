@@ -1,0 +1,88 @@
+"""The pictures of a texture as albedos and roughness that repeat.
+
+The base colour is sRGB-encoded, all else is linear. Means are of linear values, and of roughness
+the mean is that of the GGX width, its square. There is no Fresnel term here: a surface with a
+metallic map, or with a base colour alone, gets the cosine-weighted mean of Schlick's,
+F0 + (1 - F0) / 21, as its specular albedo; F0 is 0.04 for what is no metal.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.objects.maps.resample import area_means
+from storage.records.texture import content_digest
+
+DIELECTRIC_F0 = 0.04
+"""What glass, plastic, wood and stone reflect head-on, about."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TextureSet:
+    """A texture from outside, ready for scenes; the top row first."""
+
+    diffuse_rgb: NDArray[np.float32]
+    """[H, W, 3] linear."""
+    specular_rgb: NDArray[np.float32]
+    """[H, W, 3]; with the diffuse albedo at most 1 in each channel."""
+    roughness: NDArray[np.float32] | None
+    """[H, W, 1]; None where no picture says it: scenes draw one number."""
+    content_sha256: str
+    """Digest of the base colour as it was read: copies share it, whatever is beside them."""
+
+
+def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> TextureSet:
+    """Return the maps of a texture.
+
+    Args:
+        pictures: encoded values [H, W, 1 or 3] of the part "base", and of "specular", "roughness"
+            and "metallic" where there are such. They may differ in size.
+        size: most texels along a side of what is returned.
+    """
+    base = pictures["base"]
+    height, width = _fitting(base.shape[:2], size)
+
+    def means(values: NDArray) -> NDArray[np.float64]:
+        return area_means(values, height, width)
+
+    colour = _three(means(_linear(base)))
+    metallic = means(_grey(pictures["metallic"])) if "metallic" in pictures else np.zeros(1)
+    if "specular" in pictures:
+        specular = _three(means(pictures["specular"]))
+    else:
+        f0 = DIELECTRIC_F0 * (1 - metallic) + colour * metallic
+        specular = f0 + (1 - f0) / 21
+        colour = colour * (1 - specular)
+    diffuse = colour * (1 - metallic)
+    specular = np.minimum(specular, 1 - diffuse)  # where both are over 1, the lobe gives way
+    roughness = None
+    if "roughness" in pictures:
+        roughness = np.sqrt(means(np.square(_grey(pictures["roughness"]))))
+    return TextureSet(
+        diffuse_rgb=diffuse.astype(np.float32),
+        specular_rgb=np.ascontiguousarray(specular, np.float32),
+        roughness=None if roughness is None else roughness.astype(np.float32),
+        content_sha256=content_digest("base colour", base),
+    )
+
+
+def _fitting(shape: tuple[int, ...], size: int) -> tuple[int, int]:
+    """Return height and width with the proportions of a picture and no side over `size`."""
+    shrink = min(1.0, size / max(shape))
+    height, width = (max(1, round(side * shrink)) for side in shape)
+    return height, width
+
+
+def _linear(encoded: NDArray[np.float32]) -> NDArray[np.float32]:
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
+
+
+def _grey(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return values.mean(axis=2, keepdims=True, dtype=np.float32)
+
+
+def _three(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.repeat(values, 3, axis=2) if values.shape[2] == 1 else values
