@@ -6,6 +6,7 @@ mirrored, at its stated width, with v up on the sides. Floors and walls stand in
 world, so that each is one flat chart; the cube of an object turns with it.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,7 +18,7 @@ from scene_templates.own_maps import OwnMap, OwnTexture
 from scene_templates.surfaces.maps import SurfaceMaps
 from scene_templates.textures import MOST_TEXTURED, TexturedLook, TextureSettings, draw_look
 from storage.conventions import linear_from_srgb8, srgb8
-from storage.records.texture import MapSource, Texture
+from storage.records.texture import Texture
 from storage.seeds import rng_for
 
 _RIGHT = np.array([[0, 1, 0], [0, -1, 0], [-1, 0, 0], [1, 0, 0], [1, 0, 0], [-1, 0, 0]], np.float64)
