@@ -19,6 +19,7 @@ from storage.dataset.shard import samples_of, scan_members
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.licences import mixed_share_alike
+from storage.records.held_maps import HeldMaps
 from storage.records.lights import sum_of_lights
 from storage.records.objects import LockedObject, decode_objects_lock
 from storage.records.parts import part_names, sum_of_parts
@@ -220,12 +221,12 @@ def _check_content(
 ) -> None:
     if index_stream(stream, shard.name) != shard:
         found.faults.append("sha256 or member index differs from the manifest")
-    unused = set(shard.maps)
+    unused, held = set(shard.maps), HeldMaps()
     for key, members in samples_of(stream, shard.name):
         found.keys.append(key)
         unused -= members.keys()
         try:
-            sample = decode_sample(key, members)
+            sample = decode_sample(key, members, held)
         except TrilightError as error:
             found.faults.append(str(error))
             continue
