@@ -63,6 +63,7 @@ EXPERIMENTS = (
         columns=(
             Column(name="a pass of 64 samples, core-ms", figure="pass_ms"),
             Column(name="that over the plain scene's", figure="pass_ratio"),
+            Column(name="loading the scene, core-ms", figure="load_ms"),
             Column(name="samples", figure="spp", over="mean"),
             Column(name="at the cap, %", figure="at_cap", over="mean", then=percent),
             *_JUDGED,
@@ -77,7 +78,7 @@ EXPERIMENTS = (
         "above the stated one. Sizes are those in shards of the profile `compact`; a map stands in "
         "a shard once.",
         points=_points,
-        turns=lambda effort: [f"scene {index}" for index in range(effort.scenes)],
+        turns=lambda effort: [f"scene {index}" for index in range(effort.judged_scenes)],
         measure=_measure,
     ),
 )

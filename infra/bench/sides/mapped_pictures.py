@@ -69,9 +69,11 @@ def mapped_views(
         pose, fov_deg = np.asarray(scene.c2w[0], np.float64), float(scene.fov_deg[0])
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=_REFERENCE_PX)
         reference = raw_reference(scene, camera, spp, scene_index, number)
-        view, core_s = _timed_view(scene, settings, seed_for(_SEED, "mapped", scene_index, number))
+        seed = seed_for(_SEED, "mapped", scene_index, number)
+        view, core_s, load_core_s = _timed_view(scene, settings, seed)
         found[name] = {
             "core_s": core_s,
+            "load_ms": 1000 * load_core_s,
             "pass_ms": 1000 * passes[name],
             "pass_ratio": passes[name] / passes["plain"],
             **_judged(view, reference, settings.resolution),
@@ -122,13 +124,17 @@ def pass_core_s(scenes: Mapping[str, Scene], settings: RenderSettings) -> dict[s
     return {name: min(each[1:]) for name, each in spent.items()}  # the first one compiles
 
 
-def _timed_view(scene: Scene, settings: RenderSettings, seed: int) -> tuple[RenderedView, float]:
+def _timed_view(
+    scene: Scene, settings: RenderSettings, seed: int
+) -> tuple[RenderedView, float, float]:
+    """Return a scene's first view, its core-seconds with loading the scene, and those of that."""
     warm_up_kernels(scene, settings)
     warm_up_denoiser(settings.resolution)
     started = time.process_time()
     renderer = SceneRenderer(scene, settings)
+    loaded = time.process_time()
     view = renderer.render_view(scene.c2w[0], float(scene.fov_deg[0]), seed)
-    return view, time.process_time() - started
+    return view, time.process_time() - started, loaded - started
 
 
 def _judged(view: RenderedView, reference: Reference, resolution: int) -> dict[str, float]:

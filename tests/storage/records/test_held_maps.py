@@ -20,7 +20,7 @@ KEY = "000000000"
 
 def test_equal_members_give_equal_samples_with_and_without_what_is_held() -> None:
     """Another name and another turn of the same maps: both are the entry's, not the held one's."""
-    turned = sky(rotation=np.float32([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), is_seen=True)
+    turned = sky(rotation=np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32), is_seen=True)
     renamed = dataclasses.replace(turned, source=MapSource(name="dusk", licence="CC-BY-4.0"))
     first = encode_sample(textured_sample(KEY))
     scene = textured_scene(environment=renamed)
