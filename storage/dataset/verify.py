@@ -23,7 +23,7 @@ from storage.records.held_maps import HeldMaps
 from storage.records.lights import sum_of_lights
 from storage.records.objects import LockedObject, decode_objects_lock
 from storage.records.parts import part_names, sum_of_parts
-from storage.records.passes.stored import COVERAGE, decode_passes_exr, picture_passes
+from storage.records.passes.stored import decode_passes_exr, passes_in_file, picture_passes
 from storage.records.sample import Sample, decode_sample
 from storage.remote.fetch import download
 from storage.remote.tries import TransferFailed
@@ -324,10 +324,10 @@ def _check_passes(sample: Sample, names: Sequence[str] | None) -> Iterator[str]:
         except TrilightError as error:
             yield f"sample {sample.key}: view {view}: {error}"
             continue
-        if set(found) != {COVERAGE, *names}:
+        if set(found) != (wanted := set(passes_in_file(sample.scene, names))):
             yield (
                 f"sample {sample.key}: view {view} has the passes {', '.join(sorted(found))}; "
-                f"expected {', '.join(sorted({COVERAGE, *names}))}"
+                f"expected {', '.join(sorted(wanted))}"
             )
         for name, picture in found.items():
             if (share := _share_that_differs(picture, expected[name])) > MOST_DIFFERENT:
