@@ -8,6 +8,7 @@ from typing import Any
 
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.markdown import code, front_matter, table, text
+from pipeline.documents.report_maps import maps_in_words
 from pipeline.documents.rights import Rights, hub_licence, rights_markdown
 from storage.dataset.derived import Derivation, derivation_of
 from storage.dataset.layout import DatasetFolder
@@ -174,6 +175,7 @@ def _contents(manifest: Manifest, found: Distributions) -> str:
         ("objects", f"{len(found.objects)}, of which {len(found.placements)} stand in scenes"),
         ("rejected on the way", f"{len(found.failures)}, each with its reason in failures.jsonl"),
     ]
+    rows[1:1] = list(maps_in_words(found).items())
     if triangles["count"]:
         spread = f"median {triangles['median']:.0f}, most {triangles['max']:.0f}"
         rows.insert(1, ("triangles of a scene", spread))

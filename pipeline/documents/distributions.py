@@ -12,6 +12,7 @@ from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import Manifest
 from storage.errors import TrilightError
+from storage.records.map_facts import texture_families
 from storage.records.objects import Failure, LockedObject
 from storage.records.quantities import QUANTITIES, summary
 from storage.records.sample import SceneRecord
@@ -29,7 +30,9 @@ class Distributions:
     placements: Mapping[str, int]
     """How often each object stands in a scene, by uid; objects that stand in none are missing."""
     surfaces: Mapping[tuple[str, str], int]
-    """Surfaces by (object or shell; all, smooth or many_colours)."""
+    """Surfaces by (object or shell; all, smooth, many_colours or textured)."""
+    maps: Mapping[tuple[str, str], int]
+    """Scenes by (texture or sky; its family, or what its map is called)."""
     views_at_cap: Mapping[str, int]
     """Views whose sampling ended at the cap, by split."""
     objects: Sequence[LockedObject]
@@ -93,6 +96,10 @@ class Distributions:
                 name: {"objects": count, "used": used, "placements": places}
                 for name, (count, used, places) in self.licences.items()
             },
+            "maps": [
+                {"kind": kind, "family": family, "scenes": count}
+                for (kind, family), count in sorted(self.maps.items())
+            ],
             "object_uses": summary(self.uses_per_object()),
             "quantities": {name: summary(self.all(name)) for name in QUANTITIES},
             "rejections": [
@@ -112,7 +119,7 @@ class Distributions:
         }
 
 
-SURFACE_COUNTS = ("all", "smooth", "many_colours")
+SURFACE_COUNTS = ("all", "smooth", "many_colours", "textured")
 
 MEASURED = {
     "noise_floor_db": "noise_floor_db",
@@ -130,6 +137,7 @@ class _Tally:
     scenes: Counter[tuple[str, str]] = field(default_factory=Counter)
     placements: Counter[str] = field(default_factory=Counter)
     surfaces: Counter[tuple[str, str]] = field(default_factory=Counter)
+    maps: Counter[tuple[str, str]] = field(default_factory=Counter)
     views_at_cap: Counter[str] = field(default_factory=Counter)
 
     def add(self, record: SceneRecord, split: str) -> Mapping[str, Values]:
@@ -140,8 +148,12 @@ class _Tally:
             self.surfaces[surface.kind, "all"] += 1
             self.surfaces[surface.kind, "smooth"] += surface.smooth
             self.surfaces[surface.kind, "many_colours"] += surface.num_colours > 1
+            self.surfaces[surface.kind, "textured"] += surface.textured
             if surface.kind == "object":
                 self.placements[str(record.scene.objects[surface.row].uid)] += 1
+        self.maps.update(("texture", name) for name in texture_families(record.scene))
+        if (sky := record.scene.environment) is not None:
+            self.maps["sky", sky.source.name] += 1
         return scene_values(record)
 
 
@@ -178,6 +190,7 @@ def dataset_distributions(
         scenes=tally.scenes,
         placements=tally.placements,
         surfaces=tally.surfaces,
+        maps=tally.maps,
         views_at_cap=tally.views_at_cap,
         objects=dataset.objects_lock(),
         failures=dataset.failures(),
