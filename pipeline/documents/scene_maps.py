@@ -13,8 +13,7 @@ from storage.records.texture import TEXTURED, Texture
 
 MAPS_STYLE = """
 .maps { display: flex; flex-wrap: wrap; gap: .8rem; margin-bottom: 1.2rem }
-.maps figure { max-width: 272px } .maps img { width: auto; max-width: 100%; height: 112px }
-.maps figcaption { max-width: 240px }
+.maps figure { width: min-content } .maps figure img { width: auto; height: 112px }
 """
 """What `maps_section` needs of the page's style."""
 
@@ -30,7 +29,9 @@ def maps_section(scene: Scene) -> list[Markup]:
         role = " and ".join(_columns(scene, row))
         rows.append([texture.source.name, f"texture: {role}", *_rest(texture.texels, texture)])
         if row < _MOST_SHOWN:
-            figures.append(_figure(_texture_pixels(texture), f"{texture.source.name} ({role})"))
+            name = texture.source.name
+            caption = name if name.endswith(role) else f"{name} ({role})"
+            figures.append(_figure(_texture_pixels(texture), caption))
     if (sky := scene.environment) is not None:
         seen = "environment, seen" if sky.is_seen else "environment, hidden from cameras"
         rows.append([sky.source.name, seen, *_rest(sky.radiance_rgb, sky)])

@@ -62,7 +62,7 @@ def test_the_card_says_how_many(dataset: Dataset) -> None:
 def test_a_scene_shows_its_maps(dataset: Dataset) -> None:
     write_report(dataset, dataset_distributions(dataset))
     text = words((dataset.folder.report_pages / "000000000.html").read_bytes())
-    assert "colours 0 (diffuse)" in text and "roughness (roughness)" in text
+    assert "colours 0 (diffuse) roughness sky 0 (environment, seen)" in text
     assert "sky 0 (environment, seen): mean radiance 0.25, brightest texel 1 times that" in text
     plain = words((dataset.folder.report_pages / "000000002.html").read_bytes())
     assert "Textures and environment" not in plain
