@@ -7,6 +7,7 @@ from infra.bench.effort import Effort
 from infra.bench.experiment import Column, Experiment, Over, Point, TurnFigures, percent
 from infra.bench.experiments.sampling import CORE_S
 from infra.bench.sides.mapped_pictures import MAPS, mapped_views
+from infra.bench.sides.sky_picks import SKIES, WAYS, picked_pictures
 from infra.bench.workshop import Workshop
 from pipeline.builds.training import smoke
 from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
@@ -14,6 +15,9 @@ from pipeline.renders.settings import USUAL_FLOOR_DB, RenderSettings
 _PX = 64
 _REFERENCE_SHARE = 2
 """References have more samples than those of `calibration` by this: they have half its width."""
+
+_PICKED_REFERENCE = 8
+"""The same for pictures of 48 pixels, which are not denoised."""
 
 
 def picture_settings(effort: Effort) -> RenderSettings:
@@ -51,6 +55,12 @@ _JUDGED = tuple(
     for words, figure, over, then in _FIGURES
 )
 
+
+def _measure_picks(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
+    found = workshop.call(picked_pictures, turn, _PICKED_REFERENCE * workshop.effort.reference_spp)
+    yield from found.items()
+
+
 EXPERIMENTS = (
     Experiment(
         name="maps",
@@ -80,5 +90,26 @@ EXPERIMENTS = (
         points=_points,
         turns=lambda effort: [f"scene {index}" for index in range(effort.judged_scenes)],
         measure=_measure,
+    ),
+    Experiment(
+        name="sky-picks",
+        title="How often a path picks the sky",
+        about="A sampled scene below four skies, raw pictures of 16 samples: the sky is picked as "
+        "often as the average lamp, by the peaks of its map, or by its whole power.",
+        cost=Column(name="core-seconds a picture", figure="core_s", over="mean"),
+        error=Column(
+            name="error over the least of the three, worst sky", figure="over_least", over="most"
+        ),
+        against="raw references in two halves; the error is the mean square of log10(1 + radiance)",
+        columns=(
+            Column(name="error over the least, mean", figure="over_least", over="mean"),
+            Column(name="least share of picks", figure="share", over="least"),
+            Column(name="greatest share", figure="share", over="most"),
+        ),
+        because="Default: by its peaks, its mean less its median, and at least as the average "
+        "lamp. A smooth map is found by the directions that surfaces draw; a sun is not.",
+        points=lambda effort: [Point(name=way, default="ours" in way) for way in WAYS],
+        turns=lambda effort: tuple(SKIES),
+        measure=_measure_picks,
     ),
 )
