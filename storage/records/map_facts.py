@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from storage.records.environment import Environment
 from storage.records.scene import Scene
-from storage.records.texture import TEXTURED
+from storage.records.texture import CONSTANT, TEXTURED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,5 +56,5 @@ def textured_objects(scene: Scene) -> set[int]:
     """Return the rows of `Scene.objects` of which a triangle has a texture."""
     if scene.material_textures is None:
         return set()
-    textured = (scene.material_textures >= 0).any(axis=1)
+    textured: NDArray[np.bool_] = np.any(scene.material_textures != CONSTANT, axis=1)
     return set(np.unique(scene.object_index[textured[scene.material_index]]).tolist())
