@@ -63,7 +63,7 @@ def _measure_picks(workshop: Workshop, points: Sequence[Point], turn: str) -> Tu
 
 EXPERIMENTS = (
     Experiment(
-        name="maps",
+        name="map-costs",
         title="Textures and skies: their price, and their stated floors",
         about=f"The same scenes with the means of their textures, with textures on every surface, "
         f"below a sky, and with both, the sky seen: pictures of {_PX} pixels to {USUAL_FLOOR_DB:g} "
