@@ -8,7 +8,7 @@ import dataclasses
 from pipeline.builds.frozen_v1 import BUILD_V1, JUDGING_SPLITS
 from pipeline.builds.settings import BuildSettings, NamedBuild
 from pipeline.objects.generated import BENCHMARK
-from scene_templates.out_of_range import out_of_range_settings
+from scene_templates.out_of_range import out_of_range_2_settings, out_of_range_settings
 from storage.dataset.settings import StorageSettings
 
 _EXACT = StorageSettings(profile="lossless", passes=())
@@ -25,6 +25,20 @@ def out_of_range() -> BuildSettings:
         renders=dataclasses.replace(BUILD_V1.renders, max_spp=2048, min_mean_radiance=1e-5),
         splits=dataclasses.replace(JUDGING_SPLITS, scenes_per_shard=37),
         storage=_EXACT,
+    )
+
+
+def out_of_range_2() -> BuildSettings:
+    """`out-of-range` with twelve values of five axes of textures and skies after the others.
+
+    Another set: the scenes of the first nine axes are drawn as there, and are others.
+    """
+    build = out_of_range()
+    return dataclasses.replace(
+        build,
+        build="out-of-range-2",
+        scenes=out_of_range_2_settings(max_triangles=4096),
+        splits=dataclasses.replace(build.splits, scenes_per_shard=49),
     )
 
 
@@ -48,6 +62,7 @@ def benchmark_v1() -> BuildSettings:
 
 JUDGING_BUILDS = {
     "out-of-range": NamedBuild(settings=out_of_range, num_scenes=148),
+    "out-of-range-2": NamedBuild(settings=out_of_range_2, num_scenes=196),
     "benchmark-v1": NamedBuild(
         settings=benchmark_v1,
         num_scenes=200,
@@ -59,5 +74,5 @@ JUDGING_BUILDS = {
         scene_digest="c2d2baa3de32b89bc0b1eca3588ffe9d841ec5881879cf97bc69340abb3ebc49",
     ),
 }
-"""`out-of-range` counts 37 values times four layouts; the mini is the beginning of the other, and
-grows into it with more `--scenes`."""
+"""`out-of-range` counts 37 values times four layouts, its second version 49; the mini is the
+beginning of the other, and grows into it with more `--scenes`."""

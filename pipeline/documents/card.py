@@ -8,6 +8,7 @@ from typing import Any
 
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.markdown import code, front_matter, table, text
+from pipeline.documents.report_maps import maps_in_words
 from pipeline.documents.rights import Rights, hub_licence, rights_markdown
 from storage.dataset.derived import Derivation, derivation_of
 from storage.dataset.layout import DatasetFolder
@@ -176,6 +177,7 @@ def _contents(manifest: Manifest, found: Distributions) -> str:
         *_own_maps(found),
         ("rejected on the way", f"{len(found.failures)}, each with its reason in failures.jsonl"),
     ]
+    rows[1:1] = list(maps_in_words(found).items())
     if triangles["count"]:
         spread = f"median {triangles['median']:.0f}, most {triangles['max']:.0f}"
         rows.insert(1, ("triangles of a scene", spread))
@@ -186,7 +188,7 @@ def _own_maps(found: Distributions) -> list[tuple[str, str]]:
     """Return a row for textures and for maps that are not procedural, where there are such."""
     rows = []
     for kind, name in ((TEXTURE, "textures, not procedural"), (SKY, "skies, not procedural")):
-        uids = {entry.uid for entry in found.maps if entry.kind == kind}
+        uids = {entry.uid for entry in found.own_maps if entry.kind == kind}
         if uids:
             rows.append((name, f"{len(uids)}, of which {len(uids & set(found.map_uses))} are used"))
     return rows

@@ -12,6 +12,7 @@ from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import Manifest
 from storage.errors import TrilightError
+from storage.records.map_facts import texture_families
 from storage.records.objects import OBJECT, Failure, LockedObject, locked_uids
 from storage.records.quantities import QUANTITIES, summary
 from storage.records.sample import SceneRecord
@@ -31,12 +32,14 @@ class Distributions:
     map_uses: Mapping[str, int]
     """In how many scenes each texture and map of a user's own is, likewise."""
     surfaces: Mapping[tuple[str, str], int]
-    """Surfaces by (object or shell; all, smooth or many_colours)."""
+    """Surfaces by (object or shell; all, smooth, many_colours or textured)."""
+    maps: Mapping[tuple[str, str], int]
+    """Scenes by (texture or sky; its family, or what its map is called)."""
     views_at_cap: Mapping[str, int]
     """Views whose sampling ended at the cap, by split."""
     objects: Sequence[LockedObject]
     """The objects that scenes may draw from."""
-    maps: Sequence[LockedObject]
+    own_maps: Sequence[LockedObject]
     """The textures and maps of a user's own that they may draw from."""
     failures: Sequence[Failure]
     """What was rejected."""
@@ -78,7 +81,7 @@ class Distributions:
     @property
     def locked(self) -> list[LockedObject]:
         """All rows of the lock, whose rights documents list."""
-        return [*self.objects, *self.maps]
+        return [*self.objects, *self.own_maps]
 
     @property
     def licences(self) -> Mapping[str, tuple[int, int, int]]:
@@ -102,6 +105,10 @@ class Distributions:
                 name: {"objects": count, "used": used, "placements": places}
                 for name, (count, used, places) in self.licences.items()
             },
+            "maps": [
+                {"kind": kind, "family": family, "scenes": count}
+                for (kind, family), count in sorted(self.maps.items())
+            ],
             "object_uses": summary(self.uses_per_object()),
             "quantities": {name: summary(self.all(name)) for name in QUANTITIES},
             "rejections": [
@@ -121,7 +128,7 @@ class Distributions:
         }
 
 
-SURFACE_COUNTS = ("all", "smooth", "many_colours")
+SURFACE_COUNTS = ("all", "smooth", "many_colours", "textured")
 
 MEASURED = {
     "noise_floor_db": "noise_floor_db",
@@ -140,6 +147,7 @@ class _Tally:
     placements: Counter[str] = field(default_factory=Counter)
     map_uses: Counter[str] = field(default_factory=Counter)
     surfaces: Counter[tuple[str, str]] = field(default_factory=Counter)
+    maps: Counter[tuple[str, str]] = field(default_factory=Counter)
     views_at_cap: Counter[str] = field(default_factory=Counter)
 
     def add(self, record: SceneRecord, split: str) -> Mapping[str, Values]:
@@ -151,8 +159,12 @@ class _Tally:
             self.surfaces[surface.kind, "all"] += 1
             self.surfaces[surface.kind, "smooth"] += surface.smooth
             self.surfaces[surface.kind, "many_colours"] += surface.num_colours > 1
+            self.surfaces[surface.kind, "textured"] += surface.textured
             if surface.kind == "object":
                 self.placements[str(record.scene.objects[surface.row].uid)] += 1
+        self.maps.update(("texture", name) for name in texture_families(record.scene))
+        if (sky := record.scene.environment) is not None:
+            self.maps["sky", sky.source.name] += 1
         return scene_values(record)
 
 
@@ -191,9 +203,10 @@ def dataset_distributions(
         placements=tally.placements,
         map_uses=tally.map_uses,
         surfaces=tally.surfaces,
+        maps=tally.maps,
         views_at_cap=tally.views_at_cap,
         objects=[entry for entry in locked if entry.kind == OBJECT],
-        maps=[entry for entry in locked if entry.kind != OBJECT],
+        own_maps=[entry for entry in locked if entry.kind != OBJECT],
         failures=dataset.failures(),
         targets=_targets(dataset.manifest),
     )

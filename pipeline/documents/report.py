@@ -12,6 +12,7 @@ from pipeline.documents import report_sections
 from pipeline.documents.distributions import MEASURED, Distributions
 from pipeline.documents.gallery import write_gallery
 from pipeline.documents.html import Markup, element, joined, page, table
+from pipeline.documents.report_maps import maps_section
 from pipeline.documents.scene_passes import passes_command
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
@@ -37,13 +38,14 @@ _SECTIONS = {
     "objects": report_sections.objects_section,
     "triangles": report_sections.triangles_section,
     "materials": report_sections.materials_section,
+    "maps": maps_section,
     "lights": report_sections.lights_section,
     "cameras": report_sections.cameras_section,
     "pictures": report_sections.pictures_section,
     "rejections": report_sections.rejections_section,
     "licences": report_sections.licences_section,
 }
-"""What makes each section, by the name that links to it."""
+"""What makes each section, by the name that links to it; one of which there is nothing is empty."""
 
 
 def write_report(
@@ -66,13 +68,13 @@ def write_report(
     """
     folder = out or dataset.folder
     cards = write_gallery(dataset, found.failures, folder, max_scenes)
-    sections = [section(found) for section in _SECTIONS.values()] if found.scenes else []
-    anchors = [*_SECTIONS, "gallery", "settings"]
+    made = {name: make(found) for name, make in _SECTIONS.items()} if found.scenes else {}
+    anchors = [*(name for name, section in made.items() if section), "gallery", "settings"]
     body = [
         element("h1", f"Dataset {dataset.manifest.build}"),
         _overview(dataset, found),
         element("p", *(element("a", name, href=f"#{name}") for name in anchors), class_="toc"),
-        *sections,
+        *made.values(),
         element("h2", "Gallery", id="gallery"),
         cards,
         _settings(dataset),

@@ -37,7 +37,7 @@ def scenes_section(found: Distributions) -> Markup:
     totals = [sum(counts[split]) for split in splits]
     rows.append(["all", *totals, sum(totals)])
     head = ("template", *splits, "all")
-    return _section("scenes", "Scenes", picture, table(head, rows, numbers=len(splits) + 1))
+    return section("scenes", "Scenes", picture, table(head, rows, numbers=len(splits) + 1))
 
 
 def objects_section(found: Distributions) -> Markup:
@@ -48,9 +48,9 @@ def objects_section(found: Distributions) -> Markup:
         histogram(axes[0], found.all("objects_per_scene"), "objects in a scene", ylabel="scenes")
         histogram(axes[1], uses, "places of an object in scenes", ylabel="objects")
         picture = encoded(figure, "objects of a scene, and places of an object")
-    numbers = _summaries(found, "objects_per_scene", extra=[("places of an object", 0, uses)])
+    numbers = summaries(found, "objects_per_scene", extra=[("places of an object", 0, uses)])
     note = element("p", f"{int((uses > 0).sum())} of {len(uses)} objects stand in a scene.")
-    return joined([_section("objects", "Objects", picture, numbers, note), _most_used(found)])
+    return joined([section("objects", "Objects", picture, numbers, note), _most_used(found)])
 
 
 def triangles_section(found: Distributions) -> Markup:
@@ -64,8 +64,8 @@ def triangles_section(found: Distributions) -> Markup:
         values = found.all("triangles_per_object")
         histogram(axes[1], values, "triangles of an object", ylabel="places")
         picture = encoded(figure, "triangles of scenes and objects")
-    numbers = _summaries(found, "triangles_per_scene", "triangles_per_object")
-    return _section("triangles", "Triangles", picture, numbers)
+    numbers = summaries(found, "triangles_per_scene", "triangles_per_object")
+    return section("triangles", "Triangles", picture, numbers)
 
 
 def materials_section(found: Distributions) -> Markup:
@@ -76,28 +76,29 @@ def materials_section(found: Distributions) -> Markup:
         ylabel="surfaces",
         bounds=(0, 1),
     )
-    numbers = _summaries(found, "diffuse", "specular", "albedo_sum", "roughness")
+    numbers = summaries(found, "diffuse", "specular", "albedo_sum", "roughness")
     rows: list[list[Cell]] = []
     for kind in ("object", "shell"):
-        count, smooth, coloured = (found.surfaces.get((kind, name), 0) for name in SURFACE_COUNTS)
+        count, *those = (found.surfaces.get((kind, name), 0) for name in SURFACE_COUNTS)
         name = {"object": "objects", "shell": "floors and walls"}[kind]
-        rows.append([name, count, _share(smooth, count), _share(coloured, count)])
-    shares = table(("surfaces", "count", "smooth", "many colours"), rows, numbers=3)
+        rows.append([name, count, *(_share(of_them, count) for of_them in those)])
+    head = ("surfaces", "count", "smooth", "many colours", "textured")
+    shares = table(head, rows, numbers=4)
     note = element(
         "p",
-        "A surface is an object, a floor or a wall in one scene; where it has many colours, its "
-        "mean over triangles counts. Albedos are those of the strongest channel. Smooth surfaces "
-        "share vertices between triangles; the others are flat.",
+        "A surface is an object, a floor or a wall in one scene. Of many colours the mean over "
+        "triangles counts, of a texture its mean. Albedos are those of the strongest channel. "
+        "Smooth surfaces share vertices between triangles; the others are flat.",
         class_="faint",
     )
-    return _section("materials", "Materials", picture, numbers, shares, note)
+    return section("materials", "Materials", picture, numbers, shares, note)
 
 
 def lights_section(found: Distributions) -> Markup:
     """Return number, radiance, distance and size of the lights."""
     names = ("lights_per_scene", "total_emission", "light_distance", "light_size")
     picture = _histograms(found, names, ylabel=("scenes", "scenes", "lights", "lights"))
-    return _section("lights", "Lights", picture, _summaries(found, *names))
+    return section("lights", "Lights", picture, summaries(found, *names))
 
 
 def cameras_section(found: Distributions) -> Markup:
@@ -111,7 +112,7 @@ def cameras_section(found: Distributions) -> Markup:
         picture = encoded(figure, "cameras")
     replaced = int((found.all("camera_attempt") > 0).sum())
     note = element("p", f"{replaced} cameras stand in for rejected ones.")
-    return _section("cameras", "Cameras", picture, _summaries(found, *names, "azimuth_deg"), note)
+    return section("cameras", "Cameras", picture, summaries(found, *names, "azimuth_deg"), note)
 
 
 def pictures_section(found: Distributions) -> Markup:
@@ -125,8 +126,8 @@ def pictures_section(found: Distributions) -> Markup:
             values, xlabel = found.all(name), QUANTITIES[name].label
             histogram(panel, values, xlabel, ylabel="views", marks={label: mark})
         picture = encoded(figure, "noise floors, samples per pixel and coverage")
-    numbers = _summaries(found, *marks, statistics=STATISTICS)
-    return _section("pictures", "Pictures", picture, numbers, _floors_by_split(found))
+    numbers = summaries(found, *marks, statistics=STATISTICS)
+    return section("pictures", "Pictures", picture, numbers, _floors_by_split(found))
 
 
 def rejections_section(found: Distributions) -> Markup:
@@ -149,7 +150,7 @@ def rejections_section(found: Distributions) -> Markup:
     ]
     head = ("stage", "reason", "all", *parts)
     numbers = table(head, rows, numbers=len(parts) + 1)
-    return _section("rejections", "Rejections", picture, numbers)
+    return section("rejections", "Rejections", picture, numbers)
 
 
 def licences_section(found: Distributions) -> Markup:
@@ -213,7 +214,7 @@ def _histograms(
         return encoded(figure, ", ".join(QUANTITIES[name].label for name in names))
 
 
-def _summaries(
+def summaries(
     found: Distributions,
     *names: str,
     extra: Sequence[tuple[str, int, np.ndarray]] = (),
@@ -248,7 +249,8 @@ def _heading(anchor: str, title: str) -> Markup:
     return element("h2", title, id=anchor)
 
 
-def _section(anchor: str, title: str, picture: Markup, *beside: Markup) -> Markup:
+def section(anchor: str, title: str, picture: Markup, *beside: Markup) -> Markup:
+    """Return a heading that links lead to, with a picture and what stands beside it."""
     left = element("div", picture, class_="figure")
     right = element("div", *beside, class_="numbers")
     return joined([_heading(anchor, title), element("div", left, right, class_="pair")])

@@ -20,6 +20,7 @@ from pipeline.documents.html import (
     table,
 )
 from pipeline.documents.pass_colours import id_colours
+from pipeline.documents.scene_maps import MAPS_STYLE, maps_section
 from pipeline.documents.scene_passes import PASSES_STYLE, passes_section
 from storage.conventions import preview_srgb8, srgb8
 from storage.records.material import DIFFUSE
@@ -81,14 +82,14 @@ def encode_scene_page(
         _objects(scene),
         element("h2", "Materials"),
         _materials(scene),
-        *_maps(scene),
+        *maps_section(scene),
         element("h2", "Lights"),
         _lights(scene),
         *_attempts(rejected),
         element("h2", "Provenance"),
         _provenance(scene.provenance),
     ]
-    return page(title, joined(body), style=_STYLE + PASSES_STYLE)
+    return page(title, joined(body), style=_STYLE + PASSES_STYLE + MAPS_STYLE)
 
 
 def preview(radiance_rgb: NDArray[np.float32], width: int) -> NDArray[np.uint8]:
@@ -191,29 +192,6 @@ def _objects(scene: Scene) -> Markup:
     ]
     head = ("name", "kind", "uid", "licence", "attribution", "source", "shading", "triangles")
     return table(head, rows, numbers=1, class_="objects")
-
-
-def _maps(scene: Scene) -> list[Markup]:
-    """Return the textures and the environment map with their rights, where there are any."""
-    maps = [(texture.source, texture.texels, "texture") for texture in scene.textures]
-    if (sky := scene.environment) is not None:
-        role = "environment, seen" if sky.is_seen else "environment, hidden from cameras"
-        maps.append((sky.source, sky.radiance_rgb, role))
-    if not maps:
-        return []
-    rows: list[list[Cell]] = [
-        [
-            source.name,
-            role,
-            f"{values.shape[1]} x {values.shape[0]}",
-            source.licence,
-            source.attribution,
-            outside_link(source.source_url),
-        ]
-        for source, values, role in maps
-    ]
-    head = ("name", "what", "texels", "licence", "attribution", "source")
-    return [element("h2", "Textures and environment"), table(head, rows, numbers=0)]
 
 
 def _materials(scene: Scene) -> Markup:

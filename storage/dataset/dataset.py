@@ -16,6 +16,7 @@ from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
 from storage.dataset.shard import samples_of, with_maps
 from storage.digests import sha256_of_stream
 from storage.errors import TrilightError
+from storage.records.held_maps import HeldMaps
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
 from storage.records.safe_read import open_plain
 from storage.records.sample import Sample, SceneRecord, decode_sample, decode_scene
@@ -241,9 +242,10 @@ class Dataset:
         Raises:
             TrilightError: the file is missing or its bytes are not those of the manifest.
         """
+        held = HeldMaps()
         with self.files.open(shard, checked=True) as stream:
             for key, members in samples_of(stream, shard.name):
-                yield decode_sample(key, members)
+                yield decode_sample(key, members, held)
 
     def read_scenes(self, shard: ShardEntry) -> Iterator[SceneRecord]:
         """Yield the samples of a shard without their pictures, through the manifest's index.
@@ -255,22 +257,24 @@ class Dataset:
             TrilightError: the shard is missing or shorter than its index, or a scene in it is
                 unreadable or breaks a law.
         """
-        maps = shard.maps
+        maps, held = shard.maps, HeldMaps()
         with self.files.open(shard, checked=False) as stream:
             for key, members in shard.index.items():
                 scene_members = [suffix for suffix in members if not suffix.endswith("exr")]
                 with reading(self.shown, shard.name):
-                    record = decode_scene(key, _read(stream, members, scene_members, maps))
+                    found = _read(stream, members, scene_members, maps)
+                    record = decode_scene(key, found, held)
                     _require_lawful(record)
                 yield record
 
     def read_samples(self, shard: ShardEntry, keys: Iterable[str]) -> Iterator[Sample]:
         """Yield some samples of a shard with their pictures; otherwise as `read_scenes`."""
-        index, maps = shard.index, shard.maps
+        index, maps, held = shard.index, shard.maps, HeldMaps()
         with self.files.open(shard, checked=False) as stream:
             for key in keys:
                 with reading(self.shown, shard.name):
-                    sample = decode_sample(key, _read(stream, index[key], index[key], maps))
+                    found = _read(stream, index[key], index[key], maps)
+                    sample = decode_sample(key, found, held)
                     _require_lawful(sample)
                 yield sample
 

@@ -2,7 +2,7 @@
 
 A set knows its shards by number and opens each when it is wanted. An open shard gives any of its
 samples, in any order and from several threads at once; nothing of it stays in memory but the names
-of its members.
+of its members, and of a whole set as many unpacked maps as storage.records.held_maps allows.
 """
 
 import os
@@ -20,16 +20,23 @@ from storage.dataset.shard import Member, scan_samples, with_maps
 from storage.dataset.shard_places import ShardPlace
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
+from storage.records.held_maps import HeldMaps
 from storage.records.sample import Sample, decode_sample
 
 
 class OpenShard:
     """A shard that is being read."""
 
-    def __init__(self, name: str, stream: BinaryIO) -> None:
-        """Look at the headers; raises TrilightError as `storage.dataset.shard`."""
+    def __init__(self, name: str, stream: BinaryIO, held: HeldMaps) -> None:
+        """Look at the headers; raises TrilightError as `storage.dataset.shard`.
+
+        Args:
+            name: for messages.
+            stream: the file.
+            held: maps of this shard and others that were unpacked already.
+        """
         self.name = name
-        self._stream = stream
+        self._stream, self._held = stream, held
         self._maps: dict[str, Member] = {}
         self._samples: list[tuple[str, Mapping[str, Member]]] = list(
             scan_samples(stream, name, self._maps)
@@ -68,7 +75,7 @@ class OpenShard:
         """
         key, _ = self._samples[row]
         try:
-            sample = decode_sample(key, self.members(row))
+            sample = decode_sample(key, self.members(row), self._held)
             sample.check()
             return sample
         except TrilightError as error:
@@ -105,13 +112,14 @@ class ManifestShards(ShardSet):
         self.names = [entry.name for entry in entries]
         self._files = dataset.files
         self._entries = entries
+        self._held = HeldMaps()
 
     def num_samples(self, number: int) -> int:
         return self._entries[number].num_samples
 
     def open(self, number: int) -> OpenShard:
         entry = self._entries[number]
-        shard = _opened(entry.name, self._files.open(entry, checked=True))
+        shard = _opened(entry.name, self._files.open(entry, checked=True), self._held)
         if len(shard.keys) != entry.num_samples:
             shard.close()
             raise TrilightError(
@@ -157,9 +165,9 @@ def key_twice(shard: str, key: str) -> TrilightError:
     )
 
 
-def _opened(name: str, stream: BinaryIO) -> OpenShard:
+def _opened(name: str, stream: BinaryIO, held: HeldMaps) -> OpenShard:
     try:
-        return OpenShard(name, stream)
+        return OpenShard(name, stream, held)
     except BaseException:
         stream.close()
         raise
@@ -173,6 +181,7 @@ class ListedShards(ShardSet):
         self._places = places
         self._seen = seen
         self._counts: dict[int, int] = {}
+        self._held = HeldMaps()
 
     def num_samples(self, number: int) -> int:
         if number not in self._counts:
@@ -181,7 +190,7 @@ class ListedShards(ShardSet):
 
     def open(self, number: int) -> OpenShard:
         place = self._places[number]
-        shard = _opened(place.shown, place.open())
+        shard = _opened(place.shown, place.open(), self._held)
         try:
             self._seen.add(place.shown, shard.keys)
         except TrilightError:

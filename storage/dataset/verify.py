@@ -19,10 +19,11 @@ from storage.dataset.shard import samples_of, scan_members
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.licences import mixed_share_alike
+from storage.records.held_maps import HeldMaps
 from storage.records.lights import sum_of_lights
 from storage.records.objects import LockedObject, decode_objects_lock, locked_uids
 from storage.records.parts import part_names, sum_of_parts
-from storage.records.passes.stored import COVERAGE, decode_passes_exr, picture_passes
+from storage.records.passes.stored import decode_passes_exr, passes_in_file, picture_passes
 from storage.records.sample import Sample, decode_sample
 from storage.remote.fetch import download
 from storage.remote.tries import TransferFailed
@@ -220,12 +221,12 @@ def _check_content(
 ) -> None:
     if index_stream(stream, shard.name) != shard:
         found.faults.append("sha256 or member index differs from the manifest")
-    unused = set(shard.maps)
+    unused, held = set(shard.maps), HeldMaps()
     for key, members in samples_of(stream, shard.name):
         found.keys.append(key)
         unused -= members.keys()
         try:
-            sample = decode_sample(key, members)
+            sample = decode_sample(key, members, held)
         except TrilightError as error:
             found.faults.append(str(error))
             continue
@@ -322,10 +323,10 @@ def _check_passes(sample: Sample, names: Sequence[str] | None) -> Iterator[str]:
         except TrilightError as error:
             yield f"sample {sample.key}: view {view}: {error}"
             continue
-        if set(found) != {COVERAGE, *names}:
+        if set(found) != (wanted := set(passes_in_file(sample.scene, names))):
             yield (
                 f"sample {sample.key}: view {view} has the passes {', '.join(sorted(found))}; "
-                f"expected {', '.join(sorted({COVERAGE, *names}))}"
+                f"expected {', '.join(sorted(wanted))}"
             )
         for name, picture in found.items():
             if (share := _share_that_differs(picture, expected[name])) > MOST_DIFFERENT:

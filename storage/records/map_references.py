@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.environment import Environment
+from storage.records.held_maps import with_same_content
 from storage.records.scene import Scene
 from storage.records.scene_maps import MAX_TEXTURES
 from storage.records.texture import MapSource, Texture
@@ -76,24 +77,41 @@ def referenced_maps(record: Any) -> list[str]:
     return list(dict.fromkeys(map_member(entry["sha256"]) for entry in entries))
 
 
-def described_texture(entry: Mapping[str, Any], texels: NDArray, *, is_srgb: bool) -> Texture:
-    """Return the texture of an entry of `maps_record`; raises where its content is another."""
+def checked_texture(entry: Mapping[str, Any], texels: NDArray, *, is_srgb: bool) -> Texture:
+    """Return the texture of some texels; raises where it is not what an entry names."""
     texture = Texture(texels=texels, is_srgb=is_srgb, source=_source(entry))
     texture.check(f"texture {entry['sha256']}")
     _require_content(texture.sha256, entry)
     return texture
 
 
-def described_environment(entry: Mapping[str, Any], radiance_rgb: NDArray) -> Environment:
-    """Return the environment of an entry of `maps_record`; raises where its map is another."""
-    environment = Environment(
-        radiance_rgb=radiance_rgb,
+def checked_environment(entry: Mapping[str, Any], radiance_rgb: NDArray) -> Environment:
+    """Return an unturned environment; raises where its map is not what an entry names."""
+    environment = Environment(radiance_rgb=radiance_rgb)
+    environment.check()
+    _require_content(environment.sha256, entry)
+    return environment
+
+
+def described_texture(entry: Mapping[str, Any], texture: Texture) -> Texture:
+    """Return a texture with the name and rights that an entry of `maps_record` says."""
+    source = _source(entry)
+    return texture if texture.source == source else with_same_content(texture, source=source)
+
+
+def described_environment(entry: Mapping[str, Any], sky: Environment) -> Environment:
+    """Return an environment as an entry of `maps_record` names and turns it.
+
+    Raises:
+        TrilightError: the turn is no rotation.
+    """
+    environment = with_same_content(
+        sky,
         rotation=np.array(entry["rotation"], np.float64).astype(np.float32),
         is_seen=entry["is_seen"],
         source=_source(entry),
     )
     environment.check()
-    _require_content(environment.sha256, entry)
     return environment
 
 

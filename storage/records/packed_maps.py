@@ -9,7 +9,7 @@ samples as before. Nothing in a header decides how much memory is taken.
 """
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,10 @@ from safetensors.numpy import save
 
 from storage.errors import TrilightError
 from storage.records.environment import Environment
+from storage.records.held_maps import HeldMaps, Map
 from storage.records.map_references import (
+    checked_environment,
+    checked_texture,
     described_environment,
     described_texture,
     environment_entries,
@@ -84,12 +87,15 @@ def held_values(stored: NDArray) -> NDArray:
     return stored.astype(np.float32) if stored.dtype == np.float16 else stored
 
 
-def unpacked_maps(maps: Any, members: Mapping[str, bytes]) -> dict[str, Any]:
-    """Return the fields `textures` and `environment` of a scene.
+def unpacked_maps(
+    maps: Any, members: Mapping[str, bytes], held: HeldMaps | None = None
+) -> dict[str, Any]:
+    """Return the fields `textures` and `environment` of a scene, whose arrays are read-only.
 
     Args:
         maps: what `maps_record` gave, from outside.
         members: bytes of the maps by the names of their members; others are ignored.
+        held: those of other samples, which are not unpacked again; None where there is no other.
 
     Raises:
         TrilightError: not of that form, a map is missing or damaged, all of them take more than
@@ -107,26 +113,42 @@ def unpacked_maps(maps: Any, members: Mapping[str, bytes]) -> dict[str, Any]:
     total = sum(_Packed(data, name).num_bytes_held for name, data in packed.items())
     if total > MAX_MAPS_BYTES:
         wrong_map("maps", f"{total} bytes", f"at most {MAX_MAPS_BYTES}")
+    held = HeldMaps() if held is None else held
     fields: dict[str, Any] = {}
     if entries:
-        fields["textures"] = tuple(_texture(entry, packed) for entry in entries)
+        fields["textures"] = tuple(
+            described_texture(entry, _held(Texture, entry, packed, held, _texture))
+            for entry in entries
+        )
     for entry in skies:
-        fields["environment"] = _environment(entry, packed)
+        sky = _held(Environment, entry, packed, held, _environment)
+        fields["environment"] = described_environment(entry, sky)
     return fields
 
 
-def _texture(entry: Mapping[str, Any], packed: Mapping[str, bytes]) -> Texture:
-    found = _Packed(packed[map_member(entry["sha256"])], f"map {entry['sha256']}")
+def _held(
+    kind: type[Map],
+    entry: Mapping[str, Any],
+    packed: Mapping[str, bytes],
+    held: HeldMaps,
+    unpack: Callable[[Mapping[str, Any], bytes], Map],
+) -> Map:
+    data = packed[map_member(entry["sha256"])]
+    return held.found(kind, entry["sha256"], data, lambda: unpack(entry, data))
+
+
+def _texture(entry: Mapping[str, Any], packed: bytes) -> Texture:
+    found = _Packed(packed, f"map {entry['sha256']}")
     if found.form not in (_SRGB, _LINEAR):
         wrong_map(found.name, found.form, "a texture")
-    return described_texture(entry, found.values(), is_srgb=found.form == _SRGB)
+    return checked_texture(entry, found.values(), is_srgb=found.form == _SRGB)
 
 
-def _environment(entry: Mapping[str, Any], packed: Mapping[str, bytes]) -> Environment:
-    found = _Packed(packed[map_member(entry["sha256"])], f"map {entry['sha256']}")
+def _environment(entry: Mapping[str, Any], packed: bytes) -> Environment:
+    found = _Packed(packed, f"map {entry['sha256']}")
     if found.form != _ENVIRONMENT:
         wrong_map(found.name, found.form, "an environment map")
-    return described_environment(entry, found.values())
+    return checked_environment(entry, found.values())
 
 
 def _packed(values: NDArray, form: str) -> bytes:

@@ -14,7 +14,7 @@ class Quantity(NamedTuple):
     """For people, with the unit."""
     digits: int
     """Decimals that are shown."""
-    per: Literal["scene", "object", "surface", "light", "view"]
+    per: Literal["scene", "object", "surface", "texture", "light", "sky", "view"]
     """Of what a scene has a value each; `surface` is an object, a floor or a wall."""
 
 
@@ -26,10 +26,16 @@ QUANTITIES: Mapping[str, Quantity] = {
     "specular": Quantity("specular albedo", 3, "surface"),
     "albedo_sum": Quantity("diffuse + specular", 3, "surface"),
     "roughness": Quantity("roughness", 3, "surface"),
+    "textures_per_scene": Quantity("textures in a scene", 0, "scene"),
+    "texture_width": Quantity("width of a texture, texels", 0, "texture"),
     "lights_per_scene": Quantity("lights in a scene", 0, "scene"),
     "total_emission": Quantity("radiance, sum over the lights", 0, "scene"),
     "light_distance": Quantity("distance from the origin, m", 3, "light"),
     "light_size": Quantity("size (root of the area), m", 3, "light"),
+    "skies_per_scene": Quantity("skies of a scene, 0 or 1", 0, "scene"),
+    "sky_radiance": Quantity("mean radiance of a sky", 3, "sky"),
+    "sky_peak": Quantity("brightest texel of a sky over its mean", 1, "sky"),
+    "sky_half_light_deg": Quantity("angle with half of a sky's light, degrees", 1, "sky"),
     "camera_distance": Quantity("distance from the origin, m", 3, "view"),
     "elevation_deg": Quantity("elevation, degrees", 1, "view"),
     "azimuth_deg": Quantity("azimuth, degrees", 1, "view"),

@@ -28,6 +28,7 @@ from storage.digests import canonical_json
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.records.first_hits import require_row
+from storage.records.held_maps import HeldMaps
 from storage.records.lights import decode_lights_exr, encode_lights_exr, num_lights
 from storage.records.packed_maps import packed_maps, unpacked_maps
 from storage.records.parts import KNOWN_PARTS, Parts, decode_parts_exr, encode_parts_exr
@@ -222,14 +223,14 @@ def encode_sample(sample: Sample, profile: Profile = "lossless") -> dict[str, by
     return {**members, **packed_maps(scene), **sample.kept_members}
 
 
-def decode_sample(key: str, members: Mapping[str, bytes]) -> Sample:
-    """Return the sample of its members (suffix to bytes).
+def decode_sample(key: str, members: Mapping[str, bytes], held: HeldMaps | None = None) -> Sample:
+    """Return the sample of its members (suffix to bytes); `held` as `decode_scene`.
 
     Raises:
         TrilightError: a member is missing, unreadable or of another schema version. Laws are not
             checked here; `Sample.check` does that before a network learns from it.
     """
-    record = decode_scene(key, members)
+    record = decode_scene(key, members, held)
     try:
         pictures = [decode_exr(members[f"{view}.exr"]) for view in range(len(record.views))]
         radiance_rgb = np.stack(pictures)
@@ -285,10 +286,13 @@ def _decode_parts(
     return {name: np.stack([of_view[name] for of_view in found]) for name in names}
 
 
-def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
+def decode_scene(
+    key: str, members: Mapping[str, bytes], held: HeldMaps | None = None
+) -> SceneRecord:
     """Return a sample without its pictures, whose members may be absent.
 
     The maps that its record names are among the members, under the names that shards give them.
+    Those that are held are not unpacked again; equal members give equal scenes with any.
 
     Raises:
         TrilightError: as `decode_sample`.
@@ -301,7 +305,7 @@ def decode_scene(key: str, members: Mapping[str, bytes]) -> SceneRecord:
         objects = scene_objects(record["objects"])
         require_version_of_maps(record)
         maps = record.get("maps")
-        fields = {} if maps is None else unpacked_maps(maps, members)
+        fields = {} if maps is None else unpacked_maps(maps, members, held)
         fields |= decode_arrays(unpack_arrays(members), maps)
         provenance = scene_provenance(record["provenance"])
         scene = Scene(objects=objects, provenance=provenance, **fields)

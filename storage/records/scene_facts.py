@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.records.map_facts import sky_facts, textured_objects
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.sample import SceneRecord
 from storage.records.scene import Scene
@@ -27,6 +28,8 @@ class SurfaceFacts:
     """Whether triangles share vertices, and with them normals; a flat face has its own three."""
     num_colours: int
     """Rows of the palette that it uses."""
+    textured: bool
+    """Whether any of its triangles has a texture; the numbers below are then of the means."""
     diffuse: float
     """Largest channel of the diffuse albedo, mean over the triangles."""
     specular: float
@@ -74,7 +77,7 @@ class CameraFacts:
 
 def surfaces(scene: Scene) -> list[SurfaceFacts]:
     """Return the objects and shell parts of a lawful scene that have triangles."""
-    found = []
+    found, textured = [], textured_objects(scene)
     for row, entry in enumerate(scene.objects):
         mine = scene.object_index == row
         if entry.kind == "emitter" or not mine.any():
@@ -90,6 +93,7 @@ def surfaces(scene: Scene) -> list[SurfaceFacts]:
                 num_triangles=len(rows),
                 smooth=len(np.unique(faces)) < faces.size,
                 num_colours=len(np.unique(rows)),
+                textured=row in textured,
                 diffuse=float(diffuse.max(axis=1).mean()),
                 specular=float(specular.max(axis=1).mean()),
                 albedo_sum=float((diffuse + specular).max(axis=1).mean()),
@@ -145,6 +149,7 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
     scene = record.scene
     reflecting, emitting, seen_from = surfaces(scene), lights(scene), cameras(scene)
     objects = [surface for surface in reflecting if surface.kind == "object"]
+    skies = [] if scene.environment is None else [sky_facts(scene.environment)]
     values: Mapping[str, Sequence[float]] = {
         "objects_per_scene": [len(objects)],
         "triangles_per_scene": [scene.num_triangles],
@@ -153,10 +158,16 @@ def scene_values(record: SceneRecord) -> Mapping[str, Values]:
         "specular": [surface.specular for surface in reflecting],
         "albedo_sum": [surface.albedo_sum for surface in reflecting],
         "roughness": [surface.roughness for surface in reflecting],
+        "textures_per_scene": [len(scene.textures)],
+        "texture_width": [texture.texels.shape[1] for texture in scene.textures],
         "lights_per_scene": [len(emitting)],
         "total_emission": [sum(light.emission for light in emitting)],
         "light_distance": [float(np.sqrt(np.sum(np.square(light.centre)))) for light in emitting],
         "light_size": [float(np.sqrt(light.area)) for light in emitting],
+        "skies_per_scene": [len(skies)],
+        "sky_radiance": [sky.mean_radiance for sky in skies],
+        "sky_peak": [sky.peak for sky in skies],
+        "sky_half_light_deg": [sky.half_light_deg for sky in skies],
         "camera_distance": [camera.distance for camera in seen_from],
         "elevation_deg": [camera.elevation_deg for camera in seen_from],
         "azimuth_deg": [camera.azimuth_deg for camera in seen_from],

@@ -26,6 +26,8 @@ from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 from storage.records.map_references import (
+    checked_environment,
+    checked_texture,
     described_environment,
     described_texture,
     environment_entries,
@@ -255,11 +257,15 @@ def _maps(record: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> dict[str,
     if not isinstance(is_srgb, list) or [type(each) for each in is_srgb] != [bool] * len(entries):
         _broken(_IS_SRGB, is_srgb, "true or false for each texture")
     fields["textures"] = tuple(
-        described_texture(entry, _map_values(arrays, f"{_TEXTURE}{row}"), is_srgb=is_srgb[row])
+        described_texture(
+            entry,
+            checked_texture(entry, _map_values(arrays, f"{_TEXTURE}{row}"), is_srgb=is_srgb[row]),
+        )
         for row, entry in enumerate(entries)
     )
     for entry in environment_entries(record[_MAPS]):
-        fields["environment"] = described_environment(entry, _map_values(arrays, _ENVIRONMENT))
+        sky = checked_environment(entry, _map_values(arrays, _ENVIRONMENT))
+        fields["environment"] = described_environment(entry, sky)
     return fields
 
 

@@ -4,6 +4,7 @@ All channels are float32, packed without loss: ids below 2^24 are exact in it, a
 turn every channel into it anyway. Names of channels are `Pass.exr_channels`. The channel A, which
 is the pass `coverage`, is always there. Where it is 0 nothing is met, and the file holds 0 instead
 of NaN, since filters of other programs would spread NaN over its neighbours; readers restore it.
+For the same reason a scene without textures has no channels of the pass `uv`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,7 @@ from storage.records.exr import (
     encode_channels,
     window_size,
 )
-from storage.records.passes.declared import Pass, declared_passes
+from storage.records.passes.declared import UV, Pass, declared_passes
 from storage.records.passes.pictures import view_passes
 from storage.records.scene import Scene
 
@@ -37,7 +38,7 @@ def passes_exr(
 
     Args:
         scene: passes `Scene.check`.
-        names: of the passes; `coverage` is added.
+        names: of the passes; `passes_in_file` says which of them the file has.
         view, resolution, rays_a_side: as `view_passes`.
 
     Raises:
@@ -49,7 +50,11 @@ def passes_exr(
             "so that ids are exact in a file."
         )
     found = view_passes(
-        scene, _with_coverage(names), view=view, resolution=resolution, rays_a_side=rays_a_side
+        scene,
+        passes_in_file(scene, names),
+        view=view,
+        resolution=resolution,
+        rays_a_side=rays_a_side,
     )
     met = found[COVERAGE] > 0
     channels: dict[str, NDArray[np.float32]] = {}
@@ -111,8 +116,14 @@ def picture_passes(
     return {name: found[name] for name in names}
 
 
-def _with_coverage(names: Sequence[str]) -> list[str]:
-    return [*names, *({COVERAGE} - set(names))]
+def passes_in_file(scene: Scene, names: Sequence[str]) -> list[str]:
+    """Return the passes that a file has where `names` are asked for.
+
+    `coverage` is among them; `uv` only where the scene has texture coordinates, so that of a build
+    which mixes textured and plain scenes no file holds NaN where a surface is met.
+    """
+    known = [name for name in names if name != UV or scene.uv is not None]
+    return known if COVERAGE in known else [*known, COVERAGE]
 
 
 def _passes(found: Mapping[str, NDArray]) -> list[Pass]:

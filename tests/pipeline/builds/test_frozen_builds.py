@@ -34,6 +34,7 @@ FROZEN = {
         "56426772c2a91bbfecdea829bb87538a282a5a0f46ccb7b21d20fc19825fbcc6"
     ),
     "out-of-range": "c2a748aa52a8ef6b87a608ff6ff736f252915de5a32a176561d77e18755013e8",
+    "out-of-range-2": "eb1172a3f84644efdf864e36b152c463f080d15c203b1397acff1421a0277754",
     "benchmark-v1": "74bfa7914c6aa4d7e94ec60ecd0f3530e9cec5d091d47e6aad54549bce36e5fd",
     "benchmark-v1-mini": "74bfa7914c6aa4d7e94ec60ecd0f3530e9cec5d091d47e6aad54549bce36e5fd",
 }
@@ -87,6 +88,7 @@ DRAWN = {
     "renderformer-v1-256-original": "b714a23cd3b0c8fc",
     "renderformer-v1-512-original": "0904cc37f3c68d75",
     "out-of-range": "8dfb2892883d2baa",
+    "out-of-range-2": "8dfb2892883d2baa",
     "benchmark-v1": "d5aea36fd1efd811",
 }
 """Digest of the numbers of the first layouts of each set, balls in place of objects."""

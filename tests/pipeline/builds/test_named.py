@@ -18,7 +18,7 @@ from storage.settings.described import from_record
 from tests.scene_templates.published import STAGE_1, STAGE_2
 
 RENDERFORMER = [name for name in BUILDS if name.startswith("renderformer-v1")]
-JUDGED = ["out-of-range", "benchmark-v1", "benchmark-v1-mini"]
+JUDGED = ["out-of-range", "out-of-range-2", "benchmark-v1", "benchmark-v1-mini"]
 
 
 @pytest.mark.parametrize("name", BUILDS)
@@ -174,6 +174,11 @@ def test_a_turn_of_the_test_sets_is_whole() -> None:
     assert len({(one.axis, one.value) for one in strange.excursions}) == 37
     assert len({one.axis for one in strange.excursions}) == 9
     assert BUILDS["out-of-range"].num_scenes == 37 * len(strange.families)
+    again = named_build("out-of-range-2").scenes
+    assert again.excursions[:37] == strange.excursions
+    assert len({(one.axis, one.value) for one in again.excursions}) == 49
+    assert len({one.axis for one in again.excursions}) == 14
+    assert BUILDS["out-of-range-2"].num_scenes == 49 * len(again.families)
     bench = named_build("benchmark-v1").scenes
     assert bench.families_in_turn
     assert BUILDS["benchmark-v1"].num_scenes == 50 * len(bench.families)

@@ -13,6 +13,8 @@ from storage.errors import TrilightError
 from storage.records.quantities import QUANTITIES, STATISTICS, summary
 from storage.records.sample import Sample
 from tests.pipeline.documents.dataset_by_hand import five_scenes, furnished, sample, write_dataset
+from tests.scenes_by_hand import tiny_scene
+from tests.textured_by_hand import sky, textured_scene
 
 FLOAT32 = 1e-6
 """Values are kept as float32: relative rounding of 6e-8, a few times over."""
@@ -46,6 +48,12 @@ def test_uses_of_objects(found: Distributions) -> None:
         ("specular", [0.2] * 5 + [0.1] * 6),
         ("albedo_sum", [0.7] * 5 + [(0.7 + 0.5) / 2] * 6),
         ("roughness", [0.5] * 5 + [0.3] * 6),
+        ("textures_per_scene", [0] * 5),
+        ("texture_width", []),
+        ("skies_per_scene", [0] * 5),
+        ("sky_radiance", []),
+        ("sky_peak", []),
+        ("sky_half_light_deg", []),
         ("lights_per_scene", [1] * 5),
         ("total_emission", [100] * 5),
         # the middle of the light is (0, -1/30, 2), and half of 0.2 x 0.2 its area
@@ -80,9 +88,33 @@ def test_values_belong_to_their_split(found: Distributions) -> None:
 def test_surfaces(found: Distributions) -> None:
     """The floor's triangles share two vertices; an object's have three each and two colours."""
     assert found.as_json()["surfaces"] == {
-        "shell": {"all": 5, "smooth": 5, "many_colours": 0},
-        "object": {"all": 6, "smooth": 0, "many_colours": 6},
+        "shell": {"all": 5, "smooth": 5, "many_colours": 0, "textured": 0},
+        "object": {"all": 6, "smooth": 0, "many_colours": 6, "textured": 0},
     }
+
+
+def test_textures_and_skies(tmp_path: Path) -> None:
+    """Two scenes of one look, one with a sky alone, and a plain one."""
+    scenes = [
+        textured_scene(),
+        textured_scene(),
+        tiny_scene(environment=sky(radiance_rgb=np.full((2, 4, 3), 0.5, np.float32))),
+        tiny_scene(),
+    ]
+    shards = {"train-000000.tar": [sample(key, scene) for key, scene in enumerate(scenes)]}
+    maps = dataset_distributions(write_dataset(tmp_path, shards))
+    assert maps.all("textures_per_scene").tolist() == [2, 2, 0, 0]
+    assert maps.all("texture_width").tolist() == [6, 2, 6, 2]
+    assert maps.all("skies_per_scene").tolist() == [0, 0, 1, 0]
+    assert maps.all("sky_radiance") == pytest.approx([0.5])
+    assert maps.all("sky_half_light_deg") == pytest.approx([180], abs=0.01)
+    assert maps.maps == {
+        ("texture", "colours 0"): 2,
+        ("texture", "roughness"): 2,
+        ("sky", "sky 0"): 1,
+    }
+    assert maps.surfaces["shell", "textured"] == 2
+    assert {"kind": "sky", "family": "sky 0", "scenes": 1} in maps.as_json()["maps"]
 
 
 def test_rejections_by_stage_reason_and_attempt(found: Distributions) -> None:

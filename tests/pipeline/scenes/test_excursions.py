@@ -218,3 +218,33 @@ def test_everything_else_is_at_its_median(strange: list[Scene]) -> None:
                 reach = float(pdist(points).max()) / 2
                 assert 0.75 * 1.3 / 4 < reach < 1.3 / 4 + ROUNDING
             assert (points @ planes[:, :3].T + planes[:, 3]).min() > -ROUNDING
+
+
+def test_axes_of_maps_have_the_value_that_they_name(pool: list[PooledAsset]) -> None:
+    """All else, and whether a scene has any map, is as without them."""
+    settings = named_build("out-of-range-2").scenes
+    found = {}
+    for index in range(37, 49):
+        scene = first_scene(settings, pool, seed=SEED, scene_index=index)
+        axis, value = scene.provenance["excursion"].values()
+        found[axis, value] = scene
+        textured = axis in ("textured", "texture_tile_m")
+        assert (scene.environment is None) == textured, axis
+        assert textured or not scene.textures, axis
+        for other in MEASURED:
+            if not (textured and other == "roughness"):
+                assert abs(MEASURED[other](scene) / MEDIAN[other] - 1) < ROUNDING, (axis, other)
+    axes = ("textured", "texture_tile_m", "sky", "sky_seen", "sun_to_sky")
+    assert {axis for axis, _ in found} == set(axes) and len(found) == 12
+    for (axis, value), scene in found.items():
+        sky = scene.environment
+        if sky is not None:
+            over_lamps = scene.provenance["sky"]["over_lamps"]
+            assert over_lamps == pytest.approx(value if axis == "sky" else 1.0)
+            assert sky.is_seen == (axis == "sky_seen")
+        if axis == "sun_to_sky":
+            assert scene.provenance["sky"]["family"] == "sun_and_sky"
+        if axis == "textured" and value == 1.0:
+            assert scene.material_textures is not None
+            solid = ~np.any(scene.materials[:, EMISSION] > 0, axis=1)
+            assert (scene.material_textures[solid] >= 0).all()

@@ -2,10 +2,12 @@
 
 import dataclasses
 import io
+import re
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
@@ -18,6 +20,7 @@ from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.map_references import MAP_NAME, map_member
+from storage.records.packed_maps import pack_environment
 from storage.records.sample import Sample, decode_scene, encode_sample, sample_key
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, write_dataset
 from tests.scenes_by_hand import tiny_sample
@@ -199,6 +202,54 @@ def test_a_map_of_other_content_is_a_finding(dataset: Dataset) -> None:
 
     problems = repacked(dataset, change)
     assert len(problems) == 2 and "has the content" in problems[0]
+
+
+def _with_sky(value: float) -> Callable[[dict[str, bytes]], None]:
+    """Return a change to a sky of one wrong value, named as its content is."""
+    other = sky(radiance_rgb=np.full((2, 4, 3), value, np.float32))
+
+    def change(members: dict[str, bytes]) -> None:
+        if members.pop(MAPS["sky"], None) is not None:
+            members["json"] = members["json"].replace(sky().sha256.encode(), other.sha256.encode())
+            members[map_member(other.sha256)] = pack_environment(other)
+
+    return change
+
+
+def _with_bytes(name: str, damage: Callable[[bytes], bytes]) -> Callable[[dict[str, bytes]], None]:
+    def change(members: dict[str, bytes]) -> None:
+        if name in members:
+            members[name] = damage(members[name])
+
+    return change
+
+
+DAMAGED: dict[str, tuple[Callable[[dict[str, bytes]], None], str]] = {
+    "cut": (_with_bytes(MAPS["sky"], lambda data: data[:-10]), "cut short"),
+    "a byte in the middle": (
+        _with_bytes(MAPS["sky"], lambda data: data[:60] + b"\xff" + data[61:]), "damaged"
+    ),
+    "no map at all": (_with_bytes(MAPS["sky"], lambda data: b"\0" * len(data)), "damaged"),
+    "another sky under its name": (
+        _with_bytes(MAPS["sky"], lambda _: pack_environment(sky(1))), "has the content"
+    ),
+    "NaN": (_with_sky(np.nan), r"radiance_rgb\[0, 0, 0\] is nan; expected finite"),
+    "negative radiance": (_with_sky(-1.0), r"is -1\.; expected finite values from 0"),
+    "radiance beyond all suns": (_with_sky(1e10), "expected finite values from 0 to 1e"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_wrong_sky_is_a_finding_of_each_sample_that_has_it(dataset: Dataset, name: str) -> None:
+    """Of those that read for people too: `inspect` ends with one line that names the sample."""
+    change, message = DAMAGED[name]
+    problems = repacked(dataset, change)
+    assert [line.split(": ")[1] for line in problems] == [f"sample {sample_key(k)}" for k in (1, 2)]
+    assert all(re.search(message, line) for line in problems), problems
+    with pytest.raises(TrilightError, match="trilight verify") as caught:
+        list(open_dataset(str(dataset.folder.root)).scenes())
+    assert re.search(message, str(caught.value)) and sample_key(1) in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_map_that_nobody_uses_is_a_finding(dataset: Dataset) -> None:

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from storage.records.exr import channel_names, decode_channels
 from storage.records.first_hits import first_hits
 from storage.records.lookup import texture_values
 from storage.records.passes.pictures import view_passes
-from storage.records.passes.stored import decode_passes_exr, passes_exr
+from storage.records.passes.stored import decode_passes_exr, passes_exr, picture_passes
 from tests.scenes_by_hand import FLOOR, tiny_scene
 from tests.textured_by_hand import sky, textured_scene
 
@@ -76,3 +77,22 @@ def test_coordinates_go_through_a_file() -> None:
     found = decode_passes_exr(passes_exr(scene, names, view=0, resolution=RESOLUTION), RESOLUTION)
     for name, values in view_passes(scene, names, resolution=RESOLUTION).items():
         np.testing.assert_array_equal(found[name], values.astype(np.float32))
+
+
+def test_files_of_plain_scenes_have_no_coordinates_and_no_nan() -> None:
+    """Not even at hits, where other programs would spread it; asked for, they are NaN as ever."""
+    names = ["uv", "shading_normal"]
+    for scene, there in ((tiny_scene(), set()), (textured_scene(), {"uv"})):
+        packed = passes_exr(scene, names, view=0, resolution=RESOLUTION)
+        channels = set(channel_names(packed))
+        assert {name for name in channels if name.startswith("uv")} == (
+            {"uv.U", "uv.V"} if there else set()
+        )
+        found = decode_passes_exr(packed, RESOLUTION)
+        assert set(found) == {"coverage", "shading_normal"} | there
+        raw = decode_channels(packed, sorted(channels), lambda header: None, separate=True)
+        assert not any(np.isnan(plane).any() for plane in raw.values())
+        again = picture_passes(scene, names, view=0, resolution=RESOLUTION, stored=packed)
+        plain = picture_passes(scene, names, view=0, resolution=RESOLUTION)
+        for name in names:
+            np.testing.assert_array_equal(again[name], plain[name])
