@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange import renderformer_h5, renderformer_json
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
+from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
+from pipeline.exchange.gltf.read import read_gltf
 from pipeline.exchange.renderformer_h5 import (
     read_renderformer_h5,
     reflecting_emitters,
@@ -144,6 +146,13 @@ def _write_many_usd(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     )
 
 
+def _read_gltf(source: SceneSource, pictures: bool) -> LoadedScene:
+    found = read_gltf(source.path, USER_PROVIDED)
+    return LoadedScene(
+        scene=found.scene, notes=tuple(f"{source.name}: {text}" for text in found.lost)
+    )
+
+
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root, name = source.path.parent.resolve(), source.path.name
     unknown = described_by(root, name).unknown_fields
@@ -234,6 +243,7 @@ FORMATS: Registry[SceneFormat] = Registry(
             write=_write_json,
             carried=renderformer_json.CARRIED,
         ),
+        **dict.fromkeys(GLTF_SUFFIXES, SceneFormat(read=_read_gltf)),
         ".h5": SceneFormat(
             read=_read_h5,
             write=_write_h5,

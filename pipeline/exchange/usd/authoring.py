@@ -111,6 +111,7 @@ def _converter(kind: str) -> Callable[[Any], Any]:
         "float4": lambda value: Gf.Vec4f(*value),
         "asset": Sdf.AssetPath,
         "float2": Gf.Vec2f,
+        "float3": lambda value: Gf.Vec3f(*value),
         "matrix4d": Gf.Matrix4d,
     }
     plain = kind.removeprefix(UNIFORM)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.foreign_textures import asset_bytes
-from pipeline.exchange.usd.names import MAP_TEXTS, VISIBLE_TO_CAMERA
+from pipeline.exchange.usd.names import MAP_TEXTS, SKY_ROWS, SKY_VISIBLE, VISIBLE_TO_CAMERA
 from pipeline.exchange.usd.stage import OpenedUsd
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -59,6 +59,19 @@ def dome_attributes(sky: Environment) -> Attributes:
         "inputs:intensity": ("float", 1.0),
         VISIBLE_TO_CAMERA: ("bool", sky.is_seen),
         **texts,
+    }
+
+
+def sky_attributes(sky: Environment | None) -> Attributes:
+    """Return what the prim of a scene says of its environment: nothing where there is none."""
+    if sky is None:
+        return {}
+    return {
+        **{
+            name: ("float3", tuple(map(float, row)))
+            for name, row in zip(SKY_ROWS, sky.rotation, strict=True)
+        },
+        SKY_VISIBLE: ("bool", sky.is_seen),
     }
 
 

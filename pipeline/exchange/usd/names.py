@@ -46,6 +46,11 @@ MAP_TEXTS = {
 }
 """Attributes of a dome and of a texture: fields of MapSource."""
 
+SKY_ROWS = tuple(f"{NAMESPACE}skyRotationRow{row}" for row in range(3))
+SKY_VISIBLE = NAMESPACE + "skyVisibleToCamera"
+"""Attributes of `/Scene` where there is an environment: its rotation in rows, and whether it is
+seen. Blender makes a world of a dome, which keeps no attribute of its prim."""
+
 TEXTURE_ROW = NAMESPACE + "textureRow"
 """Attribute of a texture's shader: its row among the textures of the scene."""
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import as_expected
-from pipeline.exchange.usd.dome import dome_as_written, dome_attributes
+from pipeline.exchange.usd.dome import dome_as_written, dome_attributes, sky_attributes
 from pipeline.exchange.usd.exact_layer import (
     Changed,
     children_of,
@@ -108,7 +108,7 @@ def _scene(root: Any, opened: OpenedUsd | None) -> Scene:
     prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
     objects = tuple(_object(prim) for prim in prims)
     meshes = [prim for prim in prims if prim.typeName == "Mesh"]
-    vertices, normals = _vertices(root, meshes)
+    vertices, normals = _vertices(root, meshes, sky)
     faces, material_index, object_index = _faces(meshes, len(materials.rows))
     c2w, fov_deg = _cameras(folders["Cameras"])
     scene = Scene(
@@ -156,11 +156,14 @@ def _object(prim: Any) -> SceneObject:
     return SceneObject(**texts)
 
 
-def _vertices(root: Any, meshes: list[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _vertices(
+    root: Any, meshes: list[Any], sky: Environment | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return positions and normals [V, 3] from the rows that meshes and root say are theirs."""
     own = {names.VERSION, names.DIGEST, names.PROVENANCE}
     own |= {names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS}
-    require_plain(root, own)
+    require_plain(root, own | set(sky_attributes(sky)))
+    require(as_expected(root, sky_attributes(sky)))
     kinds = [(root, names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS)]
     kinds += [(mesh, names.VERTEX_ROWS, "points", "normals") for mesh in meshes]
     rows = np.concatenate([whole_numbers(prim, name) for prim, name, _, _ in kinds])

@@ -5,6 +5,7 @@ with their top row, textures of the record with their bottom one. Equal textures
 """
 
 import io
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,7 @@ def decoded_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSour
         LookupError: it is another file.
     """
     try:
-        texels = _exr_texels(data) if is_exr else _png_texels(data)
+        texels: NDArray[Any] = _exr_texels(data) if is_exr else _png_texels(data)
         texture = Texture(texels=np.ascontiguousarray(texels), is_srgb=is_srgb, source=source)
         texture.check("texture")
     except (TrilightError, OSError, SyntaxError, ValueError) as error:
@@ -76,5 +77,5 @@ def _png_texels(data: bytes) -> NDArray[np.uint8]:
     with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
         if max(image.size) > MAX_RESOLUTION or image.mode not in ("L", "RGB"):
             raise ValueError(f"{image.size} in mode {image.mode}")
-        pixels = np.asarray(image)
+        pixels: NDArray[np.uint8] = np.asarray(image, np.uint8)
     return pixels.reshape(*pixels.shape[:2], -1)[::-1]

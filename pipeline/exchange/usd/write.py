@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
-from pipeline.exchange.usd.dome import add_dome
+from pipeline.exchange.usd.dome import add_dome, sky_attributes
 from pipeline.exchange.usd.names import (
     DIGEST,
     FOV_DEG,
@@ -103,6 +103,7 @@ def root_attributes(scene: Scene) -> Attributes:
         UNUSED_ROWS: ("int[]", rows.astype(np.int32)),
         UNUSED_POSITIONS: ("point3f[]", scene.vertex_positions[rows]),
         UNUSED_NORMALS: ("normal3f[]", scene.vertex_normals[rows]),
+        **sky_attributes(scene.environment),
     }
 
 

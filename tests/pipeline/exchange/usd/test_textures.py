@@ -26,7 +26,7 @@ def _read(path: Path) -> UsdScene:
 def _all_textured() -> Scene:
     """Every column textured, of 8 bits and of float32, and two materials that share textures."""
     rng = np.random.default_rng(5)
-    diffuse = Texture(texels=rng.random((5, 3, 3), np.float32) / 2)
+    diffuse = Texture(texels=rng.uniform(0, 0.5, (5, 3, 3)).astype(np.float32))
     specular = Texture(texels=rng.integers(0, 127, (2, 7, 3), np.uint8))
     number = Texture(texels=rng.integers(0, 256, (4, 4, 1), np.uint8), is_srgb=True,
                      source=MapSource(name='a "b" ü', licence="MIT", attribution="Ö"))  # fmt: skip
