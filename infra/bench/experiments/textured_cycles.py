@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from infra.bench.sides.judged_pictures import (
     shrunk,
 )
 from infra.bench.sides.sampled_pictures import first_camera
-from infra.bench.subjects.mapped_scenes import SKIES, TEXTURED, file_below_a_sun, mapped_scene
+from infra.bench.subjects.mapped_scenes import SKIES, TEXTURED, below_a_sun, mapped_scene
 from infra.bench.workshop import Workshop
 from pipeline.exchange.usd.write import write_usd
 from pipeline.renders.noise_floor import clamped_radiance
@@ -32,23 +31,16 @@ AIM_DB = 36.0
 """Agreement by pixel that is aimed at, or Cycles' with itself less 1 dB where that is lower."""
 
 _BLOCK_PX = 8
-_FILE = "file "
 
 
 def _turns(effort: Effort) -> tuple[str, ...]:
     return (*TEXTURED, *(f"sky {name}" for name in SKIES))
 
 
-def _files(workshop: Workshop) -> list[Path]:
-    folder = workshop.asked.scenes
-    return [] if folder is None else sorted(folder.glob("*.gl*"))
-
-
-def _scenes(workshop: Workshop, turn: str) -> Scene:
-    if turn.startswith(_FILE):
-        named = {path.name: path for path in _files(workshop)}
-        return workshop.call(file_below_a_sun, named[turn.removeprefix(_FILE)])
-    return workshop.call(mapped_scene, turn)
+def _scene(workshop: Workshop, turn: str) -> Scene:
+    if turn in _turns(workshop.effort):
+        return workshop.call(mapped_scene, turn)
+    return below_a_sun(workshop.scene(turn))
 
 
 def our_side(scene: Scene, spp: int) -> Reference:
@@ -57,7 +49,7 @@ def our_side(scene: Scene, spp: int) -> Reference:
 
 
 def _measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
-    scene = _scenes(workshop, turn)
+    scene = _scene(workshop, turn)
     for point in points:
         spp = point.settings
         ours = workshop.call(our_side, scene, OUR_SHARE * spp)
@@ -117,6 +109,7 @@ EXPERIMENTS = (
         "cost ten decibels and more.",
         points=lambda effort: [Point(name=f"{effort.max_spp} samples", settings=effort.max_spp)],
         turns=_turns,
+        takes_scenes=True,
         measure=_measure,
         needs=("blender",),
     ),

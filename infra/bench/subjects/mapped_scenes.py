@@ -1,13 +1,11 @@
 """Scenes with textures and skies that are compared with another renderer, always the same ones."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 
 from infra.bench.subjects.named_scenes import first_composed
 from pipeline.builds.training import textured_256
-from pipeline.exchange.open_scene import load_source, scene_source
 from scene_templates.settings import SceneSettings
 from scene_templates.skies.draw import SkyMapSettings, draw_sky
 from storage.conventions import look_at_c2w
@@ -67,12 +65,8 @@ def mapped_scene(name: str) -> Scene:
     return scene
 
 
-def file_below_a_sun(path: Path) -> Scene:
-    """Return the scene of a file below a sky with a sun; runs in a child.
-
-    It stands in the middle of a camera that looks down on it; lights of its own stay.
-    """
-    scene = load_source(scene_source(str(path))).scene
+def below_a_sun(scene: Scene) -> Scene:
+    """Return a scene below a sky with a sun, in the middle of a camera that looks down on it."""
     sky = draw_sky(
         rng_for(_SEED, "sky", 0),
         SkyMapSettings(families=("sun_and_sky",), height=_SKY_ROWS, mean_radiance=(0.5, 0.5)),
