@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.scenes.pieces import ScenePiece, joined
 from pipeline.scenes.shading import ShadedMesh
 from storage.records.material import EMISSION, distinct_rows, laid_out
-from storage.records.retextured import AnyScene, with_textures, without_constant_textures
+from storage.records.retextured import AnyScene, with_textures
 from storage.records.scene import ObjectKind, Scene, SceneObject
 from storage.records.texture import CONSTANT, TEXTURED, Texture
 
@@ -68,10 +68,10 @@ class DressedPiece:
 def by_kind(triangles: Triangles) -> list[tuple[ObjectKind, Triangles]]:
     """Return the part that reflects, and the part that emits, where there are both."""
     emits = (triangles.rows[:, EMISSION] > 0).any(axis=1)
-    kinds: tuple[tuple[ObjectKind, NDArray[np.bool_]], ...] = (
-        ("object", ~emits),
-        ("emitter", emits),
-    )
+    kinds: list[tuple[ObjectKind, NDArray[np.bool_]]] = [
+        ("object", np.logical_not(emits)),
+        ("emitter", np.asarray(emits)),
+    ]
     return [(kind, triangles.chosen(part)) for kind, part in kinds if part.any()]
 
 
@@ -94,7 +94,7 @@ def dressed(entry: SceneObject, triangles: Triangles) -> DressedPiece:
             entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
         ),
         uv=triangles.uv,
-        worn=tuple(triangles.wardrobe[row] for row in triangles.worn[palette]),
+        worn=tuple(_varying(triangles.wardrobe[row]) for row in triangles.worn[palette]),
     )
 
 
@@ -118,7 +118,7 @@ def with_worn_textures(scene: AnyScene, pieces: Sequence[DressedPiece]) -> AnySc
         return scene
     uv = np.concatenate([each.uv.reshape(-1, 2) for each in pieces]).astype(np.float32)
     rows = np.array(index, np.int32).reshape(-1, len(TEXTURED))
-    return without_constant_textures(with_textures(scene, uv, tuple(textures.values()), rows))
+    return with_textures(scene, uv, tuple(textures.values()), rows)
 
 
 def _with_means(triangles: Triangles) -> NDArray[np.float32]:
@@ -127,9 +127,18 @@ def _with_means(triangles: Triangles) -> NDArray[np.float32]:
     for number, worn in enumerate(triangles.wardrobe):
         chosen = np.flatnonzero(triangles.worn == number)
         for name, texture in zip(TEXTURED, worn, strict=True):
-            if texture is not None:
-                rows[chosen, places[name]] = texture.mean
+            if texture is not None and len(chosen):
+                same = texture.constant
+                rows[chosen, places[name]] = texture.mean if same is None else same
     return rows
+
+
+def _varying(worn: Worn) -> Worn:
+    """Return textures without those of one colour, which stand in the columns."""
+    one, two, three = (
+        None if texture is None or texture.constant is not None else texture for texture in worn
+    )
+    return one, two, three
 
 
 def scene_with_worn(arrays: dict[str, Any], pieces: Sequence[DressedPiece], **more: Any) -> Scene:

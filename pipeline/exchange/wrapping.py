@@ -12,10 +12,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from storage.records.exr import MAX_RESOLUTION
+from storage.records.scene_maps import MAX_UV
+
 Wrap = Literal["repeat", "mirror", "clamp", "black"]
 
 MAX_TILES = 8
-"""Most tiles along a side; beyond them, textures repeat."""
+"""Most tiles along a side."""
 
 _INSIDE = 1e-4
 """How far coordinates may leave [0, 1] by rounding."""
@@ -31,11 +34,25 @@ class Tiles:
     """How many there are."""
 
 
-def tiles_of(wraps: Sequence[Wrap], at: NDArray[np.floating]) -> Tiles:
-    """Return the tiles that textures of one material need along an axis, at these coordinates.
+def tiles_of(
+    wraps: Sequence[Wrap], at: NDArray[np.floating], most_texels: int
+) -> tuple[Tiles, bool]:
+    """Return the tiles that textures of one material need along an axis, and whether they suffice.
 
-    One where all repeat, or where no coordinate leaves [0, 1].
+    One tile where all repeat, where no coordinate leaves [0, 1], or where it would be too many.
+
+    Args:
+        wraps: how each of them wraps.
+        at: coordinates of all corners along the axis.
+        most_texels: of any of them along the axis.
     """
+    wanted = _wanted(wraps, at)
+    if wanted.count <= MAX_TILES and wanted.count * most_texels <= MAX_RESOLUTION:
+        return wanted, True
+    return Tiles(first=0, count=1), wanted.count == 1
+
+
+def _wanted(wraps: Sequence[Wrap], at: NDArray[np.floating]) -> Tiles:
     low, high = (float(at.min()), float(at.max())) if at.size else (0.0, 1.0)
     others = {wrap for wrap in wraps if wrap != "repeat"}
     if not others or (low >= -_INSIDE and high <= 1 + _INSIDE):
@@ -53,6 +70,17 @@ def tiled(values: NDArray, wrap: Wrap, tiles: Tiles, axis: int) -> NDArray:
         for number in range(tiles.first, tiles.first + tiles.count)
     ]
     return np.concatenate(parts, axis=axis) if len(parts) > 1 else parts[0]
+
+
+def repeated_near_zero(uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+    """Return coordinates [T, 3, 2] within the law of scenes, and whether they show the same.
+
+    A triangle far out is moved by whole pictures, which repeat.
+    """
+    if not uv.size or np.abs(uv).max() <= MAX_UV:
+        return uv, True
+    near = uv - np.floor(uv.min(axis=1, keepdims=True))
+    return np.clip(near, -MAX_UV, MAX_UV), bool(near.max() <= MAX_UV)
 
 
 def _tile(values: NDArray, wrap: Wrap, number: int, axis: int) -> NDArray:

@@ -62,7 +62,8 @@ class GltfDocument:
             raise TrilightError(f"{self.name}: accessor {index} goes beyond its buffer.")
         values = np.ndarray((count, width), dtype, data, start, (step, dtype.itemsize)).copy()
         if stated.get("normalized") and dtype.kind in "ui":
-            return np.maximum(values / np.float32(np.iinfo(dtype).max), -1).astype(np.float32)
+            most = 2.0 ** (8 * dtype.itemsize - (dtype.kind == "i")) - 1
+            return np.maximum(values / most, -1).astype(np.float32)
         return values
 
     def picture_bytes(self, index: int) -> bytes | None:

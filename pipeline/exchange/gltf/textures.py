@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.exchange.gltf.document import GltfDocument, extension
 from pipeline.exchange.linear_maps import Map, constant_map
 from pipeline.exchange.pictures import decoded_pixels
-from pipeline.exchange.wrapping import MAX_TILES, Tiles, Wrap, tiled, tiles_of
+from pipeline.exchange.wrapping import Wrap, repeated_near_zero, tiled, tiles_of
 from storage.conventions import linear_from_srgb8
 
 Coordinates = Callable[[int], NDArray[np.float32] | None]
@@ -66,20 +66,20 @@ def sampled(
     if uv is None:
         return Sampled(maps=maps, uv=None)
     wraps = {name: _wraps(document, infos[name]) for name in kept}
-    axes = [_tiles([wraps[name][axis] for name in kept], uv[..., axis], lost) for axis in range(2)]
+    axes, same = [], True
+    for axis in range(2):
+        texels = max(pictures[name].shape[1 - axis] for name in kept)
+        tiles, fits = tiles_of([wraps[name][axis] for name in kept], uv[..., axis], texels)
+        axes.append(tiles)
+        same &= fits
     for name in kept:
         across = tiled(pictures[name], wraps[name][0], axes[0], 1)
         maps[name] = tiled(across, wraps[name][1], axes[1], 0)
     moved = (uv - [axes[0].first, axes[1].first]) / [axes[0].count, axes[1].count]
-    return Sampled(maps=maps, uv=moved.astype(np.float32))
-
-
-def _tiles(wraps: list[Wrap], at: NDArray[np.float64], lost: list[str]) -> Tiles:
-    tiles = tiles_of(wraps, at)
-    if tiles.count <= MAX_TILES:
-        return tiles
-    lost.append("textures that do not repeat, far outside [0, 1]: they repeat here")
-    return Tiles(first=0, count=1)
+    near, all_near = repeated_near_zero(moved)
+    if not (same and all_near):
+        lost.append("textures far outside of [0, 1]: some look otherwise there")
+    return Sampled(maps=maps, uv=near.astype(np.float32))
 
 
 def _picture(
@@ -96,12 +96,11 @@ def _picture(
     if pixels is None:
         lost.append(f"image {image}: missing or not readable as a picture")
         return None
-    coded = pixels[::-1]
+    coded: NDArray = pixels[::-1]
+    plain = linear = np.clip(np.nan_to_num(coded, nan=0.0), 0, 1)
     if coded.dtype == np.uint8:
         plain = coded.astype(np.float32) / np.float32(255)
         linear = linear_from_srgb8()[coded] if is_encoded else plain
-    else:
-        plain = linear = coded
     whole = np.ones((*coded.shape[:2], 4), np.float32)
     count = coded.shape[2]
     whole[..., :3] = linear[..., :3] if count >= 3 else linear[..., :1]

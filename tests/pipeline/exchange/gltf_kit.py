@@ -30,7 +30,8 @@ def png(pixels: NDArray[np.uint8]) -> str:
 def quad(**changes: Any) -> dict[str, Any]:
     """Return the tree of a textured quad; `uv`, `pictures`, `material` and `node` may be others."""
     uv = changes.pop("uv", UV)
-    arrays = [POSITIONS, np.array([0, 1, 2, 0, 2, 3], np.uint16)] + ([] if uv is None else [uv])
+    arrays: list[NDArray[Any]] = [POSITIONS, np.array([0, 1, 2, 0, 2, 3], np.uint16)]
+    arrays += [] if uv is None else [uv]
     data = b"".join(array.tobytes() for array in arrays)
     ends = np.cumsum([array.nbytes for array in arrays])
     attributes = {"POSITION": 0} | ({} if uv is None else {"TEXCOORD_0": 2})

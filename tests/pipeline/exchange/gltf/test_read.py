@@ -13,8 +13,7 @@ from pipeline.exchange.gltf.read import GltfScene, read_gltf
 from pipeline.exchange.open_scene import load_source, scene_source
 from storage.conventions import linear_from_srgb8
 from storage.errors import TrilightError
-from storage.records.lookup import textured_rows
-from storage.records.scene import Scene
+from tests.pipeline.exchange.exchange_kit import row_at
 from tests.pipeline.exchange.gltf_kit import BLUE, GREEN, GREY, PICTURE, RED, UV, png, quad
 from tests.pipeline.exchange.gltf_kit import write_gltf as written
 
@@ -24,20 +23,6 @@ F = 0.04 + 0.96 / 21
 
 def read(folder: Path, **changes: Any) -> GltfScene:
     return read_gltf(written(folder, quad(**changes)), "CC0-1.0")
-
-
-def row_at(scene: Scene, x: float, y: float) -> np.ndarray:
-    """Return the material row at a place of the floor, found by its barycentric coordinates."""
-    corners = scene.vertex_positions[scene.faces][:, :, :2].astype(np.float64)
-    for triangle, (a, b, c) in enumerate(corners):
-        one, two = np.linalg.solve(np.stack([b - a, c - a], axis=1), np.array([x, y]) - a)
-        if one >= -1e-9 and two >= -1e-9 and one + two <= 1 + 1e-9:
-            weights = np.array([1 - one - two, one, two])
-            uv = np.zeros(2) if scene.uv is None else weights @ scene.uv.reshape(-1, 3, 2)[triangle]
-            return np.asarray(
-                textured_rows(scene, scene.material_index[[triangle]], uv[None].astype(np.float64))
-            )[0]
-    raise AssertionError((x, y))
 
 
 def diffuse_of(srgb: tuple[int, int, int]) -> np.ndarray:
