@@ -22,6 +22,7 @@ from pipeline.exchange import renderformer_h5, renderformer_json
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
 from pipeline.exchange.gltf.read import read_gltf
+from pipeline.exchange.renderformer_cells import textured_triangles
 from pipeline.exchange.renderformer_h5 import (
     read_renderformer_h5,
     reflecting_emitters,
@@ -193,7 +194,9 @@ def _read_h5(source: SceneSource, pictures: bool) -> LoadedScene:
 
 def _write_h5(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
     write_renderformer_h5(target, scene, pictures)
-    return reflecting_emitters(scene)
+    count = int(textured_triangles(scene).sum())
+    cells = (f"more of {count} textured triangles than the means of 32 x 32 cells each",)
+    return (*reflecting_emitters(scene), *(cells if count else ()))
 
 
 def _read_scene_file(source: SceneSource, pictures: bool) -> LoadedScene:

@@ -24,8 +24,11 @@ from storage.metrics import psnr_linear_db
 from storage.records.scene import Scene
 
 RESOLUTION = 64
-OUR_SHARE = 8
+OUR_SHARE = 4
 """Samples of ours, in two halves, for each sample of one picture of Cycles: they cost less."""
+
+EXPOSED = 0.5
+"""Radiance that nine tenths of the pixels do not exceed where pictures are compared."""
 
 AIM_DB = 36.0
 """Agreement by pixel that is aimed at, or Cycles' with itself less 1 dB where that is lower."""
@@ -63,8 +66,16 @@ def _measure(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigu
 
 
 def figures(ours: Reference, theirs: CyclesSamples) -> dict[str, float]:
-    """Return how well ours agree with a picture of theirs, in dB, and what of it is not noise."""
+    """Return how well ours agree with a picture of theirs, in dB, and what of it is not noise.
+
+    All pictures are exposed alike, so that nine tenths of the pixels are below EXPOSED: what is
+    brighter than 1 counts as 1.
+    """
     one, other = (picture.astype(np.float64) for picture in theirs.pictures_rgb)
+    level = float(np.quantile((one + other).mean(axis=-1) / 2, 0.9))
+    exposure = EXPOSED / level if level > 0 else 1.0
+    one, other = one * exposure, other * exposure
+    ours = Reference(a_rgb=ours.a_rgb * exposure, b_rgb=ours.b_rgb * exposure)
     their_halves = Reference(a_rgb=one, b_rgb=other)
     pixels_db = _linear_db(0.5 * (ours.a_rgb + ours.b_rgb), one)
     seeds_db = _linear_db(one, other)

@@ -16,7 +16,7 @@ from storage.records.texture import MapSource
 from storage.seeds import rng_for
 from storage.settings.changes import changed
 
-TEXTURED = tuple(f"surfaces {row}" for row in range(4))
+TEXTURED = tuple(f"surfaces {row}" for row in range(2))
 """Scenes of `textured-256`: procedural surfaces on half of what there is."""
 
 SKIES = ("sun_and_sky", "clouds", "softboxes", "night")

@@ -137,7 +137,7 @@ def test_what_emitters_reflect_is_lost_in_the_published_arrays(tmp_path: Path) -
     assert "what 1 emitting materials reflect" in notes
 
 
-@pytest.mark.parametrize("form", ["json", "h5"])
+@pytest.mark.parametrize("form", ["json"])
 def test_textures_and_a_sky_are_said_to_be_lost_where_they_are(tmp_path: Path, form: str) -> None:
     """What comes back has the means of the textures, and is whole."""
     path = tmp_path / f"a.{form}"
