@@ -49,6 +49,7 @@ from pipeline.exchange.renderformer_stored import (
     stored_textures,
     with_cells,
 )
+from pipeline.exchange.renderformer_v2 import KNOWN, grey_textures, is_second_version, sky_of
 from pipeline.exchange.safe_h5 import (
     names_in,
     opened_h5,
@@ -235,7 +236,9 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
         triangles = read_whole(plain_array(file, "triangles", (None, 3, 3), MAX_TRIANGLES))
         count = len(triangles)
         normals = read_whole(plain_array(file, "vn", (count, 3, 3), MAX_TRIANGLES))
-        stored = stored_textures(file, count, lost)
+        second = is_second_version(file)
+        stored = (grey_textures if second else stored_textures)(file, count, lost)
+        sky = sky_of(file, UNKNOWN_LICENCE, lost) if second else None
         c2w = read_whole(plain_array(file, "c2w", (None, 4, 4), MAX_VIEWS))
         fov_deg = read_whole(plain_array(file, "fov", (len(c2w),), MAX_VIEWS))
         pictures = _pictures(file, len(c2w), lost) if "img" in names_in(file) else None
@@ -248,6 +251,7 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
             c2w=c2w,
             fov_deg=fov_deg,
             provenance={"template": "renderformer-h5", "file": path.name},
+            environment=sky,
         )
         scene = with_cells(scene, stored, UNKNOWN_LICENCE)
         scene.check()
@@ -255,7 +259,8 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
 
 
 def _unknown(file: Any) -> list[str]:
-    names = [f"array or group {name!r:.60}" for name in names_in(file) if name not in _KNOWN]
+    known = (*_KNOWN, *KNOWN) if is_second_version(file) else _KNOWN
+    names = [f"array or group {name!r:.60}" for name in names_in(file) if name not in known]
     names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
     return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]
 
