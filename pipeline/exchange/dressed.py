@@ -1,6 +1,6 @@
 """Pieces of a stranger's scene with their materials and textures, and how they join into a Scene.
 
-Triangles come with three corners of their own; corners of equal position and normal become one
+DressedTriangles come with three corners of their own; corners of equal position and normal become one
 vertex, and equal materials one row. Textures of one colour become constants.
 """
 
@@ -25,8 +25,8 @@ PLAIN: Worn = (None, None, None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Triangles:
-    """Triangles with a material each."""
+class DressedTriangles:
+    """DressedTriangles with a material each."""
 
     positions: NDArray[np.float32]
     """[T, 3, 3] world."""
@@ -41,9 +41,9 @@ class Triangles:
     wardrobe: Sequence[Worn]
     """Textures that a triangle may have."""
 
-    def chosen(self, part: NDArray[np.bool_]) -> "Triangles":
+    def chosen(self, part: NDArray[np.bool_]) -> "DressedTriangles":
         """Return some of them."""
-        return Triangles(
+        return DressedTriangles(
             positions=self.positions[part],
             normals=self.normals[part],
             rows=self.rows[part],
@@ -65,7 +65,7 @@ class DressedPiece:
     """Textures of each of its material rows."""
 
 
-def by_kind(triangles: Triangles) -> list[tuple[ObjectKind, Triangles]]:
+def by_kind(triangles: DressedTriangles) -> list[tuple[ObjectKind, DressedTriangles]]:
     """Return the part that reflects, and the part that emits, where there are both."""
     emits = (triangles.rows[:, EMISSION] > 0).any(axis=1)
     kinds: list[tuple[ObjectKind, NDArray[np.bool_]]] = [
@@ -75,7 +75,7 @@ def by_kind(triangles: Triangles) -> list[tuple[ObjectKind, Triangles]]:
     return [(kind, triangles.chosen(part)) for kind, part in kinds if part.any()]
 
 
-def dressed(entry: SceneObject, triangles: Triangles) -> DressedPiece:
+def dressed(entry: SceneObject, triangles: DressedTriangles) -> DressedPiece:
     """Return triangles as an object of a scene."""
     corners = np.concatenate([triangles.positions, triangles.normals], axis=2).reshape(-1, 6)
     first, index = distinct_rows(corners)
@@ -121,7 +121,7 @@ def with_worn_textures(scene: AnyScene, pieces: Sequence[DressedPiece]) -> AnySc
     return with_textures(scene, uv, tuple(textures.values()), rows)
 
 
-def _with_means(triangles: Triangles) -> NDArray[np.float32]:
+def _with_means(triangles: DressedTriangles) -> NDArray[np.float32]:
     """Return the rows with the means of textures, so that equal looks are equal."""
     rows, places = triangles.rows.copy(), {column.name: part for column, part in laid_out()}
     for number, worn in enumerate(triangles.wardrobe):

@@ -173,7 +173,7 @@ def _write_texture(file: Any, rows: NDArray[np.floating], scene: Scene) -> None:
         block = rows[start : start + step, :, None, None]
         cells = np.where(filled, block, rows.dtype.type(0))
         for triangle in start + np.flatnonzero(textured[start : start + step]):
-            for part, values in cells_of(scene, triangle):
+            for part, values in cells_of(scene, int(triangle)):
                 cells[triangle - start, part] = values
         texture[start : start + step] = cells
 

@@ -111,5 +111,5 @@ def _varying_cells(file: Any, count: int, varies: NDArray[np.bool_]) -> NDArray[
     rank = np.cumsum(varies) - 1
     for where, block in iterate_blocks(texture):
         chosen = np.flatnonzero(varies[where[0]])
-        cells[(rank[where[0]][chosen], *where[1:])] = block[chosen]
+        cells[rank[where[0]][chosen], where[1], where[2], where[3]] = block[chosen]
     return cells[:, REFLECTING]

@@ -33,7 +33,7 @@ _MOST_EMISSION = 1e9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Look:
+class GltfLook:
     """A material over one mesh."""
 
     worn: Worn
@@ -50,7 +50,7 @@ def look_of(
     coordinates: Coordinates,
     source: MapSource,
     lost: list[str],
-) -> Look:
+) -> GltfLook:
     """Return what a material of a file comes to on a mesh.
 
     Args:
@@ -78,7 +78,7 @@ def look_of(
     diffuse, specular = _albedos(maps, _head_on(material, lost))
     colours = colour_textures(diffuse, specular, source)
     roughness = number_texture(maps["roughness"], source)
-    return Look(
+    return GltfLook(
         worn=(*colours, roughness), emission_rgb=_emission(document, material, lost), uv=found.uv
     )
 

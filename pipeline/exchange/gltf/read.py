@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.exchange.dressed import (
     DressedPiece,
-    Triangles,
+    DressedTriangles,
     by_kind,
     dressed,
     joined_arrays,
@@ -118,7 +118,7 @@ class _Reading:
             for kind, triangles in by_kind(self._triangles(placed, primitive)):
                 yield dressed(self._entry(name, kind), triangles)
 
-    def _triangles(self, placed: PlacedNode, primitive: dict[str, Any]) -> Triangles:
+    def _triangles(self, placed: PlacedNode, primitive: dict[str, Any]) -> DressedTriangles:
         found = GltfTriangles(self.document, primitive, placed.to_world)
         if found.without_area:
             self.lost.append("triangles without an area")
@@ -136,7 +136,7 @@ class _Reading:
         rows = default_rows(count)
         rows[:, EMISSION] = look.emission_rgb
         uv = np.zeros((count, 3, 2), np.float32) if look.uv is None else look.uv
-        return Triangles(
+        return DressedTriangles(
             positions=found.positions,
             normals=found.normals,
             rows=rows,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.dressed import PLAIN, Triangles
+from pipeline.exchange.dressed import PLAIN, DressedTriangles
 from pipeline.exchange.gltf.placed import PlacedNode
 from pipeline.exchange.usd.foreign_cameras import rigid_pose
 from storage.records.environment import Environment
@@ -38,7 +38,7 @@ def camera_of(
 
 def light_triangles(
     light: dict[str, Any], placed: PlacedNode, reach: float, lost: list[str]
-) -> Triangles | None:
+) -> DressedTriangles | None:
     """Return what stands for a punctual light; None where nothing can.
 
     Args:
@@ -66,7 +66,7 @@ def light_triangles(
     if not rows[:, EMISSION].any() or not np.isfinite(rows).all():
         lost.append("lights that shine no light")
         return None
-    return Triangles(
+    return DressedTriangles(
         positions=positions,
         normals=np.repeat((cross / length)[:, None], 3, axis=1).astype(np.float32),
         rows=rows,

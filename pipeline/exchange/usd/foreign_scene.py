@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.exchange.dressed import (
     PLAIN,
     DressedPiece,
-    Triangles,
+    DressedTriangles,
     by_kind,
     dressed,
     joined_arrays,
@@ -122,14 +122,14 @@ def _pieces(
     return _split(each, _of_mesh(prim, soup, time, opened, licence), licence, names)
 
 
-def _of_light(prim: Any, triangles: NDArray[np.float32], time: Any) -> Triangles:
+def _of_light(prim: Any, triangles: NDArray[np.float32], time: Any) -> DressedTriangles:
     count = len(triangles)
     rows = default_rows(count)
     rows[:, ROUGHNESS] = 1
     rows[:, EMISSION] = radiance(prim, triangles, time)
     corners = triangles.reshape(-1, 3)
     flat = flat_shaded(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
-    return Triangles(
+    return DressedTriangles(
         positions=triangles,
         normals=flat.normals.reshape(-1, 3, 3),
         rows=rows,
@@ -141,7 +141,7 @@ def _of_light(prim: Any, triangles: NDArray[np.float32], time: Any) -> Triangles
 
 def _of_mesh(
     prim: Any, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
-) -> Triangles:
+) -> DressedTriangles:
     from pxr import UsdGeom
 
     indices = np.array(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get(time), np.int64)
@@ -158,7 +158,7 @@ def _of_mesh(
             opened.lost.append(
                 f"{prim.GetPath()}: its material does not glow; the light's own taken"
             )
-    return Triangles(
+    return DressedTriangles(
         positions=soup.positions,
         normals=soup.normals,
         rows=rows,
@@ -168,7 +168,9 @@ def _of_mesh(
     )
 
 
-def _split(each: Placed, triangles: Triangles, licence: str, names: set[str]) -> list[DressedPiece]:
+def _split(
+    each: Placed, triangles: DressedTriangles, licence: str, names: set[str]
+) -> list[DressedPiece]:
     """Return the part of a mesh that reflects, and the part that emits, where there are both."""
     return [
         dressed(_entry(each.prim, kind, licence, names), part) for kind, part in by_kind(triangles)

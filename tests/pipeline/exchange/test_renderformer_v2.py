@@ -1,6 +1,7 @@
 """Files of RenderFormer's successor: what can be read of them, and what is said to be lost."""
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -13,7 +14,7 @@ from tests.scenes_by_hand import LIGHT, tiny_scene
 from tests.sky_maps import COLOURS, POLES, six_poles
 
 
-def write_v2(path: Path, lit: bool = True, **more: np.ndarray) -> None:
+def write_v2(path: Path, lit: bool = True, **more: Any) -> None:
     scene = tiny_scene()
     light = np.zeros((3, 3), np.float16)
     light[2] = 100 if lit else 0
