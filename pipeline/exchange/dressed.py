@@ -26,7 +26,7 @@ PLAIN: Worn = (None, None, None)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DressedTriangles:
-    """DressedTriangles with a material each."""
+    """Triangles with a material each."""
 
     positions: NDArray[np.float32]
     """[T, 3, 3] world."""

@@ -21,7 +21,7 @@ _SMALLEST_DOUBLE_AREA = 1e-12
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TriangleSoup:
-    """DressedTriangles with three corners of their own each."""
+    """Triangles with three corners of their own each."""
 
     positions: NDArray[np.float32]  # [T, 3, 3] world
     normals: NDArray[np.float32]  # [T, 3, 3] unit
