@@ -1,6 +1,6 @@
 """Pieces of a stranger's scene with their materials and textures, and how they join into a Scene.
 
-DressedTriangles come with three corners of their own; corners of equal position and normal become one
+Triangles come with three corners of their own; corners of equal position and normal become one
 vertex, and equal materials one row. Textures of one colour become constants.
 """
 
