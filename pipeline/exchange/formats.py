@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange import renderformer_h5, renderformer_json
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
+from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
+from pipeline.exchange.gltf.read import read_gltf
+from pipeline.exchange.renderformer_cells import textured_triangles
 from pipeline.exchange.renderformer_h5 import (
     read_renderformer_h5,
     reflecting_emitters,
@@ -144,6 +147,13 @@ def _write_many_usd(target: Path, scenes: Iterable[tuple[str, Scene]]) -> None:
     )
 
 
+def _read_gltf(source: SceneSource, pictures: bool) -> LoadedScene:
+    found = read_gltf(source.path, USER_PROVIDED)
+    return LoadedScene(
+        scene=found.scene, notes=tuple(f"{source.name}: {text}" for text in found.lost)
+    )
+
+
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root, name = source.path.parent.resolve(), source.path.name
     unknown = described_by(root, name).unknown_fields
@@ -184,7 +194,9 @@ def _read_h5(source: SceneSource, pictures: bool) -> LoadedScene:
 
 def _write_h5(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
     write_renderformer_h5(target, scene, pictures)
-    return reflecting_emitters(scene)
+    count = int(textured_triangles(scene).sum())
+    cells = (f"more of {count} textured triangles than the means of 32 x 32 cells each",)
+    return (*reflecting_emitters(scene), *(cells if count else ()))
 
 
 def _read_scene_file(source: SceneSource, pictures: bool) -> LoadedScene:
@@ -234,6 +246,7 @@ FORMATS: Registry[SceneFormat] = Registry(
             write=_write_json,
             carried=renderformer_json.CARRIED,
         ),
+        **dict.fromkeys(GLTF_SUFFIXES, SceneFormat(read=_read_gltf)),
         ".h5": SceneFormat(
             read=_read_h5,
             write=_write_h5,

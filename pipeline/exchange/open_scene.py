@@ -3,6 +3,7 @@
     scene.json                 RenderFormer scene; its meshes lie in the folder of the file
     scene.safetensors          storage.records.scene_file
     scene.h5                   the published layout (pipeline.exchange.renderformer_h5)
+    scene.glb .gltf            glTF 2.0 (pipeline.exchange.gltf)
     scene.usda .usdc .usdz .usd   a USD stage (pipeline.scenes.usd)
     train-000000.tar::KEY      the sample KEY of a shard
     scenes.usdc::KEY           a scene of a shard in USD, or a time code of a stage that moves

@@ -10,8 +10,9 @@
 | `img` | f16 [V, H, W, 4] | linear radiance, premultiplied RGBA; where there are pictures |
 | `mvp` | f32 [V, 4, 4] | world to clip space, near 0.05, far 5; where there are pictures |
 
-- A texture is one value in all of its cells (x, y) with x + y <= 32, which are 559 of 1024; the
-  others are zero. It takes 1024 times the bytes of what it says.
+- A texture fills its cells (x, y) with x + y <= 32, which are 559 of 1024; the others are zero.
+  Published files hold one value in all of them: 1024 times the bytes of what it says. Textures of
+  a scene become cells, and cells that vary textures (pipeline.exchange.renderformer_cells).
 - Normals of a texture are (.5, .5, 1): no bump, in the file's tangent space.
 - An emitter's texture says diffuse (1, 1, 1) and roughness 1, as published, though our emitters
   reflect nothing (as do the published ones when rendered).
@@ -22,9 +23,7 @@
 - `mvp` is OpenGL's, for column vectors; the published training multiplies it by zero.
 
 What a file cannot say: which triangles are one object, names and rights, provenance, shared
-vertices. The reader does not trust the file (pipeline.exchange.safe_h5). Textures may vary in files
-of other tools; a `Scene` has one material a triangle, so the mean of the filled cells is taken, and
-a note says so.
+vertices. The reader does not trust the file (pipeline.exchange.safe_h5).
 """
 
 import io
@@ -35,13 +34,27 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.renderformer_cells import (
+    CELLS,
+    cells_of,
+    filled_cells,
+    textured_triangles,
+)
+from pipeline.exchange.renderformer_stored import (
+    CHANNELS,
+    FLAT_NORMAL,
+    MAX_TRIANGLES,
+    TEXTURE_EMISSION,
+    TEXTURE_NORMAL,
+    stored_textures,
+    with_cells,
+)
+from pipeline.exchange.renderformer_v2 import KNOWN, grey_textures, is_second_version, sky_of
 from pipeline.exchange.safe_h5 import (
-    iterate_blocks,
     names_in,
     opened_h5,
     plain_array,
     read_whole,
-    require_finite,
 )
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX
@@ -59,28 +72,16 @@ from storage.records.material import (
 from storage.records.scene import ALBEDO_SUM_TOLERANCE, UNIT_NORMAL_TOLERANCE, Scene, SceneObject
 
 CARRIED = frozenset(
-    {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg"}
+    {"vertex_positions", "vertex_normals", "faces", "material_index", "c2w", "fov_deg", "textures"}
     | {f"materials.{name}" for name in PUBLISHED_COLUMNS}
 )
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
-CHANNELS, CELLS = 13, 32
-"""A texture has CHANNELS channels of CELLS x CELLS cells."""
-TEXTURE_EMISSION = slice(10, 13)
-TEXTURE_NORMAL = slice(7, 10)
-"""Channels of a texture row; those before them are REFLECTING (storage.records.material)."""
-FLAT_NORMAL = (0.5, 0.5, 1.0)
 NEAR, FAR = 0.05, 5.0
 """Clip distances of `mvp`, in metres."""
 GZIP_LEVEL = 9
 
 TextureType = Literal["float16", "float32"]
-
-
-def filled_cells() -> NDArray[np.bool_]:
-    """Return which cells [32, 32] of a texture hold its value: those with x + y <= 32."""
-    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS))
-    return x + y <= CELLS
 
 
 def write_renderformer_h5(
@@ -106,7 +107,7 @@ def write_renderformer_h5(
     with h5py.File(stream, "w") as file:
         _write(file, "triangles", scene.vertex_positions[corners])
         _write(file, "vn", scene.vertex_normals[corners])
-        _write_texture(file, texture)
+        _write_texture(file, texture, scene)
         _write(file, "c2w", scene.c2w)
         _write(file, "fov", scene.fov_deg)
         if radiance_rgb is not None:
@@ -160,8 +161,9 @@ def _write(file: Any, name: str, values: NDArray) -> None:
     file.create_dataset(name, data=values, compression="gzip", compression_opts=GZIP_LEVEL)
 
 
-def _write_texture(file: Any, rows: NDArray[np.floating]) -> None:
+def _write_texture(file: Any, rows: NDArray[np.floating], scene: Scene) -> None:
     """Write textures a block of triangles at a time: whole, they take 53 kB a triangle."""
+    textured = textured_triangles(scene)
     shape = (len(rows), CHANNELS, CELLS, CELLS)
     texture = file.create_dataset(
         "texture", shape, rows.dtype, compression="gzip", compression_opts=GZIP_LEVEL
@@ -169,7 +171,11 @@ def _write_texture(file: Any, rows: NDArray[np.floating]) -> None:
     filled, step = filled_cells(), texture.chunks[0]
     for start in range(0, len(rows), step):
         block = rows[start : start + step, :, None, None]
-        texture[start : start + step] = np.where(filled, block, rows.dtype.type(0))
+        cells = np.where(filled, block, rows.dtype.type(0))
+        for triangle in start + np.flatnonzero(textured[start : start + step]):
+            for part, values in cells_of(scene, int(triangle)):
+                cells[triangle - start, part] = values
+        texture[start : start + step] = cells
 
 
 def _rgba(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float16]:
@@ -187,7 +193,6 @@ def _mvp(scene: Scene) -> NDArray[np.float32]:
     return np.einsum("vij,vjk->vik", clip, view).astype(np.float32)
 
 
-MAX_TRIANGLES = 1_000_000
 MAX_VIEWS = 1000
 MAX_PICTURE_BYTES = 1 << 30
 """Maximum size of all pictures of a file as float32."""
@@ -231,7 +236,9 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
         triangles = read_whole(plain_array(file, "triangles", (None, 3, 3), MAX_TRIANGLES))
         count = len(triangles)
         normals = read_whole(plain_array(file, "vn", (count, 3, 3), MAX_TRIANGLES))
-        rows = _texture_rows(file, count, lost)
+        second = is_second_version(file)
+        stored = (grey_textures if second else stored_textures)(file, count, lost)
+        sky = sky_of(file, UNKNOWN_LICENCE, lost) if second else None
         c2w = read_whole(plain_array(file, "c2w", (None, 4, 4), MAX_VIEWS))
         fov_deg = read_whole(plain_array(file, "fov", (len(c2w),), MAX_VIEWS))
         pictures = _pictures(file, len(c2w), lost) if "img" in names_in(file) else None
@@ -240,43 +247,22 @@ def read_renderformer_h5(path: Path) -> RenderFormerFile:
             vertex_positions=positions,
             vertex_normals=normals,
             faces=faces,
-            **_palette(rows, lost),
+            **_palette(stored.rows, stored.varies, lost),
             c2w=c2w,
             fov_deg=fov_deg,
             provenance={"template": "renderformer-h5", "file": path.name},
+            environment=sky,
         )
+        scene = with_cells(scene, stored, UNKNOWN_LICENCE)
         scene.check()
     return RenderFormerFile(scene=scene, radiance_rgb=pictures, lost=tuple(lost))
 
 
 def _unknown(file: Any) -> list[str]:
-    names = [f"array or group {name!r:.60}" for name in names_in(file) if name not in _KNOWN]
+    known = (*_KNOWN, *KNOWN) if is_second_version(file) else _KNOWN
+    names = [f"array or group {name!r:.60}" for name in names_in(file) if name not in known]
     names += [f"attribute {name!r:.60}" for name in sorted(file.attrs)]
     return names if len(names) <= 10 else [*names[:10], f"and {len(names) - 10} more"]
-
-
-def _texture_rows(file: Any, count: int, lost: list[str]) -> NDArray[np.float32]:
-    """Return the value [T, 13] of each texture, holding one block of cells at a time."""
-    texture = plain_array(file, "texture", (count, CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
-    filled = filled_cells()
-    low = np.full((count, CHANNELS), np.inf, np.float32)
-    high, total = -low, np.zeros((count, CHANNELS))
-    for where, block in iterate_blocks(texture):
-        rows, cells = where[:2], filled[where[2:]]
-        if cells.any():
-            require_finite(texture, block[:, :, cells])
-            values = block[:, :, cells].astype(np.float32)
-            low[rows] = np.minimum(low[rows], values.min(axis=2))
-            high[rows] = np.maximum(high[rows], values.max(axis=2))
-            total[rows] += values.sum(axis=2, dtype=np.float64)
-    varies = (low != high).any(axis=1)
-    if varies.any():
-        lost.append(f"textures that vary, of {varies.sum()} triangles: their mean was taken")
-    bumpy = (low[:, TEXTURE_NORMAL] != np.array(FLAT_NORMAL, np.float32)).any(axis=1)
-    if bumpy.any():
-        lost.append(f"normal textures of {bumpy.sum()} triangles")
-    mean = (total / filled.sum()).astype(np.float32)
-    return np.where(low == high, low, mean)
 
 
 def _pictures(file: Any, num_views: int, lost: list[str]) -> NDArray[np.float32]:
@@ -317,7 +303,9 @@ def _indexed(
     return kept[:, :3].copy(), kept[:, 3:].copy(), faces
 
 
-def _palette(rows: NDArray[np.float32], lost: list[str]) -> dict[str, Any]:
+def _palette(
+    rows: NDArray[np.float32], varies: NDArray[np.bool_], lost: list[str]
+) -> dict[str, Any]:
     emits = (rows[:, TEXTURE_EMISSION] > 0).any(axis=1)
     materials = default_rows(len(rows))
     materials[:, REFLECTING] = rows[:, REFLECTING]
@@ -325,8 +313,9 @@ def _palette(rows: NDArray[np.float32], lost: list[str]) -> dict[str, Any]:
     if (materials[emits, REFLECTING] != _PUBLISHED_EMITTER).any():
         lost.append("what emitters reflect: ours reflect nothing")
     materials[emits, REFLECTING] = [0, 0, 0, 0, 0, 0, 1]
+    materials[varies, REFLECTING] = 0  # one row for all of them: their cells say the rest
     _within_one(materials, lost)
-    order = np.where(emits, np.cumsum(emits), 0)  # emitters stay apart, even of equal radiance
+    order = np.where(emits, np.cumsum(emits), -1.0 * varies)  # emitters stay apart, even if equal
     first, index = distinct_rows(np.column_stack([materials, order.astype(np.float32)]))
     if len(first) > MAX_PALETTE or emits.sum() >= MAX_PALETTE:
         raise TrilightError(

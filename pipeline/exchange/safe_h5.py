@@ -122,6 +122,9 @@ def iterate_blocks(array: H5Array) -> Iterator[tuple[tuple[slice, ...], NDArray]
     num_bytes = math.prod(array.shape) * array.dtype.itemsize
     if array.dataset.id.get_storage_size() != num_bytes:
         raise TrilightError(f"{array.name}: holds other bytes than its shape needs.")
+    if not array.shape:
+        yield (), np.asarray(array.dataset[()])
+        return
     row_bytes = num_bytes // array.shape[0]
     _require_memory(array, row_bytes, MAX_BLOCK_BYTES)
     rows = MAX_BLOCK_BYTES // row_bytes

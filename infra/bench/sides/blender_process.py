@@ -35,6 +35,7 @@ def main(folder: Path) -> None:
     with np.load(folder / "scene.npz", allow_pickle=False) as arrays:
         scene = {name: arrays[name] for name in arrays.files}
     bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.scene.world = None
     add_meshes(scene)
     add_camera(np.array(request["c2w"]), request["fov_deg"])
     target = folder / "render.exr"
@@ -142,7 +143,6 @@ def add_camera(c2w: NDArray[np.float64], fov_deg: float) -> None:
 def set_up_cycles(request: dict[str, Any], target: Path) -> None:
     """Set what the reference pictures were made with; the rest is as Blender ships it."""
     scene = bpy.context.scene
-    scene.world = None
     render, cycles = scene.render, scene.cycles
     render.engine = "CYCLES"
     render.resolution_x = render.resolution_y = request["resolution"]

@@ -1,10 +1,11 @@
-"""A view of a `Scene` as Blender's Cycles renders it, with its cost."""
+"""A view of a `Scene` as Blender's Cycles renders it, from its arrays or our USD; with its cost."""
 
 import dataclasses
 import json
 import os
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from storage.errors import TrilightError
 from storage.records.scene import ARRAY_FIELDS, Scene
 
 _SCRIPT = Path(__file__).with_name("blender_process.py")
+_USD_SCRIPT = Path(__file__).with_name("usd_process.py")
 _TIMEOUT_S = 4 * 3600
 
 
@@ -71,7 +73,7 @@ def cycles_picture(scene: Scene, view: int, request: Request) -> CyclesPicture:
         np.savez(folder / "scene.npz", **{field: getattr(scene, field) for field in ARRAY_FIELDS})
         asked = {**dataclasses.asdict(request), **camera}
         (folder / "request.json").write_text(json.dumps(asked))
-        _run_blender(python, folder)
+        _run_blender(_SCRIPT, folder, python)
         timing = json.loads((folder / "timing.json").read_text())
         return CyclesPicture(
             radiance_rgb=np.load(folder / "picture.npy", allow_pickle=False),
@@ -81,12 +83,46 @@ def cycles_picture(scene: Scene, view: int, request: Request) -> CyclesPicture:
         )
 
 
-def _run_blender(python: Path, folder: Path) -> None:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CyclesSamples:
+    """Pictures of one view that share no samples, and their cost."""
+
+    pictures_rgb: tuple[NDArray[np.float32], ...]
+    """[R, R, 3] linear radiance, a picture a seed."""
+    core_s: float
+    """Core-seconds of all renders; reading the file came before."""
+
+
+def cycles_of_usd(usd: Path, request: Request, seeds: Sequence[int]) -> CyclesSamples:
+    """Render the first view of a USD file of ours as Blender shows it after our script.
+
+    Args:
+        usd: the file, with what it names beside it.
+        request: how; its seed counts for nothing.
+        seeds: of the samples of each picture.
+
+    Raises:
+        TrilightError: as `cycles_picture`.
+    """
+    python = blender_python()
+    asked = {**dataclasses.asdict(request), "usd": str(usd.resolve()), "seeds": list(seeds)}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "request.json").write_text(json.dumps(asked))
+        _run_blender(_USD_SCRIPT, folder, python)
+        found = [folder / f"picture{number}.npy" for number in range(len(seeds))]
+        return CyclesSamples(
+            pictures_rgb=tuple(np.load(path, allow_pickle=False) for path in found),
+            core_s=json.loads((folder / "timing.json").read_text())["core_s"],
+        )
+
+
+def _run_blender(script: Path, folder: Path, python: Path) -> None:
     """Run the script; what Blender writes of its own accord stays in the folder."""
     surroundings = {**os.environ, "HOME": str(folder), "BLENDER_USER_RESOURCES": str(folder)}
     try:
         result = subprocess.run(
-            [str(python), "-I", str(_SCRIPT), str(folder)],
+            [str(python), "-I", str(script), str(folder)],
             env=surroundings,
             capture_output=True,
             text=True,

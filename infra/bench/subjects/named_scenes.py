@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.builds.training import smoke
+from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
+from pipeline.exchange.gltf.read import read_gltf
 from pipeline.exchange.scene_files import build_scene
 from pipeline.isolation import IsolatedChild
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, assets_of, attempt_scene
+from pipeline.objects.licences import USER_PROVIDED
 from pipeline.renders.renderer import RenderedView, SceneRenderer
 from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.compose import compose_scene
@@ -63,18 +66,27 @@ def sampled_names(count: int) -> tuple[str, ...]:
 
 
 def described(folder: Path | None) -> list[NamedScene]:
-    """Return the scenes of a folder of RenderFormer files; none without a folder.
+    """Return the scenes of a folder of RenderFormer and glTF files; none without a folder.
 
     Raises:
-        TrilightError: no JSON file of the folder holds a scene's objects.
+        TrilightError: no file of the folder is glTF, or JSON that holds a scene's objects.
     """
     if folder is None:
         return []
     root = folder.resolve()
     names = [path.name for path in sorted(root.glob("*.json")) if _holds_a_scene(path)]
-    if not names:
-        raise TrilightError(f"--scenes {folder}: holds no RenderFormer scene (*.json).")
-    return [
+    trees = [path for suffix in GLTF_SUFFIXES for path in sorted(root.glob(f"*{suffix}"))]
+    if not names and not trees:
+        raise TrilightError(f"--scenes {folder}: holds no RenderFormer scene (*.json), nor glTF.")
+    found = [
+        NamedScene(
+            name=path.name,
+            make=lambda child, path=path: child.call(gltf_scene, path),  # type: ignore[misc]
+            publishable=False,
+        )
+        for path in trees
+    ]
+    return found + [
         NamedScene(
             name=Path(name).stem,
             make=lambda child, name=name: child.call(described_scene, root, name),  # type: ignore[misc]
@@ -82,6 +94,11 @@ def described(folder: Path | None) -> list[NamedScene]:
         )
         for name in names
     ]
+
+
+def gltf_scene(path: Path) -> Scene:
+    """Return the scene of a glTF file; runs in a child."""
+    return read_gltf(path, USER_PROVIDED).scene
 
 
 def sampled_scene(scene_index: int) -> Scene:

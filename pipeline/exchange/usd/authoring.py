@@ -55,13 +55,16 @@ def add_relationship(prim: Any, name: str, target: str) -> None:
     relationship.targetPathList.explicitItems = [_target(target)]
 
 
-def add_output(prim: Any, name: str, source: str | None = None) -> None:
-    """Write a token output, connected to another one where there is a source."""
+def add_link(prim: Any, name: str, kind: str, source: str | None = None) -> None:
+    """Write an input or output, connected to an output where there is a source.
+
+    Where the prim has it with a value, the value stays.
+    """
     from pxr import Sdf
 
-    output = Sdf.AttributeSpec(prim, name, Sdf.ValueTypeNames.Token)
+    link = prim.attributes.get(name) or Sdf.AttributeSpec(prim, name, _value_type(kind))
     if source is not None:
-        output.connectionPathList.explicitItems = [_target(source)]
+        link.connectionPathList.explicitItems = [_target(source)]
 
 
 def as_expected(prim: Any, attributes: Attributes) -> bool:
@@ -103,9 +106,12 @@ def _converter(kind: str) -> Callable[[Any], Any]:
         "token[]": Vt.TokenArray,
         "int[]": Vt.IntArray.FromNumpy,
         "float[]": Vt.FloatArray.FromNumpy,
+        "texCoord2f[]": Vt.Vec2fArray.FromNumpy,
         "color3f": Gf.Vec3f,
+        "float4": lambda value: Gf.Vec4f(*value),
         "asset": Sdf.AssetPath,
         "float2": Gf.Vec2f,
+        "float3": lambda value: Gf.Vec3f(*value),
         "matrix4d": Gf.Matrix4d,
     }
     plain = kind.removeprefix(UNIFORM)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
 from pipeline.exchange.usd.foreign_textures import asset_bytes
-from pipeline.exchange.usd.names import ENVIRONMENT_TEXTS, VISIBLE_TO_CAMERA
+from pipeline.exchange.usd.names import MAP_TEXTS, SKY_ROWS, SKY_VISIBLE, VISIBLE_TO_CAMERA
 from pipeline.exchange.usd.stage import OpenedUsd
 from storage.errors import TrilightError
 from storage.records.environment import Environment
@@ -50,9 +50,7 @@ def dome_attributes(sky: Environment) -> Attributes:
     """Return the attributes of the prim of an environment."""
     to_world = np.eye(4)
     to_world[:3, :3] = sky.rotation.astype(np.float64) @ TO_OUR_AXES
-    texts = {
-        name: ("string", getattr(sky.source, field)) for field, name in ENVIRONMENT_TEXTS.items()
-    }
+    texts = {name: ("string", getattr(sky.source, field)) for field, name in MAP_TEXTS.items()}
     return {
         "xformOp:transform": ("matrix4d", to_world.T.tolist()),  # USD multiplies from the left
         "xformOpOrder": ("uniform token[]", ("xformOp:transform",)),
@@ -64,6 +62,19 @@ def dome_attributes(sky: Environment) -> Attributes:
     }
 
 
+def sky_attributes(sky: Environment | None) -> Attributes:
+    """Return what the prim of a scene says of its environment: nothing where there is none."""
+    if sky is None:
+        return {}
+    return {
+        **{
+            name: ("float3", tuple(map(float, row)))
+            for name, row in zip(SKY_ROWS, sky.rotation, strict=True)
+        },
+        SKY_VISIBLE: ("bool", sky.is_seen),
+    }
+
+
 def dome_as_written(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
     """Return the environment of a prim that `add_dome` wrote; raises LookupError without a file."""
     found = opened.inside(layer, prim.attributes[_PATH].default.path)
@@ -71,7 +82,7 @@ def dome_as_written(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
     if data is None:
         raise LookupError(_PATH)
     matrix = np.array(prim.attributes["xformOp:transform"].default).T
-    texts = {field: prim.attributes[name].default for field, name in ENVIRONMENT_TEXTS.items()}
+    texts = {field: prim.attributes[name].default for field, name in MAP_TEXTS.items()}
     return Environment(
         radiance_rgb=decode_exr(data),
         rotation=(matrix[:3, :3] @ TO_OUR_AXES.T).astype(np.float32),

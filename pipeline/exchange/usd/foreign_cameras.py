@@ -48,7 +48,7 @@ def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.floa
         camera.GetHorizontalApertureAttr().Get(time),
         camera.GetVerticalApertureAttr().Get(time),
     )
-    pose = _rigid(placed.to_world)
+    pose = rigid_pose(placed.to_world)
     if camera.GetProjectionAttr().Get(time) != "perspective" or pose is None or not focal > 0:
         lost.append(f"{where}: no perspective camera with a focal length")
         return None
@@ -63,7 +63,7 @@ def _camera(placed: Placed, time: Any, lost: list[str]) -> tuple[NDArray[np.floa
     return (pose, angle) if 0 < angle < 180 else None
 
 
-def _rigid(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def rigid_pose(matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return a place without its scale; None where it has no direction."""
     backward, right = matrix[:3, 2], matrix[:3, 0]
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -3,53 +3,35 @@
 UsdPreviewSurface in both workflows, and the constants of OpenPBR and Standard Surface where a
 material has no preview. Our BRDF has no Fresnel term: the specular albedo is what such a material
 reflects head-on, metals have no diffuse part, and the diffuse albedo gives way where both together
-would reflect more than they get. Coats, transparency, bumps and textures finer than a triangle are
-lost, and named.
+would reflect more than they get. Coats, transparency and bumps are lost, and named.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.usd.foreign_meshes import TriangleSoup, per_corner
-from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
+from pipeline.exchange.dressed import PLAIN, Worn
+from pipeline.exchange.usd.foreign_inputs import NAMES as _NAMES
+from pipeline.exchange.usd.foreign_inputs import PREVIEW as _PREVIEW
+from pipeline.exchange.usd.foreign_inputs import ShaderInputs, worn_textures
+from pipeline.exchange.usd.foreign_meshes import MeshToShade, per_corner
+from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
 from pipeline.exchange.usd.names import added_column
 from pipeline.exchange.usd.stage import OpenedUsd
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
-    REFLECTING,
     ROUGHNESS,
     SPECULAR,
     default_rows,
     laid_out,
 )
+from storage.records.texture import MapSource
 
 _DEFAULT_DIFFUSE = (0.18, 0.18, 0.18)
-_PREVIEW = "UsdPreviewSurface"
-_NAMES = {
-    _PREVIEW: {},
-    "ND_open_pbr_surface_surfaceshader": {
-        "diffuseColor": "base_color",
-        "metallic": "base_metalness",
-        "roughness": "specular_roughness",
-        "ior": "specular_ior",
-        "emissiveColor": "emission_color",
-        "strength": "emission_luminance",
-    },
-    "ND_standard_surface_surfaceshader": {
-        "diffuseColor": "base_color",
-        "metallic": "metalness",
-        "roughness": "specular_roughness",
-        "ior": "specular_IOR",
-        "emissiveColor": "emission_color",
-        "strength": "emission",
-    },
-}
-"""How shaders call what UsdPreviewSurface calls by the first name."""
-
 _LOST = {
     "opacity": 1.0,
     "clearcoat": 0.0,
@@ -64,66 +46,105 @@ _LOST = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MeshToShade:
-    """A mesh whose triangles get materials."""
+class Dressing:
+    """The materials and textures of the triangles of a mesh."""
 
-    prim: Any  # the mesh
-    soup: TriangleSoup  # its triangles
-    indices: NDArray[np.int64]  # point of each of its corners
+    rows: NDArray[np.float32]
+    """[T, 10 or more]"""
+    uv: NDArray[np.float32]
+    """[T, 3, 2] where textures are looked up."""
+    worn: NDArray[np.int64]
+    """[T] rows of `wardrobe`."""
+    wardrobe: tuple[Worn, ...]
+    """Textures by material."""
 
 
-def material_rows(surface: MeshToShade, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:
-    """Return the material row of each triangle of a mesh."""
+def dressing(surface: MeshToShade, time: Any, opened: OpenedUsd, licence: str) -> Dressing:
+    """Return materials and textures of the triangles of a mesh.
+
+    Args:
+        surface: the mesh.
+        time: of the values.
+        opened: the file; what is lost is noted there.
+        licence: of its textures.
+
+    Raises:
+        TrilightError: a texture is outside of the folder, on the network, or too large.
+    """
     from pxr import UsdShade
 
     binding = UsdShade.MaterialBindingAPI(surface.prim)
-    rows = default_rows(len(surface.soup.polygons))
-    rows[:] = _shaded(binding.ComputeBoundMaterial()[0], surface, time, opened)
+    polygons = surface.soup.polygons
+    whole = _shaded(binding.ComputeBoundMaterial()[0], surface, time, opened, licence)
+    rows, uv, wardrobe = whole.rows, whole.uv, [whole.worn]
+    worn = np.zeros(len(polygons), np.int64)
     for subset in binding.GetMaterialBindSubsets():
-        chosen = np.isin(surface.soup.polygons, np.array(subset.GetIndicesAttr().Get(time) or []))
+        chosen = np.isin(polygons, np.array(subset.GetIndicesAttr().Get(time) or []))
         bound = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0]
         if bound:
-            rows[chosen] = _shaded(bound, surface, time, opened)[chosen]
+            part = _shaded(bound, surface, time, opened, licence)
+            rows[chosen], uv[chosen], worn[chosen] = (
+                part.rows[chosen],
+                part.uv[chosen],
+                len(wardrobe),
+            )
+            wardrobe.append(part.worn)
+    _limit(rows, worn, wardrobe, surface, opened.lost)
+    return Dressing(rows=rows, uv=uv, worn=worn, wardrobe=tuple(wardrobe))
+
+
+def _limit(
+    rows: NDArray[np.float32],
+    worn: NDArray[np.int64],
+    wardrobe: Sequence[Worn],
+    surface: MeshToShade,
+    lost: list[str],
+) -> None:
+    """Lower diffuse albedos that, with the specular ones, would reflect more than they get."""
+    is_plain = np.array([textures[:2] == (None, None) for textures in wardrobe])[worn]
     excess = (rows[:, DIFFUSE] + rows[:, SPECULAR]).max(axis=1, initial=0) > 1 + 1e-6
+    excess &= is_plain
     if excess.any():
-        opened.lost.append(
+        lost.append(
             f"{surface.prim.GetPath()}: diffuse lowered on {int(excess.sum())} triangles that "
             "would reflect more than they get"
         )
-        rows[:, DIFFUSE] = np.minimum(rows[:, DIFFUSE], 1 - rows[:, SPECULAR])
-    return rows
+        rows[excess, DIFFUSE] = np.minimum(rows[excess, DIFFUSE], 1 - rows[excess, SPECULAR])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Shaded:
+    """One material over a whole mesh."""
+
+    rows: NDArray[np.float32]  # [T, 10 or more]
+    uv: NDArray[np.float32]  # [T, 3, 2]
+    worn: Worn  # its textures
 
 
 def _shaded(
-    material: Any, surface: MeshToShade, time: Any, opened: OpenedUsd
-) -> NDArray[np.float32]:
-    """Return rows of a material over the whole mesh; of its display colour without one."""
+    material: Any, surface: MeshToShade, time: Any, opened: OpenedUsd, licence: str
+) -> _Shaded:
+    """Return a material over the whole mesh; its display colour without one."""
     shader = _shader(material, opened.lost) if material else None
-    rows = default_rows(len(surface.soup.polygons))
+    count = len(surface.soup.polygons)
+    rows, nowhere = default_rows(count), np.zeros((count, 3, 2), np.float32)
     if shader is None:
         rows[:, DIFFUSE] = _display_colour(surface, time)
         rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
-        return rows
-    names = _NAMES[shader.GetShaderId()]
-
-    def value(name: str, default: Any) -> NDArray[np.float32]:
-        return _value(shader, names.get(name, name), default, surface, time, opened)
-
-    base, metal = value("diffuseColor", _DEFAULT_DIFFUSE), value("metallic", 0.0)
-    if value("useSpecularWorkflow", 0.0).any():
-        rows[:, DIFFUSE], rows[:, SPECULAR] = base, value("specularColor", 0.0)
-    else:
-        ior = value("ior", 1.5)
-        head_on = np.square((ior - 1) / np.maximum(ior + 1, 1e-3))
-        rows[:, DIFFUSE] = base * (1 - metal)
-        rows[:, SPECULAR] = head_on * (1 - metal) + base * metal
-    rows[:, ROUGHNESS] = value("roughness", 0.5)[:, 0]
-    rows[:, REFLECTING] = np.clip(rows[:, REFLECTING], 0, 1)
-    strength = value("strength", 0.0) if "strength" in names else 1.0
-    rows[:, EMISSION] = np.maximum(value("emissiveColor", 0.0) * strength, 0)
+        return _Shaded(rows=rows, uv=nowhere, worn=PLAIN)
+    inputs = ShaderInputs(shader, _NAMES[shader.GetShaderId()], time, opened)
+    source = MapSource(name=str(material.GetPrim().GetName()), licence=licence)
+    skin = skinned(inputs.textures(CHANNELS), surface, time, source, opened.lost)
+    worn = worn_textures(inputs, skin.textures, source, f"{surface.prim.GetPath()}", opened.lost)
+    for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), worn, strict=True):
+        rows[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
+    rows[:, EMISSION] = inputs.emission(surface)
     _note_losses(shader, time, opened.lost)
     _take_added_columns(rows, material, time, opened.lost)
-    return rows
+    kept = [texture if texture.constant is None else None for texture in worn]
+    return _Shaded(
+        rows=rows, uv=nowhere if skin.uv is None else skin.uv, worn=(kept[0], kept[1], kept[2])
+    )
 
 
 def _take_added_columns(
@@ -168,57 +189,6 @@ def _shader(material: Any, lost: list[str]) -> Any:
     if found is None:
         lost.append(f"{material.GetPath()}: no shader that is understood; display colour taken")
     return found
-
-
-def _value(
-    shader: Any, name: str, default: Any, surface: MeshToShade, time: Any, opened: OpenedUsd
-) -> NDArray[np.float32]:
-    """Return an input for each triangle, [T, 3]; a single number stands in every column."""
-    from pxr import UsdShade
-
-    count = len(surface.soup.polygons)
-    known = shader.GetInput(name)
-    sources = UsdShade.Utils.GetValueProducingAttributes(known) if known else []
-    if sources and UsdShade.Output.IsOutput(sources[0]):
-        output = UsdShade.Output(sources[0])
-        node = UsdShade.Shader(sources[0].GetPrim())
-        if node.GetShaderId() == "UsdUVTexture":
-            texture = read_texture(node, output.GetBaseName(), time, opened)
-            found = None if texture is None else _textured(texture, name, surface, time, opened)
-            if found is not None:
-                return found
-        opened.lost.append(
-            f"{shader.GetPath()}.{name}: a network that is not read; {default} taken"
-        )
-        sources = []
-    stated = sources[0].Get(time) if sources else None
-    value = np.array(default if stated is None else stated, np.float32)
-    if value.ndim > 1 or value.shape not in ((), (3,)) or not np.isfinite(value).all():
-        opened.lost.append(
-            f"{shader.GetPath()}.{name}: no finite number or colour; {default} taken"
-        )
-        value = np.array(default, np.float32)
-    return np.broadcast_to(value, (count, 3)).astype(np.float32)
-
-
-def _textured(
-    texture: ForeignTexture, name: str, surface: MeshToShade, time: Any, opened: OpenedUsd
-) -> NDArray[np.float32] | None:
-    from pxr import UsdGeom
-
-    primvar = UsdGeom.PrimvarsAPI(surface.prim).FindPrimvarWithInheritance(texture.primvar)
-    if not primvar or not primvar.HasValue():
-        return None
-    values = np.array(primvar.ComputeFlattened(time), np.float64).reshape(-1, 2)
-    uv = per_corner(values, str(primvar.GetInterpolation()), surface.indices, surface.soup)
-    if uv is None:
-        return None
-    means, spread = texture.means(uv)
-    opened.lost.append(
-        f"{surface.prim.GetPath()}: texture of {name} became one value a triangle; texels lie "
-        f"{spread:.3f} (root mean square, linear) from it"
-    )
-    return means
 
 
 def _display_colour(surface: MeshToShade, time: Any) -> NDArray[np.float32]:

@@ -30,6 +30,15 @@ class TriangleSoup:
     polygons: NDArray[np.int64]  # [T] which polygon of the mesh
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeshToShade:
+    """A mesh whose triangles get materials."""
+
+    prim: Any  # the mesh
+    soup: TriangleSoup  # its triangles
+    indices: NDArray[np.int64]  # point of each of its corners
+
+
 def read_mesh(placed: Placed, time: Any, lost: list[str]) -> TriangleSoup:
     """Return the triangles of a mesh that have an area.
 

@@ -6,19 +6,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.dressed import (
+    PLAIN,
+    DressedPiece,
+    DressedTriangles,
+    by_kind,
+    dressed,
+    joined_arrays,
+    scene_with_worn,
+)
 from pipeline.exchange.usd.dome import foreign_dome
 from pipeline.exchange.usd.foreign_cameras import camera_that_sees_all, cameras
 from pipeline.exchange.usd.foreign_lights import light_triangles, radiance
-from pipeline.exchange.usd.foreign_materials import MeshToShade, material_rows
-from pipeline.exchange.usd.foreign_meshes import TriangleSoup, read_mesh
+from pipeline.exchange.usd.foreign_materials import dressing
+from pipeline.exchange.usd.foreign_meshes import MeshToShade, TriangleSoup, read_mesh
 from pipeline.exchange.usd.foreign_placed import Placed, placed_prims
 from pipeline.exchange.usd.names import OBJECT_TEXTS
 from pipeline.exchange.usd.stage import OpenedUsd
-from pipeline.scenes.pieces import ScenePiece, joined
-from pipeline.scenes.shading import ShadedMesh, flat_shaded
+from pipeline.scenes.shading import flat_shaded
 from storage.errors import TrilightError
 from storage.records.environment import Environment
-from storage.records.material import EMISSION, ROUGHNESS, default_rows, distinct_rows
+from storage.records.material import EMISSION, ROUGHNESS, default_rows
 from storage.records.scene import ObjectKind, Scene, SceneObject
 
 MAX_TRIANGLES = 1_000_000
@@ -34,14 +42,14 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
             no light at all.
     """
     placed = placed_prims(stage, time, opened.lost)
-    pieces: list[ScenePiece] = []
+    pieces: list[DressedPiece] = []
     names: set[str] = set()
     triangles = 0
     for each in placed:
         if each.prim.GetTypeName() in ("Camera", "DomeLight"):
             continue
         found = _pieces(each, time, opened, licence, names)
-        triangles += sum(len(piece.mesh.faces) for piece in found)
+        triangles += sum(len(one.piece.mesh.faces) for one in found)
         if triangles > MAX_TRIANGLES:
             raise TrilightError(f"more than {MAX_TRIANGLES} triangles.")
         pieces += found
@@ -49,41 +57,39 @@ def scene_of_stage(stage: Any, time: Any, opened: OpenedUsd, licence: str) -> Sc
             raise TrilightError(f"more than {MAX_ROWS} objects.")
     sky = _environment(placed, time, opened, licence)
     is_lit = sky is not None and sky.radiance_rgb.any()
-    if not is_lit and not any(piece.entry.kind == "emitter" for piece in pieces):
+    if not is_lit and not any(one.piece.entry.kind == "emitter" for one in pieces):
         raise TrilightError(
             "no light that can be carried over; expected an emissive material, or a rectangle, "
             "disk, sphere, mesh or dome light."
         )
-    materials = sum(len(piece.materials) for piece in pieces)
+    materials = sum(len(one.piece.materials) for one in pieces)
     if materials > MAX_ROWS:
         raise TrilightError(f"{materials} materials; expected at most {MAX_ROWS}.")
     return _scene(pieces, placed, time, opened, sky)
 
 
 def _scene(
-    pieces: Sequence[ScenePiece],
+    pieces: Sequence[DressedPiece],
     placed: Sequence[Placed],
     time: Any,
     opened: OpenedUsd,
     sky: Environment | None,
 ) -> Scene:
-    arrays = joined(pieces)
+    arrays = joined_arrays(pieces)
     seen = [each for each in placed if each.prim.GetTypeName() == "Camera"]
     c2w, fov_deg = cameras(seen, time, opened.lost)
     if not len(c2w):
         opened.lost.append("no camera: one was added that sees everything")
         c2w, fov_deg = camera_that_sees_all(arrays["vertex_positions"])
     code = time.GetValue() if time.IsNumeric() and not time.IsEarliestTime() else None
-    scene = Scene(
-        **arrays,
+    return scene_with_worn(
+        arrays,
+        pieces,
         c2w=c2w,
         fov_deg=fov_deg,
-        objects=tuple(piece.entry for piece in pieces),
         provenance={"template": "usd", "file": opened.path.name, "time_code": code},
         environment=sky,
     )
-    scene.check()
-    return scene
 
 
 def _environment(
@@ -102,32 +108,46 @@ def _environment(
 
 def _pieces(
     each: Placed, time: Any, opened: OpenedUsd, licence: str, names: set[str]
-) -> list[ScenePiece]:
+) -> list[DressedPiece]:
     prim = each.prim
     if prim.GetTypeName() != "Mesh":
         triangles = light_triangles(each, time, opened.lost)
         if triangles is None:
             return []
-        rows = default_rows(len(triangles))
-        rows[:, ROUGHNESS] = 1
-        rows[:, EMISSION] = radiance(prim, triangles, time)
-        corners = triangles.reshape(-1, 3)
-        faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-        flat = flat_shaded(corners, faces)
-        return _split(each, flat.normals.reshape(-1, 3, 3), triangles, rows, licence, names)
+        return _split(each, _of_light(prim, triangles, time), licence, names)
     soup = read_mesh(each, time, opened.lost)
     if not len(soup.positions):
         opened.lost.append(f"{prim.GetPath()}: no triangle with an area")
         return []
-    rows = _mesh_rows(prim, soup, time, opened)
-    return _split(each, soup.normals, soup.positions, rows, licence, names)
+    return _split(each, _of_mesh(prim, soup, time, opened, licence), licence, names)
 
 
-def _mesh_rows(prim: Any, soup: TriangleSoup, time: Any, opened: OpenedUsd) -> NDArray[np.float32]:
+def _of_light(prim: Any, triangles: NDArray[np.float32], time: Any) -> DressedTriangles:
+    count = len(triangles)
+    rows = default_rows(count)
+    rows[:, ROUGHNESS] = 1
+    rows[:, EMISSION] = radiance(prim, triangles, time)
+    corners = triangles.reshape(-1, 3)
+    flat = flat_shaded(corners, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3))
+    return DressedTriangles(
+        positions=triangles,
+        normals=flat.normals.reshape(-1, 3, 3),
+        rows=rows,
+        uv=np.zeros((count, 3, 2), np.float32),
+        worn=np.zeros(count, np.int64),
+        wardrobe=(PLAIN,),
+    )
+
+
+def _of_mesh(
+    prim: Any, soup: TriangleSoup, time: Any, opened: OpenedUsd, licence: str
+) -> DressedTriangles:
     from pxr import UsdGeom
 
     indices = np.array(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get(time), np.int64)
-    rows = material_rows(MeshToShade(prim=prim, soup=soup, indices=indices), time, opened)
+    surface = MeshToShade(prim=prim, soup=soup, indices=indices)
+    found = dressing(surface, time, opened, licence)
+    rows = found.rows
     if prim.HasAPI("MeshLightAPI"):
         light = radiance(prim, soup.positions, time)
         mode = prim.GetAttribute("light:materialSyncMode").Get(time)
@@ -138,46 +158,23 @@ def _mesh_rows(prim: Any, soup: TriangleSoup, time: Any, opened: OpenedUsd) -> N
             opened.lost.append(
                 f"{prim.GetPath()}: its material does not glow; the light's own taken"
             )
-    return rows
+    return DressedTriangles(
+        positions=soup.positions,
+        normals=soup.normals,
+        rows=rows,
+        uv=found.uv,
+        worn=found.worn,
+        wardrobe=found.wardrobe,
+    )
 
 
 def _split(
-    each: Placed,
-    normals: NDArray[np.float32],
-    positions: NDArray[np.float32],
-    rows: NDArray[np.float32],
-    licence: str,
-    names: set[str],
-) -> list[ScenePiece]:
+    each: Placed, triangles: DressedTriangles, licence: str, names: set[str]
+) -> list[DressedPiece]:
     """Return the part of a mesh that reflects, and the part that emits, where there are both."""
-    emits = (rows[:, EMISSION] > 0).any(axis=1)
-    found = []
-    for part, kind in ((~emits, "object"), (emits, "emitter")):
-        if part.any():
-            entry = _entry(each.prim, "emitter" if kind == "emitter" else "object", licence, names)
-            found.append(_piece(entry, positions[part], normals[part], rows[part]))
-    return found
-
-
-def _piece(
-    entry: SceneObject,
-    positions: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    rows: NDArray[np.float32],
-) -> ScenePiece:
-    corners = np.concatenate([positions, normals], axis=2).reshape(-1, 6)
-    first, index = distinct_rows(corners)
-    kept, faces = corners[first], index.reshape(-1, 3).astype(np.uint32)
-    palette, material_index = distinct_rows(rows)
-    mesh = ShadedMesh(
-        positions=kept[:, :3].copy(),
-        normals=kept[:, 3:].copy(),
-        faces=faces,
-        groups=np.zeros(len(faces), np.int64),
-    )
-    return ScenePiece(
-        entry=entry, mesh=mesh, materials=rows[palette], material_index=material_index
-    )
+    return [
+        dressed(_entry(each.prim, kind, licence, names), part) for kind, part in by_kind(triangles)
+    ]
 
 
 def _entry(prim: Any, kind: ObjectKind, licence: str, names: set[str]) -> SceneObject:

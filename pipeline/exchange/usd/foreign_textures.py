@@ -1,149 +1,133 @@
-"""Textures of a USD material, averaged over each triangle in linear light.
+"""Textures of a USD material: pictures with their colour space, channel, scale and wrapping.
 
-A `Scene` has one colour a triangle. A triangle takes the mean of its texture at 36 points spread
-evenly over it; how far the texels lie from that mean is what is lost, and is said.
+Where nothing is scaled, the bytes of a picture stay as they are. What a colour space says is taken
+as said; without one, colours in 8 bits are sRGB-encoded, as USD states.
 """
 
-import io
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.pictures import MAX_BYTES, Pixels, decoded_pixels, is_encoded
+from pipeline.exchange.usd.foreign_coordinates import Chart, chart_of, value_of
 from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.exchange.wrapping import Wrap
 from storage.errors import TrilightError
-
-MAX_BYTES = 256 << 20
-MAX_PIXELS = 64 << 20
-"""Maximum size of one picture."""
+from storage.records.texture import MapSource, Texture
 
 _STEPS = 8
 """Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""
+
+_WRAPS = ("repeat", "mirror", "clamp", "black")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ForeignTexture:
     """A picture as a material uses it."""
 
-    linear: NDArray[np.float32]  # [H, W, C] linear values, row 0 on top
-    wrap: tuple[str, str]  # USD's wrap modes along s and t
-    scale: NDArray[np.float32]  # [4]
-    bias: NDArray[np.float32]  # [4]
-    primvar: str  # name of the texture coordinates
-    output: str  # rgb, r, g, b or a: what is connected
+    pixels: Pixels
+    """[H, W, 1 to 4] as stored, the bottom row first."""
+    is_srgb: bool
+    """Whether its colours are sRGB-encoded; alpha is not."""
+    wrap: tuple[Wrap, Wrap]
+    """Wrap modes along s and t."""
+    scale: NDArray[np.float32]
+    """[4]"""
+    bias: NDArray[np.float32]
+    """[4]"""
+    chart: Chart
+    """Where it is looked up."""
+    output: str
+    """rgb, r, g, b or a: what is connected."""
 
-    def means(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.float32], float]:
-        """Return the mean [T, 3] over triangles with coordinates [T, 3, 2], and the deviation.
+    def texture(self, channels: int, source: MapSource, lost: list[str]) -> Texture:
+        """Return what is connected, as a texture of one or of three channels.
 
-        The deviation is the root mean square distance of a sample from its triangle's mean.
+        It does not repeat yet as the picture wraps.
         """
+        is_plain = (self.scale == 1).all() and (self.bias == 0).all()
+        if self.pixels.dtype == np.uint8 and is_plain:
+            chosen = _channels(self.pixels, self.output, channels, 255)
+            is_srgb = self.is_srgb and not self._is_alpha
+            return Texture(texels=np.ascontiguousarray(chosen), is_srgb=is_srgb, source=source)
+        values = _channels(self._scaled(), self.output, channels, 1)
+        if not (values.min() >= 0 and values.max() <= 1):  # or NaN
+            lost.append("texels that are no number from 0 to 1: they were clamped, NaN to 0")
+            values = np.clip(np.nan_to_num(values, nan=0.0), 0, 1)
+        return Texture(texels=np.ascontiguousarray(values, np.float32), source=source)
+
+    def means(self, uv: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the means [T, 3] over triangles with coordinates [T, 3, 2], at 36 points each."""
         points = np.einsum("pk,tkc->tpc", _grid(), uv)
-        columns = _wrapped(points[..., 0], self.linear.shape[1], self.wrap[0])
-        rows = _wrapped(1 - points[..., 1], self.linear.shape[0], self.wrap[1])
-        texels = self._channels(self.linear[rows, columns])
-        mean = texels.mean(axis=1)
-        spread = float(np.sqrt(np.square(texels - mean[:, None]).mean())) if len(texels) else 0.0
-        return mean.astype(np.float32), spread
+        height, width = self.pixels.shape[:2]
+        columns = _wrapped(points[..., 0], width, self.wrap[0])
+        rows = _wrapped(points[..., 1], height, self.wrap[1])
+        values = _channels(self._scaled(), self.output, 3, 1)
+        means: NDArray[np.float32] = np.nan_to_num(values[rows, columns].mean(axis=1), nan=0.0)
+        return means.astype(np.float32)
 
-    def _channels(self, texels: NDArray[np.float32]) -> NDArray[np.float32]:
-        count = texels.shape[-1]
-        whole = np.ones((*texels.shape[:-1], 4), np.float32)
-        if count < 3:
-            whole[..., :3] = texels[..., :1]
-        else:
-            whole[..., : min(count, 4)] = texels[..., :4]
-        whole = whole * self.scale + self.bias
-        if self.output == "rgb":
-            return whole[..., :3]
-        return np.repeat(whole[..., ["rgba".index(self.output)]], 3, axis=-1)
+    @property
+    def _is_alpha(self) -> bool:
+        return self.output == "a"
+
+    def _scaled(self) -> NDArray[np.float32]:
+        """Return linear values [H, W, 4], scaled and moved."""
+        values = self.pixels.astype(np.float32)
+        if self.pixels.dtype == np.uint8:
+            values = values / np.float32(255)
+        count = values.shape[2]
+        whole = np.ones((*values.shape[:2], 4), np.float32)
+        whole[..., :3] = values[..., :3] if count >= 3 else values[..., :1]
+        if self.is_srgb:
+            whole[..., :3] = _linear(whole[..., :3])
+        if count in (2, 4):
+            whole[..., 3] = values[..., -1]
+        return whole * self.scale + self.bias
 
 
-def read_texture(shader: Any, output: str, time: Any, opened: OpenedUsd) -> ForeignTexture | None:
-    """Return the texture of a UsdUVTexture shader, or None, with a note, if unreadable.
+def read_texture(
+    shader: Any, output: str, time: Any, opened: OpenedUsd
+) -> ForeignTexture | NDArray[np.float64] | None:
+    """Return the texture of a UsdUVTexture shader.
+
+    Where it is not readable, a note says so, and its `fallback` [4] is returned if it states one;
+    else None.
 
     Raises:
-        TrilightError: its file is outside of the folder or on the network.
+        TrilightError: its file is outside of the folder or on the network, or too large.
     """
     attribute = shader.GetInput("file")
     asset = attribute.Get(time) if attribute else None
-    if asset is None or not asset.path:
-        opened.lost.append(f"{shader.GetPath()}: a texture without a file")
-        return None
-    spec = attribute.GetAttr().GetPropertyStack(time)
-    layer = spec[0].layer if spec else opened.root
-    found = opened.inside(layer, asset.path)
-    pixels = None if found is None else _pixels(found)
+    named = "" if asset is None else asset.path
+    pixels = None
+    if named:
+        specs = attribute.GetAttr().GetPropertyStack(time)
+        found = opened.inside(specs[0].layer if specs else opened.root, named)
+        data = None if found is None else asset_bytes(found)
+        pixels = None if data is None else decoded_pixels(data, Path(named).name)
     if pixels is None:
-        opened.lost.append(f"texture {asset.path!r:.100}: missing or not readable as a picture")
-        return None
-    space = _get(shader, "sourceColorSpace", time, "auto")
-    linear = _linear(pixels) if space != "raw" and pixels.shape[2] >= 3 else pixels
+        opened.lost.append(
+            f"texture {named!r:.100}: missing or not readable as a picture"
+            if named
+            else f"{shader.GetPath()}: a texture without a file"
+        )
+        fallback = value_of(shader, "fallback", time, None)
+        return None if fallback is None else np.array(fallback, np.float64)
+    space = str(value_of(shader, "sourceColorSpace", time, "auto"))
+    is_srgb = is_encoded(pixels) if space not in ("sRGB", "raw") else space == "sRGB"
     return ForeignTexture(
-        linear=linear,
-        wrap=(
-            str(_get(shader, "wrapS", time, "repeat")),
-            str(_get(shader, "wrapT", time, "repeat")),
-        ),
-        scale=np.array(_get(shader, "scale", time, (1, 1, 1, 1)), np.float32),
-        bias=np.array(_get(shader, "bias", time, (0, 0, 0, 0)), np.float32),
-        primvar=_primvar(shader, time, opened.lost),
+        pixels=pixels[::-1],
+        is_srgb=is_srgb,
+        wrap=(_wrap(shader, "wrapS", time), _wrap(shader, "wrapT", time)),
+        scale=np.array(value_of(shader, "scale", time, (1, 1, 1, 1)), np.float32),
+        bias=np.array(value_of(shader, "bias", time, (0, 0, 0, 0)), np.float32),
+        chart=chart_of(shader, time),
         output=output if output in ("r", "g", "b", "a") else "rgb",
     )
-
-
-def _primvar(shader: Any, time: Any, lost: list[str]) -> str:
-    """Return the name of the coordinates that a texture reads."""
-    st = shader.GetInput("st")
-    for _ in range(8):
-        source = st.GetConnectedSources()[0] if st and st.HasConnectedSource() else []
-        if not source:
-            break
-        reader = source[0].source.GetPrim()
-        from pxr import UsdShade
-
-        node = UsdShade.Shader(reader)
-        if node.GetIdAttr().Get() == "UsdTransform2d":
-            lost.append(f"{reader.GetPath()}: texture coordinates are moved; they were taken as is")
-            st = node.GetInput("in")
-            continue
-        name = node.GetInput("varname")
-        value = UsdShade.Utils.GetValueProducingAttributes(name) if name else []
-        if value:
-            return str(value[0].Get(time))
-        break
-    return "st"
-
-
-def _get(shader: Any, name: str, time: Any, default: Any) -> Any:
-    attribute = shader.GetInput(name)
-    value = attribute.Get(time) if attribute else None
-    return default if value is None else value
-
-
-def _pixels(resolved: str) -> NDArray[np.float32] | None:
-    """Return a picture [H, W, C] of values in [0, 1]; None where it is none."""
-    from PIL import Image
-
-    name = Path(resolved).name
-    data = asset_bytes(resolved)
-    if data is None:
-        return None
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF", "BMP", "TGA")) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise TrilightError(f"{name}: expected at most {MAX_PIXELS} pixels.")
-            if image.mode.startswith("I;16") or image.mode == "I":
-                return (np.asarray(image, np.float32) / np.float32(65535))[..., None]
-            mode = image.mode if image.mode in ("L", "RGB", "RGBA") else "RGB"
-            values = np.asarray(image.convert(mode), np.float32) / np.float32(255)
-    except TrilightError:
-        raise
-    except (OSError, SyntaxError, ValueError, LookupError, Image.DecompressionBombError):
-        return None  # PIL says so in all of these ways
-    return values if values.ndim == 3 else values[..., None]
 
 
 def asset_bytes(resolved: str) -> bytes | None:
@@ -161,23 +145,38 @@ def asset_bytes(resolved: str) -> bytes | None:
         return None
 
 
+def _wrap(shader: Any, name: str, time: Any) -> Wrap:
+    """Return a wrap mode; `useMetadata` and what is unknown repeat."""
+    mode = str(value_of(shader, name, time, "repeat"))
+    return cast(Wrap, mode) if mode in _WRAPS else "repeat"
+
+
+def _channels(values: NDArray, output: str, channels: int, opaque: int) -> NDArray:
+    """Return one or three channels [H, W, 1 or 3] of a picture for what is connected."""
+    count = values.shape[2]
+    if output == "a":
+        alpha = values[..., -1:] if count in (2, 4) else np.full_like(values[..., :1], opaque)
+        return np.repeat(alpha, channels, axis=-1)
+    if output == "rgb" and channels == 3 and count >= 3:
+        return values[..., :3]
+    row = "rgb".index(output) if output in ("r", "g", "b") and count >= 3 else 0
+    return np.repeat(values[..., row : row + 1], channels, axis=-1)
+
+
 def _linear(encoded: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return values whose colour channels were sRGB-encoded as linear ones; alpha stays."""
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    linear[..., 3:] = encoded[..., 3:]
     return linear.astype(np.float32)
 
 
 def _wrapped(at: NDArray[np.float64], size: int, mode: str) -> NDArray[np.int64]:
     """Return the texel of coordinates; `black` is treated as `clamp`."""
-    finite = np.nan_to_num(at, nan=0.0, posinf=0.0, neginf=0.0)
     if mode == "mirror":
-        finite = 1 - np.abs(np.mod(finite, 2) - 1)
+        at = 1 - np.abs(np.mod(at, 2) - 1)
     elif mode in ("clamp", "black"):
-        finite = np.clip(finite, 0, 1)
+        at = np.clip(at, 0, 1)
     else:
-        finite = np.mod(finite, 1)
-    return np.minimum((finite * size).astype(np.int64), size - 1)
+        at = np.mod(at, 1)
+    return np.minimum((at * size).astype(np.int64), size - 1)
 
 
 def _grid() -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Paths of a scene in a USD stage, and attributes for what USD has no word for.
 
     /Scene                        Xform, the default prim: provenance and digest
-    /Scene/Materials/material_<m> one per material row: UsdPreviewSurface and OpenPBR
+    /Scene/Materials/material_<m> one per material row: UsdPreviewSurface, and OpenPBR or textures
     /Scene/Objects/<name>         one Mesh per object, with a GeomSubset per material
     /Scene/Cameras/camera_<c>     one per camera
     /Scene/Environment            a DomeLight, where there is an environment
@@ -38,13 +38,21 @@ OBJECT_TEXTS = {
 }
 """Attributes of a mesh: row of its object, rows of vertices and faces, fields of SceneObject."""
 
-ENVIRONMENT_TEXTS = {
+MAP_TEXTS = {
     "name": NAMESPACE + "name",
     "licence": NAMESPACE + "licence",
     "attribution": NAMESPACE + "attribution",
     "source_url": NAMESPACE + "sourceUrl",
 }
-"""Attributes of a dome: fields of MapSource."""
+"""Attributes of a dome and of a texture: fields of MapSource."""
+
+SKY_ROWS = tuple(f"{NAMESPACE}skyRotationRow{row}" for row in range(3))
+SKY_VISIBLE = NAMESPACE + "skyVisibleToCamera"
+"""Attributes of `/Scene` where there is an environment: its rotation in rows, and whether it is
+seen. Blender makes a world of a dome, which keeps no attribute of its prim."""
+
+TEXTURE_ROW = NAMESPACE + "textureRow"
+"""Attribute of a texture's shader: its row among the textures of the scene."""
 
 MATERIAL_ATTRIBUTES = {
     "diffuse": NAMESPACE + "diffuseAlbedo",

@@ -7,7 +7,6 @@ where anything differs, this reader returns None and the file is read as a forei
 """
 
 import json
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,41 +14,29 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import as_expected
-from pipeline.exchange.usd.dome import dome_as_written, dome_attributes
+from pipeline.exchange.usd.dome import dome_as_written, dome_attributes, sky_attributes
+from pipeline.exchange.usd.exact_layer import (
+    Changed,
+    children_of,
+    numbered,
+    require,
+    require_plain,
+    vectors,
+    whole_numbers,
+)
+from pipeline.exchange.usd.read_our_materials import materials_as_written
 from pipeline.exchange.usd.stage import OpenedUsd
 from pipeline.exchange.usd.write import ENVIRONMENT, camera_attributes
-from pipeline.exchange.usd.write_materials import OPENPBR, PREVIEW, material_tables
 from pipeline.exchange.usd.write_meshes import MESH, SUBSET, object_attributes
+from pipeline.exchange.usd.write_textures import ST
 from storage.conventions import require_readable
 from storage.errors import TrilightError
 from storage.records.environment import Environment
-from storage.records.material import (
-    PUBLISHED_COLUMNS,
-    UndeclaredColumn,
-    declared_column,
-    default_rows,
-    laid_out,
-)
+from storage.records.material import UndeclaredColumn
 from storage.records.scene import OBJECT_KINDS, Scene, SceneObject
 from storage.records.scene_file import scene_digest, scene_provenance
 
-_PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
-"""What may stand on a prim without changing what it shows."""
 _ARRAYS = {"points", "normals", "extent", "faceVertexCounts", "faceVertexIndices"}
-
-_OUTPUTS: Mapping[str, Mapping[str, str | None]] = {
-    "": {
-        "outputs:surface": f"{PREVIEW}.outputs:surface",
-        "outputs:mtlx:surface": f"{OPENPBR}.outputs:out",
-    },
-    f"/{PREVIEW}": {"outputs:surface": None},
-    f"/{OPENPBR}": {"outputs:out": None},
-}
-"""Outputs of the prims of a material, and what each is connected to."""
-
-
-class _Changed(Exception):
-    """The layer is not as export wrote it."""
 
 
 def scene_keys(layer: Any) -> list[str] | None:
@@ -75,7 +62,7 @@ def read_exact(layer: Any, key: str | None = None, opened: OpenedUsd | None = No
     Args:
         layer: of one scene, or of a shard.
         key: which of a shard.
-        opened: the way to the file of an environment; without it, a scene that has one is not read.
+        opened: the way to files of maps; without it, a scene that has any is not read.
 
     Raises:
         TrilightError: it was written by a Trilight that this one cannot read, has a material column
@@ -90,7 +77,7 @@ def read_exact(layer: Any, key: str | None = None, opened: OpenedUsd | None = No
         scene = _scene(root, opened)
     except UndeclaredColumn as error:
         raise TrilightError(f"{name}: {error}") from error
-    except (_Changed, LookupError, TypeError, ValueError, AttributeError):
+    except (Changed, LookupError, TypeError, ValueError, AttributeError):
         return None
     if scene_digest(scene) != root.attributes[names.DIGEST].default:
         return None
@@ -113,37 +100,41 @@ def _root_of(layer: Any, key: str | None) -> Any:
 def _scene(root: Any, opened: OpenedUsd | None) -> Scene:
     sky = _environment(root, opened)
     names_of = {"Materials", "Objects", "Cameras"}
-    folders = _children(root, names_of if sky is None else {*names_of, ENVIRONMENT})
+    folders = children_of(root, names_of if sky is None else {*names_of, ENVIRONMENT})
     for folder in folders:
         if folder.name != ENVIRONMENT:
-            _plain(folder, set())
-    materials = _materials(folders["Materials"])
+            require_plain(folder, set())
+    materials = materials_as_written(folders["Materials"], opened)
     prims = sorted(folders["Objects"].nameChildren, key=lambda p: p.attributes[names.INDEX].default)
     objects = tuple(_object(prim) for prim in prims)
     meshes = [prim for prim in prims if prim.typeName == "Mesh"]
-    vertices, normals = _vertices(root, meshes)
-    faces, material_index, object_index = _faces(meshes, len(materials))
+    vertices, normals = _vertices(root, meshes, sky)
+    faces, material_index, object_index = _faces(meshes, len(materials.rows))
     c2w, fov_deg = _cameras(folders["Cameras"])
     scene = Scene(
         vertex_positions=vertices,
         vertex_normals=normals,
         faces=faces,
         material_index=material_index,
-        materials=materials,
+        materials=materials.rows,
         object_index=object_index,
         c2w=c2w,
         fov_deg=fov_deg,
         objects=objects,
         provenance=scene_provenance(json.loads(root.attributes[names.PROVENANCE].default)),
+        uv=_coordinates(meshes, len(faces)) if materials.textures else None,
+        textures=materials.textures,
+        material_textures=materials.material_textures,
         environment=sky,
     )
     for row, prim in enumerate(prims):
-        _require(as_expected(prim, object_attributes(scene, row)))
+        require(as_expected(prim, object_attributes(scene, row)))
         expected = {*object_attributes(scene, row)}
         if prim.typeName == "Mesh":
             expected |= {*MESH, *_ARRAYS, names.VERTEX_ROWS, names.FACE_ROWS, "material:binding"}
-            _require(as_expected(prim, MESH))
-        _plain(prim, expected)
+            expected |= {ST} if scene.textures else set()
+            require(as_expected(prim, MESH))
+        require_plain(prim, expected)
     return scene
 
 
@@ -151,63 +142,38 @@ def _environment(root: Any, opened: OpenedUsd | None) -> Environment | None:
     prim = root.nameChildren.get(ENVIRONMENT)
     if prim is None:
         return None
-    _require(opened is not None and prim.typeName == "DomeLight")
+    require(opened is not None and prim.typeName == "DomeLight")
     assert opened is not None
     sky = dome_as_written(prim, root.layer, opened)
-    _require(as_expected(prim, dome_attributes(sky)))
-    _plain(prim, set(dome_attributes(sky)))
+    require(as_expected(prim, dome_attributes(sky)))
+    require_plain(prim, set(dome_attributes(sky)))
     return sky
-
-
-def _materials(folder: Any) -> NDArray[np.float32]:
-    prims = _numbered(folder, names.material_name)
-    rows = default_rows(len(prims))
-    columns = _columns(prims[0])
-    for row, prim in enumerate(prims):
-        for column, part in laid_out():
-            if column.name in columns:
-                rows[row, part] = prim.attributes[names.column_attribute(column.name)].default
-        _children(prim, {PREVIEW, OPENPBR})
-        for place, table in material_tables(rows[row], columns).items():
-            part = prim.nameChildren[place.removeprefix("/")] if place else prim
-            _require(as_expected(part, table))
-            outputs = _OUTPUTS[place]
-            _plain(part, {*table, *outputs})
-            for output, source in outputs.items():
-                found = [str(p) for p in part.attributes[output].connectionPathList.explicitItems]
-                own = prim.path.StripAllVariantSelections()
-                _require(found == ([] if source is None else [f"{own}/{source}"]))
-    return rows
-
-
-def _columns(prim: Any) -> tuple[str, ...]:
-    """Return the columns that a material has; raises UndeclaredColumn."""
-    found = (names.added_column(attribute.name) for attribute in prim.attributes)
-    added = [name for name in found if name is not None]
-    return (*PUBLISHED_COLUMNS, *(declared_column(name).name for name in added))
 
 
 def _object(prim: Any) -> SceneObject:
     texts = {field: prim.attributes[name].default for field, name in names.OBJECT_TEXTS.items()}
-    _require(texts["kind"] in OBJECT_KINDS)
+    require(texts["kind"] in OBJECT_KINDS)
     return SceneObject(**texts)
 
 
-def _vertices(root: Any, meshes: list[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _vertices(
+    root: Any, meshes: list[Any], sky: Environment | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return positions and normals [V, 3] from the rows that meshes and root say are theirs."""
     own = {names.VERSION, names.DIGEST, names.PROVENANCE}
     own |= {names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS}
-    _plain(root, own)
+    require_plain(root, own | set(sky_attributes(sky)))
+    require(as_expected(root, sky_attributes(sky)))
     kinds = [(root, names.UNUSED_ROWS, names.UNUSED_POSITIONS, names.UNUSED_NORMALS)]
     kinds += [(mesh, names.VERTEX_ROWS, "points", "normals") for mesh in meshes]
-    rows = np.concatenate([_whole(prim, name) for prim, name, _, _ in kinds])
-    _require(len(rows) > 0 and rows.min() >= 0)
+    rows = np.concatenate([whole_numbers(prim, name) for prim, name, _, _ in kinds])
+    require(len(rows) > 0 and rows.min() >= 0)
     count = int(rows.max()) + 1
-    _require(count <= len(rows) and len(np.unique(rows)) == count)
+    require(count <= len(rows) and len(np.unique(rows)) == count)
     arrays = []
     for column in (2, 3):
         values = np.zeros((count, 3), np.float32)
-        values[rows] = np.concatenate([_vectors(kind[0], kind[column]) for kind in kinds])
+        values[rows] = np.concatenate([vectors(kind[0], kind[column]) for kind in kinds])
         arrays.append(values)
     return arrays[0], arrays[1]
 
@@ -215,26 +181,38 @@ def _vertices(root: Any, meshes: list[Any]) -> tuple[NDArray[np.float32], NDArra
 def _faces(
     meshes: list[Any], num_materials: int
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint16], NDArray[np.uint16]]:
-    rows = np.concatenate([_whole(mesh, names.FACE_ROWS) for mesh in meshes])
+    rows = np.concatenate([whole_numbers(mesh, names.FACE_ROWS) for mesh in meshes])
     count = len(rows)
-    _require(np.array_equal(np.sort(rows), np.arange(count)))
+    require(np.array_equal(np.sort(rows), np.arange(count)))
     faces = np.zeros((count, 3), np.uint32)
     material_index, object_index = np.zeros(count, np.uint16), np.zeros(count, np.uint16)
     for mesh in meshes:
-        own, vertices = _whole(mesh, names.FACE_ROWS), _whole(mesh, names.VERTEX_ROWS)
-        _require(np.array_equal(_whole(mesh, "faceVertexCounts"), np.full(len(own), 3)))
-        faces[own] = vertices[_whole(mesh, "faceVertexIndices").reshape(-1, 3)]
+        own, vertices = whole_numbers(mesh, names.FACE_ROWS), whole_numbers(mesh, names.VERTEX_ROWS)
+        require(np.array_equal(whole_numbers(mesh, "faceVertexCounts"), np.full(len(own), 3)))
+        faces[own] = vertices[whole_numbers(mesh, "faceVertexIndices").reshape(-1, 3)]
         object_index[own] = mesh.attributes[names.INDEX].default
         index = np.full(len(own), -1)
         for subset in mesh.nameChildren:
-            _require(as_expected(subset, SUBSET))
-            _plain(subset, {*SUBSET, "indices", "material:binding"})
+            require(as_expected(subset, SUBSET))
+            require_plain(subset, {*SUBSET, "indices", "material:binding"})
             material = _bound(subset)
-            _require(material < num_materials)
-            index[_whole(subset, "indices")] = material
-        _require(len(index) > 0 and index.min() >= 0 and _bound(mesh) == index.min())
+            require(material < num_materials)
+            index[whole_numbers(subset, "indices")] = material
+        require(len(index) > 0 and index.min() >= 0 and _bound(mesh) == index.min())
         material_index[own] = index
     return faces, material_index, object_index
+
+
+def _coordinates(meshes: list[Any], count: int) -> NDArray[np.float32]:
+    """Return the texture coordinates [3T, 2] of all corners."""
+    uv = np.zeros((count, 3, 2), np.float32)
+    for mesh in meshes:
+        attribute = mesh.attributes[ST]
+        require(attribute.GetInfo("interpolation") == "faceVarying")
+        require(attribute.typeName == "texCoord2f[]" and not attribute.HasInfo("timeSamples"))
+        own = np.array(attribute.default, np.float32)
+        uv[whole_numbers(mesh, names.FACE_ROWS)] = own.reshape(-1, 3, 2)
+    return uv.reshape(-1, 2)
 
 
 def _bound(prim: Any) -> int:
@@ -242,53 +220,17 @@ def _bound(prim: Any) -> int:
     (target,) = prim.relationships["material:binding"].targetPathList.explicitItems
     own = str(prim.path.StripAllVariantSelections()).partition("/Objects/")[0]
     row = int(target.name.rpartition("_")[2])
-    _require(str(target) == f"{own}/Materials/{names.material_name(row)}")
+    require(str(target) == f"{own}/Materials/{names.material_name(row)}")
     return row
 
 
 def _cameras(folder: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    prims = _numbered(folder, names.camera_name)
+    prims = numbered(folder, names.camera_name)
     c2w, fov_deg = np.zeros((len(prims), 4, 4), np.float32), np.zeros(len(prims), np.float32)
     for row, prim in enumerate(prims):
         c2w[row] = np.array(prim.attributes["xformOp:transform"].default).T
         fov_deg[row] = prim.attributes[names.FOV_DEG].default
         expected = camera_attributes(c2w[row], float(fov_deg[row]))
-        _require(as_expected(prim, expected))
-        _plain(prim, set(expected))
+        require(as_expected(prim, expected))
+        require_plain(prim, set(expected))
     return c2w, fov_deg
-
-
-def _numbered(folder: Any, name: Callable[[int], str]) -> list[Any]:
-    """Return the children of a folder by their rows; asking it for each by name is quadratic."""
-    prims = {prim.name: prim for prim in folder.nameChildren}
-    return [prims[name(row)] for row in range(len(prims))]
-
-
-def _children(prim: Any, expected: set[str]) -> Any:
-    _require(set(prim.nameChildren.keys()) == expected)
-    return prim.nameChildren
-
-
-def _plain(prim: Any, properties: set[str]) -> None:
-    """Require that a prim has exactly these properties, and nothing that composes or hides."""
-    _require(set(prim.properties.keys()) == properties)
-    _require(set(prim.ListInfoKeys()) <= _PLAIN_INFO)
-
-
-def _whole(prim: Any, name: str) -> NDArray[np.int64]:
-    attribute = prim.attributes[name]
-    values = np.array(attribute.default, np.int64)
-    _require(values.ndim == 1 and not attribute.HasInfo("timeSamples"))
-    return values
-
-
-def _vectors(prim: Any, name: str) -> NDArray[np.float32]:
-    attribute = prim.attributes[name]
-    values = np.array(attribute.default, np.float32).reshape(-1, 3)
-    _require(not attribute.HasInfo("timeSamples"))
-    return values
-
-
-def _require(law: Any) -> None:
-    if not law:
-        raise _Changed

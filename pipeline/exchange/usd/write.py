@@ -1,7 +1,7 @@
 """`Scene` to USD: `.usda`, `.usdc` or `.usdz`, one scene or the scenes of a whole shard.
 
-Z up, metres, a default prim; an environment map is a file beside it, or in the archive. Equal
-scenes give equal bytes.
+Z up, metres, a default prim; textures and an environment map are files beside it, or in the
+archive. Equal scenes give equal bytes.
 `pipeline.exchange.usd.names` lists the paths; `pipeline.exchange.usd.read_ours` reads it back. A
 camera has a pose and a lens, in tenths of a metre, on a square film of 36 mm. A `.usdz` file is a
 zip archive of plainly stored members that begin at multiples of 64 bytes.
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
-from pipeline.exchange.usd.dome import add_dome
+from pipeline.exchange.usd.dome import add_dome, sky_attributes
 from pipeline.exchange.usd.names import (
     DIGEST,
     FOV_DEG,
@@ -36,10 +36,12 @@ from pipeline.exchange.usd.names import (
 )
 from pipeline.exchange.usd.write_materials import add_materials
 from pipeline.exchange.usd.write_meshes import add_objects
+from pipeline.exchange.usd.write_textures import texture_files
 from storage.atomic import write_atomically
 from storage.conventions import SCHEMA_VERSION
 from storage.digests import canonical_json
 from storage.errors import TrilightError
+from storage.records.retextured import without_constant_textures
 from storage.records.scene import ARRAY_FIELDS, Scene
 from storage.records.scene_file import scene_digest
 
@@ -49,7 +51,8 @@ ENVIRONMENT = "Environment"
 """Name of the prim of an environment."""
 
 CARRIED = frozenset(
-    {*ARRAY_FIELDS, "provenance", "environment"} | {f"objects.{field}" for field in OBJECT_TEXTS}
+    {*ARRAY_FIELDS, "provenance", "textures", "environment"}
+    | {f"objects.{field}" for field in OBJECT_TEXTS}
 )
 """Members of a scene that the file holds (pipeline.exchange.formats)."""
 
@@ -100,6 +103,7 @@ def root_attributes(scene: Scene) -> Attributes:
         UNUSED_ROWS: ("int[]", rows.astype(np.int32)),
         UNUSED_POSITIONS: ("point3f[]", scene.vertex_positions[rows]),
         UNUSED_NORMALS: ("normal3f[]", scene.vertex_normals[rows]),
+        **sky_attributes(scene.environment),
     }
 
 
@@ -108,22 +112,27 @@ def _add_scene(layer: Any, path: str, scene: Scene) -> dict[str, bytes]:
     from pxr import Sdf
 
     scene.check()
+    scene = without_constant_textures(scene)
     for entry in scene.objects:
         _require_text(entry.name, entry.uid, entry.licence, entry.attribution, entry.source_url)
+    for texture in scene.textures:
+        source = texture.source
+        _require_text(source.name, source.licence, source.attribution, source.source_url)
     with Sdf.ChangeBlock():
         add_attributes(add_prim(layer, path, "Xform"), root_attributes(scene))
-        add_materials(layer, f"{path}/Materials", scene.materials)
+        add_materials(layer, f"{path}/Materials", scene)
         add_objects(layer, f"{path}/Objects", scene, f"{path}/Materials")
         add_cameras(layer, f"{path}/Cameras", scene)
+        files = texture_files(scene)
         if scene.environment is None:
-            return {}
-        return add_dome(layer, f"{path}/{ENVIRONMENT}", scene.environment)
+            return files
+        return files | add_dome(layer, f"{path}/{ENVIRONMENT}", scene.environment)
 
 
 def _require_text(*texts: str) -> None:
     for text in texts:
         if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-            raise TrilightError(f"objects: {text!r:.80} has a character that USD cannot store.")
+            raise TrilightError(f"names: {text!r:.80} has a character that USD cannot store.")
 
 
 def _new_layer(path: Path, root: str) -> Any:

@@ -4,7 +4,8 @@ Our BRDF is Lambert + specular x GGX without a Fresnel term. UsdPreviewSurface i
 workflow takes the same albedos and roughness, but lets its specular albedo rise to 1 at grazing
 angles. OpenPBR's base has one index of refraction: it is chosen so that the strongest channel
 reflects our specular albedo head-on, and the tint gives the others. So both look alike and neither
-is equal; the exact values are in the attributes, which our Blender script reads.
+is equal; the exact values are in the attributes, which our Blender script reads. Textures are
+connected to the preview (pipeline.exchange.usd.write_textures).
 
 OpenPBR counts emission in nits and UsdPreviewSurface as a plain colour: both get our radiance.
 """
@@ -19,13 +20,21 @@ from numpy.typing import NDArray
 from pipeline.exchange.usd.authoring import (
     Attributes,
     add_attributes,
-    add_output,
+    add_link,
     add_prim,
     usd_value,
 )
 from pipeline.exchange.usd.names import (
     column_attribute,
     material_name,
+)
+from pipeline.exchange.usd.write_textures import (
+    OPENPBR,
+    PREVIEW,
+    Used,
+    material_links,
+    texture_tables,
+    used_textures,
 )
 from storage.records.material import (
     DIFFUSE,
@@ -35,28 +44,30 @@ from storage.records.material import (
     laid_out,
     stored_columns,
 )
+from storage.records.scene import Scene
 
-PREVIEW, OPENPBR = "Preview", "OpenPBR"
-"""Names of the two shaders of a material."""
+Colour = tuple[float, float, float]
 
 _MOST_REFLECTING = 0.98
 """Head-on reflectance beyond which no index of refraction is sought: 0.98 needs 199."""
 
 
-def add_materials(layer: Any, folder: str, materials: NDArray[np.float32]) -> None:
+def add_materials(layer: Any, folder: str, scene: Scene) -> None:
     """Write a prim for each material row below `folder`.
 
-    Copies of the first prim get their values: that takes half the time of writing each anew.
+    Copies of the first prim without textures get their values: that takes half the time of writing
+    each anew.
     """
     from pxr import Sdf
 
     add_prim(layer, folder, "Scope")
-    first = f"{folder}/{material_name(0)}"
-    names = stored_columns(materials)
-    for row, values in enumerate(materials):
-        path = f"{folder}/{material_name(row)}"
-        if row == 0:
-            _add_material(layer, path, material_tables(values, names))
+    first = None
+    names = stored_columns(scene.materials)
+    for row, values in enumerate(scene.materials):
+        path, used = f"{folder}/{material_name(row)}", used_textures(scene, row)
+        if used or first is None:
+            _add_material(layer, path, material_tables(values, names, used), list(used))
+            first = first if used else path
             continue
         Sdf.CopySpec(layer, first, layer, path)
         for place, attributes in material_tables(values, names).items():
@@ -66,18 +77,19 @@ def add_materials(layer: Any, folder: str, materials: NDArray[np.float32]) -> No
                     prim.attributes[name].default = usd_value(kind, value)
 
 
-def material_tables(values: NDArray[np.float32], columns: Sequence[str]) -> dict[str, Attributes]:
+def material_tables(
+    values: NDArray[np.float32], columns: Sequence[str], used: Used | None = None
+) -> dict[str, Attributes]:
     """Return the attributes of the prims of a material row, by their place below it.
 
     Args:
         values: the row, with all declared columns.
         columns: names of those that the file holds (storage.records.material.stored_columns).
+        used: its textures; none by default.
     """
     diffuse, specular, emission = (_rgb(values[part]) for part in (DIFFUSE, SPECULAR, EMISSION))
     roughness = float(values[ROUGHNESS])
-    head_on, luminance = max(specular), max(emission)
-    root = math.sqrt(min(head_on, _MOST_REFLECTING))
-    return {
+    tables: dict[str, Attributes] = {
         "": _exact(values, columns),
         f"/{PREVIEW}": {
             "info:id": ("uniform token", "UsdPreviewSurface"),
@@ -87,18 +99,26 @@ def material_tables(values: NDArray[np.float32], columns: Sequence[str]) -> dict
             "inputs:roughness": ("float", roughness),
             "inputs:emissiveColor": ("color3f", emission),
         },
-        f"/{OPENPBR}": {
-            "info:id": ("uniform token", "ND_open_pbr_surface_surfaceshader"),
-            "inputs:base_color": ("color3f", diffuse),
-            "inputs:base_weight": ("float", 1.0),
-            "inputs:base_diffuse_roughness": ("float", 0.0),
-            "inputs:specular_weight": ("float", 1.0 if head_on > 0 else 0.0),
-            "inputs:specular_color": ("color3f", _share(specular, head_on)),
-            "inputs:specular_roughness": ("float", roughness),
-            "inputs:specular_ior": ("float", _single((1 + root) / (1 - root))),
-            "inputs:emission_luminance": ("float", luminance),
-            "inputs:emission_color": ("color3f", _share(emission, luminance)),
-        },
+    }
+    if used:
+        return {**tables, **texture_tables(used)}
+    return {**tables, f"/{OPENPBR}": _openpbr(diffuse, specular, roughness, emission)}
+
+
+def _openpbr(diffuse: Colour, specular: Colour, roughness: float, emission: Colour) -> Attributes:
+    head_on, luminance = max(specular), max(emission)
+    root = math.sqrt(min(head_on, _MOST_REFLECTING))
+    return {
+        "info:id": ("uniform token", "ND_open_pbr_surface_surfaceshader"),
+        "inputs:base_color": ("color3f", diffuse),
+        "inputs:base_weight": ("float", 1.0),
+        "inputs:base_diffuse_roughness": ("float", 0.0),
+        "inputs:specular_weight": ("float", 1.0 if head_on > 0 else 0.0),
+        "inputs:specular_color": ("color3f", _share(specular, head_on)),
+        "inputs:specular_roughness": ("float", roughness),
+        "inputs:specular_ior": ("float", _single((1 + root) / (1 - root))),
+        "inputs:emission_luminance": ("float", luminance),
+        "inputs:emission_color": ("color3f", _share(emission, luminance)),
     }
 
 
@@ -116,23 +136,23 @@ def _exact(values: NDArray[np.float32], columns: Sequence[str]) -> Attributes:
     return found
 
 
-def _add_material(layer: Any, path: str, tables: Mapping[str, Attributes]) -> None:
+def _add_material(
+    layer: Any, path: str, tables: Mapping[str, Attributes], textured: Sequence[str]
+) -> None:
+    links = material_links(textured)
     for place, attributes in tables.items():
         prim = add_prim(layer, path + place, "Shader" if place else "Material")
         add_attributes(prim, attributes)
-        if place:
-            add_output(prim, "outputs:surface" if place == f"/{PREVIEW}" else "outputs:out")
-        else:
-            add_output(prim, "outputs:surface", f"{path}/{PREVIEW}.outputs:surface")
-            add_output(prim, "outputs:mtlx:surface", f"{path}/{OPENPBR}.outputs:out")
+        for name, (kind, source) in links[place].items():
+            add_link(prim, name, kind, None if source is None else f"{path}/{source}")
 
 
-def _rgb(values: NDArray[np.float32]) -> tuple[float, float, float]:
+def _rgb(values: NDArray[np.float32]) -> Colour:
     red, green, blue = (float(value) for value in values)
     return red, green, blue
 
 
-def _share(rgb: tuple[float, float, float], largest: float) -> tuple[float, float, float]:
+def _share(rgb: Colour, largest: float) -> Colour:
     """Return a colour divided by its largest channel; white for black."""
     if largest <= 0:
         return 1.0, 1.0, 1.0

@@ -23,6 +23,7 @@ from pipeline.exchange.usd.names import (
     VISIBLE_TO_CAMERA,
     material_name,
 )
+from pipeline.exchange.usd.write_textures import ST
 from storage.records.scene import Scene
 
 BINDING = "material:binding"
@@ -122,3 +123,7 @@ def _add_arrays(prim: Any, scene: Scene, faces: NDArray[np.intp]) -> None:
         },
     )
     prim.attributes["normals"].SetInfo("interpolation", "vertex")
+    if scene.uv is not None:
+        own = np.ascontiguousarray(scene.uv.reshape(-1, 3, 2)[faces].reshape(-1, 2))
+        add_attributes(prim, {ST: ("texCoord2f[]", own)})
+        prim.attributes[ST].SetInfo("interpolation", "faceVarying")

@@ -13,6 +13,7 @@ from pipeline.exchange.renderformer_json import described_files
 from pipeline.exchange.scene_files import build_scene
 from pipeline.exchange.usd.read import read_usd
 from pipeline.exchange.usd.write import write_usd
+from storage.records.lookup import textured_rows
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
@@ -75,6 +76,20 @@ def assert_h5_keeps_light(back: Scene, scene: Scene) -> None:
     assert np.array_equal(found[:, EMISSION], want[:, EMISSION])
     assert np.array_equal(back.c2w, scene.c2w)
     assert np.array_equal(back.fov_deg, scene.fov_deg)
+
+
+def row_at(scene: Scene, x: float, y: float) -> np.ndarray:
+    """Return the material row at a place of a flat scene, found by its barycentric coordinates."""
+    corners = scene.vertex_positions[scene.faces][:, :, :2].astype(np.float64)
+    for triangle, (a, b, c) in enumerate(corners):
+        one, two = np.linalg.solve(np.stack([b - a, c - a], axis=1), np.array([x, y]) - a)
+        if one >= -1e-9 and two >= -1e-9 and one + two <= 1 + 1e-9:
+            weights = np.array([1 - one - two, one, two])
+            uv = np.zeros(2) if scene.uv is None else weights @ scene.uv.reshape(-1, 3, 2)[triangle]
+            return np.asarray(
+                textured_rows(scene, scene.material_index[[triangle]], uv[None].astype(np.float64))
+            )[0]
+    raise AssertionError((x, y))
 
 
 def _sorted_rows(scene: Scene) -> NDArray[np.float32]:

@@ -163,14 +163,15 @@ def test_what_other_tools_write_is_carried_over_or_named(tmp_path: Path) -> None
     assert read.lost == (
         "array or group 'depth'",
         "attribute 'export_metadata'",
-        "textures that vary, of 1 triangles: their mean was taken",
         "normal textures of 1 triangles",
         "alpha of pictures: they stand before black",
         "lengths of 3 normals that were not 1",
         "what emitters reflect: ours reflect nothing",
     )
     scene = read.scene
-    assert scene.materials[scene.material_index[0], 0] == pytest.approx(0.501, abs=1e-6)
+    # one of 559 cells is brighter: a texture, whose mean is that of its 8 bits
+    assert scene.textures
+    assert scene.materials[scene.material_index[0], 0] == pytest.approx(0.501, abs=0.005)
     assert np.array_equal(scene.vertex_normals[scene.faces[0]], [[0, 0, 1]] * 3)
     (light,) = scene.material_index[scene.triangle_emits]
     assert scene.materials[light].tolist() == [0, 0, 0, 0, 0, 0, 1, 100, 100, 100]

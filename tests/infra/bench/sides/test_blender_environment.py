@@ -53,7 +53,8 @@ def test_only_what_runs_in_blender_imports_it() -> None:
         for path in (ROOT / package).rglob("*.py")
         if "bpy" in _imports(path)
     }
-    scripts = {"infra/bench/sides/blender_process.py", "infra/blender/exact_materials.py"}
+    sides = {f"infra/bench/sides/{name}_process.py" for name in ("blender", "usd")}
+    scripts = {*sides, "infra/blender/exact_materials.py"}
     assert importing == scripts
     ours = {"infra", "pipeline", "storage", "scene_templates", "model", "train"}
     assert not any(_imports(ROOT / script) & ours for script in scripts)

@@ -1,0 +1,115 @@
+"""The textures of a RenderFormer file: their means, and the cells of those that vary."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.renderformer_cells import CELLS, MAX_VARYING, atlas_of, filled_cells
+from pipeline.exchange.safe_h5 import iterate_blocks, plain_array, require_finite
+from storage.records.material import REFLECTING
+from storage.records.retextured import with_textures, without_constant_textures
+from storage.records.scene import Scene
+from storage.records.texture import CONSTANT, TEXTURED, MapSource
+
+MAX_TRIANGLES = 1_000_000
+
+CHANNELS = 13
+"""A texture has CHANNELS channels of CELLS x CELLS cells."""
+TEXTURE_EMISSION = slice(10, 13)
+TEXTURE_NORMAL = slice(7, 10)
+"""Channels of a texture row; those before them are REFLECTING (storage.records.material)."""
+FLAT_NORMAL = (0.5, 0.5, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StoredTextures:
+    """What the textures of all triangles say."""
+
+    rows: NDArray[np.float32]
+    """[T, 13] their means."""
+    varies: NDArray[np.bool_]
+    """[T] whether a texture is more than its mean."""
+    cells: NDArray[np.float32] | None
+    """[N, 7, 32, 32] what those reflect, cell by cell; None where none varies."""
+
+
+def stored_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
+    """Return the textures of an open file.
+
+    Args:
+        file: its root group.
+        count: of its triangles.
+        lost: receives what cannot be carried over.
+
+    Raises:
+        TrilightError: as `plain_array` and `iterate_blocks`, or a value is not finite.
+    """
+    rows, varies = _texture_rows(file, count, lost)
+    cells = _varying_cells(file, count, varies) if varies.any() else None
+    return StoredTextures(rows=rows, varies=varies, cells=cells)
+
+
+def with_cells(scene: Scene, stored: StoredTextures, licence: str) -> Scene:
+    """Return a scene with the textures that cells are; its varying triangles share a material."""
+    varies = stored.varies
+    if stored.cells is None:
+        return scene
+    atlas = atlas_of(stored.cells, MapSource(name="cells of triangles", licence=licence))
+    uv = np.zeros((scene.num_triangles, 3, 2), np.float32)
+    uv[varies] = atlas.uv
+    index = np.full((len(scene.materials), len(TEXTURED)), CONSTANT, np.int32)
+    distinct = dict.fromkeys(texture.sha256 for texture in atlas.textures)
+    order = list(distinct)
+    index[np.unique(scene.material_index[varies])] = [
+        order.index(texture.sha256) for texture in atlas.textures
+    ]
+    kept = tuple(next(t for t in atlas.textures if t.sha256 == key) for key in order)
+    return without_constant_textures(with_textures(scene, uv.reshape(-1, 2), kept, index))
+
+
+def _texture_rows(
+    file: Any, count: int, lost: list[str]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the mean [T, 13] of each texture, and whether it is to be read cell by cell.
+
+    One block of cells is held at a time.
+    """
+    texture = plain_array(file, "texture", (count, CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
+    filled = filled_cells()
+    low = np.full((count, CHANNELS), np.inf, np.float32)
+    high, total = -low, np.zeros((count, CHANNELS))
+    for where, block in iterate_blocks(texture):
+        rows, cells = where[:2], filled[where[2:]]
+        if cells.any():
+            require_finite(texture, block[:, :, cells])
+            values = block[:, :, cells].astype(np.float32)
+            low[rows] = np.minimum(low[rows], values.min(axis=2))
+            high[rows] = np.maximum(high[rows], values.max(axis=2))
+            total[rows] += values.sum(axis=2, dtype=np.float64)
+    emits = (total[:, TEXTURE_EMISSION] > 0).any(axis=1)
+    differs = low != high
+    varies = differs[:, REFLECTING].any(axis=1) & ~emits
+    glows = differs[:, TEXTURE_EMISSION].any(axis=1)
+    if varies.sum() > MAX_VARYING:
+        lost.append(f"textures that vary, of {varies.sum()} triangles: their mean was taken")
+        varies[:] = False
+    if glows.any():
+        lost.append(f"emission that varies, of {glows.sum()} triangles: its mean was taken")
+    bumpy = (low[:, TEXTURE_NORMAL] != np.array(FLAT_NORMAL, np.float32)).any(axis=1)
+    if bumpy.any():
+        lost.append(f"normal textures of {bumpy.sum()} triangles")
+    mean = (total / filled.sum()).astype(np.float32)
+    return np.where(differs, mean, low), varies
+
+
+def _varying_cells(file: Any, count: int, varies: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return the cells [N, 7, 32, 32] of what triangles reflect whose textures vary."""
+    texture = plain_array(file, "texture", (count, CHANNELS, CELLS, CELLS), MAX_TRIANGLES)
+    cells = np.zeros((int(varies.sum()), CHANNELS, CELLS, CELLS), np.float32)
+    rank = np.cumsum(varies) - 1
+    for where, block in iterate_blocks(texture):
+        chosen = np.flatnonzero(varies[where[0]])
+        cells[rank[where[0]][chosen], where[1], where[2], where[3]] = block[chosen]
+    return cells[:, REFLECTING]

@@ -1,0 +1,104 @@
+"""What of a file of RenderFormer's successor can be read: lights and environment.
+
+Its `texture` holds [T, 16, 32, 32] cells, or what an image encoder made of them. Nine of the 16
+channels are the code of a learned network for a BRDF, which no formula turns back into albedos, and
+the rest of what can be read is told by `light_strength` [T, 3] and `env_map`. So surfaces are grey,
+and a note says exactly that.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.renderformer_stored import (
+    CHANNELS,
+    FLAT_NORMAL,
+    MAX_TRIANGLES,
+    TEXTURE_EMISSION,
+    TEXTURE_NORMAL,
+    StoredTextures,
+)
+from pipeline.exchange.safe_h5 import names_in, plain_array, read_whole
+from storage.errors import TrilightError
+from storage.records.environment import Environment
+from storage.records.exr import MAX_RESOLUTION
+from storage.records.material import DIFFUSE, REFLECTING, ROUGHNESS
+from storage.records.texture import MapSource
+
+KNOWN = ("env_map", "env_map_rotation", "env_map_strength", "light_strength")
+"""Arrays that are read here, besides those of the first version."""
+
+_GREY = 0.5
+
+
+def is_second_version(file: Any) -> bool:
+    """Return whether an open file is of the successor: its lights are apart."""
+    return "light_strength" in names_in(file)
+
+
+def grey_textures(file: Any, count: int, lost: list[str]) -> StoredTextures:
+    """Return grey surfaces with the lights of a file.
+
+    Args:
+        file: its root group.
+        count: of its triangles.
+        lost: receives what cannot be carried over.
+
+    Raises:
+        TrilightError: as `plain_array`, or a value is not finite.
+    """
+    light = read_whole(plain_array(file, "light_strength", (count, 3), MAX_TRIANGLES))
+    rows = np.zeros((count, CHANNELS), np.float32)
+    rows[:, DIFFUSE], rows[:, ROUGHNESS] = _GREY, 1
+    rows[light.any(axis=1), REFLECTING] = [1, 1, 1, 0, 0, 0, 1]  # as the first version says
+    rows[:, TEXTURE_NORMAL], rows[:, TEXTURE_EMISSION] = FLAT_NORMAL, light
+    lost.append(
+        f"materials: nine channels of a learned code for a BRDF, which no formula turns into "
+        f"albedos; a diffuse grey of {_GREY} was taken for all {count} triangles"
+    )
+    return StoredTextures(rows=rows, varies=np.zeros(count, np.bool_), cells=None)
+
+
+def sky_of(file: Any, licence: str, lost: list[str]) -> Environment | None:
+    """Return the environment of a file, which cameras do not see; None where it has none.
+
+    Its axes are ours: the middle is +X, a quarter from the left +Y, the top +Z.
+
+    Raises:
+        TrilightError: a map of another shape, or as `plain_array`.
+    """
+    if "env_map" not in names_in(file):
+        return None
+    values = read_whole(plain_array(file, "env_map", (None, None, None), MAX_RESOLUTION))
+    if 3 not in (values.shape[0], values.shape[2]):
+        raise TrilightError(
+            f"env_map has shape {values.shape}; expected (3, H, 2 H) or (H, 2 H, 3)."
+        )
+    is_processed = values.shape[0] == 3  # it is turned and scaled already
+    radiance = np.moveaxis(values, 0, -1) if is_processed else values
+    if not is_processed:
+        radiance = radiance * _number(file, "env_map_strength", 1.0)
+        if np.any(_numbers(file, "env_map_rotation")):
+            lost.append("rotation of the environment: three angles whose order it does not state")
+    if not radiance.any():
+        return None  # how it says that there is none
+    return Environment(
+        radiance_rgb=np.ascontiguousarray(radiance, np.float32),
+        source=MapSource(name="env_map", licence=licence),
+    )
+
+
+def _number(file: Any, name: str, default: float) -> np.float32:
+    found = _numbers(file, name)
+    return np.float32(found.ravel()[0]) if found.size == 1 else np.float32(default)
+
+
+def _numbers(file: Any, name: str) -> NDArray[np.float32]:
+    """Return a small array of a file; none where it has not got it."""
+    if name not in names_in(file):
+        return np.zeros(0, np.float32)
+    try:
+        return read_whole(plain_array(file, name, (), 1))
+    except TrilightError:
+        return read_whole(plain_array(file, name, (None,), 16))

@@ -1,0 +1,54 @@
+"""Looks at prims of a layer that Trilight may have written, and that may have been edited since.
+
+Each function gives what stands there, or raises `Changed`, LookupError, TypeError or ValueError
+where it is not as export writes it.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_PLAIN_INFO = {"specifier", "typeName", "apiSchemas", "documentation", "comment", "displayName"}
+"""What may stand on a prim without changing what it shows."""
+
+
+class Changed(Exception):
+    """The layer is not as export wrote it."""
+
+
+def numbered(folder: Any, name: Callable[[int], str]) -> list[Any]:
+    """Return the children of a folder by their rows; asking it for each by name is quadratic."""
+    prims = {prim.name: prim for prim in folder.nameChildren}
+    return [prims[name(row)] for row in range(len(prims))]
+
+
+def children_of(prim: Any, expected: set[str]) -> Any:
+    require(set(prim.nameChildren.keys()) == expected)
+    return prim.nameChildren
+
+
+def require_plain(prim: Any, properties: set[str]) -> None:
+    """Require that a prim has exactly these properties, and nothing that composes or hides."""
+    require(set(prim.properties.keys()) == properties)
+    require(set(prim.ListInfoKeys()) <= _PLAIN_INFO)
+
+
+def whole_numbers(prim: Any, name: str) -> NDArray[np.int64]:
+    attribute = prim.attributes[name]
+    values = np.array(attribute.default, np.int64)
+    require(values.ndim == 1 and not attribute.HasInfo("timeSamples"))
+    return values
+
+
+def vectors(prim: Any, name: str) -> NDArray[np.float32]:
+    attribute = prim.attributes[name]
+    values = np.array(attribute.default, np.float32).reshape(-1, 3)
+    require(not attribute.HasInfo("timeSamples"))
+    return values
+
+
+def require(law: Any) -> None:
+    if not law:
+        raise Changed

@@ -1,0 +1,81 @@
+"""A texture as a file beside a stage: the texels that the record holds, to the last bit.
+
+8-bit textures become PNG, float32 ones OpenEXR, of one channel or three. Files of pictures begin
+with their top row, textures of the record with their bottom one. Equal textures have one file.
+"""
+
+import io
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import TrilightError
+from storage.records.exr import MAX_RESOLUTION, decode_channels, encode_channels
+from storage.records.texture import MapSource, Texture
+
+_CHANNELS = {1: "Y", 3: "RGB"}
+"""What OpenEXR calls the channels of a number and of a colour."""
+
+
+def texture_file(texture: Texture) -> str:
+    """Return the name of the file of a texture."""
+    suffix = "png" if texture.texels.dtype == np.uint8 else "exr"
+    return f"texture-{texture.sha256[:16]}.{suffix}"
+
+
+def encoded_texture(texture: Texture) -> bytes:
+    """Return the file of a texture; no clock is in it.
+
+    Raises:
+        TrilightError: it is larger than textures that are read from USD.
+    """
+    from PIL import Image
+
+    height, width, channels = texture.texels.shape
+    if max(height, width) > MAX_RESOLUTION:
+        raise TrilightError(
+            f"texture: {width} x {height} texels; expected at most {MAX_RESOLUTION} each way in "
+            "USD. Write it as .safetensors, or make it smaller."
+        )
+    picture = np.ascontiguousarray(texture.texels[::-1])
+    if picture.dtype == np.float32:
+        values = picture if channels == 3 else picture[..., 0]
+        return encode_channels({_CHANNELS[channels]: np.ascontiguousarray(values)})
+    stream = io.BytesIO()
+    Image.fromarray(picture if channels == 3 else picture[..., 0]).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def decoded_texture(data: bytes, *, is_exr: bool, is_srgb: bool, source: MapSource) -> Texture:
+    """Return the texture of a file that `encoded_texture` made.
+
+    Raises:
+        LookupError: it is another file.
+    """
+    try:
+        texels: NDArray[Any] = _exr_texels(data) if is_exr else _png_texels(data)
+        texture = Texture(texels=np.ascontiguousarray(texels), is_srgb=is_srgb, source=source)
+        texture.check("texture")
+    except (TrilightError, OSError, SyntaxError, ValueError) as error:
+        raise LookupError(str(error)) from error
+    return texture
+
+
+def _exr_texels(data: bytes) -> NDArray[np.float32]:
+    from storage.records.exr import channel_names
+
+    name = "Y" if channel_names(data) == ["Y"] else "RGB"
+    pixels = decode_channels(data, name, lambda header: None)[name]
+    texels: NDArray[np.float32] = pixels.reshape(*pixels.shape[:2], -1)[::-1]
+    return texels
+
+
+def _png_texels(data: bytes) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        if max(image.size) > MAX_RESOLUTION or image.mode not in ("L", "RGB"):
+            raise ValueError(f"{image.size} in mode {image.mode}")
+        pixels: NDArray[np.uint8] = np.asarray(image, np.uint8)
+    return pixels.reshape(*pixels.shape[:2], -1)[::-1]

@@ -1,0 +1,231 @@
+"""glTF as a scene: places, colours at corners, the rule for Fresnel, and what is lost."""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.exchange.convert import convert_scene
+from pipeline.exchange.gltf.read import GltfScene, read_gltf
+from pipeline.exchange.open_scene import load_source, scene_source
+from storage.conventions import linear_from_srgb8
+from storage.errors import TrilightError
+from tests.pipeline.exchange.exchange_kit import row_at
+from tests.pipeline.exchange.gltf_kit import BLUE, GREEN, GREY, PICTURE, RED, UV, png, quad
+from tests.pipeline.exchange.gltf_kit import write_gltf as written
+
+F = 0.04 + 0.96 / 21
+"""What a dielectric of index 1.5 reflects: F0, and the mean of Schlick's rise to 1."""
+
+
+def read(folder: Path, **changes: Any) -> GltfScene:
+    return read_gltf(written(folder, quad(**changes)), "CC0-1.0")
+
+
+def diffuse_of(srgb: tuple[int, int, int]) -> np.ndarray:
+    return np.asarray(linear_from_srgb8()[list(srgb)] * (1 - F))
+
+
+CORNERS = {(-0.5, 0.5): RED, (0.5, 0.5): GREEN, (-0.5, -0.5): BLUE, (0.5, -0.5): GREY}
+"""Centres of the texels on the floor: where the picture's own top is +Y."""
+
+CODED = 0.005
+"""Half a step of 8 sRGB-encoded bits is at most 0.0045 in linear light."""
+
+
+def test_every_texel_lies_where_gltf_puts_it(tmp_path: Path) -> None:
+    """A mirrored u, a flipped v or a turned floor would exchange colours; sRGB is decoded."""
+    scene = read(tmp_path).scene
+    for (x, y), colour in CORNERS.items():
+        found = row_at(scene, x, y)
+        assert found[:3] == pytest.approx(diffuse_of(colour), abs=CODED), colour
+        assert found[3:7] == pytest.approx([F, F, F, 0.5], abs=1e-6)
+    assert scene.vertex_normals == pytest.approx(np.tile([0, 0, 1], (4, 1)), abs=1e-6)
+    assert scene.objects[0].attribution == "A. Maker"
+
+
+def test_a_glb_is_read_as_a_gltf(tmp_path: Path) -> None:
+    text = json.dumps(quad()).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON")
+    (tmp_path / "a.glb").write_bytes(head + text)
+    found = load_source(scene_source(str(tmp_path / "a.glb")))
+    for (x, y), colour in CORNERS.items():
+        assert row_at(found.scene, x, y)[:3] == pytest.approx(diffuse_of(colour), abs=CODED)
+    assert any("no light" in note for note in found.notes)
+
+
+def test_transforms_of_nodes_and_of_textures(tmp_path: Path) -> None:
+    """A quarter turn counter-clockwise of the coordinates turns the picture clockwise."""
+    moved = {"rotation": np.pi / 2, "offset": [0, 1]}
+    info = {"index": 0, "extensions": {"KHR_texture_transform": moved}}
+    surface = {"metallicFactor": 0, "baseColorTexture": info}
+    node = {"translation": [0, 0, -2], "scale": [2, 2, 2]}
+    scene = read(tmp_path, material={"pbrMetallicRoughness": surface}, node=node).scene
+    assert scene.vertex_positions.min(axis=0) == pytest.approx([-2, 0, 0], abs=1e-6)
+    turned = {(-1, 3): BLUE, (1, 3): RED, (1, 1): GREEN, (-1, 1): GREY}
+    for (x, y), colour in turned.items():
+        assert row_at(scene, x, y)[:3] == pytest.approx(diffuse_of(colour), abs=CODED), colour
+
+
+@pytest.mark.parametrize(
+    ("wrap", "colour"),
+    [(10497, RED), (33071, GREEN), (33648, GREEN)],
+    ids=["repeat", "clamp", "mirror"],
+)
+def test_coordinates_beyond_the_picture(tmp_path: Path, wrap: int, colour: Any) -> None:
+    """u from 0 to 2: at a right quarter of the floor, u is 1.25 (above the middle row)."""
+    wide = UV * np.array([2, 1], np.float32)
+    scene = read(tmp_path, uv=wide, sampler={"wrapS": wrap, "wrapT": wrap}).scene
+    assert row_at(scene, 0.25, 0.5)[:3] == pytest.approx(diffuse_of(colour), abs=CODED)
+    assert row_at(scene, -0.75, 0.5)[:3] == pytest.approx(diffuse_of(RED), abs=CODED)
+
+
+def test_metal_is_blue_and_roughness_green(tmp_path: Path) -> None:
+    mixed = np.array([[[9, 255, 0], [9, 51, 255]]], np.uint8)
+    surface = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
+    tree = {
+        "pictures": [png(PICTURE[:1]), png(mixed)],
+        "material": {"pbrMetallicRoughness": surface},
+    }
+    scene = read(tmp_path, **tree).scene
+    plain, metal = row_at(scene, -0.5, 0), row_at(scene, 0.5, 0)
+    assert plain[:3] == pytest.approx(diffuse_of(RED), abs=CODED) and plain[6] == 1
+    assert metal[:3] == pytest.approx([0, 0, 0], abs=CODED) and metal[6] == pytest.approx(0.2)
+    assert metal[3:6] == pytest.approx(np.array(GREEN) / 255 * 20 / 21 + 1 / 21, abs=CODED)
+
+
+def test_the_specular_extension_scales_what_is_reflected_head_on(tmp_path: Path) -> None:
+    gloss = {"specularFactor": 0.5, "specularColorFactor": [1, 0.5, 0]}
+    material = {"extensions": {"KHR_materials_specular": gloss}}
+    found = row_at(read(tmp_path, material=material).scene, 0.5, 0.5)[3:6]
+    head_on = 0.5 * 0.04 * np.array([1, 0.5, 0])
+    assert found == pytest.approx(head_on + (0.5 - head_on) / 21, abs=1e-6)
+
+
+def test_cameras_lights_and_emission(tmp_path: Path) -> None:
+    lens = {"type": "perspective", "perspective": {"yfov": 0.5, "aspectRatio": 1.0}}
+    tree = quad(
+        material={"emissiveFactor": [1, 0.5, 0],
+                  "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 4}}},
+        cameras=[lens],
+        extensions={"KHR_lights_punctual": {"lights": [{"type": "point", "intensity": 3.0}]}},
+    )  # fmt: skip
+    tree["nodes"] += [
+        {"camera": 0, "translation": [0, 2, 5]},
+        {
+            "name": "lamp",
+            "translation": [0, 3, 0],
+            "extensions": {"KHR_lights_punctual": {"light": 0}},
+        },
+    ]
+    tree["scenes"][0]["nodes"] = [0, 1, 2]
+    found = read_gltf(written(tmp_path, tree), "CC0-1.0")
+    scene = found.scene
+    assert scene.environment is None
+    assert scene.c2w[0, :3, 3] == pytest.approx([0, -5, 2], abs=1e-6)
+    assert scene.c2w[0, :3, 2] == pytest.approx([0, -1, 0], abs=1e-6), "it looks along +Y"
+    assert scene.fov_deg[0] == pytest.approx(np.degrees(0.5))
+    assert [entry.name for entry in scene.objects] == ["floor", "lamp"]
+    rows = scene.materials[scene.material_index]
+    assert rows[0, 7:10] == pytest.approx([4, 2, 0])
+    own = scene.faces[scene.object_index == 1]
+    a, b, c = np.moveaxis(scene.vertex_positions[own].astype(np.float64), 1, 0)
+    cross = np.cross(b - a, c - a)
+    outward = np.einsum("ti,ti->t", cross, a + b + c - 3 * np.array([0, 0, 3]))
+    assert (outward > 0).all() and len(own) == 8
+    seen = np.linalg.norm(cross, axis=1).sum() / 8
+    assert rows[-1, 7] * seen == pytest.approx(3.0, rel=1e-5)  # candela, on average
+
+
+def test_what_is_lost_is_said_once(tmp_path: Path) -> None:
+    material = {
+        "normalTexture": {"index": 0},
+        "occlusionTexture": {"index": 0},
+        "alphaMode": "BLEND",
+        "emissiveFactor": [1, 1, 1],
+        "emissiveTexture": {"index": 0},
+        "extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 1}},
+    }
+    found = read(tmp_path, material=material, animations=[{}])
+    for words in (
+        "normal maps",
+        "occlusion",
+        "transparency",
+        "emission",
+        "clearcoat",
+        "animations",
+    ):
+        assert sum(words in text for text in found.lost) == 1, words
+    files = convert_scene(
+        scene_source(str(tmp_path / "a.gltf")), tmp_path / "a.usda", budget=None,
+        done=lambda finished, total: None,
+    )  # fmt: skip
+    assert any("normal maps" in note for note in files.notes)
+    assert not any("cannot hold textures" in note for note in files.notes)
+
+
+def test_a_missing_picture_leaves_the_factor(tmp_path: Path) -> None:
+    found = read(tmp_path, pictures=["gone.png"])
+    assert any("image 0: missing" in text for text in found.lost)
+    assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx([1 - F] * 3, abs=1e-6)
+
+
+@pytest.mark.parametrize("uri", ["../a.png", "http://example.com/a.png", "/etc/hostname"])
+def test_pictures_elsewhere_are_refused(tmp_path: Path, uri: str) -> None:
+    with pytest.raises(TrilightError, match=r"a\.gltf: names .*(outside|expected a file)"):
+        read(tmp_path, pictures=[uri])
+
+
+def test_a_huge_picture_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    """A header that claims 9000 x 9000 pixels."""
+    import base64
+    import zlib
+
+    head = struct.pack(">IIBBBBB", 9000, 9000, 8, 2, 0, 0, 0)
+    chunk = b"IHDR" + head
+    data = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk
+    data += struct.pack(">I", zlib.crc32(chunk)) + struct.pack(">I", 0) + b"IDAT" + b"\0" * 8
+    uri = "data:image/png;base64," + base64.b64encode(data).decode()
+    with pytest.raises(TrilightError, match="9000 x 9000 pixels; expected at most"):
+        read(tmp_path, pictures=[uri])
+
+
+def test_a_mesh_without_coordinates_takes_the_mean(tmp_path: Path) -> None:
+    found = read(tmp_path, uv=None)
+    assert any("without texture coordinates" in text for text in found.lost)
+    assert not found.scene.textures
+    mean = linear_from_srgb8()[PICTURE].mean(axis=(0, 1)) * (1 - F)
+    assert found.scene.materials[0, :3] == pytest.approx(mean, abs=1e-5)
+
+
+def test_one_texel_is_a_constant(tmp_path: Path) -> None:
+    found = read(tmp_path, pictures=[png(PICTURE[:1, 1:])])
+    assert not found.scene.textures
+    assert found.scene.materials[0, :3] == pytest.approx(diffuse_of(GREEN), abs=1e-6)
+
+
+@pytest.mark.parametrize("value", [float("nan"), "red", -1, 2])
+def test_factors_that_are_no_albedo(tmp_path: Path, value: Any) -> None:
+    surface = {"metallicFactor": value, "baseColorFactor": [0.5, 0.5, 0.5, 1]}
+    found = read(tmp_path, material={"pbrMetallicRoughness": surface})
+    assert any("metallicFactor" in text for text in found.lost)
+
+
+def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    broken = UV.copy()
+    broken[0, 0] = np.nan
+    with pytest.raises(TrilightError, match="TEXCOORD_0 holds no finite"):
+        read(tmp_path, uv=broken)
+
+
+@pytest.mark.parametrize(
+    "damage", [{"textures": []}, {"materials": [[]]}, {"accessors": []}, {"meshes": [{}]},
+               {"bufferViews": [{"buffer": 0, "byteLength": 10**9}] * 3}]
+)  # fmt: skip
+def test_a_broken_tree_is_one_sentence(tmp_path: Path, damage: dict[str, Any]) -> None:
+    with pytest.raises(TrilightError, match=r"^a\.gltf: "):
+        read(tmp_path, **damage)

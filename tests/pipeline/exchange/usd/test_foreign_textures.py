@@ -1,0 +1,222 @@
+"""Textures that other programs name in USD: corners, channels, wrapping, and damage."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+
+from pipeline.exchange.usd.read import UsdScene, read_usd
+from pipeline.exchange.usd.write import write_usd
+from storage.conventions import linear_from_srgb8
+from storage.errors import TrilightError
+from storage.records.exr import encode_channels
+from tests.pipeline.exchange.exchange_kit import row_at
+from tests.pipeline.exchange.strangers_stage import write_stage
+from tests.textured_by_hand import textured_scene
+
+RED, GREEN, BLUE, GREY = (200, 0, 0), (0, 200, 0), (0, 0, 200), (100, 100, 100)
+PICTURE = np.array([[RED, GREEN], [BLUE, GREY]], np.uint8)
+"""The top row first; the stage's floor has u along +X and v along -Y."""
+
+CORNERS = {(-0.5, -0.5): RED, (0.5, -0.5): GREEN, (-0.5, 0.5): BLUE, (0.5, 0.5): GREY}
+
+
+def linear(srgb: tuple[int, int, int]) -> np.ndarray:
+    return np.asarray(linear_from_srgb8()[list(srgb)])
+
+
+Edit = Callable[[Any, UsdShade.Shader, UsdShade.Shader], None]
+
+
+def changed(folder: Path, edit: Edit | None = None, pixels: Any = PICTURE) -> UsdScene:
+    """Return the stage of a stranger with another picture, edited (stage, preview, texture)."""
+    path = write_stage(folder)
+    if pixels is not None:
+        Image.fromarray(pixels).save(folder / "tex.png")
+    stage = Usd.Stage.Open(str(path))
+    shaders = (UsdShade.Shader.Get(stage, f"/W/mat/{name}") for name in ("preview", "texture"))
+    if edit is not None:
+        edit(stage, *shaders)
+    stage.GetRootLayer().Save()
+    return read_usd(path, None, None, "LicenseRef-user-provided")
+
+
+def token(name: str, value: str) -> Edit:
+    return lambda stage, preview, texture: texture.CreateInput(name, Sdf.ValueTypeNames.Token).Set(
+        value
+    )
+
+
+def test_every_texel_lies_where_usd_puts_it(tmp_path: Path) -> None:
+    found = changed(tmp_path)
+    for (x, y), colour in CORNERS.items():
+        row = row_at(found.scene, x, y)
+        assert row[:3] == pytest.approx(linear(colour), abs=1e-6), colour  # bytes stay bytes
+        assert row[3:7] == pytest.approx([0.04, 0.04, 0.04, 0.3])
+    assert not any("texture" in text for text in found.lost)
+
+
+def test_an_edit_of_our_own_file_keeps_its_textures(tmp_path: Path) -> None:
+    """Whatever is moved, bytes and floats of textures come back as they were."""
+    write_usd(tmp_path / "a.usda", textured_scene())
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    UsdGeom.Xformable(stage.GetPrimAtPath("/Scene/Objects/floor")).AddTranslateOp().Set((0, 0, 1))
+    stage.GetRootLayer().Save()
+    found = read_usd(tmp_path / "a.usda", None, None, "CC0-1.0")
+    assert not found.exact
+    assert [t.sha256 for t in found.scene.textures] == [t.sha256 for t in textured_scene().textures]
+    assert np.array_equal(found.scene.uv[:6], textured_scene().uv[:6])  # type: ignore[index]
+
+
+def test_what_a_colour_space_says_is_taken_as_said(tmp_path: Path) -> None:
+    """Colours that are called raw are not decoded, numbers that are called sRGB are."""
+    raw = changed(tmp_path, token("sourceColorSpace", "raw"))
+    assert row_at(raw.scene, -0.5, -0.5)[:3] == pytest.approx(np.array(RED) / 255, abs=1e-6)
+    grey = np.array([[10, 200]], np.uint8)
+    encoded = changed(tmp_path, token("sourceColorSpace", "sRGB"), grey)
+    assert row_at(encoded.scene, 0.5, 0)[0] == pytest.approx(linear_from_srgb8()[200], abs=1e-6)
+    plain = changed(tmp_path, None, grey)
+    assert row_at(plain.scene, 0.5, 0)[0] == pytest.approx(200 / 255, abs=1e-6)
+
+
+def test_a_transform_scales_then_turns_then_moves(tmp_path: Path) -> None:
+    """u' = -v / 2 + 1, v' = u / 2 for 90 degrees, half, and a shift by 1."""
+
+    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
+        node = UsdShade.Shader.Define(stage, "/W/mat/move")
+        node.CreateIdAttr("UsdTransform2d")
+        types = Sdf.ValueTypeNames
+        reader = UsdShade.Shader.Get(stage, "/W/mat/reader")
+        node.CreateInput("in", types.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
+        node.CreateInput("scale", types.Float2).Set(Gf.Vec2f(0.5, 0.5))
+        node.CreateInput("rotation", types.Float).Set(90.0)
+        node.CreateInput("translation", types.Float2).Set(Gf.Vec2f(1, 0))
+        texture.GetInput("st").ConnectToSource(node.ConnectableAPI(), "result")
+
+    scene = changed(tmp_path, edit).scene
+    assert scene.uv is not None
+    corners = {tuple(uv) for uv in np.round(scene.uv[:6].astype(np.float64), 6).tolist()}
+    assert corners == {(1, 0), (1, 0.5), (0.5, 0.5), (0.5, 0)}
+    assert row_at(scene, 0, 0)[:3] == pytest.approx(linear(GREY), abs=1e-6)  # at (0.75, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("mode", "colour"), [("repeat", RED), ("clamp", GREEN), ("mirror", GREEN), ("black", (0, 0, 0))]
+)
+def test_coordinates_beyond_the_picture(tmp_path: Path, mode: str, colour: Any) -> None:
+    """u from 0 to 2: at x = 0.25 it is 1.25, in the row of red and green."""
+
+    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
+        token("wrapS", mode)(stage, preview, texture)
+        primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/W/Grid")).GetPrimvar("st")
+        primvar.Set([(0, 0), (2, 0), (2, 1), (0, 1)])
+
+    scene = changed(tmp_path, edit).scene
+    assert row_at(scene, 0.25, -0.5)[:3] == pytest.approx(linear(colour), abs=1e-6)
+    assert row_at(scene, -0.75, -0.5)[:3] == pytest.approx(linear(RED), abs=1e-6)
+
+
+@pytest.mark.parametrize("output", ["r", "g", "b"])
+def test_a_single_channel_feeds_roughness(tmp_path: Path, output: str) -> None:
+    """Not decoded, since the shader says so; bytes again."""
+
+    def edit(stage: Any, preview: UsdShade.Shader, texture: UsdShade.Shader) -> None:
+        token("sourceColorSpace", "raw")(stage, preview, texture)
+        preview.GetInput("diffuseColor").ClearSources()
+        preview.GetInput("diffuseColor").Set((0.5, 0.5, 0.5))
+        texture.CreateOutput(output, Sdf.ValueTypeNames.Float)
+        preview.GetInput("roughness").ConnectToSource(texture.ConnectableAPI(), output)
+
+    scene = changed(tmp_path, edit).scene
+    (texture,) = scene.textures
+    assert texture.texels.dtype == np.uint8 and texture.channels == 1
+    for (x, y), colour in CORNERS.items():
+        value = colour["rgb".index(output)] / 255
+        assert row_at(scene, x, y)[[0, 6]] == pytest.approx([0.5, value], abs=1e-6)
+
+
+def test_scale_and_bias_are_applied_in_linear_light_and_bounded(tmp_path: Path) -> None:
+    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
+        for name, value in (("scale", (2, 0.5, 0.5, 1)), ("bias", (0, 0.25, -1, 0))):
+            texture.CreateInput(name, Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(*value))
+
+    found = changed(tmp_path, edit)
+    grey = linear(GREY)[0]
+    expected = [2 * grey, 0.5 * grey + 0.25, 0]
+    assert row_at(found.scene, 0.5, 0.5)[:3] == pytest.approx(expected, abs=0.005)  # 8 bits
+    assert any("clamped" in text for text in found.lost)
+
+
+def test_numbers_that_are_none_become_black(tmp_path: Path) -> None:
+    """NaN, infinity and negative values in an OpenEXR file."""
+    values = np.array([[[np.nan] * 3, [np.inf] * 3], [[-1] * 3, [0.5] * 3]], np.float32)
+
+    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
+        (tmp_path / "tex.exr").write_bytes(encode_channels({"RGB": values}))
+        texture.GetInput("file").Set("./tex.exr")
+
+    found = changed(tmp_path, edit)
+    assert any("clamped to [0, 1], NaN to 0" in text or "NaN to 0" in text for text in found.lost)
+    rows = [row_at(found.scene, x, y)[0] for x, y in CORNERS]
+    assert rows == pytest.approx([0, 0.96, 0, 0.5], abs=0.005)
+
+
+def test_a_missing_file_takes_its_fallback(tmp_path: Path) -> None:
+    def edit(stage: Any, preview: Any, texture: UsdShade.Shader) -> None:
+        texture.CreateInput("fallback", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(0.1, 0.2, 0.3, 1))
+        texture.GetInput("file").Set("./gone.png")
+
+    found = changed(tmp_path, edit)
+    assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx([0.1, 0.2, 0.3])
+    assert any("'./gone.png': missing" in text for text in found.lost)
+
+
+def test_a_huge_picture_is_refused(tmp_path: Path) -> None:
+    path = write_stage(tmp_path)
+    Image.new("L", (9000, 9000)).save(tmp_path / "tex.png")
+    with pytest.raises(TrilightError, match=r"tex.png: 9000 x 9000 pixels; expected at most"):
+        read_usd(path, None, None, "CC0-1.0")
+
+
+def test_a_mesh_without_coordinates_takes_the_mean(tmp_path: Path) -> None:
+    def edit(stage: Any, preview: Any, texture: Any) -> None:
+        stage.GetPrimAtPath("/W/Grid").RemoveProperty("primvars:st")
+
+    found = changed(tmp_path, edit)
+    assert any("no coordinates 'st'" in text for text in found.lost)
+    mean = linear_from_srgb8()[PICTURE].mean(axis=(0, 1))
+    assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx(mean, abs=1e-5)
+
+
+def test_coordinates_that_are_no_numbers_count_as_none(tmp_path: Path) -> None:
+    def edit(stage: Any, preview: Any, texture: Any) -> None:
+        primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/W/Grid")).GetPrimvar("st")
+        primvar.Set([(float("nan"), 0), (1, 0), (1, 1), (0, 1)])
+
+    assert any("no coordinates 'st'" in text for text in changed(tmp_path, edit).lost)
+
+
+def test_one_texel_is_a_constant(tmp_path: Path) -> None:
+    found = changed(tmp_path, None, PICTURE[:1, :1])
+    assert not found.scene.textures
+    assert row_at(found.scene, 0, 0.1)[:3] == pytest.approx(linear(RED), abs=1e-6)
+
+
+def test_metals_take_their_colour_where_a_texture_says_metal(tmp_path: Path) -> None:
+    """One picture for the colour, and its green channel for the metal."""
+
+    def edit(stage: Any, preview: UsdShade.Shader, texture: UsdShade.Shader) -> None:
+        texture.CreateOutput("g", Sdf.ValueTypeNames.Float)
+        metal = preview.CreateInput("metallic", Sdf.ValueTypeNames.Float)
+        metal.ConnectToSource(texture.ConnectableAPI(), "g")
+
+    found = changed(tmp_path, edit)
+    share = linear(GREEN)[1]  # decoded too: the shader states no space
+    plain, metal = row_at(found.scene, -0.5, -0.5), row_at(found.scene, 0.5, -0.5)
+    assert plain[:6] == pytest.approx([*linear(RED), 0.04, 0.04, 0.04], abs=0.005)
+    assert metal[1] == pytest.approx(share * (1 - share), abs=0.005)
+    assert metal[4] == pytest.approx(0.04 * (1 - share) + share * share, abs=0.005)
