@@ -49,7 +49,7 @@ def test_geometry_lights_and_cameras_are_read_and_the_code_is_not(tmp_path: Path
 def test_its_environment_has_our_axes(tmp_path: Path, processed: bool) -> None:
     """Raw ones are scaled by their strength; either may be the only light."""
     radiance = six_poles().radiance_rgb
-    more = {"env_map": np.moveaxis(radiance, -1, 0) if processed else radiance / 2}
+    more: dict[str, Any] = {"env_map": np.moveaxis(radiance, -1, 0) if processed else radiance / 2}
     if not processed:
         more |= {"env_map_strength": np.array(2, np.float32), "env_map_rotation": np.zeros(3, "f4")}
     write_v2(tmp_path / "a.h5", lit=False, **more)
@@ -60,7 +60,10 @@ def test_its_environment_has_our_axes(tmp_path: Path, processed: bool) -> None:
 
 
 def test_a_turned_environment_is_said(tmp_path: Path) -> None:
-    more = {"env_map": six_poles().radiance_rgb, "env_map_rotation": np.array([0, 0, 90], "f4")}
+    more: dict[str, Any] = {
+        "env_map": six_poles().radiance_rgb,
+        "env_map_rotation": np.array([0, 0, 90], "f4"),
+    }
     write_v2(tmp_path / "a.h5", **more)
     assert any("rotation of the" in text for text in read_renderformer_h5(tmp_path / "a.h5").lost)
 
