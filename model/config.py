@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar, Literal
 
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, material_columns
+from storage.records.texture import TEXTURED
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -97,6 +98,9 @@ class ModelConfig:
     """hits: whether anchors ask the scene's tokens; false leaves out the view-independent stage."""
     material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """Material columns that the network reads, in the order of its input."""
+    texture_cells: Annotated[int, Within(0, 64, unit="cells")] = 0
+    """Cells along a side of the square in which a textured triangle's token is told its texture;
+    with 0, it is told the mean of the whole material. 4 or 8 suit triangles of some 30 pixels."""
 
     def __post_init__(self) -> None:
         if self.width % self.num_heads or self.head_width % 2:
@@ -114,6 +118,10 @@ class ModelConfig:
             _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
         _check_columns(self.material_columns)
         self._check_hits()
+        if self.texture_cells and not self.scene_tokens:
+            _wrong(f"texture_cells {self.texture_cells} without scene_tokens", "0")
+        if self.texture_cells and (unread := set(TEXTURED) - set(self.material_columns)):
+            _wrong(f"texture_cells {self.texture_cells} without columns {sorted(unread)}", "0")
         if self.head == "dpt":
             self._check_dpt()
         elif self.dpt_features or self.dpt_channels or self.dpt_taps:

@@ -22,7 +22,7 @@ from model.hits.tracing import (
 from model.image_head import blacken
 from model.positions import TriangleRotary, token_places
 from model.precision import tf32
-from model.scene_tensors import Cameras, SceneBatch, in_units
+from model.scene_tensors import Cameras, SceneBatch, batch_with_cells, in_units
 from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError
@@ -109,6 +109,7 @@ class RenderFormer(nn.Module):
         )
         keys_values: tuple[KeysValues, ...] = ()
         if self.encoder is not None:
+            batch = batch_with_cells(batch, self.config.texture_cells)
             if sides_BT12 is not None and unit_B3 is not None:
                 sides_BT12 = sides_BT12 / unit_B3.repeat(1, 4)[:, None]
                 batch = in_units(batch, unit_B3)
@@ -215,6 +216,8 @@ class RenderFormer(nn.Module):
             tokens.append(self.decoder.token_W)
         for token in tokens:
             nn.init.normal_(token, std=TOKEN_STD, generator=generator)
+        for weight in [] if self.encoder is None else self.encoder.zero_start():
+            nn.init.zeros_(weight)
         blacken(self.decoder.head)
 
 

@@ -223,6 +223,7 @@ _LATER = (
     "scene_tokens",
     "projected_freqs",
     "demodulated",
+    "texture_cells",
 )
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from model.scene_tensors import with_cells
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
 from storage.records.sample import Sample
@@ -172,7 +173,16 @@ class _SceneMaker:
         seen = with_views(scene, np.sort(views))
         if settings.augmentation:
             seen = augmented(seen, settings.augmentation, rng)
-        if settings.network is None or not settings.network.hit_rays:
+        return self._prepared(seen, rng)
+
+    def _prepared(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
+        """Return a scene with all that its network wants to be told."""
+        settings = self._settings
+        if settings.network is None:
+            return seen
+        tensors = with_cells(seen.tensors, settings.network.texture_cells)
+        seen = dataclasses.replace(seen, tensors=tensors)
+        if not settings.network.hit_rays:
             return seen
         # these bring the checker of settings along
         from model.demodulated import with_albedo
