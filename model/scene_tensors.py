@@ -22,9 +22,11 @@ from torch import Tensor
 
 from model.hits.textures import SurfaceTextures, surface_textures
 from model.hits.traced import Traced, stack_traced
+from model.sky.known import shining
 from model.texture_cells import TextureCells, stack_cells, texture_cells
 from storage.conventions import log10_radiance
 from storage.errors import TrilightError
+from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, chosen_columns, laid_out, material_columns
 from storage.records.scene import MAX_POSITION_M, Scene
 from storage.records.texture import TEXTURED
@@ -57,6 +59,8 @@ class SceneTensors:
     the means. None where nothing is textured."""
     cells: TextureCells | None = None
     """What tokens are told of textures, for a network with `texture_cells` (`with_cells`)."""
+    sky: Environment | None = None
+    """Light from far away; None where there is none, or none but black."""
 
     @property
     def num_triangles(self) -> int:
@@ -107,6 +111,8 @@ class SceneBatch:
     """Those of each scene; None where no scene has any."""
     cells: TextureCells | None = None
     """Those of all scenes; None where no scene has any."""
+    skies: tuple[Environment | None, ...] | None = None
+    """That of each scene; None where no scene has any."""
 
     @property
     def cameras(self) -> Cameras:
@@ -141,15 +147,9 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
             (`ModelConfig.material_columns`); None: all that are declared, for any network.
 
     Raises:
-        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis, a
-            column is not declared, or an environment lights the scene, whose light no network
-            knows: its picture would be that of another scene.
+        TrilightError: a vertex is farther than MAX_POSITION_M from the origin along an axis, or a
+            column is not declared.
     """
-    if scene.environment is not None:
-        raise TrilightError(
-            "scene: it has an environment, and networks do not know its light; expected none. "
-            "Train on scenes without one (scenes.skies.share=0)."
-        )
     farthest = np.abs(scene.vertex_positions).max()
     if not farthest <= MAX_POSITION_M:  # not a number is no place either
         raise TrilightError(
@@ -171,6 +171,7 @@ def scene_tensors(scene: Scene, columns: tuple[str, ...] | None = None) -> Scene
         fov_deg_V=torch.from_numpy(scene.fov_deg.copy()),
         columns=columns,
         textures=surface_textures(scene),
+        sky=shining(scene.environment),
     )
 
 
@@ -243,6 +244,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
     traced = [scene.traced for scene in scenes if scene.traced is not None]
     albedo = [scene.albedo_VRR6 for scene in scenes if scene.albedo_VRR6 is not None]
     textures = tuple(scene.textures for scene in scenes)
+    skies = tuple(scene.sky for scene in scenes)
     return SceneBatch(
         triangles_BT33=_stack_padded([scene.triangles_T33 for scene in scenes], longest),
         normals_BT33=_stack_padded([scene.normals_T33 for scene in scenes], longest),
@@ -255,6 +257,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
         albedo_BVRR6=torch.stack(albedo) if len(albedo) == len(scenes) else None,
         textures=None if all(each is None for each in textures) else textures,
         cells=stack_cells([scene.cells for scene in scenes]),
+        skies=None if all(each is None for each in skies) else skies,
     )
 
 

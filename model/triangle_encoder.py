@@ -19,6 +19,7 @@ from model.positions import (
 )
 from model.precision import as_given
 from model.scene_tensors import SceneBatch
+from model.sky.tokens import SkyTokens
 from model.texture_cells import CHANNELS, TextureCells
 from storage.records.material import material_width
 
@@ -86,6 +87,7 @@ class TriangleEncoder(nn.Module):
         self.recompute = False
         self.columns = config.material_columns
         self.tokens = TriangleTokens(config)
+        self.sky = SkyTokens(config) if config.sky_cells else None
         self.registers_NW = nn.Parameter(torch.zeros(config.num_registers, config.width))
         self.layers = nn.ModuleList(
             EncoderLayer(config.width, config.num_heads, config.hidden_width)
@@ -93,19 +95,28 @@ class TriangleEncoder(nn.Module):
         )
 
     def forward(
-        self, batch: SceneBatch, places: TokenPlaces, light_BTL: Tensor | None = None
+        self,
+        batch: SceneBatch,
+        places: TokenPlaces,
+        light_BTL: Tensor | None = None,
+        sky_BSW: Tensor | None = None,
     ) -> Tensor:
-        """Return the context [B, N, W] with N = registers + triangles.
+        """Return the context [B, N, W] with N = registers + cells of the sky + triangles.
 
-        `light_BTL` is as in TriangleTokens.
+        `light_BTL` is as in TriangleTokens, `sky_BSW` of SkyTokens; None where no scene has a sky.
         """
         materials = batch.material_of(self.columns)
         cells = None if self.tokens.cells_WC is None else batch.cells
         if cells is not None:
             materials = cells.means_in(materials, self.columns)
         tokens_BTW = self.tokens(materials, batch.normals_BT33, light_BTL, cells)
-        registers_BNW = self.registers_NW.expand(len(tokens_BTW), -1, -1)
-        x_BNW = torch.cat([registers_BNW, tokens_BTW], dim=1).to(dtype_of(self.layers))
+        parts = [self.registers_NW.expand(len(tokens_BTW), -1, -1), tokens_BTW]
+        if sky_BSW is not None:
+            parts.insert(1, sky_BSW)
+        elif self.sky is not None and torch.is_grad_enabled():
+            # a step without skies has gradients of 0: resumed runs need every memory
+            parts[1] = tokens_BTW + 0 * sum(weight.sum() for weight in self.sky.parameters())
+        x_BNW = torch.cat(parts, dim=1).to(dtype_of(self.layers))
         rotation = world_rotation(self.rotary, places)
         for layer in self.layers:
             x_BNW = run_layer(layer, x_BNW, rotation, places.is_key_BN, recompute=self.recompute)

@@ -224,6 +224,8 @@ _LATER = (
     "projected_freqs",
     "demodulated",
     "texture_cells",
+    "sky_cells",
+    "sky_rays",
 )
 
 

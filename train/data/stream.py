@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from model.scene_tensors import with_cells
+from model.sky.known import require_known
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
 from storage.records.sample import Sample
@@ -237,12 +238,15 @@ class _SceneMaker:
                 f"sample {sample.key}: {sample.scene.num_views} views; the run draws "
                 f"{settings.views_per_scene} of each scene."
             )
-        return training_scene(
+        scene = training_scene(
             sample,
             settings.resolution,
             most_triangles=settings.most_triangles,
             lights_apart=settings.augmentation is not None and settings.augmentation.light_mix > 1,
         )
+        if settings.network is not None:
+            require_known(scene.tensors.sky, settings.network)
+        return scene
 
 
 def _named(shard: str, error: TrilightError) -> TrilightError:
