@@ -1,7 +1,7 @@
 """`DrawnSky`: an environment map as rays use it: directions drawn by its light, and their odds.
 
 A texel is drawn in proportion to the light that comes through it, and a direction evenly within it
-by solid angle: a sun of one texel is found by nearly every draw. Draws are made in the axes of the
+by solid angle: a sun of one texel is found by most draws. Draws are made in the axes of the
 map, so that a scene turned together with its map has the same noise.
 """
 

@@ -18,7 +18,7 @@ from storage.records.sky_texels import row_solid_angles
 from tests.laws.test_rigid_motion import moved
 from tests.model.hits.kit import FLOOR, corner, direct, lit_scene, traced
 from tests.pipeline.renders.scene_kit import join, material, quad, sphere
-from tests.sky_maps import centres, constant, night, one_sun, smooth
+from tests.sky_maps import centres, constant, one_sun, smooth
 
 
 def _floor(sky: Environment) -> Scene:
@@ -38,7 +38,7 @@ def test_a_plane_below_a_constant_sky_receives_its_radiance() -> None:
 @pytest.mark.parametrize("roughness", [0.05, 0.3, 0.8])
 def test_a_white_ball_in_a_white_sky_is_white(roughness: float) -> None:
     """Convex, energy-conserving, and lit from everywhere: direct light alone makes it vanish."""
-    thing = sphere([0, 0, 0], 0.4, material(diffuse=0.3, specular=0.7, roughness=roughness))
+    thing = sphere([0, 0, 0], 0.4, material(diffuse=0.0, specular=1.0, roughness=roughness))
     scene = join([thing], eye=(0.3, -2, 0.4), fov_deg=24, sky=constant(1.0))
     inputs = [traced(scene, sky_rays=8, seed=seed) for seed in range(4)]
     picture = np.mean([direct(each) for each in inputs], axis=0)
@@ -51,7 +51,7 @@ def _irradiance_twin(scene: Scene, place: np.ndarray, normal: np.ndarray) -> np.
     """Return irradiance over pi: texel by texel, with one shadow ray each."""
     lit, sky = lit_scene(scene), scene.environment
     assert sky is not None
-    fine = 48
+    fine = 64
     angles, total = row_solid_angles(fine), np.zeros(3)
     local = centres(fine)
     for row in range(fine):
@@ -67,7 +67,8 @@ def _irradiance_twin(scene: Scene, place: np.ndarray, normal: np.ndarray) -> np.
     return total
 
 
-@pytest.mark.parametrize("sky", [smooth(), night(64), one_sun(1e6)], ids=["smooth", "night", "sun"])
+@pytest.mark.slow
+@pytest.mark.parametrize("sky", [smooth(), one_sun(1e6)], ids=["smooth", "sun"])
 def test_light_of_a_sky_is_that_of_all_its_texels_with_shadows(sky: Environment) -> None:
     scene = corner(sky=sky)
     lit = lit_scene(scene)
@@ -85,7 +86,7 @@ def test_light_of_a_sky_is_that_of_all_its_texels_with_shadows(sky: Environment)
         found += light.diffuse / count
     for point in range(3):
         expected = _irradiance_twin(scene, points.position[:, point], points.normal[:, point])
-        assert expected.max() > 0.05
+        assert expected.max() > 0.02
         # 512 rays: 3 % where half of a smooth sky is hidden; a sun's texel is read once by the twin
         assert found[:, point] == pytest.approx(expected, rel=0.08, abs=0.01 * expected.max())
 
