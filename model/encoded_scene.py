@@ -50,10 +50,11 @@ class EncodedScene:
     def only(self, index: int) -> "EncodedScene":
         """Return one scene of the batch, without the padding that its company brought."""
         places = self.places
-        exists, num_registers = slice(None), places.num_registers
-        if places.is_key_BN is not None:
-            exists = places.is_key_BN[index]
-            num_registers = int(exists[:num_registers].sum())
+        is_key_N = None if places.is_key_BN is None else places.is_key_BN[index]
+        num_registers = places.num_registers
+        if is_key_N is not None:
+            num_registers = int(is_key_N[:num_registers].sum())
+        exists = slice(None) if is_key_N is None else is_key_N
         return EncodedScene(
             places=TokenPlaces(
                 positions_BN33=places.positions_BN33[[index]][:, exists],

@@ -38,7 +38,8 @@ def sky_cells(sky: Environment, count: int) -> SkyCells:
     radiance = sky.radiance_rgb.reshape(-1, 3)[places.texel_N]
 
     def sums(values_N: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.bincount(places.cell_N, values_N, count)
+        found: NDArray[np.float64] = np.bincount(places.cell_N, values_N, count).astype(np.float64)
+        return found
 
     angle_S = sums(places.angle_N)
     light_N3 = radiance * places.angle_N[:, None]

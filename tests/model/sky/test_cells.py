@@ -29,7 +29,7 @@ def test_cells_are_equal_parts_of_the_sphere_and_hang_together(count: int) -> No
     assert len(found) == count
     assert np.abs(found / found.mean() - 1).max() < 5 * np.sqrt(count / 200_000)
     middle = np.stack([np.bincount(cells, places[:, c]) for c in range(3)], axis=-1)
-    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
     farthest = np.degrees(np.arccos((places * middle[cells]).sum(axis=1).clip(-1, 1))).max()
     assert farthest < {48: 32, 192: 16.5}[count]  # a disc of that area has a radius of 16.6 or 8.3
 
