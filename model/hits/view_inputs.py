@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from model.hits.anchors import anchor_pixels, gathered_at
 from model.hits.camera import Rays
-from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight
+from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, drawn, gloss_at, lobe
@@ -121,14 +121,9 @@ def view_inputs(
             pixel, turn = shaded.pixel + part.start, shaded.turn
             _add_surface(block, scene, rays.origin)
             lobe_rays = 1 if gather_rays else 0
-            of_lamps = spread(on_lamps[:, :, pixel], turn)
-            lit = direct_light(scene, block.points, block.gloss, of_lamps, lobe_rays=lobe_rays)
+            _add_direct(block, scene, spread(on_lamps[:, :, pixel], turn), lobe_rays)
             if to_sky is not None:
-                add_sky_light(
-                    lit, scene, block.points, block.gloss, to_sky[:, pixel], turn,
-                    rays=sky_rays, lobe_rays=lobe_rays,
-                )  # fmt: skip
-            _add_direct(block, scene, lit)
+                _add_sky(block, scene, to_sky[:, pixel], turn, sky_rays, lobe_rays)
             if gather_rays:
                 u = chance[:5, pixel]
                 u[:2] = spread(u[:2], turn)
@@ -234,7 +229,29 @@ def _add_surface(block: _Block, scene: LitScene, origin: NDArray[np.float32]) ->
     block.add(Channel.ROUGHNESS, scene.roughness_at(points)[None])
 
 
-def _add_direct(block: _Block, scene: LitScene, lit: DirectLight) -> None:
+def _add_direct(
+    block: _Block, scene: LitScene, on_lamps: NDArray[np.float32], lobe_rays: int
+) -> None:
+    lit = direct_light(scene, block.points, block.gloss, on_lamps, lobe_rays=lobe_rays)
+    _add_light(block, scene, lit)
+
+
+def _add_sky(
+    block: _Block,
+    scene: LitScene,
+    shift: NDArray[np.float32],
+    turn: NDArray[np.intp],
+    rays: int,
+    lobe_rays: int,
+) -> None:
+    lit = no_light(block.points)
+    add_sky_light(
+        lit, scene, block.points, block.gloss, shift, turn, rays=rays, lobe_rays=lobe_rays
+    )
+    _add_light(block, scene, lit)
+
+
+def _add_light(block: _Block, scene: LitScene, lit: DirectLight) -> None:
     block.add(Channel.OPEN_DIFFUSE, lit.open_diffuse)
     block.add(Channel.DIRECT_DIFFUSE, lit.diffuse)
     block.add(Channel.OPEN_SPECULAR, lit.open_specular)
