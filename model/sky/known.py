@@ -24,7 +24,7 @@ def require_known(sky: Environment | None, config: "ModelConfig") -> None:
     if sky is None:
         return
     if not config.knows_sky:
-        setting = "model.sky_rays=4" if config.view_stage == "hits" else "model.sky_cells=48"
+        setting = "model.sky_rays=16" if config.view_stage == "hits" else "model.sky_cells=48"
         raise TrilightError(
             "scene: it has an environment, and this network does not know its light; expected "
             f"none. Use a network that knows skies ({setting}), or scenes without one "

@@ -35,6 +35,22 @@ def test_a_plane_below_a_constant_sky_receives_its_radiance() -> None:
     assert inputs.pixels[..., Channel.OPEN_DIFFUSE].mean(axis=(0, 1)) == pytest.approx(found)
 
 
+def test_below_a_roof_a_sky_gives_what_comes_from_the_sides() -> None:
+    """Under the middle of a square roof a constant sky lacks the roof's view factor.
+
+    With a = half width over height: 4 x 1/(2 pi) x 2 x a/sqrt(1 + a^2) x atan(a/sqrt(1 + a^2)).
+    """
+    roof = [[-0.5, -0.5, 0.5], [0.5, -0.5, 0.5], [0.5, 0.5, 0.5], [-0.5, 0.5, 0.5]]
+    parts = [quad(FLOOR, material(diffuse=0.5)), quad(roof, material(diffuse=0.0))]
+    scene = join(parts, eye=(1.2, 0, 0.25), target=(0, 0, 0), fov_deg=1, sky=constant(1.0))
+    inputs = traced(scene, 8, sky_rays=64)
+    slope = 1 / np.sqrt(2)
+    hidden = 4 / (2 * np.pi) * 2 * slope * np.arctan(slope)
+    found = inputs.pixels[..., Channel.DIRECT_DIFFUSE].mean()
+    assert inputs.pixels[..., Channel.OPEN_DIFFUSE].mean() == pytest.approx(1, rel=0.03)
+    assert found == pytest.approx(1 - hidden, abs=0.03)  # 64 pixels of 64 rays and more: 1 %
+
+
 @pytest.mark.parametrize("roughness", [0.05, 0.3, 0.8])
 def test_a_white_ball_in_a_white_sky_is_white(roughness: float) -> None:
     """Convex, energy-conserving, and lit from everywhere: direct light alone makes it vanish."""

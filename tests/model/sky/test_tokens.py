@@ -99,7 +99,7 @@ def test_tokens_move_with_the_batch() -> None:
 
 @pytest.mark.parametrize(
     ("config", "setting"),
-    [(tiny_config(), "model.sky_cells=48"), (hits_config(), "model.sky_rays=4")],
+    [(tiny_config(), "model.sky_cells=48"), (hits_config(), "model.sky_rays=16")],
     ids=["bundles", "hits"],
 )
 def test_networks_that_know_no_sky_refuse_it_and_say_so_when_rendering(
