@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar, Literal
 
 from storage.errors import TrilightError
 from storage.records.material import PUBLISHED_COLUMNS, material_columns
+from storage.records.texture import TEXTURED
 from storage.registry import Registry
 from storage.settings.described import checked
 from storage.settings.ranges import Within
@@ -97,6 +98,15 @@ class ModelConfig:
     """hits: whether anchors ask the scene's tokens; false leaves out the view-independent stage."""
     material_columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """Material columns that the network reads, in the order of its input."""
+    texture_cells: Annotated[int, Within(0, 64, unit="cells")] = 0
+    """Cells along a side of the square in which a textured triangle's token is told its texture;
+    with 0, it is told the mean of the whole material. 4 or 8 suit triangles of some 30 pixels."""
+    sky_cells: Literal[0, 48, 192] = 0
+    """Tokens that are told the light of a sky, each by an equal part of the sphere; a scene without
+    a sky has none of them. With 0, the scene's tokens know no sky."""
+    sky_rays: Annotated[int, Within(0, 64, unit="rays")] = 0
+    """hits: rays towards the sky from each point that is shaded; with 0, the network knows no sky.
+    0 with bundles."""
 
     def __post_init__(self) -> None:
         if self.width % self.num_heads or self.head_width % 2:
@@ -114,6 +124,7 @@ class ModelConfig:
             _wrong(f"window_bundles {self.window_bundles}", "0 or an even number")
         _check_columns(self.material_columns)
         self._check_hits()
+        self._check_maps()
         if self.head == "dpt":
             self._check_dpt()
         elif self.dpt_features or self.dpt_channels or self.dpt_taps:
@@ -150,6 +161,24 @@ class ModelConfig:
         elif self.demodulated != (self.hit_rays > 0):
             expected = "1 or more" if self.demodulated else "0, or demodulated true"
             _wrong(f"hit_rays {self.hit_rays} with view_stage bundles", expected)
+
+    def _check_maps(self) -> None:
+        for name in ("texture_cells", "sky_cells"):
+            if getattr(self, name) and not self.scene_tokens:
+                _wrong(f"{name} {getattr(self, name)} without scene_tokens", "0")
+        if self.texture_cells and (unread := set(TEXTURED) - set(self.material_columns)):
+            _wrong(f"texture_cells {self.texture_cells} without columns {sorted(unread)}", "0")
+        if self.sky_rays and self.view_stage != "hits":
+            _wrong(f"sky_rays {self.sky_rays} with view_stage bundles", "0")
+        if self.sky_cells and self.view_stage == "hits" and not self.sky_rays:
+            _wrong(
+                f"sky_cells {self.sky_cells} with view_stage hits", "0, or sky_rays of 1 or more"
+            )
+
+    @property
+    def knows_sky(self) -> bool:
+        """Whether the network is told the light of an environment."""
+        return bool(self.sky_rays if self.view_stage == "hits" else self.sky_cells)
 
     @property
     def head_width(self) -> int:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from model.sky.symmetries import scaled
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
 
@@ -33,7 +34,7 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     Emitting triangles that touch are one lamp and stay together, since the faces of a lamp block
     each other's light. Lamps within the bounding box of an object are never grouped with others:
     networks are trained on lights that hang outside. What has no area gives no light and is left
-    out.
+    out. A sky lights the first group.
 
     Args:
         scene: passes `Scene.check`.
@@ -43,6 +44,8 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
         One group with the very scene, at a share of 1, where that is enough.
     """
     emitting_E = np.flatnonzero(scene.triangle_emits)
+    if not len(emitting_E):  # a sky alone
+        return [LightGroup(scene=scene, share=1.0)]
     corners_E33 = scene.vertex_positions[scene.faces[emitting_E]].astype(np.float64)
     lamp_E = _lamps(corners_E33)
     groups = _packed(lamp_E, _is_inside(scene, corners_E33, lamp_E), most)
@@ -50,10 +53,12 @@ def light_groups(scene: Scene, most: int) -> list[LightGroup]:
     powers = [float(power_E[np.isin(lamp_E, lamps)].sum()) for lamps in groups]
     if len(groups) == 1 or not any(powers):
         return [LightGroup(scene=scene, share=1.0)]
+    lit = [
+        (lamps, power / sum(powers)) for lamps, power in zip(groups, powers, strict=True) if power
+    ]
     return [
-        _group(scene, emitting_E[~np.isin(lamp_E, lamps)], power / sum(powers))
-        for lamps, power in zip(groups, powers, strict=True)
-        if power > 0
+        _group(scene, emitting_E[~np.isin(lamp_E, lamps)], share, has_sky=number == 0)
+        for number, (lamps, share) in enumerate(lit)
     ]
 
 
@@ -118,14 +123,16 @@ def _emitted_power(
     return area_E * emission_E3.mean(axis=1, dtype=np.float64)
 
 
-def _group(scene: Scene, others: NDArray[np.int64], share: float) -> LightGroup:
+def _group(scene: Scene, others: NDArray[np.int64], share: float, *, has_sky: bool) -> LightGroup:
     materials = scene.materials.copy()
     materials[:, EMISSION] /= share
+    sky = scene.environment if has_sky else None
     alone = dataclasses.replace(
         scene,
         faces=np.delete(scene.faces, others, axis=0),
         material_index=np.delete(scene.material_index, others),
         object_index=np.delete(scene.object_index, others),
         materials=materials,
+        environment=None if sky is None else scaled(sky, 1 / share),
     )
     return LightGroup(scene=alone, share=share)

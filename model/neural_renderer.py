@@ -141,7 +141,7 @@ class NeuralRenderer:
             TrilightError: the scene is larger than memory.
         """
         self._require_memory(scene.num_triangles)
-        below_sky, scene = scene, dataclasses.replace(scene, environment=None)
+        below_sky, scene = scene, self._with_known_sky(scene)
         by_hits = self._model.config.view_stage == "hits"
         all_lights = [LightGroup(scene=scene, share=1.0)]
         groups = [
@@ -203,12 +203,24 @@ class NeuralRenderer:
             f"a worse one than with --resolution {trained}",
         )
 
+    def _with_known_sky(self, scene: Scene) -> Scene:
+        """Return the scene with the light of its sky alone, or without it where it is not known."""
+        sky = scene.environment
+        if sky is not None:
+            known = self._model.config.knows_sky
+            sky = dataclasses.replace(sky, is_seen=False) if known else None
+        return dataclasses.replace(scene, environment=sky)
+
     def _notes(self, scene: Scene, num_groups: int) -> tuple[str, ...]:
         notes = []
-        if scene.environment is not None:
+        knows_sky = self._model.config.knows_sky
+        if scene.environment is not None and not knows_sky:
             notes.append(
-                "the scene has an environment, whose light networks do not know: it is missing here"
+                "the scene has an environment, whose light this network does not know: it is "
+                "missing here"
             )
+        if scene.environment is not None and scene.environment.is_seen and knows_sky:
+            notes.append("cameras see the environment, and networks leave it black behind things")
         if num_groups > 1:
             notes.append(
                 f"the {int(scene.triangle_emits.sum())} emitting triangles are rendered in "

@@ -22,7 +22,9 @@ from model.hits.tracing import (
 from model.image_head import blacken
 from model.positions import TriangleRotary, token_places
 from model.precision import tf32
-from model.scene_tensors import Cameras, SceneBatch, in_units
+from model.scene_tensors import Cameras, SceneBatch, batch_with_cells, in_units
+from model.sky.known import require_known
+from model.sky.tokens import sky_batch, without_absent
 from model.triangle_encoder import TriangleEncoder
 from model.view_decoder import ViewDecoder
 from storage.errors import TrilightError
@@ -58,7 +60,8 @@ class RenderFormer(nn.Module):
         """Return log10(1 + radiance) [B, V, R, R, 3], before the ELU: what training compares.
 
         Raises:
-            TrilightError: the resolution is not a multiple of `config.picture_px`.
+            TrilightError: the resolution is not a multiple of `config.picture_px`, or a scene has a
+                sky whose light the network is not told.
         """
         if batch.albedo_BVRR6 is None and self.config.view_stage == "bundles":
             return self.decode(self.encode(batch), batch.cameras, resolution)
@@ -101,19 +104,27 @@ class RenderFormer(nn.Module):
         surfaces: tuple[LitScene, ...] = (),
     ) -> EncodedScene:
         """Return the scenes after the view-independent stage, if there is one."""
+        for sky in batch.skies or ():
+            require_known(sky, self.config)
+        registers = self.config.num_registers
+        skies = sky_batch(batch.skies, self.config.sky_cells, batch.triangles_BT33)
         places = token_places(
             batch.triangles_BT33,
             batch.is_triangle_BT,
-            num_registers=self.config.num_registers,
+            num_registers=registers + (0 if skies is None else self.config.sky_cells),
             eps=self.config.register_eps,
         )
+        if skies is not None:
+            places = without_absent(places, skies, registers)
         keys_values: tuple[KeysValues, ...] = ()
         if self.encoder is not None:
+            batch = batch_with_cells(batch, self.config.texture_cells)
             if sides_BT12 is not None and unit_B3 is not None:
                 sides_BT12 = sides_BT12 / unit_B3.repeat(1, 4)[:, None]
                 batch = in_units(batch, unit_B3)
             with tf32(self.tf32):
-                context_BNW = self.encoder(batch, places, sides_BT12)
+                sky_BSW = None if skies is None else self.encoder.sky(skies, unit_B3)
+                context_BNW = self.encoder(batch, places, sides_BT12, sky_BSW)
                 keys_values = self.decoder.keys_values(context_BNW, places)
         return EncodedScene(
             places=places, keys_values=keys_values, traced=traced, surfaces=surfaces
@@ -215,6 +226,8 @@ class RenderFormer(nn.Module):
             tokens.append(self.decoder.token_W)
         for token in tokens:
             nn.init.normal_(token, std=TOKEN_STD, generator=generator)
+        for weight in [] if self.encoder is None else self.encoder.zero_start():
+            nn.init.zeros_(weight)
         blacken(self.decoder.head)
 
 

@@ -223,6 +223,9 @@ _LATER = (
     "scene_tokens",
     "projected_freqs",
     "demodulated",
+    "texture_cells",
+    "sky_cells",
+    "sky_rays",
 )
 
 

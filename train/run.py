@@ -11,6 +11,7 @@ import torch
 
 from model.open import open_network
 from model.renderformer import count_parameters
+from model.sky.known import require_known, shining
 from model.weights import decode_config, encode_weights
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
@@ -223,6 +224,8 @@ def _make_judge(data: TrainingData, settings: TrainSettings, unusable: Unusable)
     ]
     # no damage is allowed here: a score over fewer scenes would be another score
     samples = list(first_samples(data.split(VALIDATION), settings.validation_scenes, Unusable(0)))
+    for sample in samples:  # before any step, not at the first validation
+        require_known(shining(sample.scene.environment), settings.model)
     return Judge(samples, settings.resolution, median_picture(training))
 
 

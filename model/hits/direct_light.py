@@ -25,7 +25,7 @@ _EVEN = np.float32(0.05)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DirectLight:
-    """Light of lamps at P points, [3, P] each."""
+    """Light of lamps and the sky at P points, [3, P] each."""
 
     open_diffuse: Floats
     """Irradiance over pi, as if nothing stood between."""
@@ -35,6 +35,14 @@ class DirectLight:
     """Irradiance over pi, shadowed."""
     specular: Floats
     """Specular radiance towards the viewer, shadowed."""
+
+
+def no_light(points: Points) -> DirectLight:
+    """Return zeros, to which light may be added."""
+    zeros = [np.zeros_like(points.position) for _ in range(4)]
+    return DirectLight(
+        open_diffuse=zeros[0], open_specular=zeros[1], diffuse=zeros[2], specular=zeros[3]
+    )
 
 
 def direct_light(
@@ -55,10 +63,7 @@ def direct_light(
         lobe_rays: 1 where a ray is drawn by the lobe at each of these points too: what such rays
             are better at finding is left to them (the power heuristic, Veach and Guibas 1995).
     """
-    zeros = [np.zeros_like(points.position) for _ in range(4)]
-    light = DirectLight(
-        open_diffuse=zeros[0], open_specular=zeros[1], diffuse=zeros[2], specular=zeros[3]
-    )
+    light = no_light(points)
     for number, lamp in enumerate(scene.lamps):
         _add(light, scene, points, gloss, int(lamp), on_lamps[:, number], lobe_rays)
     return light

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from model.hits.textures import SurfaceTextures
 from model.hits.vectors import Floats, as_rows, brightest, dot, unit
+from model.sky.drawn import DrawnSky
+from storage.records.environment import Environment
 from storage.records.lobes import lobes_of
 from storage.records.material import EMISSION, ROUGHNESS
 from storage.records.multiscatter import scattered_again
@@ -108,6 +110,7 @@ class LitScene:
         normals_T33: Floats,
         materials_TM: NDArray[np.float32],
         textures: SurfaceTextures | None = None,
+        sky: Environment | None = None,
     ) -> None:
         """Take triangles in world space.
 
@@ -117,6 +120,7 @@ class LitScene:
             materials_TM: the ten published numbers of each triangle's material, emission linear;
                 of textures, their means.
             textures: what stands for those numbers at each point; None where nothing is textured.
+            sky: light from far away; None where there is none, or no ray is to look for it.
         """
         self.corners = np.ascontiguousarray(corners_T33.transpose(1, 2, 0))  # [corner, 3, T]
         self.normals = np.ascontiguousarray(normals_T33.transpose(1, 2, 0))
@@ -129,6 +133,7 @@ class LitScene:
         self.diffuse, self.specular, self.again = means.diffuse, means.specular, means.again
         self.alpha, self.roughness = means.alpha, means.roughness
         self.textures, self._materials_TM = textures, materials_TM
+        self.sky = sky
         self.emission = np.ascontiguousarray(materials_TM[:, EMISSION].T.astype(np.float32))
         self._corner_rows = corners_T33
         self.emits = self.emission.max(axis=0) > 0
@@ -137,6 +142,12 @@ class LitScene:
     @property
     def num_triangles(self) -> int:
         return len(self.area)
+
+    @cached_property
+    def drawn_sky(self) -> DrawnSky:
+        """The sky of a scene that has one, for rays."""
+        assert self.sky is not None
+        return DrawnSky(self.sky)
 
     @cached_property
     def seen(self) -> Triangles:

@@ -4,17 +4,22 @@ One number a side of a triangle: what a scene's tokens are told, and what gather
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.hits.direct_light import direct_light
+from model.hits.direct_light import direct_light, no_light
 from model.hits.lit_scene import LitScene, Points
+from model.hits.sky_light import add_sky_light
 from model.hits.vectors import Floats, cosine_direction, spread
 from storage.seeds import rng_for
 
 DIRECT_POINTS = 4
 """Points of a side at which direct light is taken."""
+
+SKY_RAYS = 6
+"""Rays towards the sky from each of those points."""
 
 RAYS = 32
 """Rays of a side that say which triangles it faces: 40 ms for 800 triangles."""
@@ -30,13 +35,25 @@ class SceneLight:
     """What the two sides of T triangles receive, as irradiance over pi: front, then back."""
 
     direct_2T3: Floats
-    """[2, T, 3] from lamps."""
+    """[2, T, 3] from lamps and the sky."""
     indirect_2T3: Floats
     """[2, T, 3] from other triangles, each as if it were diffuse."""
     mean_3: Floats
     """Mean direct light of the scene's surface, by colour: the unit of all light that a network is
     told, so that it cannot tell a bright scene from a dark one. No colour counts as darker than a
     thirtieth of the brightest, and it is above 0 without any light."""
+    sky_2T3: Floats | None = None
+    """[2, T, 3] the part of the direct light that comes from the sky; None where there is none."""
+
+    @cached_property
+    def but_lamps_2T3(self) -> Floats:
+        """All but the direct light of lamps, [2, T, 3]: what rays take where they have met a side.
+
+        Of the sky that is a mean over the side: its shadows there have no edges.
+        """
+        if self.sky_2T3 is None:
+            return self.indirect_2T3
+        return self.indirect_2T3 + self.sky_2T3
 
     @property
     def num_triangles(self) -> int:
@@ -51,6 +68,10 @@ def scene_light(scene: LitScene) -> SceneLight:
     """Return the light of a scene; equal scenes give equal numbers."""
     rng = rng_for(0, "radiosity")
     direct = _direct(scene, rng)
+    sky = None
+    if scene.sky is not None:
+        sky = _from_sky(scene, rng_for(0, "radiosity of a sky"))
+        direct = direct + sky
     indirect = _bounced(scene, direct, rng)
     weight = scene.area / max(float(2 * scene.area.sum()), 1e-12)
     mean = (direct.sum(axis=0) * weight[:, None]).sum(axis=0)
@@ -58,6 +79,7 @@ def scene_light(scene: LitScene) -> SceneLight:
         direct_2T3=direct,
         indirect_2T3=indirect,
         mean_3=np.maximum(np.maximum(mean, LEAST_SHARE * mean.max()), np.float32(1e-6)),
+        sky_2T3=sky,
     )
 
 
@@ -75,6 +97,25 @@ def _direct(scene: LitScene, rng: np.random.Generator) -> Floats:
             points = _points(scene, rows[some], places[:, some])
             lit = direct_light(scene, points, None, spread(on_lamps[:, :, some], turn), lobe_rays=0)
             total[:, some] += lit.diffuse
+    return _by_side(total / np.float32(DIRECT_POINTS), scene)
+
+
+def _from_sky(scene: LitScene, rng: np.random.Generator) -> Floats:
+    """Return the light of the sky [2, T, 3], with its shadows."""
+    rows = _sides(scene)
+    total = np.zeros((3, len(rows)), np.float32)
+    on_triangle = rng.random((2, len(rows)), np.float32)
+    towards = rng.random((2, len(rows)), np.float32)
+    for turn in range(DIRECT_POINTS):
+        places = spread(on_triangle, turn)
+        for first in range(0, len(rows), _BLOCK):
+            some = slice(first, first + _BLOCK)
+            points = _points(scene, rows[some], places[:, some])
+            light = no_light(points)
+            add_sky_light(
+                light, scene, points, None, towards[:, some], turn, rays=SKY_RAYS, lobe_rays=0
+            )
+            total[:, some] += light.diffuse
     return _by_side(total / np.float32(DIRECT_POINTS), scene)
 
 

@@ -47,7 +47,8 @@ def brought(
 ) -> Floats:
     """Return the radiance [3, P] that points which rays have met send back along these rays.
 
-    Emission is not counted: what lamps send to where a ray came from is direct light.
+    Emission is not counted: what lamps send to where a ray came from is direct light. Light of the
+    sky there is that of the whole side of the triangle.
 
     Args:
         scene, light: the scene.
@@ -63,7 +64,7 @@ def brought(
     spread_out = scene.diffuse_at(points)
     spread_out = spread_out + np.where(is_mirror, np.float32(0), specular)
     sides = points.back.astype(np.intp)
-    sent: Floats = spread_out * light.indirect_2T3[sides, points.triangle].T
+    sent: Floats = spread_out * light.but_lamps_2T3[sides, points.triangle].T
     has_lobe_ray = is_sharp & is_mirror
     keeps_width = has_lobe_ray | (is_sharp & (alpha >= SMOOTH_ALPHA))
     gloss = gloss_at(scene, points, np.where(keeps_width, np.float32(0), WIDENED_ALPHA))
@@ -103,7 +104,13 @@ def _mirrored(
         chance = chances[number, rows[lit]]
         kept = lobe_ray_weight(scene, there, some.position, density, chance)
         seen[:, lit] += np.take(scene.emission, there.triangle, axis=1) * kept
-    return gloss.colour * np.where(met, weight * seen, np.float32(0))
+    arrives = np.where(met, weight * seen, np.float32(0))
+    if scene.sky is not None:
+        # blurred: no other ray shares the sun with this one, which is met once in thousands
+        beyond_all = np.flatnonzero(~met & (weight > 0))
+        sky = scene.drawn_sky.blurred(onward[:, beyond_all])
+        arrives[:, beyond_all] = weight[beyond_all] * sky
+    return gloss.colour * arrives
 
 
 def blocks(count: int) -> Iterator[slice]:

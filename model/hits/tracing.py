@@ -14,7 +14,9 @@ from model.hits.textures import SurfaceTextures
 from model.hits.traced import INPUTS, Traced, stack_traced
 from model.hits.view_inputs import ViewInputs, view_inputs
 from model.scene_tensors import Cameras, SceneBatch, SceneTensors
+from model.sky.known import require_known
 from storage.conventions import radiance_from_log10
+from storage.records.environment import Environment
 from storage.records.material import PUBLISHED_COLUMNS, laid_out
 
 
@@ -38,6 +40,7 @@ class TracedScene:
             rays_a_side=config.hit_rays,
             anchors_a_side=anchors_a_side(config, resolution),
             gather_rays=config.gather_rays,
+            sky_rays=config.sky_rays,
             seed=seed,
         )
 
@@ -52,20 +55,21 @@ def lit_scene(
     normals_T33: Tensor,
     materials_TM: Tensor,
     textures: SurfaceTextures | None = None,
+    sky: Environment | None = None,
 ) -> LitScene:
     """Return the surfaces of a scene.
 
     Args:
         triangles_T33, normals_T33: as in SceneTensors.
         materials_TM: its published columns.
-        textures: as in SceneTensors.
+        textures, sky: as in SceneTensors.
     """
     materials = materials_TM.detach().cpu().numpy().copy()
     for column, part in laid_out(PUBLISHED_COLUMNS):
         if column.is_log_encoded:
             materials[:, part] = np.maximum(radiance_from_log10(materials[:, part]), 0)
     triangles, normals = (each.detach().cpu().numpy() for each in (triangles_T33, normals_T33))
-    return LitScene(triangles, normals, materials, textures)
+    return LitScene(triangles, normals, materials, textures, sky)
 
 
 def traced_batch(batch: SceneBatch) -> tuple[TracedScene, ...]:
@@ -85,6 +89,7 @@ def lit_scenes(batch: SceneBatch) -> tuple[LitScene, ...]:
                 batch.normals_BT33[row][there],
                 materials[row][there],
                 None if batch.textures is None else batch.textures[row],
+                None if batch.skies is None else batch.skies[row],
             )
         )
     return tuple(found)
@@ -97,6 +102,7 @@ def with_traced(
 
     `seed` is that of the noise: a network that saw one noise alone might learn it.
     """
+    require_known(scene.sky, config)
     lit = lit_scene_of(scene)
     ready = TracedScene(lit=lit, light=scene_light(lit))
     traced = traced_views(ready, scene.c2w_V44, scene.fov_deg_V, resolution, config, seed)
@@ -108,7 +114,9 @@ def lit_scene_of(scene: SceneTensors) -> LitScene:
     columns = {column.name: part for column, part in laid_out(scene.columns)}
     numbers = [scene.material_TM[:, columns[name]] for name in PUBLISHED_COLUMNS]
     materials_TM = torch.cat(numbers, dim=-1)
-    return lit_scene(scene.triangles_T33, scene.normals_T33, materials_TM, scene.textures)
+    return lit_scene(
+        scene.triangles_T33, scene.normals_T33, materials_TM, scene.textures, scene.sky
+    )
 
 
 def traced_cameras(

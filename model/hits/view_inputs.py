@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from model.hits.anchors import anchor_pixels, gathered_at
 from model.hits.camera import Rays
-from model.hits.direct_light import direct_light, lobe_ray_weight
+from model.hits.direct_light import DirectLight, direct_light, lobe_ray_weight, no_light
 from model.hits.lit_scene import LitScene, Points
 from model.hits.radiosity import SceneLight
 from model.hits.reflectance import Gloss, drawn, gloss_at, lobe
 from model.hits.second_hits import DIMMEST, SMOOTH_ALPHA, blocks, brought
+from model.hits.sky_light import add_sky_light, escaped_light
 from model.hits.vectors import brightest, dot, spread
 from storage.seeds import rng_for
 
@@ -41,15 +42,15 @@ class Channel:
     ROUGHNESS = slice(17, 18)
     """Mean roughness."""
     OPEN_DIFFUSE = slice(18, 21)
-    """Irradiance over pi from lamps as if nothing stood between."""
+    """Irradiance over pi from lamps and the sky as if nothing stood between."""
     DIRECT_DIFFUSE = slice(21, 24)
-    """Irradiance over pi from lamps, shadowed."""
+    """Irradiance over pi from them, shadowed."""
     OPEN_SPECULAR = slice(24, 27)
-    """Specular radiance from lamps as if nothing stood between; over all rays of the pixel."""
+    """Specular radiance from them as if nothing stood between; over all rays of the pixel."""
     DIRECT_SPECULAR = slice(27, 30)
-    """Specular radiance from lamps, shadowed; over all rays of the pixel."""
+    """Specular radiance from them, shadowed; over all rays of the pixel."""
     SHOWN_DIFFUSE = slice(30, 33)
-    """Diffuse radiance from lamps, shadowed: albedo times irradiance, over all rays."""
+    """Diffuse radiance from them, shadowed: albedo times irradiance, over all rays."""
     MIRRORED = slice(33, 36)
     """Specular radiance from other surfaces, by one ray; over all rays of the pixel."""
     SEEN_ALBEDO = slice(36, 39)
@@ -83,6 +84,7 @@ def view_inputs(
     rays_a_side: int,
     anchors_a_side: int,
     gather_rays: int,
+    sky_rays: int = 0,
     seed: int = 0,
 ) -> ViewInputs:
     """Return what is traced for a view; equal arguments give equal numbers.
@@ -95,12 +97,14 @@ def view_inputs(
         rays_a_side: rays along a side of each pixel.
         anchors_a_side: anchors along a side of the picture, a divisor of the resolution.
         gather_rays: of each anchor; 0: nothing is gathered, and nothing mirrored.
+        sky_rays: towards the sky from each point that is shaded, where the scene has a sky.
         seed: of the noise, which stays where it is on the picture from view to view.
     """
     rays = Rays(c2w, fov_deg, resolution, rays_a_side)
     rng = rng_for(seed, "hits", resolution)
     on_lamps = rng.random((2, len(scene.lamps), resolution**2), np.float32)
     chance = rng.random((6, resolution**2), np.float32)
+    to_sky = _towards_sky(scene, resolution, seed)
     sums = np.zeros((NUM_CHANNELS, resolution**2), np.float32)
     directions = [rays.direction(turn) for turn in range(rays.turns)]
     for part in blocks(resolution**2):
@@ -118,10 +122,13 @@ def view_inputs(
             _add_surface(block, scene, rays.origin)
             lobe_rays = 1 if gather_rays else 0
             _add_direct(block, scene, spread(on_lamps[:, :, pixel], turn), lobe_rays)
+            if to_sky is not None:
+                _add_sky(block, scene, to_sky[:, pixel], turn, sky_rays, lobe_rays)
             if gather_rays:
                 u = chance[:5, pixel]
                 u[:2] = spread(u[:2], turn)
-                _add_lobe_rays(block, scene, light, u, shaded.chosen * np.float32(rays.turns))
+                shading = shaded.chosen * np.float32(rays.turns)
+                _add_lobe_rays(block, scene, light, u, shading, sky_rays)
     pixels = _averaged(sums, rays.turns)
     anchor = anchor_pixels(pixels[0].reshape(resolution, resolution), anchors_a_side)
     return ViewInputs(
@@ -129,6 +136,13 @@ def view_inputs(
         anchor=anchor,
         gathered=gathered_at(scene, light, rays, anchor, gather_rays, seed),
     )
+
+
+def _towards_sky(scene: LitScene, resolution: int, seed: int) -> NDArray[np.float32] | None:
+    """Return uniform numbers [2, pixels]; None without a sky. Other scenes keep their noise."""
+    if scene.sky is None:
+        return None
+    return rng_for(seed, "hits of a sky", resolution).random((2, resolution**2), np.float32)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -219,6 +233,25 @@ def _add_direct(
     block: _Block, scene: LitScene, on_lamps: NDArray[np.float32], lobe_rays: int
 ) -> None:
     lit = direct_light(scene, block.points, block.gloss, on_lamps, lobe_rays=lobe_rays)
+    _add_light(block, scene, lit)
+
+
+def _add_sky(
+    block: _Block,
+    scene: LitScene,
+    shift: NDArray[np.float32],
+    turn: NDArray[np.intp],
+    rays: int,
+    lobe_rays: int,
+) -> None:
+    lit = no_light(block.points)
+    add_sky_light(
+        lit, scene, block.points, block.gloss, shift, turn, rays=rays, lobe_rays=lobe_rays
+    )
+    _add_light(block, scene, lit)
+
+
+def _add_light(block: _Block, scene: LitScene, lit: DirectLight) -> None:
     block.add(Channel.OPEN_DIFFUSE, lit.open_diffuse)
     block.add(Channel.DIRECT_DIFFUSE, lit.diffuse)
     block.add(Channel.OPEN_SPECULAR, lit.open_specular)
@@ -233,15 +266,18 @@ def _add_lobe_rays(
     light: SceneLight,
     u: NDArray[np.float32],
     shading: NDArray[np.float32],
+    sky_rays: int,
 ) -> None:
     """Add what rays drawn by the lobe meet: lamps, by their share of what finds them, and surfaces.
 
-    What surfaces send back takes a shadow ray each, so one ray of a pixel stands for all.
+    Those that meet nothing bring their share of the sky. What surfaces send back takes a shadow ray
+    each, so one ray of a pixel stands for all.
 
     Args:
         block, scene, light: where.
         u: [5, P] uniform numbers.
         shading: [P] rays of the pixel that a ray counts for as to surfaces; 0: none is asked.
+        sky_rays: as in `view_inputs`.
     """
     some = np.flatnonzero(brightest(block.gloss.colour) > DIMMEST)
     direction, weight = drawn(block.gloss.only(some), block.points.only(some), u[:2, some])
@@ -261,6 +297,10 @@ def _add_lobe_rays(
         emitted = arrives[:, lamps] * np.take(scene.emission, there.triangle, axis=1) * kept
         block.add(Channel.DIRECT_SPECULAR, emitted, some[lamps])
         block.add(Channel.OPEN_SPECULAR, emitted, some[lamps])
+    if scene.sky is not None:
+        escaped = escaped_light(scene, points, gloss, direction, weight, sky_rays)
+        block.add(Channel.OPEN_SPECULAR, escaped, some)
+        block.add(Channel.DIRECT_SPECULAR, np.where(met, np.float32(0), escaped), some)
     asked = np.flatnonzero(met & (shading[some] > 0))
     if len(asked):
         rows = some[asked]

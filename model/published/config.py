@@ -130,6 +130,8 @@ def encode_published(config: PublishedConfig) -> dict[str, Any]:
             f"projected_freqs {model.projected_freqs}, demodulated {model.demodulated}",
             "0 and false",
         )
+    if model.texture_cells:
+        _unpublished(f"texture_cells {model.texture_cells}", "0")
     if model.material_columns != PUBLISHED_COLUMNS:
         _unpublished(f"material_columns {model.material_columns}", f"{PUBLISHED_COLUMNS}")
     if model.window_bundles not in (0, WINDOW_BUNDLES):

@@ -8,11 +8,11 @@ much as the average lamp (docs/log).
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from storage.records.environment import Environment
 from storage.records.material import EMISSION
 from storage.records.scene import Scene
+from storage.records.sky_texels import row_solid_angles
 
 
 def shining_sky(scene: Scene) -> Environment | None:
@@ -54,10 +54,3 @@ def peaked_radiance(sky: Environment) -> float:
     below = np.cumsum(weight.ravel()[order])
     median = grey.ravel()[order][min(np.searchsorted(below, 0.5), len(order) - 1)]
     return max(0.0, float((grey * weight).sum() - median))
-
-
-def row_solid_angles(height: int) -> NDArray[np.float64]:
-    """Return the steradians [H] of a texel in each row of a map with 2 H columns."""
-    edges = np.cos(np.pi * np.arange(height + 1) / height)
-    angles: NDArray[np.float64] = (edges[:-1] - edges[1:]) * np.pi / height
-    return angles

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.renders.device_memory import own_floats
-from pipeline.renders.sky_share import row_solid_angles
 from storage.records.environment import Environment
+from storage.records.sky_texels import row_solid_angles, texel_means
 
 _ONE_MINUS_EPSILON = 0.99999994
 _TINY = 1e-30
@@ -125,17 +125,6 @@ class SkyTable:
         chosen = dr.select(kept, place, mi.UInt32(alias))
         fraction = dr.select(kept, fraction / keep, (fraction - keep) / (1 - keep))
         return chosen, dr.clip(fraction, 0, _ONE_MINUS_EPSILON)
-
-
-def texel_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean over each texel [H, W] of what interpolation between their centres gives."""
-    wide = np.pad(values, ((1, 1), (0, 0)), mode="edge")
-    tall = (wide[:-2] + 6 * wide[1:-1] + wide[2:]) / 8
-    round_about = np.pad(tall, ((0, 0), (1, 1)), mode="wrap")
-    means: NDArray[np.float64] = (
-        round_about[:, :-2] + 6 * round_about[:, 1:-1] + round_about[:, 2:]
-    ) / 8
-    return means
 
 
 def alias_rows(weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:

@@ -196,6 +196,8 @@ NETWORKS: dict[str, ModelConfig] = {
         LEAST, width=2 * (9 + 128), projected_freqs=64, num_registers=1
     ),
     "most rays of demodulated pixels": dataclasses.replace(LEAST, demodulated=True, hit_rays=8),
+    "most cells of a sky": dataclasses.replace(LEAST, sky_cells=192),
+    "most texture cells": dataclasses.replace(LEAST, texture_cells=64),
     "narrowest dpt": tiny_config("dpt", dpt_features=2, dpt_channels=(1, 1, 1, 1)),
 }
 

@@ -4,22 +4,27 @@ import numpy as np
 import pytest
 
 from model.hits.view_inputs import Channel
+from storage.records.environment import Environment
 from storage.records.scene import Scene
 from tests.model.hits.kit import corner, direct, traced
 from tests.pipeline.renders.sampling import Estimate, assert_agree, render_blocks
+from tests.pipeline.renders.test_sky_paths import open_scene
+from tests.sky_maps import night, one_sun, smooth
 
 PASSES = 12
 
+SKIES = {"smooth": smooth(), "sun": one_sun(1e5), "night": night()}
 
-def _traced_blocks(scene: Scene, part: slice | None) -> Estimate:
+
+def _traced_blocks(scene: Scene, part: slice | None, passes: int = PASSES) -> Estimate:
     """Return the means of 4 x 4 pixels over several noises, with their standard errors."""
     pictures = []
-    for seed in range(PASSES):
+    for seed in range(passes):
         inputs = traced(scene, 32, seed=seed)
         picture = direct(inputs) if part is None else inputs.pixels[..., part]
         pictures.append(picture.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3)))
     cells = np.array(pictures, np.float64)
-    return Estimate(mean=cells.mean(axis=0), error=cells.std(axis=0, ddof=1) / np.sqrt(PASSES))
+    return Estimate(mean=cells.mean(axis=0), error=cells.std(axis=0, ddof=1) / np.sqrt(passes))
 
 
 @pytest.mark.parametrize("roughness", [0.15, 0.4, 1.0])
@@ -34,6 +39,24 @@ def test_direct_light_is_that_of_paths_of_two_edges(llvm: None, roughness: float
     of_mean = float(np.sqrt(np.square(both).sum()) / both.size)
     apart = abs(float(ours.mean.mean() - theirs.mean.mean()))
     assert apart < 5 * of_mean + 0.005 * float(theirs.mean.mean())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sky", SKIES.values(), ids=SKIES.keys())
+@pytest.mark.parametrize("num_lights", [0, 2])
+def test_direct_light_of_a_sky_is_that_of_paths_of_two_edges(
+    llvm: None, sky: Environment, num_lights: int
+) -> None:
+    """With lamps beside it, and without any."""
+    scene = open_scene(sky, num_lights)
+    ours = _traced_blocks(scene, None, passes=24)
+    theirs = render_blocks(scene, max_depth=2, passes=6)
+    at_rims = 0.03 * theirs.mean.max()  # as above
+    assert_agree(Estimate(mean=ours.mean, error=np.hypot(ours.error, at_rims)), theirs)
+    both = np.hypot(ours.error, theirs.error)
+    of_mean = float(np.sqrt(np.square(both).sum()) / both.size)
+    apart = abs(float(ours.mean.mean() - theirs.mean.mean()))
+    assert apart < 5 * of_mean + 0.01 * float(theirs.mean.mean())
 
 
 def test_diffuse_light_of_other_surfaces_is_that_of_longer_paths(llvm: None) -> None:

@@ -3,11 +3,9 @@
 import dataclasses
 
 import numpy as np
-import pytest
 import torch
 
 from model.scene_tensors import batch_scenes, scene_tensors, tensors_of
-from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.material import EMISSION, material_width
 from storage.records.scene import ARRAY_FIELDS
@@ -63,8 +61,9 @@ def test_equal_lengths_need_no_mask() -> None:
     assert batch.is_triangle_BT is None
 
 
-def test_a_scene_below_a_sky_is_refused() -> None:
-    """Without its light the picture would be that of another scene."""
-    environment = Environment(radiance_rgb=np.ones((2, 4, 3), np.float32))
-    with pytest.raises(TrilightError, match="it has an environment.*skies.share=0"):
-        scene_tensors(dataclasses.replace(toy_scene(0), environment=environment))
+def test_a_black_sky_is_none() -> None:
+    for height, radiance, is_there in ((2, 1.0, True), (2, 0.0, False), (1, 0.0, False)):
+        texels = np.full((height, 2 * height, 3), radiance, np.float32)
+        scene = dataclasses.replace(toy_scene(0), environment=Environment(radiance_rgb=texels))
+        batch = batch_scenes([scene_tensors(scene)])
+        assert (batch.skies is not None) == is_there

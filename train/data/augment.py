@@ -22,6 +22,7 @@ from torch import Tensor
 
 from model.hits.textures import SurfaceTextures
 from model.scene_tensors import SceneTensors
+from model.sky import symmetries
 from storage.records.material import laid_out
 from train.data.scenes import TrainingScene
 
@@ -91,6 +92,7 @@ def moved(scene: TrainingScene, rotation_33: Tensor, shift_3: Tensor) -> Trainin
         triangles_T33=(old.triangles_T33.double() @ rotation_33.T + shift_3).float(),
         normals_T33=(old.normals_T33.double() @ rotation_33.T).float(),
         c2w_V44=(motion_44 @ old.c2w_V44.double()).float(),
+        sky=None if old.sky is None else symmetries.turned(old.sky, rotation_33.numpy()),
     )
     return dataclasses.replace(scene, tensors=tensors)
 
@@ -112,6 +114,7 @@ def mirrored(scene: TrainingScene) -> TrainingScene:
         # the reflection before and after: row and column of x change their signs
         c2w_V44=_tensor(sides_4[:, None] * old.c2w_V44.numpy() * sides_4),
         textures=_turned(old, np.tile(np.array([2, 1, 0]), (old.num_triangles, 1))),
+        sky=None if old.sky is None else symmetries.behind_mirror(old.sky, sides_3),
     )
     target_VRR3 = _tensor(scene.target_VRR3.numpy()[:, :, ::-1])
     return dataclasses.replace(scene, tensors=tensors, target_VRR3=target_VRR3, lights_VLRR3=None)
@@ -127,9 +130,14 @@ def with_channels(scene: TrainingScene, order: np.ndarray) -> TrainingScene:
     textures = scene.tensors.textures
     if textures is not None:
         textures = textures.with_channels(order)
+    sky = scene.tensors.sky
+    if sky is not None:
+        sky = symmetries.with_channels(sky, order)
     return dataclasses.replace(
         scene,
-        tensors=dataclasses.replace(scene.tensors, material_TM=material_TM, textures=textures),
+        tensors=dataclasses.replace(
+            scene.tensors, material_TM=material_TM, textures=textures, sky=sky
+        ),
         target_VRR3=_tensor(scene.target_VRR3.numpy()[..., order]),
         lights_VLRR3=None,
     )
@@ -189,9 +197,12 @@ LN_10 = math.log(10.0)
 def with_light_scaled(scene: TrainingScene, factor: float) -> TrainingScene:
     """Return the scene with all of its light `factor` times as strong. Drops single lights."""
     factor_T = torch.full((scene.tensors.num_triangles,), factor)
+    tensors = _relit(scene.tensors, factor_T)
+    if tensors.sky is not None:
+        tensors = dataclasses.replace(tensors, sky=symmetries.scaled(tensors.sky, factor))
     return dataclasses.replace(
         scene,
-        tensors=_relit(scene.tensors, factor_T),
+        tensors=tensors,
         target_VRR3=_log10(factor * _linear(scene.target_VRR3)),
         lights_VLRR3=None,
     )

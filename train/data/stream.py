@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from model.scene_tensors import with_cells
+from model.sky.known import require_known
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
 from storage.records.sample import Sample
@@ -172,7 +174,16 @@ class _SceneMaker:
         seen = with_views(scene, np.sort(views))
         if settings.augmentation:
             seen = augmented(seen, settings.augmentation, rng)
-        if settings.network is None or not settings.network.hit_rays:
+        return self._prepared(seen, rng)
+
+    def _prepared(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
+        """Return a scene with all that its network wants to be told."""
+        settings = self._settings
+        if settings.network is None:
+            return seen
+        tensors = with_cells(seen.tensors, settings.network.texture_cells)
+        seen = dataclasses.replace(seen, tensors=tensors)
+        if not settings.network.hit_rays:
             return seen
         # these bring the checker of settings along
         from model.demodulated import with_albedo
@@ -227,12 +238,15 @@ class _SceneMaker:
                 f"sample {sample.key}: {sample.scene.num_views} views; the run draws "
                 f"{settings.views_per_scene} of each scene."
             )
-        return training_scene(
+        scene = training_scene(
             sample,
             settings.resolution,
             most_triangles=settings.most_triangles,
             lights_apart=settings.augmentation is not None and settings.augmentation.light_mix > 1,
         )
+        if settings.network is not None:
+            require_known(scene.tensors.sky, settings.network)
+        return scene
 
 
 def _named(shard: str, error: TrilightError) -> TrilightError:

@@ -12,29 +12,10 @@ from model.hits.tracing import TracedScene, traced_batch
 from model.hits.view_inputs import Channel, ViewInputs, view_inputs
 from model.scene_tensors import SceneTensors, batch_scenes, scene_tensors
 from storage.records.first_hits import first_hits
-from storage.records.retextured import with_textures
 from storage.records.scene import Scene
-from storage.records.texture import Texture
-from tests.model.hits.kit import corner, traced
+from tests.model.hits.kit import corner, textured, traced
 from train.data.augment import mirrored, with_channels, with_vertices_turned
 from train.data.scenes import TrainingScene
-
-
-def _textured(*, roughness: bool = True) -> Scene:
-    """Return the corner with a coloured floor, and a ball of which the gloss is textured."""
-    scene = corner()
-    rng = np.random.default_rng(0)
-    colours = Texture(texels=rng.integers(0, 200, (8, 8, 3), np.uint8), is_srgb=True)
-    rough = Texture(texels=rng.uniform(0.2, 0.9, (4, 4, 1)).astype(np.float32))
-    index = np.full((len(scene.materials), 3), -1, np.int32)
-    index[0, 0] = 0
-    if roughness:
-        index[3, 2] = 1
-    uv = 1.3 * scene.vertex_positions[scene.faces.ravel(), :2] - 0.4
-    textures = (colours, rough)[: 1 + roughness]
-    found = with_textures(scene, uv.astype(np.float32), textures, index)
-    found.check()
-    return found
 
 
 def _traced(scene: Scene, rays_a_side: int = 2) -> ViewInputs:
@@ -57,7 +38,7 @@ def _traced(scene: Scene, rays_a_side: int = 2) -> ViewInputs:
 
 
 def test_a_pixel_has_the_material_at_its_hit() -> None:
-    scene = _textured()
+    scene = textured()
     hits = first_hits(scene, resolution=32)
     pixels = _traced(scene, rays_a_side=1).pixels
     met = hits.met
@@ -73,7 +54,7 @@ def test_a_pixel_has_the_material_at_its_hit() -> None:
 
 def test_every_ray_of_a_textured_pixel_counts() -> None:
     """The albedo of a pixel is the mean over its rays, not that of one of them."""
-    scene = _textured(roughness=False)
+    scene = textured(roughness=False)
     fine = first_hits(scene, resolution=64).material[..., 0:3]
     means = np.asarray(fine).reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
     found = _traced(scene).pixels
@@ -83,7 +64,7 @@ def test_every_ray_of_a_textured_pixel_counts() -> None:
 
 
 def test_plain_triangles_of_a_textured_scene_and_plain_scenes_stay() -> None:
-    plain, scene = corner(), _textured()
+    plain, scene = corner(), textured()
     assert surface_textures(plain) is None
     without, there = traced(plain).pixels, _traced(scene).pixels
     wall = first_hits(scene, resolution=32).material[..., 6] == 1.0
@@ -94,7 +75,7 @@ def test_plain_triangles_of_a_textured_scene_and_plain_scenes_stay() -> None:
 
 @pytest.mark.parametrize("symmetry", ["turned", "mirrored", "channels"])
 def test_textures_go_through_the_symmetries_of_training(symmetry: str) -> None:
-    scene = _textured()
+    scene = textured()
     tensors = scene_tensors(scene)
     training = TrainingScene(
         key="",

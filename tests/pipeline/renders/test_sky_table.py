@@ -4,10 +4,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pipeline.renders.sky_share import peaked_radiance, row_solid_angles, sky_share
-from pipeline.renders.sky_table import SkyTable, alias_rows, texel_means
+from pipeline.renders.sky_share import peaked_radiance, sky_share
+from pipeline.renders.sky_table import SkyTable, alias_rows
 from scene_templates.rotations import uniform_rotation
 from storage.records.lookup import environment_values
+from storage.records.sky_texels import row_solid_angles, texel_means
 from tests.pipeline.renders.scene_kit import join, light, material, quad
 from tests.sky_maps import as_sky, constant, night, one_sun, six_poles, smooth
 

@@ -1,0 +1,122 @@
+"""Direct light from the sky at points: rays drawn by its map and rays drawn by the surface.
+
+A smooth sky is found by directions that lie around the normal, a sun by those that its map draws,
+and what a glossy surface mirrors by rays that its lobe draws. Each direction counts by the density
+of all of them together (the balance heuristic, Veach and Guibas 1995). Unbiased.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.hits.direct_light import DirectLight
+from model.hits.lit_scene import LitScene, Points, off_surface
+from model.hits.reflectance import Gloss, lobe
+from model.hits.vectors import Floats, as_rows, cosine_direction, dot, spread
+
+_INV_PI = np.float32(1 / np.pi)
+
+_FAR_M = np.float32(1e30)
+"""Beyond all surfaces."""
+
+_LEAST = np.float32(1e-20)
+
+
+def add_sky_light(
+    light: DirectLight,
+    scene: LitScene,
+    points: Points,
+    gloss: Gloss | None,
+    shift: Floats,
+    turn: NDArray[np.intp] | int,
+    *,
+    rays: int,
+    lobe_rays: int,
+) -> None:
+    """Add the light of a scene's sky to that of its lamps.
+
+    Args:
+        light: what is added to.
+        scene: has a sky.
+        points, gloss, lobe_rays: as in `direct_light`.
+        shift: [2, P] uniform numbers.
+        turn: which of the rays of its pixel a point is ([P]), whose directions all differ.
+        rays: towards the sky from each point, half of them, or one more, by the map.
+    """
+    by_map = (rays + 1) // 2
+    for number in range(rays):
+        u = spread(shift, turn * rays + number)
+        if number < by_map:
+            direction = scene.drawn_sky.drawn(u)
+        else:
+            direction = cosine_direction(u, points.normal, points.edge)
+        _add(light, scene, points, gloss, direction, by_map, rays - by_map, lobe_rays)
+
+
+def _add(
+    light: DirectLight,
+    scene: LitScene,
+    points: Points,
+    gloss: Gloss | None,
+    direction: Floats,
+    by_map: int,
+    by_surface: int,
+    lobe_rays: int,
+) -> None:
+    cosine = np.maximum(dot(points.normal, direction), 0)
+    density = sky_density(scene, direction, cosine, by_map, by_surface)
+    diffuse = cosine * _INV_PI / density
+    specular = None
+    if gloss is not None:
+        value, of_lobe = lobe(gloss, points, direction, dot(points.normal, direction))
+        specular = value / (density + lobe_rays * of_lobe)
+    useful = np.flatnonzero(diffuse if specular is None else (diffuse > 0) | (specular > 0))
+    if not len(useful):
+        return
+    here = points.only(useful)
+    is_free = sees_sky(scene, here, direction[:, useful])
+    radiance = scene.drawn_sky.radiance(direction[:, useful])
+    arrives = radiance * diffuse[useful]
+    light.open_diffuse[:, useful] += arrives
+    light.diffuse[:, useful] += arrives * is_free
+    if specular is not None and gloss is not None:
+        coloured = gloss.colour[:, useful] * specular[useful] * radiance
+        light.open_specular[:, useful] += coloured
+        light.specular[:, useful] += coloured * is_free
+
+
+def sky_density(
+    scene: LitScene, direction: Floats, cosine: Floats, by_map: int, by_surface: int
+) -> Floats:
+    """Return how many rays [P] `add_sky_light` sends along directions, per steradian."""
+    density: Floats = by_map * scene.drawn_sky.density(direction)
+    density += by_surface * _INV_PI * np.maximum(cosine, 0)
+    return np.maximum(density, _LEAST)
+
+
+def escaped_light(
+    scene: LitScene, points: Points, gloss: Gloss, direction: Floats, weight: Floats, rays: int
+) -> Floats:
+    """Return what directions [3, P] that the lobe has drawn bring of the sky, without shadows.
+
+    It is their share of what `add_sky_light` brings with so many rays and one by the lobe.
+
+    Args:
+        scene: has a sky.
+        points, gloss: where the rays begin.
+        direction, weight: of `reflectance.drawn`.
+        rays: as in `add_sky_light`.
+    """
+    cosine = dot(points.normal, direction)
+    _, of_lobe = lobe(gloss, points, direction, cosine)
+    by_map = (rays + 1) // 2
+    others = sky_density(scene, direction, cosine, by_map, rays - by_map)
+    share = of_lobe / (of_lobe + others)
+    found: Floats = gloss.colour * (weight * share) * scene.drawn_sky.radiance(direction)
+    return found
+
+
+def sees_sky(scene: LitScene, points: Points, direction: Floats) -> NDArray[np.bool_]:
+    """Return whether rays from points meet nothing, lamps included."""
+    start = off_surface(points.position, points.plane, direction)
+    far = np.full(direction.shape[1], _FAR_M, np.float32)
+    return scene.everything.is_free(as_rows(start), as_rows(direction), far)

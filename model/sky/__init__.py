@@ -1,0 +1,1 @@
+"""Light from far away, for networks: directions drawn by it, cells of it, and its symmetries."""

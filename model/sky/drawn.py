@@ -1,0 +1,77 @@
+"""`DrawnSky`: an environment map as rays use it: directions drawn by its light, and their odds.
+
+A texel is drawn in proportion to the light that comes through it, and a direction evenly within it
+by solid angle: a sun of one texel is found by most draws. Draws are made in the axes of the
+map, so that a scene turned together with its map has the same noise.
+"""
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.hits.vectors import Floats, as_rows
+from storage.conventions import latlong_uv
+from storage.records.environment import Environment
+from storage.records.lookup import environment_values
+from storage.records.sky_texels import row_solid_angles, texel_means
+
+_BLURRED_ROWS = 16
+"""Rows of the map that hardly any direction is worth a sharp look at: 11 degrees each."""
+
+
+class DrawnSky:
+    """The map of a scene, which is not all black."""
+
+    def __init__(self, sky: Environment) -> None:
+        self.sky = sky
+        height, width = sky.radiance_rgb.shape[:2]
+        angles = row_solid_angles(height)[:, None]
+        flux = texel_means(sky.radiance_rgb.mean(axis=-1, dtype=np.float64)) * angles
+        self._share = flux.ravel() / flux.sum()
+        self._below = np.cumsum(self._share)
+        self._density = flux / flux.sum() / angles
+        self._edges = np.cos(np.pi * np.arange(height + 1) / height)
+        self._height, self._width = height, width
+
+    def drawn(self, u: Floats) -> Floats:
+        """Return unit directions [3, P] of the world from u [2, P] in the unit square."""
+        first = u[0].astype(np.float64)
+        texel = np.searchsorted(self._below, first, side="right").clip(0, self._share.size - 1)
+        share = self._share[texel]
+        along = (first - (self._below[texel] - share)) / np.maximum(share, 1e-300)
+        row, column = np.divmod(texel, self._width)
+        z = self._edges[row] + (self._edges[row + 1] - self._edges[row]) * u[1]
+        azimuth = (0.5 - (column + along.clip(0, 1)) / self._width) * 2 * np.pi
+        flat = np.sqrt(np.maximum(1 - z * z, 0))
+        local = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z])
+        return (self.sky.rotation.astype(np.float64) @ local).astype(np.float32)
+
+    def density(self, direction: Floats) -> Floats:
+        """Return with what density [P], per steradian, unit directions [3, P] are drawn."""
+        u, v = np.moveaxis(latlong_uv(self.sky.to_map(direction.T)), -1, 0)
+        row = ((1 - v) * self._height).astype(np.intp).clip(0, self._height - 1)
+        column = np.floor(u * self._width).astype(np.intp) % self._width
+        return self._density[row, column].astype(np.float32)
+
+    def radiance(self, direction: Floats) -> Floats:
+        """Return the radiance [3, P] that comes from unit directions [3, P]."""
+        return environment_values(self.sky, as_rows(direction)).T.astype(np.float32)
+
+    def blurred(self, direction: Floats) -> Floats:
+        """Return it from a map with few rows, which has as much light in all."""
+        return environment_values(self._coarse, as_rows(direction)).T.astype(np.float32)
+
+    @cached_property
+    def _coarse(self) -> Environment:
+        factor = max(self._height // _BLURRED_ROWS, 1)
+        while self._height % factor:
+            factor -= 1
+        rows = self._height // factor
+        angles: NDArray[np.float64] = row_solid_angles(self._height)[:, None, None]
+        light = (self.sky.radiance_rgb * angles).reshape(rows, factor, 2 * rows, factor, 3)
+        means = (
+            light.sum(axis=(1, 3))
+            / (factor**2 * angles.reshape(rows, factor).mean(axis=1))[:, None, None]
+        )
+        return Environment(radiance_rgb=means.astype(np.float32), rotation=self.sky.rotation)

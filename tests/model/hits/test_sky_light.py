@@ -1,0 +1,176 @@
+"""Light of a sky at hits: closed forms, a slow twin, and nothing where there is none."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from model.hits.direct_light import no_light
+from model.hits.radiosity import scene_light
+from model.hits.reflectance import drawn, gloss_at
+from model.hits.sky_light import add_sky_light, escaped_light, sees_sky
+from model.hits.view_inputs import Channel
+from scene_templates.rotations import uniform_rotation
+from storage.records.environment import Environment
+from storage.records.lookup import environment_values
+from storage.records.scene import Scene
+from storage.records.sky_texels import row_solid_angles
+from tests.laws.test_rigid_motion import moved
+from tests.model.hits.kit import FLOOR, corner, direct, lit_scene, traced
+from tests.pipeline.renders.scene_kit import join, material, quad, sphere
+from tests.sky_maps import centres, constant, one_sun, smooth
+
+
+def _floor(sky: Environment) -> Scene:
+    parts = [quad(FLOOR, material(diffuse=0.5, specular=0.0))]
+    return join(parts, eye=(0, 0.1, 3), target=(0, 0, 0), fov_deg=40, sky=sky)
+
+
+def test_a_plane_below_a_constant_sky_receives_its_radiance() -> None:
+    """Irradiance over pi is the radiance: a sky all around, and half of it above."""
+    inputs = traced(_floor(constant((0.5, 1.0, 2.0))), sky_rays=16)
+    found = inputs.pixels[..., Channel.DIRECT_DIFFUSE].mean(axis=(0, 1))
+    # 1,024 pixels of 16 rays, half of them by the cosine, the others even: 0.3 %.
+    assert found == pytest.approx(np.array([0.5, 1.0, 2.0]), rel=0.01)
+    assert inputs.pixels[..., Channel.OPEN_DIFFUSE].mean(axis=(0, 1)) == pytest.approx(found)
+
+
+def test_below_a_roof_a_sky_gives_what_comes_from_the_sides() -> None:
+    """Under the middle of a square roof a constant sky lacks the roof's view factor.
+
+    With a = half width over height: 4 x 1/(2 pi) x 2 x a/sqrt(1 + a^2) x atan(a/sqrt(1 + a^2)).
+    """
+    roof = [[-0.5, -0.5, 0.5], [0.5, -0.5, 0.5], [0.5, 0.5, 0.5], [-0.5, 0.5, 0.5]]
+    parts = [quad(FLOOR, material(diffuse=0.5)), quad(roof, material(diffuse=0.0))]
+    scene = join(parts, eye=(1.2, 0, 0.25), target=(0, 0, 0), fov_deg=1, sky=constant(1.0))
+    inputs = traced(scene, 8, sky_rays=64)
+    slope = 1 / np.sqrt(2)
+    hidden = 4 / (2 * np.pi) * 2 * slope * np.arctan(slope)
+    found = inputs.pixels[..., Channel.DIRECT_DIFFUSE].mean()
+    assert inputs.pixels[..., Channel.OPEN_DIFFUSE].mean() == pytest.approx(1, rel=0.03)
+    assert found == pytest.approx(1 - hidden, abs=0.03)  # 64 pixels of 64 rays and more: 1 %
+
+
+@pytest.mark.parametrize("roughness", [0.05, 0.3, 0.8])
+def test_a_white_ball_in_a_white_sky_is_white(roughness: float) -> None:
+    """Convex, energy-conserving, and lit from everywhere: direct light alone makes it vanish."""
+    thing = sphere([0, 0, 0], 0.4, material(diffuse=0.0, specular=1.0, roughness=roughness))
+    scene = join([thing], eye=(0.3, -2, 0.4), fov_deg=24, sky=constant(1.0))
+    inputs = [traced(scene, sky_rays=8, seed=seed) for seed in range(4)]
+    picture = np.mean([direct(each) for each in inputs], axis=0)
+    full = np.all([each.pixels[..., 0] == 1 for each in inputs], axis=0)
+    # Noise of 4 x 4 x 8 rays a pixel and 500 pixels: 0.3 %; triangles of a ball shade their rims.
+    assert picture[full].mean() == pytest.approx(1.0, abs=0.02)
+
+
+def _irradiance_twin(scene: Scene, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return irradiance over pi: texel by texel, with one shadow ray each."""
+    lit, sky = lit_scene(scene), scene.environment
+    assert sky is not None
+    fine = 64
+    angles, total = row_solid_angles(fine), np.zeros(3)
+    local = centres(fine)
+    for row in range(fine):
+        for direction in local[row] @ sky.rotation.astype(np.float64).T:
+            cosine = float(normal @ direction)
+            if cosine <= 0:
+                continue
+            start = np.array([place + 1e-4 * normal], np.float32)
+            free = lit.everything.is_free(
+                start, direction[None].astype(np.float32), np.array([1e6], np.float32)
+            )
+            total += environment_values(sky, direction) * (free[0] * cosine * angles[row] / np.pi)
+    return total
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sky", [smooth(), one_sun(1e6)], ids=["smooth", "sun"])
+def test_light_of_a_sky_is_that_of_all_its_texels_with_shadows(sky: Environment) -> None:
+    scene = corner(sky=sky)
+    lit = lit_scene(scene)
+    origin = np.array([1.0, -3.0, 1.4], np.float32)
+    targets = np.array([[0.9, -0.6, 0.0], [-0.9, 0.6, 0.0], [0.6, 1.5, 1.2]])
+    rays = ((targets - origin) / np.linalg.norm(targets - origin, axis=1)[:, None]).T
+    points, met = lit.first_points(origin, rays.astype(np.float32))
+    assert len(met) == 3
+    found, count = np.zeros((3, 3)), 64
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        light = no_light(points)
+        shift = rng.random((2, 3), np.float32)
+        add_sky_light(light, lit, points, None, shift, 0, rays=8, lobe_rays=0)
+        found += light.diffuse / count
+    for point in range(3):
+        expected = _irradiance_twin(scene, points.position[:, point], points.normal[:, point])
+        assert expected.max() > 0.02
+        # 512 rays: 3 % where half of a smooth sky is hidden; a sun's texel is read once by the twin
+        assert found[:, point] == pytest.approx(expected, rel=0.08, abs=0.01 * expected.max())
+
+
+def test_scenes_without_a_sky_stay_as_they_are_to_the_bit() -> None:
+    plain, asked = traced(corner(), sky_rays=0), traced(corner(), sky_rays=8)
+    for name, value in vars(plain).items():
+        assert np.array_equal(value, getattr(asked, name)), name
+
+
+def test_a_sky_joins_the_unit_and_what_triangles_receive() -> None:
+    """Twice the light is twice the unit; without lamps the sky alone is the unit."""
+    without, below = (scene_light(lit_scene(corner(sky=sky))) for sky in (None, constant(1.0)))
+    double = scene_light(lit_scene(corner(sky=constant(2.0))))
+    assert without.sky_2T3 is None and below.sky_2T3 is not None and double.sky_2T3 is not None
+    assert double.sky_2T3 == pytest.approx(2 * below.sky_2T3, rel=1e-5)
+    assert (below.mean_3 > without.mean_3).all()
+    assert below.but_lamps_2T3 == pytest.approx(below.indirect_2T3 + below.sky_2T3)
+    dark = scene_light(lit_scene(corner(radiance=0.0, sky=constant((1.0, 0.0, 0.0)))))
+    assert dark.mean_3[0] > 0.1
+    assert dark.mean_3[1] == pytest.approx(0.03 * dark.mean_3[0], rel=1e-5)
+
+
+def test_a_scene_without_lamps_is_lit_by_its_sky() -> None:
+    inputs = traced(corner(radiance=0.0, sky=smooth()))
+    met = inputs.pixels[..., 0] == 1
+    assert np.median(direct(inputs)[met]) > 0.05
+    assert inputs.gathered.max() > 0.01
+    assert inputs.pixels[..., Channel.MIRRORED].max() > 0.01
+
+
+def test_scene_and_sky_turned_together_look_the_same() -> None:
+    """The noise too turns with them, but where a ray meets a rim."""
+    rotation = uniform_rotation(np.random.default_rng(2))
+    scene = corner(sky=smooth())
+    sky = scene.environment
+    assert sky is not None
+    turned = dataclasses.replace(sky, rotation=(rotation @ sky.rotation).astype(np.float32))
+    there = dataclasses.replace(moved(scene, rotation, [0.3, -0.2, 0.1]), environment=turned)
+    before, after = direct(traced(scene)), direct(traced(there))
+    assert np.mean(np.abs(before - after).max(axis=-1) > 1e-3) < 0.02
+
+
+@pytest.mark.parametrize("sky", [one_sun(1e6), constant(1e9), constant(1e-9, height=1)])
+def test_extreme_skies_are_finite(sky: Environment) -> None:
+    inputs = traced(corner(sky=sky), sky_rays=3)
+    assert all(np.isfinite(value).all() for value in vars(inputs).values())
+
+
+def test_the_lobe_ray_and_the_others_share_what_a_mirror_shows() -> None:
+    """A ball in a smooth sky: with and without rays by the lobe the same light."""
+    scene = corner(radiance=0.0, roughness=0.3, sky=smooth())
+    lit = lit_scene(scene)
+    origin = np.array([1.0, -3.0, 1.4], np.float32)
+    ray = np.array([0.5, -0.2, 0.4]) - origin
+    ray = (ray / np.linalg.norm(ray)).astype(np.float32)[:, None]
+    points, _ = lit.first_points(origin, np.repeat(ray, 4_000, axis=1))
+    light, gloss = no_light(points), gloss_at(lit, points)
+    shift = np.random.default_rng(0).random((2, 4_000), np.float32)
+    add_sky_light(light, lit, points, gloss, shift, 0, rays=8, lobe_rays=0)
+    alone = light.specular.mean(axis=1)
+    shared = no_light(points)
+    add_sky_light(shared, lit, points, gloss, shift, 0, rays=8, lobe_rays=1)
+    direction, weight = drawn(
+        gloss, points, np.random.default_rng(1).random((2, 4_000), np.float32)
+    )
+    free = sees_sky(lit, points, direction) & (weight > 0)
+    escaped = escaped_light(lit, points, gloss, direction, weight, 8) * free
+    together = shared.specular.mean(axis=1) + escaped.mean(axis=1)
+    assert escaped.mean() > 0.1 * together.mean()
+    assert together == pytest.approx(alone, rel=0.03)  # 32,000 rays of a narrow lobe: 1 %
