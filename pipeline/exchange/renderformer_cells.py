@@ -88,7 +88,7 @@ def _means(texture: Texture, uv: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Atlas:
+class CellAtlas:
     """Cells of many triangles side by side."""
 
     textures: tuple[Texture, Texture, Texture]
@@ -97,7 +97,7 @@ class Atlas:
     """[N, 3, 2] of the corners of each triangle."""
 
 
-def atlas_of(cells: NDArray[np.float32], source: MapSource) -> Atlas:
+def atlas_of(cells: NDArray[np.float32], source: MapSource) -> CellAtlas:
     """Return cells [N, 7, 32, 32] as textures of 8 bits, in the order of their triangles.
 
     The diffuse albedo gives way where both add up to more than 1. Cells that no look-up meets have
@@ -119,4 +119,4 @@ def atlas_of(cells: NDArray[np.float32], source: MapSource) -> Atlas:
     corner = np.stack([column, row], axis=-1)[:, None] * _TILE + _BORDER
     places = np.array([[CELLS, 0], [0, CELLS], [0, 0]])
     uv = (corner + places) / [across * _TILE, up * _TILE]
-    return Atlas(textures=(*colours, roughness), uv=uv.astype(np.float32))
+    return CellAtlas(textures=(*colours, roughness), uv=uv.astype(np.float32))

@@ -11,7 +11,7 @@ from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
 from infra.setup.settings_page import ROOTS, reachable
 from model.config import ModelConfig, smoke, tiny
-from pipeline.assets.settings import AssetSettings, GateSettings
+from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
 from pipeline.builds.named import named_build
 from pipeline.builds.revisit import GivenCamera, RevisitSettings
 from pipeline.builds.settings import BuildSettings
@@ -55,6 +55,7 @@ EXAMPLES: dict[type, Any] = {
     BuildSettings: SMOKE,
     AssetSettings: SMOKE.assets,
     GateSettings: SMOKE.assets.gate,
+    OwnMaterialSettings: SMOKE.assets.own_materials,
     SceneSettings: SMOKE.scenes,
     Family: ONE_FAMILY_EACH[0],
     SharedRoom: SharedRoom(),

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.assets.settings import OwnMaterialSettings
 from pipeline.builds.named import BUILDS, frozen_note, named_build, object_source
 from pipeline.builds.settings import BuildSettings, differences
 from scene_templates.skies.settings import SkySettings
@@ -34,7 +35,8 @@ def test_settings_survive_the_manifest(name: str) -> None:
 
 _LATER = {
     *("noise_floor_linear_db", "noise_floor_objects_db", "split", "split_lobes", "passes"),
-    *("revisit", "listed_shards", "textures", "skies"),
+    *("revisit", "listed_shards", "textures", "skies", "source", "own_share"),
+    "own_materials",
 }
 """Settings that no record holds where they say nothing."""
 
@@ -43,9 +45,8 @@ def _rebuilt(like: Any, stored: Any) -> Any:
     """Settings of the kind of `like` from JSON values; nothing may be lost on the way."""
     if dataclasses.is_dataclass(like) and not isinstance(like, type):
         unset = _LATER - set(stored)
-        held = [getattr(like, name, None) for name in unset]
-        assert not any(
-            each.share if isinstance(each, TextureSettings | SkySettings) else each for each in held
+        assert all(
+            _says_nothing(like, field) for field in dataclasses.fields(like) if field.name in unset
         )
         names = [field.name for field in dataclasses.fields(like) if field.name not in unset]
         assert set(stored) == set(names)
@@ -54,6 +55,15 @@ def _rebuilt(like: Any, stored: Any) -> Any:
     if isinstance(like, tuple):
         return tuple(_rebuilt(old, new) for old, new in zip(like, stored, strict=True))
     return stored
+
+
+def _says_nothing(like: Any, field: dataclasses.Field[Any]) -> bool:
+    held = getattr(like, field.name)
+    if isinstance(held, TextureSettings | SkySettings):
+        return held.share == 0
+    if isinstance(held, OwnMaterialSettings):
+        return not held.keep
+    return bool(held == field.default)
 
 
 def test_builds_differ_from_each_other() -> None:
