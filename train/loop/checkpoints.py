@@ -28,6 +28,7 @@ from storage.settings.described import from_record, settings_record
 from train.data.unusable import Unusable
 from train.folder import RunFolder
 from train.loop.crew import Crew
+from train.loop.schedule import decay_begins
 from train.loop.state import TrainState, new_state
 from train.settings import Precision, TrainSettings
 
@@ -237,8 +238,9 @@ def keep_checkpoint(
 ) -> None:
     """Save the state, whole or not at all, and only then delete what the run does not keep.
 
-    Kept are the newest `checkpoints_kept` and every multiple of `keep_every`. One of a later step
-    was damaged when the run resumed from an earlier one, and does not count.
+    Kept are the newest `checkpoints_kept`, every multiple of `keep_every`, and the one where the
+    decay of the learning rate begins, from which a longer run can go on. One of a later step was
+    damaged when the run resumed from an earlier one, and does not count.
 
     Raises:
         TrilightError: the folder is full or cannot be written; the older ones are still there.
@@ -248,7 +250,8 @@ def keep_checkpoint(
     remove_leftovers(folder)
     passed = [step for step in saved_steps(folder) if step <= state.step]
     for step in passed[: -settings.checkpoints_kept]:
-        if not settings.keep_every or step % settings.keep_every:
+        milestone = settings.keep_every and step % settings.keep_every == 0
+        if not milestone and step != decay_begins(settings):
             path_of_step(folder, step).unlink(missing_ok=True)
 
 

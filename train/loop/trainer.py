@@ -15,7 +15,7 @@ from train.folder import RunFolder
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.crew import Crew
 from train.loop.interrupts import Stopped, deferred_interrupts
-from train.loop.optim import learning_rate
+from train.loop.schedule import decay_begins, learning_rate
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
 from train.loop.step import Stepper, StepReport
@@ -183,7 +183,7 @@ class Trainer:
             if last or step % settings.validate_every == 0:
                 with self.window.pause():
                     self.recorder.validate(self.state)
-        if last or step % settings.checkpoint_every == 0:
+        if last or step % settings.checkpoint_every == 0 or step == decay_begins(settings):
             with self.window.pause():
                 self._save()
 
