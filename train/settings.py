@@ -1,9 +1,9 @@
 """Training runs: one frozen description of everything that decides the weights. Without torch.
 
 A run is a Python function that returns the whole description (train.runs); the command line picks
-one and may replace fields. What is not here cannot be changed. Fields marked EXECUTION may differ at
-every resume: the weights are the same but for rounding, or do not depend on them at all. All others
-are what the run means, and change by a decision that the run records (train.going_on).
+one and may replace fields. What is not here cannot be changed. Fields marked EXECUTION may differ
+at every resume: the weights are the same but for rounding, or do not depend on them at all. All
+others are what the run means, and change by a decision that the run records (train.going_on).
 """
 
 from dataclasses import field
@@ -103,8 +103,8 @@ class TrainSettings:
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
     """Random augmentation of the training scenes."""
     num_steps: Count
-    """Number of steps, each one update of the weights; the schedule of the learning rate ends at the
-    last one."""
+    """Number of steps, each one update of the weights; the schedule of the learning rate ends at
+    the last one."""
     scenes_per_step: Annotated[int, Within(1, 65_536, unit="scenes")]
     """Batch size: the number of scenes whose gradients are averaged into one update."""
     views_per_scene: Annotated[int, Within(1, 1000, unit="views")]

@@ -2,8 +2,8 @@
 
     scenes_per_pass: Annotated[int, Within(1, 65_536, unit="scenes"), EXECUTION] = 16
 
-Execution is what would change nothing if numbers had no rounding: the result is the same to a stated
-tolerance, so it is free to differ whenever work goes on. All that is not marked is meaning.
+Execution is what would change nothing if numbers had no rounding, so it is free to differ whenever
+work goes on. All that is not marked is meaning.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What changes while a run goes on: weights, mean, the updater's memories, counters, damage met.
+"""What changes while a run goes on: weights, mean, memories, counters, damage met, decisions.
 
 Everything else (order, augmentation, learning rate) is a function of the settings and the step;
 no random generator's state has to be saved.
@@ -12,6 +12,7 @@ import torch
 from model.renderformer import RenderFormer
 from storage.seeds import seed_for
 from train.data.unusable import Unusable
+from train.going_on import Event
 from train.loop.optim import Updater
 from train.settings import Precision, TrainSettings
 
@@ -32,6 +33,8 @@ class TrainState:
     """Steps done, including skipped ones; also the position in the data."""
     skipped_steps: int = 0
     """Steps that were not finite and changed nothing."""
+    history: tuple[Event, ...] = ()
+    """What happened to the run beside its steps, oldest first."""
 
     @property
     def shown(self) -> RenderFormer:

@@ -17,6 +17,7 @@ from storage.errors import TrilightError
 from tests.conftest import ROOT
 from tests.train.kit import tiny_run
 from train.folder import RunFolder
+from train.going_on import going_on
 from train.loop.checkpoints import (
     keep_checkpoint,
     network_of_run,
@@ -101,7 +102,7 @@ def test_the_one_where_the_decay_begins_stays(tmp_path: Path) -> None:
 def test_killed_while_saving_leaves_a_whole_one(killed: Path, call: str, when: str) -> None:
     folder = killed / f"{call} {when}"
     newest = resumed_checkpoint(folder, ALONE, pytest.fail)
-    step = resumed_state(newest, tiny_run(), "d").step
+    step = resumed_state(newest, going_on(newest.header, tiny_run(), "d", {})).step
     assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
     state = new_state(tiny_run())
     state.step = state.skipped_steps = 3

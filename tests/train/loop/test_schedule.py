@@ -1,4 +1,4 @@
-"""Laws of the learning rate: one rise, one fall, and a constant part that knows nothing of the end."""
+"""Laws of the learning rate: one rise, one fall, a constant part that knows nothing of the end."""
 
 import math
 
@@ -67,7 +67,7 @@ def test_old_records_are_cosines() -> None:
 
 
 def test_who_has_which() -> None:
-    """The paper's, and what made the networks that come along, are cosines; ours can be extended."""
+    """The paper's are cosines, and what made the networks that come along; ours can go on."""
     cosines = {name for name in RUNS if named_run(name).schedule == "cosine"}
     assert {name for name in RUNS if name.startswith("paper-")} <= cosines
     assert {"builtin", "hits", "hits-tokens"} <= cosines
