@@ -26,7 +26,6 @@ from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
 from storage.records.safe_read import read_safetensors
 from storage.settings.described import settings_record
-from train.data.unusable import Unusable
 from train.folder import RunFolder
 from train.going_on import GoingOn, event_records
 from train.loop.crew import Crew
@@ -58,6 +57,7 @@ def save_checkpoint(
     header = {
         "step": state.step,
         "skipped_steps": state.skipped_steps,
+        "skipped_in_a_row": state.skipped_in_a_row,
         "unusable": dict(state.unusable.met),
         "settings": settings_record(settings),
         "model": encode_config(settings.model),
@@ -148,9 +148,10 @@ def resumed_state(
     """
     header, settings = checkpoint.header, going.settings
     require_same_extensions("resume: the run", header.get("extensions", {}), recorded("weights"))
-    state = new_state(settings, device, muon_precision=muon_precision)
+    state = new_state(settings, device, muon_precision=muon_precision, met=header["unusable"])
     state.step, state.skipped_steps = header["step"], header["skipped_steps"]
-    state.unusable = Unusable(settings.most_unusable, header["unusable"])
+    if not going.has_decided:
+        state.skipped_in_a_row = header.get("skipped_in_a_row", 0)
     state.history = going.history
     weights = _part(checkpoint.arrays, "model")
     load_tensors(state.model, weights)

@@ -96,7 +96,6 @@ class Trainer:
         self.stepper = Stepper(state, settings, objective, crew)
         self.start_watch = StartWatch(settings)
         self.window = Window()
-        self.skipped_in_a_row = 0
         self.num_noted = 0
 
     def run(self, batches: Iterator[list[TrainingScene]]) -> None:
@@ -142,7 +141,7 @@ class Trainer:
         self.start_watch.add(report)
         self.state.step += 1
         if report.applied:
-            self.skipped_in_a_row = 0
+            self.state.skipped_in_a_row = 0
         else:
             self._skip([scene.key for scene in drawn])
         return report
@@ -172,8 +171,8 @@ class Trainer:
                 f"step {self.state.step} was skipped, since its loss or gradient was not finite; "
                 f"its scenes were {', '.join(keys)}"
             )
-        self.skipped_in_a_row += 1
-        if self.skipped_in_a_row == MOST_SKIPPED_IN_A_ROW:
+        self.state.skipped_in_a_row += 1
+        if self.state.skipped_in_a_row == MOST_SKIPPED_IN_A_ROW:
             raise TrilightError(
                 f"training: {MOST_SKIPPED_IN_A_ROW} steps in a row up to step {self.state.step} "
                 "had a loss or gradient that was not finite; the weights are unchanged by them. "
