@@ -175,6 +175,8 @@ def _differing(old: Mapping[str, Any], wrong: Mapping[str, Any]) -> TrilightErro
         for name, value in wrong.items()
     )
     back = " ".join(f"--set {name}={_shown(_at(old, name))}" for name in wrong)
+    if "num_steps" in wrong:
+        back += " (and no --steps)"
     if fixed := [name for name in wrong if name.split(".")[0] in _FIXED]:
         other = f"begin another run in another folder, since {fixed[0]} is the run's for good"
     else:

@@ -140,7 +140,10 @@ def _trained(order: TrainOrder, settings: TrainSettings, *, quiet: bool) -> "Tra
 
 
 def _announce(order: TrainOrder, settings: TrainSettings) -> None:
-    """Say what begins, before torch is imported."""
+    """Say what begins or goes on, before torch is imported."""
+    if order.start().goes_on:  # how, the checkpoint says
+        console.print(f"Run {settings.run} goes on. Loading torch and the checkpoint ...")
+        return
     if (steps := order.steps) is not None:
         shorter = in_proportion(named_run(order.run), steps, order.changes)
         if shorter:

@@ -44,7 +44,8 @@ fields, such as `min_spp` of at most `max_spp`, are not here: the complaint abou
 expects. Every setting of a build or a run can be changed with `--set NAME=VALUE`, by its dotted
 name, such as `--set scenes.lights.count=[2,4]`, `--set scenes.families.0.weight=2` or `--set
 model=large`. Settings of a run that say *free* are how it is executed: the weights do not depend on
-them, or by rounding alone.
+them, or by rounding alone. All others are what the run means, and change by `--change`, which the
+run records ([Carry on a run](../how-to/carry-on-a-run.md)).
 """
 
 

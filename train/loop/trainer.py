@@ -14,8 +14,8 @@ from train.data.scenes import TrainingScene
 from train.folder import RunFolder
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.crew import Crew
+from train.loop.enough_memory import enough_memory
 from train.loop.interrupts import Stopped, deferred_interrupts
-from train.loop.memory import enough_memory
 from train.loop.recorder import Recorder
 from train.loop.schedule import decay_begins, learning_rate
 from train.loop.state import TrainState
