@@ -93,6 +93,7 @@ def beginning(
         checkpoint = resumed_checkpoint(checkpoints, crew, progress.noted)
     else:
         checkpoint = read_checkpoint(branch)
+        crew.any(False)  # a barrier: the first process soon writes what was just looked for
     if settings.from_weights:
         config = decode_config(checkpoint.header["model"])
         settings = dataclasses.replace(settings, model=config)

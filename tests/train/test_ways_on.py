@@ -282,6 +282,26 @@ def test_a_branch_takes_other_data_and_other_pictures(dataset: Dataset, tmp_path
     assert again.history == result.history, "the same command with --resume, as it is printed"
 
 
+def test_what_is_decided_is_done(dataset: Dataset, tmp_path: Path) -> None:
+    """By the stream, the loss, the update: none of them still reads what the command states."""
+    settings = wsd(num_steps=5, ema_decay=0.0)
+    run(settings, dataset, tmp_path / "whole")
+    branch = str(path_of_step(tmp_path / "whole/checkpoints", 4))
+    for name, value in {
+        "seed": 3,
+        "views_per_scene": 1,
+        "augmentation.rotation": "uniform",
+        "loss.perceptual": "ms_ssim",
+        "weight_decay": 1.0,
+        "learning_rate": 1e-3,
+    }.items():
+        out = tmp_path / name
+        run(settings, dataset, out, branch=branch, decisions={name: value})
+        assert not same(weights(out), weights(tmp_path / "whole")), name
+    run(settings, dataset, tmp_path / "as it was", branch=branch)
+    assert same(weights(tmp_path / "as it was"), weights(tmp_path / "whole"))
+
+
 @pytest.mark.parametrize(
     ("start", "message"),
     [
