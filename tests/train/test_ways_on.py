@@ -271,7 +271,8 @@ def test_a_branch_takes_other_data_and_other_pictures(dataset: Dataset, tmp_path
     with pytest.raises(TrilightError, match=f"--change data={digest}"):
         run(wsd(ema_decay=0.0), other, tmp_path / "second", branch=branch)
     assert not (tmp_path / "second").exists()
-    out, start = tmp_path / "second", {"branch": branch, "decisions": stage}
+    out = tmp_path / "second"
+    start: dict[str, Any] = {"branch": branch, "decisions": stage}
     result = run(wsd(ema_decay=0.0), other, out, **start)
     assert result.num_steps == 12
     assert {event.name for event in result.history} == {*stage, "checkpoint"}
