@@ -18,12 +18,14 @@ from train.loop.schedule import decay_begins
 from train.settings import TrainSettings
 
 DATA = "data"
-"""Name by which a decision names other data; its value is `sha256:` with the digest's start."""
+"""Name by which a decision names other data; its value is the start of their digest, behind
+`sha256:` for a dataset and `list:` for listed shards, so that no digits pass for a number."""
 
 _FIXED = ("run", "from_weights", "model")
 """Settings that no decision changes: with others it would be another run."""
 
-_LEAST_DIGEST = len("sha256:") + 8
+_LEAST_DIGITS = 8
+"""So many of a digest name data; fewer could be those of others."""
 
 _EXECUTION = frozenset(field.name for field in described(TrainSettings) if field.is_execution)
 
@@ -153,17 +155,18 @@ def _of_data(header: Mapping[str, Any], digest: str, decided: Any) -> Iterator[E
     before = header["data_digest"]
     if digest == before:
         return
-    given = f"sha256:{digest}"
+    given = _short(digest)
     if decided is None:
         raise TrilightError(
-            f"resume: the data are {given[:19]}, but the checkpoint was made with "
-            f"sha256:{before[:12]}. Go on with those by --data, or decide to go on with these by "
-            f"--change {DATA}={given[:19]}, which the run records."
+            f"resume: the data are {given}, but the checkpoint was made with {_short(before)}. Go "
+            f"on with those by --data, or decide to go on with these by --change {DATA}={given}, "
+            "which the run records."
         )
-    if not given.startswith(str(decided)) or len(str(decided)) < _LEAST_DIGEST:
+    digits = str(decided).rpartition(":")[2]
+    if not _prefixed(digest).startswith(str(decided)) or len(digits) < _LEAST_DIGITS:
         raise TrilightError(
-            f"--change {DATA} is {decided}, but the data are {given[:19]}; expected that, or the "
-            "other data by --data."
+            f"--change {DATA} is {decided}, but the data are {given}; expected that, or the other "
+            "data by --data."
         )
     yield Event(step=header["step"], kind="meaning", name=DATA, before=before, after=digest)
 
@@ -214,19 +217,22 @@ def _notes(
     past: Sequence[Event],
     events: Sequence[Event],
 ) -> Iterator[str]:
+    def value(event: Event, which: Any) -> str:
+        return _short(which) if event.name == DATA else _shown(which)
+
     standing = {event.name: event for event in past if event.kind == "meaning"}
     for event in standing.values():
         if event.name not in {other.name for other in events}:
-            yield f"as decided at step {event.step}, {event.name} is {_shown(event.after)}"
+            yield f"as decided at step {event.step}, {event.name} is {value(event, event.after)}"
     for event in events:
-        said = f"{event.name} is {_shown(event.after)}"
+        said = f"{event.name} is {value(event, event.after)}"
         if event.kind == "earlier":
             yield (
                 f"{said} and not {_shown(event.before)}, since the run is older than that setting; "
                 f"--change {event.name}={_shown(event.before)} changes it"
             )
         else:
-            yield f"from step {step} on, {said} instead of {_shown(event.before)}"
+            yield f"from step {step} on, {said} instead of {value(event, event.before)}"
     begins = decay_begins(before)
     if now.num_steps > before.num_steps and begins is not None and begins < step:
         yield (
@@ -236,10 +242,18 @@ def _notes(
 
 
 def _shown(value: Any) -> str:
-    """Return a value as a person writes it behind `=`; a digest by its start."""
-    if isinstance(value, str):
-        return f"sha256:{value[:12]}" if len(value) == 64 else value
-    return json.dumps(value)
+    """Return a value as a person writes it behind `=`."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _prefixed(digest: str) -> str:
+    return digest if ":" in digest else f"sha256:{digest}"
+
+
+def _short(digest: str) -> str:
+    """Return the start of a digest of data, enough to tell them apart."""
+    kind, _, digits = _prefixed(digest).partition(":")
+    return f"{kind}:{digits[:12]}"
 
 
 def _at(record: Mapping[str, Any], name: str) -> Any:

@@ -152,6 +152,9 @@ def test_other_data_is_a_decision_by_digest() -> None:
     (event,) = going.history
     assert (event.name, event.before, event.after) == ("data", DIGEST, OTHER)
     assert going.has_decided
+    assert "data is sha256:012345678901 instead of sha256:dddddddddddd" in going.notes[0]
+    listed = going_on(header(), tiny_run(), f"list:{OTHER}", {"data": "list:01234567"})
+    assert listed.history[0].after == f"list:{OTHER}"
     later = following(header(), going, 9) | {"data_digest": OTHER}
     assert not going_on(later, tiny_run(), OTHER, {"data": "sha256:012345678901"}).has_decided
 
