@@ -26,7 +26,15 @@ class TrainOrder:
     out: str | None = None
     """Folder for the run, on the machine that trains; by default runs/RUN."""
     resume: bool = False
-    """Continue from the newest checkpoint."""
+    """Continue from the newest checkpoint. Settings are stated as at the start; those of how it is
+    executed may differ."""
+    branch: str | None = None
+    """Checkpoint, or folder of a run, to continue from in a new folder (--out), which then goes its
+    own way; by default there is none."""
+    decisions: Mapping[str, Any] = field(default_factory=dict)
+    """Changes to what the run means, with --resume or --branch, such as num_steps=20000 or
+    learning_rate=1e-4; they hold from the checkpoint on and are recorded; by default there are
+    none."""
     begin_with: str | None = None
     """Folder of a run, or checkpoint, with the initial weights of a finetune run; by default, and
     in all other runs, they are random."""
@@ -74,7 +82,13 @@ class TrainOrder:
 
     def start(self) -> Start:
         """Return how the run begins."""
-        return Start(resume=self.resume, begin_with=self.begin_with, lpips=self.lpips)
+        return Start(
+            resume=self.resume,
+            branch=self.branch,
+            decisions=self.decisions,
+            begin_with=self.begin_with,
+            lpips=self.lpips,
+        )
 
     def command(self) -> list[str]:
         """Return the command line that trains."""

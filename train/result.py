@@ -12,6 +12,7 @@ from train.evaluation.judge import Judge
 from train.evaluation.scores import Lead
 from train.evaluation.sheet import drawn_validation_sheet, write_picture
 from train.folder import RunFolder
+from train.going_on import Event
 from train.loop.recorder import read_rows
 from train.loop.state import TrainState
 from train.settings import TrainSettings
@@ -44,6 +45,8 @@ class TrainResult:
     """Advantage of the network over the median picture."""
     unusable: tuple[str, ...]
     """What was wrong with data that was left out in this call."""
+    history: tuple[Event, ...]
+    """What it began with, what was decided about it, and how it was executed otherwise."""
     seconds: float
     """Wall time of this call, from opening the data to writing the sheet."""
 
@@ -80,6 +83,7 @@ def finished(
         median_scores=judge.median_scores if judge else None,
         lead=judgement.lead if judgement else None,
         unusable=tuple(state.unusable.messages),
+        history=state.history,
         seconds=seconds_before,
     )
     record = dataclasses.asdict(result) | {"beats_median": result.beats_median}

@@ -1,7 +1,5 @@
 """One training run, from a dataset to weights, figures and a sheet: joins the parts."""
 
-import dataclasses
-import platform
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -9,38 +7,25 @@ from pathlib import Path
 
 import torch
 
-from model.open import open_network
 from model.renderformer import count_parameters
 from model.sky.known import require_known, shining
-from model.weights import decode_config, encode_weights
-from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
-from storage.digests import sha256_hex
 from storage.errors import TrilightError
-from storage.extensions import recorded
-from storage.settings.described import settings_record
+from train.beginning import beginning, begun
 from train.data.scenes import training_scene
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable, first_samples
 from train.evaluation.judge import Judge
 from train.evaluation.rivals import median_picture
 from train.folder import RunFolder
-from train.loop.checkpoints import (
-    Checkpoint,
-    network_of_run,
-    resumed_checkpoint,
-    resumed_state,
-    saved_steps,
-)
 from train.loop.crew import Crew
-from train.loop.muon import fitting_precision
 from train.loop.recorder import Recorder
-from train.loop.state import TrainState, new_state
+from train.loop.state import TrainState
 from train.loop.trainer import Trainer
 from train.loss.lpips import load_lpips
 from train.loss.objective import Objective
 from train.progress import TrainProgress
-from train.result import TrainResult, finished, pretty_json
+from train.result import TrainResult, finished
 from train.settings import TrainSettings
 from train.start import Start
 
@@ -86,7 +71,7 @@ def train_run(
         TrilightError: no dataset, an empty split, a damaged shard, a bad target, a resolution or
             number of views that the data does not have, a folder that already holds a run, a
             checkpoint that is missing or of another run, LPIPS without its weights, a start that
-            went dead, or a signal that asked to stop.
+            went dead, too little memory, or a signal that asked to stop.
     """
     began = time.monotonic()
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
@@ -94,9 +79,11 @@ def train_run(
     opened, folder = open_training_data(data), RunFolder(out)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         progress.noted(note)
+    plan = beginning(settings, folder, opened.digest, start, crew, progress)
+    settings = plan.settings
     objective = Objective(settings.loss, load_lpips(start.lpips)).to(crew.device)
     _check_data(opened, settings)
-    settings, state = _begin(settings, folder, opened, start, crew, progress)
+    state = begun(plan, folder, opened.digest, crew, progress)
     judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
     recorder = _recorder(state, settings, folder, judge, progress) if crew.is_first else None
     trainer = Trainer(
@@ -151,67 +138,6 @@ def _check_data(data: TrainingData, settings: TrainSettings) -> None:
         raise TrilightError(
             f"views_per_scene is {settings.views_per_scene}, but scenes of {data.shown} "
             f"have {num_views} views; expected at most that many."
-        )
-
-
-def _begin(
-    settings: TrainSettings,
-    folder: RunFolder,
-    data: TrainingData,
-    start: Start,
-    crew: Crew,
-    progress: TrainProgress,
-) -> tuple[TrainSettings, TrainState]:
-    """Return the state that the run begins or goes on with, and the settings with its network."""
-    precision = fitting_precision(crew)
-    if start.resume:
-        checkpoint = resumed_checkpoint(folder.checkpoints, crew, progress.noted)
-        if settings.from_weights:
-            config = decode_config(checkpoint.header["model"])
-            settings = dataclasses.replace(settings, model=config)
-        state = resumed_state(checkpoint, settings, data.digest, crew.device, precision)
-        _note_other_execution(checkpoint, crew, state, progress)
-        return settings, state
-    if saved_steps(folder.checkpoints):
-        raise TrilightError(
-            f"{folder.root}: holds a run already; add --resume to go on with it, or choose "
-            "another --out."
-        )
-    start.check(settings)
-    network = None if start.begin_with is None else open_network(start.begin_with, network_of_run)
-    if network is not None:
-        settings = dataclasses.replace(settings, model=network.config)
-    state = new_state(settings, crew.device, network, precision)
-    if crew.is_first:
-        record = {
-            "settings": settings_record(settings),
-            "begun_with_sha256": sha256_hex(encode_weights(network)) if network else None,
-            "data_digest": data.digest,
-            **({"extensions": found} if (found := recorded("weights")) else {}),
-            "versions": {"torch": torch.__version__, "python": platform.python_version()},
-            "threads": torch.get_num_threads(),
-            "processes": crew.world_size,
-            "muon_precision": state.updater.muon_precision,
-        }
-        write_atomically(folder.settings, pretty_json(record))
-    return settings, state
-
-
-def _note_other_execution(
-    checkpoint: Checkpoint, crew: Crew, state: TrainState, progress: TrainProgress
-) -> None:
-    before = checkpoint.header["world_size"]
-    if before != crew.world_size:
-        progress.noted(
-            f"the run goes on with {crew.world_size} processes instead of {before}: the same to "
-            "rounding, not to the bit"
-        )
-    now = state.updater.muon_precision
-    earlier = checkpoint.header.get("muon_precision", "bfloat16")  # the only one that there was
-    if now and now != earlier:
-        progress.noted(
-            f"the run goes on with Muon's products in {now} instead of {earlier}, which suits the "
-            "processors here: the same to the rounding of bfloat16, not to the bit"
         )
 
 

@@ -4,7 +4,8 @@
 stages, AdamW, one cosine, random rigid motions; `-large` are those of its larger network. What we
 hold to be mistakes in the code is not repeated: positions rounded to bfloat16, a learning rate that
 starts again, samples drawn with replacement, and the loss behind the ELU. `pretrain` and `finetune`
-are ours.
+are ours: their rate is constant until the last fifth, so that they can be extended and branched.
+`builtin` and `hits` have the cosine with which the networks that come along were made.
 """
 
 import dataclasses
@@ -34,6 +35,7 @@ def smoke() -> TrainSettings:
         scenes_per_step=4,
         views_per_scene=4,
         learning_rate=1.5e-3,
+        schedule="wsd",
         warmup_steps=50,
         validate_every=60,
         checkpoint_every=60,
@@ -47,6 +49,7 @@ def builtin() -> TrainSettings:
         run="builtin",
         num_steps=9_000,
         learning_rate=1e-3,
+        schedule="cosine",
         muon_rate=3.0,
         weight_decay=0.1,
         warmup_steps=200,
@@ -115,6 +118,7 @@ def paper_pretrain() -> TrainSettings:
         precision="bfloat16",
         recompute_activations=True,
         learning_rate=1e-4,
+        schedule="cosine",
         warmup_steps=8_000,
         final_rate_share=0.01,
         betas=(0.9, 0.999),
@@ -194,6 +198,7 @@ def pretrain() -> TrainSettings:
         ),
         num_steps=250_000,
         learning_rate=3e-4,
+        schedule="wsd",
         muon_rate=3.0,
         warmup_steps=2_000,
         final_rate_share=0.02,

@@ -1,7 +1,9 @@
 """Training runs: one frozen description of everything that decides the weights. Without torch.
 
 A run is a Python function that returns the whole description (train.runs); the command line picks
-one and may replace fields. What is not here cannot be changed.
+one and may replace fields. What is not here cannot be changed. Fields marked EXECUTION may differ
+at every resume: the weights are the same but for rounding, or do not depend on them at all. All
+others are what the run means, and change by a decision that the run records (train.going_on).
 """
 
 from dataclasses import field
@@ -10,6 +12,7 @@ from typing import Annotated, Literal
 from model.config import ModelConfig
 from storage.errors import TrilightError
 from storage.settings.described import checked
+from storage.settings.execution import EXECUTION
 from storage.settings.ranges import Seed, Share, Within
 
 Rotation = Literal["none", "recipe", "uniform"]
@@ -63,8 +66,15 @@ Precision = Literal["float32", "bfloat16"]
 """Precision of the network's matrix products. Positions, losses, weights and optimisers' memories
 stay float32."""
 
+Schedule = Literal["wsd", "cosine"]
+"""Course of the learning rate after its warm-up. `wsd` (warm-up, stable, decay) stays at the peak
+and falls over the last steps by 1 - sqrt; `cosine` falls along half a wave from the first."""
+
 Count = Annotated[int, Within(1, 10**9)]
 """Number of steps or of scenes; no run reaches a billion."""
+
+FreeCount = Annotated[Count, EXECUTION]
+"""The same for how a run is executed."""
 
 BelowOne = Within(0, 1, high_open=True)
 """Range of the decay of a running mean; with a decay of 1 the mean would never move."""
@@ -93,17 +103,17 @@ class TrainSettings:
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
     """Random augmentation of the training scenes."""
     num_steps: Count
-    """Number of steps, each one update of the weights; the cosine schedule of the learning rate
-    ends at the last one."""
+    """Number of steps, each one update of the weights; the schedule of the learning rate ends at
+    the last one."""
     scenes_per_step: Annotated[int, Within(1, 65_536, unit="scenes")]
     """Batch size: the number of scenes whose gradients are averaged into one update."""
     views_per_scene: Annotated[int, Within(1, 1000, unit="views")]
     """Views of each scene in a step, drawn anew at every visit; at most as many as the dataset has.
     """
-    scenes_per_pass: Annotated[int, Within(1, 65_536, unit="scenes")] = 16
+    scenes_per_pass: Annotated[int, Within(1, 65_536, unit="scenes"), EXECUTION] = 16
     """Maximum number of scenes in one pass through the network; a step accumulates the gradients of
     its passes."""
-    precision: Precision = "float32"
+    precision: Annotated[Precision, EXECUTION] = "float32"
     """Precision of the network's matrix products."""
     learning_rate: Annotated[float, Within(0, 1, low_open=True)]
     """Peak learning rate."""
@@ -112,6 +122,13 @@ class TrainSettings:
     AdamW updates every weight."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear warm-up to the peak learning rate."""
+    schedule: Schedule = "cosine"
+    """Course of the learning rate after the warm-up: `wsd` stays at the peak until the last steps,
+    so that a run can be made longer or branched; `cosine`, which all runs were that do not say,
+    falls from the start."""
+    decay_share: Share = 0.2
+    """Last share of the steps, over which the rate of a `wsd` schedule falls; with 0 it never
+    does."""
     final_rate_share: Share = 0.05
     """Learning rate at the last step, as a share of the peak."""
     weight_decay: Annotated[float, Within(0, 10)] = 0.01
@@ -123,25 +140,25 @@ class TrainSettings:
     ema_decay: Annotated[float, BelowOne] = 0.0
     """Decay of the exponential moving average (EMA) of the weights, which is what is then evaluated
     and saved; 0 keeps no average."""
-    recompute_activations: bool = False
+    recompute_activations: Annotated[bool, EXECUTION] = False
     """Recompute activations in the backward pass, which saves memory and takes a third more time
     (see RenderFormer.recompute_activations)."""
     shuffle_shards: Annotated[int, Within(1, 100_000, unit="shards")] = 4
     """Number of shards that are open at the same time; samples are shuffled among them."""
-    most_unusable: Annotated[int, Within(0, 10**9, unit="samples")] = 0
+    most_unusable: Annotated[int, Within(0, 10**9, unit="samples"), EXECUTION] = 0
     """Maximum number of unusable samples that are replaced by others; with 0, the first one stops
     the run."""
-    log_every: Count = 10
+    log_every: FreeCount = 10
     """Steps between rows of metrics.jsonl."""
-    validate_every: Count
+    validate_every: FreeCount
     """Steps between validations."""
-    checkpoint_every: Count
+    checkpoint_every: FreeCount
     """Steps between checkpoints."""
-    checkpoints_kept: Count = 2
+    checkpoints_kept: FreeCount = 2
     """Number of newest checkpoints to keep; older ones are deleted."""
-    keep_every: Annotated[int, Within(0, 10**9, unit="steps")] = 0
+    keep_every: Annotated[int, Within(0, 10**9, unit="steps"), EXECUTION] = 0
     """Steps between checkpoints that are never deleted; 0 keeps none of them."""
-    validation_scenes: Count = 64
+    validation_scenes: FreeCount = 64
     """Maximum number of scenes of the validation split that are evaluated."""
 
     def __post_init__(self) -> None:

@@ -34,6 +34,8 @@ def train_network(
     steps: int | None = None,
     changes: Mapping[str, Any] | None = None,
     resume: bool = False,
+    branch: str | None = None,
+    decisions: Mapping[str, Any] | None = None,
     begin_with: str | None = None,
     lpips: str | None = None,
     workers: int = 1,
@@ -51,6 +53,8 @@ def train_network(
         steps: replaces the run's number of steps.
         changes: other settings by dotted name, such as `{"model.width": 64}`.
         resume: go on from the folder's newest checkpoint.
+        branch: checkpoint, or folder of a run, to go on from in the new folder `out`.
+        decisions: settings by dotted name that change where the run goes on, which it records.
         begin_with: network that a finetune run begins with.
         lpips: folder of LPIPS' weights, or `hub`.
         workers: threads that decode samples.
@@ -63,7 +67,13 @@ def train_network(
     """
     require_torch("train_network")
     settings = changed_run(run, changes or {}, steps=steps)
-    start = Start(resume=resume, begin_with=begin_with, lpips=lpips)
+    start = Start(
+        resume=resume,
+        branch=branch,
+        decisions=decisions or {},
+        begin_with=begin_with,
+        lpips=lpips,
+    )
     start.check(settings)
     from train.loop.crew import Crew, choose_device
     from train.run import train_run

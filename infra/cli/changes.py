@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from storage.errors import TrilightError
-from storage.settings.changes import changed, json_or_word
+from storage.settings.changes import changed, differences, json_or_word
 from storage.settings.described import checked, settings_record
 
 _OF_SOURCES = ("build", "derived", "revisit")
@@ -68,7 +68,7 @@ def all_changes(
     filed = {} if shared.settings is None else _read(shared.settings)
     values = {name: value for name, (value, _) in filed.items()}
     found: dict[str, Any] = {}
-    for layer in (_differences(settings_record(settings), liked), values, stated):
+    for layer in (differences(settings_record(settings), liked), values, stated):
         for name, value in layer.items():  # a whole group takes the place of what was in it
             kept = [old for old in found if not f"{old}.".startswith(f"{name}.")]
             found = {old: found[old] for old in kept} | {name: value}
@@ -86,19 +86,6 @@ def _read(file: str) -> "Stated":
     from infra.cli.settings_file import read_settings_file  # YAML takes time to import
 
     return read_settings_file(file)
-
-
-def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by dotted name what differs in a record; groups of another kind are whole."""
-    found: dict[str, Any] = {}
-    for name, value in now.items():
-        old = before.get(name)
-        if isinstance(old, Mapping) and isinstance(value, Mapping) and old.keys() == value.keys():
-            inner = _differences(old, value)
-            found |= {f"{name}.{below}": entry for below, entry in inner.items()}
-        elif old != value:
-            found[name] = value
-    return found
 
 
 def dataset_record(shared: Shared) -> dict[str, Any]:

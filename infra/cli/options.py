@@ -30,6 +30,7 @@ ALIASES = {
     "arc_deg": "--arc",
     "begin_with": "--from",
     "changes": "--set",
+    "decisions": "--change",
     "error_db": "--error",
     "exposure_ev": "--exposure",
     "min_noise_floor_db": "--min-noise-floor",

@@ -24,6 +24,7 @@ from train.runs import in_proportion, named_run
 from train.settings import TrainSettings
 
 if TYPE_CHECKING:
+    from train.going_on import Event
     from train.result import TrainResult
 
 
@@ -139,7 +140,10 @@ def _trained(order: TrainOrder, settings: TrainSettings, *, quiet: bool) -> "Tra
 
 
 def _announce(order: TrainOrder, settings: TrainSettings) -> None:
-    """Say what begins, before torch is imported."""
+    """Say what begins or goes on, before torch is imported."""
+    if order.start().goes_on:  # how, the checkpoint says
+        console.print(f"Run {settings.run} goes on. Loading torch and the checkpoint ...")
+        return
     if (steps := order.steps) is not None:
         shorter = in_proportion(named_run(order.run), steps, order.changes)
         if shorter:
@@ -160,12 +164,18 @@ def _report(result: "TrainResult") -> None:
         *_judged(result),
         ("steps", f"{result.num_steps}, of which {result.skipped_steps} not finite and skipped"),
         *(("left out", message) for message in result.unusable),
+        *(("changed", _said(event)) for event in result.history if event.kind == "meaning"),
         ("wall time", f"{result.seconds / 60:.1f} min"),
         ("weights", str(result.folder.weights)),
     ]
     print_rows("Training finished", rows)
     if result.scores is not None:
         console.print(f"\nLook at {result.folder.sheet}", style="bold")
+
+
+def _said(event: "Event") -> str:
+    before, after = event.before, event.after
+    return f"{event.name} from {before} to {after} at step {event.step}"
 
 
 def _judged(result: "TrainResult") -> list[tuple[str, str]]:

@@ -31,6 +31,7 @@ TRAIN_FORMS: Mapping[str, Any] = {
     "run": RunName,
     "data": list[PublicUrl],
     "begin_with": PublicUrl | None,
+    "branch": PublicUrl | None,
     "lpips": PublicUrl | None,
     "changes": RunChanges | None,
 }

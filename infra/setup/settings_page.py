@@ -43,7 +43,9 @@ refused in one line that names the field. Tests go to both ends of every range a
 fields, such as `min_spp` of at most `max_spp`, are not here: the complaint about one says what it
 expects. Every setting of a build or a run can be changed with `--set NAME=VALUE`, by its dotted
 name, such as `--set scenes.lights.count=[2,4]`, `--set scenes.families.0.weight=2` or `--set
-model=large`.
+model=large`. Settings of a run that say *free* are how it is executed: the weights do not depend on
+them, or by rounding alone. All others are what the run means, and change by `--change`, which the
+run records ([Carry on a run](../how-to/carry-on-a-run.md)).
 """
 
 
@@ -61,7 +63,8 @@ def settings_page() -> str:
             if rows := list(_rows(settings)):
                 first = _first_sentence(inspect.getdoc(settings) or "")
                 parts.append(f"### `{settings.__name__}`\n\n{first}\n")
-                parts.append(table(("field", "meaning", "expected", "default"), rows) + "\n")
+                head = ("field", "meaning", "expected", "default", "when a run goes on")
+                parts.append(table(head[: len(rows[0])], rows) + "\n")
     return "\n".join(parts)
 
 
@@ -93,7 +96,9 @@ def _rows(kind: type) -> Iterator[tuple[str, ...]]:
             sentence = _first_sentence(field_sentences(Scene)[declared.name])
             yield f"`{declared.name}`{part}", sentence, str(declared.within), ""
         return
-    for field in described(kind) if hasattr(kind, "__pydantic_fields__") else ():
+    fields = described(kind) if hasattr(kind, "__pydantic_fields__") else ()
+    is_marked = any(field.is_execution for field in fields)
+    for field in fields:
         named = [name for kind in _kinds(field.hint) for name in getattr(kind, "PRESETS", ())]
         presets = f", or one of {', '.join(named)}" if named else ""
         yield (
@@ -101,6 +106,7 @@ def _rows(kind: type) -> Iterator[tuple[str, ...]]:
             _first_sentence(field.sentence).replace("|", "\\|"),
             (field.expected + presets).replace("|", "\\|"),
             _shown(field.default),
+            *(["free" if field.is_execution else ""] if is_marked else []),
         )
 
 

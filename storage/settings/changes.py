@@ -50,6 +50,23 @@ def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
     return found
 
 
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    """Return by dotted name what differs in a record; groups of another kind are whole.
+
+    Args:
+        before: a record (storage.settings.described.settings_record), or part of one.
+        now: that whose values are returned; what it lacks does not differ.
+    """
+    found: dict[str, Any] = {}
+    for name, value in now.items():
+        old = before.get(name)
+        if isinstance(old, Mapping) and isinstance(value, Mapping) and old.keys() == value.keys():
+            found |= {f"{name}.{below}": each for below, each in differences(old, value).items()}
+        elif old != value:
+            found[name] = value
+    return found
+
+
 def _changed(group: Any, changes: Sequence[Change]) -> Any:
     values = {
         field: _changed_field(group, field, own) for field, own in _by_field(group, changes).items()

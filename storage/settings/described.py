@@ -26,6 +26,7 @@ import pydantic
 from pydantic.dataclasses import dataclass
 
 from storage.errors import TrilightError, expected_one_of
+from storage.settings.execution import is_execution
 from storage.settings.ranges import Within, declared_ranges
 
 Settings = TypeVar("Settings")
@@ -89,6 +90,8 @@ class Described:
     """The range of its numbers."""
     expected: str
     """What to write, for a person."""
+    is_execution: bool
+    """Whether it says how something is executed, and not what it means."""
 
 
 @functools.cache
@@ -109,6 +112,7 @@ def described(kind: type) -> tuple[Described, ...]:
                 if field.name in ranges
                 else expected_of(hints[field.name])
             ),
+            is_execution=is_execution(hints[field.name]),
         )
         for field in dataclasses.fields(kind)
     )

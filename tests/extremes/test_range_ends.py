@@ -37,7 +37,7 @@ from train.data.augment import augmented
 from train.data.buckets import make_batch
 from train.data.scenes import training_scene
 from train.loop.crew import Crew
-from train.loop.optim import learning_rate
+from train.loop.schedule import learning_rate
 from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective

@@ -26,7 +26,7 @@ from train.evaluation.judged_view import NETWORK, summary
 from train.evaluation.rivals import MEDIAN, NEAREST
 from train.loop.checkpoints import network_of_run
 from train.loop.crew import Crew
-from train.loop.optim import learning_rate
+from train.loop.schedule import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective

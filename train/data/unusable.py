@@ -18,14 +18,18 @@ from storage.records.sample import Sample
 class Unusable:
     """The damaged samples and shards that a run has met."""
 
-    def __init__(self, most: int, met: Mapping[str, int] | None = None) -> None:
+    def __init__(
+        self, most: int, met: Mapping[str, int] | None = None, *, way_on: str = ""
+    ) -> None:
         """Remember the limit.
 
         Args:
             most: samples that may be unusable; at 0 the first one ends the run.
             met: the property `met` of the run that is resumed.
+            way_on: a sentence for whoever meets the limit.
         """
         self.most = most
+        self._way_on = way_on
         self._met: dict[str, int] = dict(met or {})
         self._messages: dict[str, str] = {}
         self._lock = threading.Lock()
@@ -50,10 +54,10 @@ class Unusable:
             error: what is wrong with it; names it.
 
         Raises:
-            TrilightError: `error` itself where none is allowed, or that the limit is passed.
+            TrilightError: what `error` says where none is allowed, or that the limit is passed.
         """
         if not self.most:
-            raise error
+            raise TrilightError(" ".join(filter(None, [str(error), self._way_on]))) from error
         with self._lock:
             self._met.setdefault(sha256_hex(name.encode())[:16], num_samples)
             self._messages.setdefault(name, str(error))
@@ -61,7 +65,7 @@ class Unusable:
         if count > self.most:
             raise TrilightError(
                 f"data: {count} samples are unusable; expected at most {self.most}. The last: "
-                f"{error}"
+                + " ".join(filter(None, [str(error), self._way_on]))
             ) from error
 
 

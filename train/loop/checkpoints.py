@@ -1,8 +1,9 @@
 """Checkpoints of a run: one safetensors file each, with all that changes while the run goes on.
 
 It appears by rename, so a kill while saving leaves the previous one whole. It also names the
-settings and the data, because going on with others would be neither the old run nor a new one; and
-it holds the sha256 of itself, because safetensors would not notice a weight that a disk changed.
+settings and the data, with what was decided about them since the run began (train.going_on),
+because going on with others in silence would be neither the old run nor a new one; and it holds the
+sha256 of itself, because safetensors would not notice a weight that a disk changed.
 """
 
 import hashlib
@@ -24,10 +25,11 @@ from storage.atomic import atomic_writer, remove_leftovers
 from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
 from storage.records.safe_read import read_safetensors
-from storage.settings.described import from_record, settings_record
-from train.data.unusable import Unusable
+from storage.settings.described import settings_record
 from train.folder import RunFolder
+from train.going_on import GoingOn, event_records
 from train.loop.crew import Crew
+from train.loop.schedule import decay_begins
 from train.loop.state import TrainState, new_state
 from train.settings import Precision, TrainSettings
 
@@ -35,8 +37,8 @@ PREFIX, SUFFIX = "step-", ".safetensors"
 """Names of the files, around the number of the step."""
 
 HEADER_KEY = "trilight_checkpoint"
-"""Metadata entry with counters, damage met, settings, digest of the data, and how it was executed:
-number of processes, precision of Muon's products."""
+"""Metadata entry with counters, damage met, settings, digest of the data, the run's history, and
+how it was executed: number of processes and threads, precision of Muon's products."""
 
 UNSEALED = "0" * 64
 """Placeholder for the sha256 while it is computed. Old checkpoints have no sha256."""
@@ -55,11 +57,14 @@ def save_checkpoint(
     header = {
         "step": state.step,
         "skipped_steps": state.skipped_steps,
+        "skipped_in_a_row": state.skipped_in_a_row,
         "unusable": dict(state.unusable.met),
         "settings": settings_record(settings),
         "model": encode_config(settings.model),
         "data_digest": data_digest,
+        "history": event_records(state.history),
         "world_size": world_size,
+        "threads": torch.get_num_threads(),
         "muon_precision": state.updater.muon_precision,
         **({"extensions": found} if (found := recorded("weights")) else {}),
         "sha256": UNSEALED,
@@ -77,7 +82,7 @@ class Checkpoint:
     """A checkpoint as it was read."""
 
     header: Mapping[str, Any]
-    """Step, settings, digest of the data, number of processes."""
+    """Step, settings, digest of the data, history, number of processes."""
     arrays: Mapping[str, NDArray]
     """Tensors by part and name."""
 
@@ -125,28 +130,33 @@ def _seal(before: memoryview, after: memoryview) -> str:
 
 def resumed_state(
     checkpoint: Checkpoint,
-    settings: TrainSettings,
-    data_digest: str,
+    going: GoingOn,
     device: torch.device | None = None,
     muon_precision: Precision = "bfloat16",
 ) -> TrainState:
-    """Return the state of a run, ready for its next step; the last two are those of `new_state`.
+    """Return the state of a run, ready for its next step.
+
+    Args:
+        checkpoint: where it goes on.
+        going: how (train.going_on.going_on). Where only its settings have a running mean, that
+            begins with the weights.
+        device: as in `new_state`.
+        muon_precision: as in `new_state`.
 
     Raises:
-        TrilightError: the checkpoint belongs to other settings or other data; the first field that
-            differs is named.
+        TrilightError: the run has begun with other extensions.
     """
-    header = checkpoint.header
+    header, settings = checkpoint.header, going.settings
     require_same_extensions("resume: the run", header.get("extensions", {}), recorded("weights"))
-    begun = from_record(TrainSettings, header["settings"])  # a field that came later is at default
-    _require_same("settings", settings_record(begun), settings_record(settings))
-    _require_same("data", {"digest": header["data_digest"]}, {"digest": data_digest})
-    state = new_state(settings, device, muon_precision=muon_precision)
+    state = new_state(settings, device, muon_precision=muon_precision, met=header["unusable"])
     state.step, state.skipped_steps = header["step"], header["skipped_steps"]
-    state.unusable = Unusable(settings.most_unusable, header["unusable"])
-    load_tensors(state.model, _part(checkpoint.arrays, "model"))
+    if not going.has_decided:
+        state.skipped_in_a_row = header.get("skipped_in_a_row", 0)
+    state.history = going.history
+    weights = _part(checkpoint.arrays, "model")
+    load_tensors(state.model, weights)
     if state.mean_model is not None:
-        load_tensors(state.mean_model, _part(checkpoint.arrays, "mean"))
+        load_tensors(state.mean_model, _part(checkpoint.arrays, "mean") or weights)
     if updates := state.step - state.skipped_steps:
         tensors = {name: torch.from_numpy(array) for name, array in checkpoint.arrays.items()}
         state.updater.remember(tensors, updates)
@@ -160,19 +170,6 @@ def _part(arrays: Mapping[str, NDArray], prefix: str) -> dict[str, Tensor]:
         for name, array in arrays.items()
         if name.startswith(start)
     }
-
-
-def _require_same(place: str, saved: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise for the first field that differs between a checkpoint and what is asked for now."""
-    for name in sorted(saved.keys() | wanted.keys()):
-        before, now = saved.get(name), wanted.get(name)
-        if isinstance(before, dict) and isinstance(now, dict):
-            _require_same(f"{place}.{name}", before, now)
-        elif before != now:
-            raise TrilightError(
-                f"resume: {place}.{name} is {now}, but the checkpoint was made with {before}. "
-                "Resume with the same, or start another run in another folder."
-            )
 
 
 def saved_steps(folder: Path) -> list[int]:
@@ -237,8 +234,9 @@ def keep_checkpoint(
 ) -> None:
     """Save the state, whole or not at all, and only then delete what the run does not keep.
 
-    Kept are the newest `checkpoints_kept` and every multiple of `keep_every`. One of a later step
-    was damaged when the run resumed from an earlier one, and does not count.
+    Kept are the newest `checkpoints_kept`, every multiple of `keep_every`, and the one where the
+    decay of the learning rate begins, from which a longer run can go on. One of a later step was
+    damaged when the run resumed from an earlier one, and does not count.
 
     Raises:
         TrilightError: the folder is full or cannot be written; the older ones are still there.
@@ -248,7 +246,8 @@ def keep_checkpoint(
     remove_leftovers(folder)
     passed = [step for step in saved_steps(folder) if step <= state.step]
     for step in passed[: -settings.checkpoints_kept]:
-        if not settings.keep_every or step % settings.keep_every:
+        milestone = settings.keep_every and step % settings.keep_every == 0
+        if not milestone and step != decay_begins(settings):
             path_of_step(folder, step).unlink(missing_ok=True)
 
 

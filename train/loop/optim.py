@@ -1,7 +1,6 @@
-"""Optimizers and learning rate: a linear warm-up, then one cosine, and no restart."""
+"""What moves the weights: AdamW, and Muon for the matrices."""
 
 import itertools
-import math
 from collections.abc import Mapping
 
 import torch
@@ -81,14 +80,3 @@ class Updater:
 
 def _kept(optimizer: torch.optim.Optimizer) -> tuple[str, ...]:
     return ADAMW_KEEPS if isinstance(optimizer, torch.optim.AdamW) else MUON_KEEPS
-
-
-def learning_rate(step: int, settings: TrainSettings) -> float:
-    """Return the rate of step 0 ... num_steps - 1; the first is above 0, the last the final one."""
-    if step < settings.warmup_steps:
-        return settings.learning_rate * (step + 1) / (settings.warmup_steps + 1)
-    after_warmup = max(settings.num_steps - 1 - settings.warmup_steps, 1)
-    fraction = min((step - settings.warmup_steps) / after_warmup, 1.0)
-    final = settings.learning_rate * settings.final_rate_share
-    cosine = 0.5 * (1 + math.cos(math.pi * fraction))
-    return final + (settings.learning_rate - final) * cosine

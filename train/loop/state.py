@@ -1,10 +1,11 @@
-"""What changes while a run goes on: weights, mean, the updater's memories, counters, damage met.
+"""What changes while a run goes on: weights, mean, memories, counters, damage met, decisions.
 
 Everything else (order, augmentation, learning rate) is a function of the settings and the step;
 no random generator's state has to be saved.
 """
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -12,8 +13,14 @@ import torch
 from model.renderformer import RenderFormer
 from storage.seeds import seed_for
 from train.data.unusable import Unusable
+from train.going_on import Event
 from train.loop.optim import Updater
 from train.settings import Precision, TrainSettings
+
+_WAY_ON = (
+    "To replace such samples by others, allow a number of them: --skip-unusable, with --resume "
+    "where the run has begun."
+)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -32,6 +39,10 @@ class TrainState:
     """Steps done, including skipped ones; also the position in the data."""
     skipped_steps: int = 0
     """Steps that were not finite and changed nothing."""
+    skipped_in_a_row: int = 0
+    """Those of them since the last update, or since a decision about the run."""
+    history: tuple[Event, ...] = ()
+    """What happened to the run beside its steps, oldest first."""
 
     @property
     def shown(self) -> RenderFormer:
@@ -59,6 +70,7 @@ def new_state(
     device: torch.device | None = None,
     begin_with: RenderFormer | None = None,
     muon_precision: Precision = "bfloat16",
+    met: Mapping[str, int] | None = None,
 ) -> TrainState:
     """Return the state before the first step.
 
@@ -67,6 +79,7 @@ def new_state(
         device: where it is to be; the CPU unless said.
         begin_with: a network of the same configuration whose weights take their place.
         muon_precision: of Muon's products, where the run has Muon (loop.muon.fitting_precision).
+        met: damage that the run has met, as `Unusable.met` has it.
     """
     model = RenderFormer(settings.model)
     if begin_with is None:
@@ -81,6 +94,6 @@ def new_state(
     return TrainState(
         model=model,
         updater=Updater(model, settings, muon_precision),
-        unusable=Unusable(settings.most_unusable),
+        unusable=Unusable(settings.most_unusable, met, way_on=_WAY_ON),
         mean_model=mean_model,
     )

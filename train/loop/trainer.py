@@ -14,9 +14,10 @@ from train.data.scenes import TrainingScene
 from train.folder import RunFolder
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.crew import Crew
+from train.loop.enough_memory import enough_memory
 from train.loop.interrupts import Stopped, deferred_interrupts
-from train.loop.optim import learning_rate
 from train.loop.recorder import Recorder
+from train.loop.schedule import decay_begins, learning_rate
 from train.loop.state import TrainState
 from train.loop.step import Stepper, StepReport
 from train.loop.window import Window, device_peak
@@ -95,7 +96,7 @@ class Trainer:
         self.stepper = Stepper(state, settings, objective, crew)
         self.start_watch = StartWatch(settings)
         self.window = Window()
-        self.skipped_in_a_row = 0
+        self.num_noted = 0
 
     def run(self, batches: Iterator[list[TrainingScene]]) -> None:
         """Take all remaining steps; `batches` begins with that of the state's step.
@@ -128,7 +129,9 @@ class Trainer:
         waited_s = time.monotonic() - asked
         settings, step = self.settings, self.state.step
         buckets = bucket_scenes(drawn, self._flops, settings.scenes_per_pass)
-        report = self.stepper.step(buckets, learning_rate(step, settings))
+        with enough_memory(settings, step):
+            report = self.stepper.step(buckets, learning_rate(step, settings))
+        self._note_unusable()
         self.window.add(
             report,
             views=settings.scenes_per_step * settings.views_per_scene,
@@ -138,7 +141,7 @@ class Trainer:
         self.start_watch.add(report)
         self.state.step += 1
         if report.applied:
-            self.skipped_in_a_row = 0
+            self.state.skipped_in_a_row = 0
         else:
             self._skip([scene.key for scene in drawn])
         return report
@@ -152,6 +155,14 @@ class Trainer:
         )
         return training_flops(settings.model, workload)
 
+    def _note_unusable(self) -> None:
+        """Name each damaged sample or shard once, when it has been left out."""
+        messages = self.state.unusable.messages
+        if self.recorder is not None:
+            for message in messages[self.num_noted :]:
+                self.recorder.progress.noted(f"left out: {message.rstrip('.')}")
+        self.num_noted = len(messages)
+
     def _skip(self, keys: Sequence[str]) -> None:
         """Count a skipped step, and name this process's scenes."""
         self.state.skipped_steps += 1
@@ -160,12 +171,15 @@ class Trainer:
                 f"step {self.state.step} was skipped, since its loss or gradient was not finite; "
                 f"its scenes were {', '.join(keys)}"
             )
-        self.skipped_in_a_row += 1
-        if self.skipped_in_a_row == MOST_SKIPPED_IN_A_ROW:
+        self.state.skipped_in_a_row += 1
+        if self.state.skipped_in_a_row == MOST_SKIPPED_IN_A_ROW:
             raise TrilightError(
                 f"training: {MOST_SKIPPED_IN_A_ROW} steps in a row up to step {self.state.step} "
                 "had a loss or gradient that was not finite; the weights are unchanged by them. "
-                "Start again with a lower learning_rate."
+                "Resumed as it is, it would come here again. Go on with --resume --change "
+                f"learning_rate={self.settings.learning_rate / 2:g}, or with another order of the "
+                f"data, --change seed={self.settings.seed + 1}; or from an earlier checkpoint in "
+                "another folder, --branch."
             )
 
     def _after_step(self, report: StepReport) -> None:
@@ -183,7 +197,7 @@ class Trainer:
             if last or step % settings.validate_every == 0:
                 with self.window.pause():
                     self.recorder.validate(self.state)
-        if last or step % settings.checkpoint_every == 0:
+        if last or step % settings.checkpoint_every == 0 or step == decay_begins(settings):
             with self.window.pause():
                 self._save()
 

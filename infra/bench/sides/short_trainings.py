@@ -23,7 +23,7 @@ from train.evaluation.judge import Judge
 from train.evaluation.scores import ViewScore
 from train.loop.crew import Crew
 from train.loop.muon import fitting_precision
-from train.loop.optim import learning_rate
+from train.loop.schedule import learning_rate
 from train.loop.state import new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective

@@ -55,6 +55,12 @@ def test_mistakes_and_the_first_words_come_before_torch(tmp_path: Path) -> None:
     assert "run 'smok': no such run; did you mean smoke?" in said("smok")[1]
     assert "setting 'widht' does not exist" in said("smoke", "--set", "widht=3")[1]
     assert "expected begin_with" in said("finetune")[1]
+    assert (
+        "it has not begun, so --change seed changes nothing"
+        in said("smoke", "--change", "seed=1")[1]
+    )
+    going_on = said("smoke", "--resume", "--change", "seed=1", "--set", "log_every=5")[0]
+    assert "Run smoke goes on. Loading torch and the checkpoint" in going_on
     words, mistake = said("smoke", "--steps", "24")
     assert "warmup_steps=3, log_every=1, validate_every=4, checkpoint_every=4" in words
     assert "Run smoke: 24 steps of 4 scenes at 64 pixels. Loading torch" in words

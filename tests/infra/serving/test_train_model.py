@@ -12,6 +12,7 @@ from prefect.exceptions import ParameterTypeError
 
 from infra.serving.train_model import RunChanges, TrainOrder, train_model, train_order
 from storage.errors import TrilightError
+from storage.settings.described import described
 from tests.conftest import ROOT
 from train.runs import RUNS, named_run
 from train.settings import TrainSettings
@@ -21,7 +22,7 @@ SECOND_STAGES = sorted(name for name in RUNS if named_run(name).from_weights)
 
 def _parameters(**given: Any) -> dict[str, Any]:
     """Return what the flow is called with where nothing else is filled in."""
-    plain = {field.name: field.default for field in dataclasses.fields(TrainOrder)}
+    plain = {field.name: field.default for field in described(TrainOrder)}
     return {**plain, "data": ["a"], "changes": None, **given}
 
 
@@ -93,6 +94,9 @@ def test_a_second_stage_begins_with_the_first(run: str) -> None:
         f"train {run} --data a --begin-with runs/pretrain --lpips hub "
         "--changes loss.perceptual_weight=0.1 --changes num_steps=9000"
     )
+    going_on = {"resume": True, "changes": None, "decisions": {"learning_rate": 1e-5}}
+    command = train_order(_parameters(**going_on)).command()
+    assert " ".join(command[4:]) == "smoke --data a --resume --decisions learning_rate=1e-05"
     again = TrainOrder(run=run, resume=True).command()
     assert "--resume" in again and "--begin-with" not in again
 

@@ -17,6 +17,7 @@ from storage.errors import TrilightError
 from tests.conftest import ROOT
 from tests.train.kit import tiny_run
 from train.folder import RunFolder
+from train.going_on import going_on
 from train.loop.checkpoints import (
     keep_checkpoint,
     network_of_run,
@@ -87,11 +88,21 @@ def test_the_newest_and_the_milestones_stay(tmp_path: Path) -> None:
     assert saved_steps(tmp_path) == [10, 20, 24]
 
 
+def test_the_one_where_the_decay_begins_stays(tmp_path: Path) -> None:
+    """It is the last from which a longer run can go on as if it had been longer all along."""
+    settings = tiny_run(schedule="wsd", num_steps=25, checkpoints_kept=1)
+    state = new_state(settings)
+    for step in (16, 20, 24):
+        state.step = step
+        keep_checkpoint(tmp_path, state, settings, data_digest="d", world_size=1)
+    assert saved_steps(tmp_path) == [20, 24]
+
+
 @pytest.mark.parametrize(("call", "when"), CASES)
 def test_killed_while_saving_leaves_a_whole_one(killed: Path, call: str, when: str) -> None:
     folder = killed / f"{call} {when}"
     newest = resumed_checkpoint(folder, ALONE, pytest.fail)
-    step = resumed_state(newest, tiny_run(), "d").step
+    step = resumed_state(newest, going_on(newest.header, tiny_run(), "d", {})).step
     assert step == (1 if (call, when) in (("fsync", "before"), ("replace", "before")) else 2)
     state = new_state(tiny_run())
     state.step = state.skipped_steps = 3

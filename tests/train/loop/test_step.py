@@ -15,7 +15,6 @@ from tests.train.toy import toy_sample
 from train.data.buckets import TrainingBatch, bucket_scenes, make_batch
 from train.data.scenes import training_scene
 from train.loop.crew import Crew
-from train.loop.optim import learning_rate
 from train.loop.state import TrainState, new_state
 from train.loop.step import Stepper, StepReport, predicted
 from train.loss.objective import Objective, view_l1
@@ -186,17 +185,6 @@ def test_a_long_gradient_is_shortened() -> None:
     assert free == pytest.approx(free_again, rel=1e-5)  # float32 norm
     assert shortened == pytest.approx(1e-3, rel=1e-3)  # clip_grad_norm_ divides by norm + 1e-6
     assert unclipped == pytest.approx(free, rel=1e-5)
-
-
-def test_the_rate_rises_to_its_peak_and_falls_to_its_end_once() -> None:
-    settings = tiny_run(num_steps=100, warmup_steps=10, final_rate_share=0.1)
-    rates = [learning_rate(step, settings) for step in range(100)]
-    assert 0 < rates[0] < rates[9] < settings.learning_rate
-    assert rates[10] == settings.learning_rate
-    assert rates[99] == pytest.approx(0.1 * settings.learning_rate)
-    assert rates[:11] == sorted(set(rates[:11]))
-    assert rates[10:] == sorted(set(rates[10:]), reverse=True)
-    assert learning_rate(500, settings) == rates[99], "no restart after the end"
 
 
 def test_a_fresh_network_learns_eight_pictures() -> None:

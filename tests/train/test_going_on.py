@@ -1,0 +1,194 @@
+"""What a command that resumes may say: execution as it likes, meaning as it was, or a decision."""
+
+import dataclasses
+import json
+from typing import Any
+
+import pytest
+
+from storage.errors import TrilightError
+from storage.settings.described import settings_record
+from tests.train.kit import TINY_MODEL, tiny_run
+from train.going_on import GoingOn, event_records, events_of, going_on
+from train.settings import AugmentationSettings, TrainSettings
+
+DIGEST = "d" * 64
+OTHER = "0123456789" * 6 + "abcd"
+
+
+def header(settings: TrainSettings | None = None, *, step: int = 8, **more: Any) -> dict[str, Any]:
+    record = {
+        "step": step,
+        "settings": settings_record(settings or tiny_run()),
+        "data_digest": DIGEST,
+        "history": [],
+    }
+    return json.loads(json.dumps(record | more))
+
+
+def following(before: dict[str, Any], going: GoingOn, step: int) -> dict[str, Any]:
+    """Return the header of a later checkpoint of a run that went on."""
+    return header(going.settings, step=step, history=event_records(going.history)) | {
+        "data_digest": before["data_digest"]
+    }
+
+
+def test_the_same_command_goes_on_and_nothing_happens() -> None:
+    going = going_on(header(), tiny_run(), DIGEST, {})
+    assert going == GoingOn(settings=tiny_run(), history=(), notes=(), has_decided=False)
+
+
+EXECUTED: dict[str, Any] = {
+    "scenes_per_pass": 1,
+    "precision": "bfloat16",
+    "recompute_activations": True,
+    "most_unusable": 3,
+    "log_every": 1,
+    "validate_every": 3,
+    "checkpoint_every": 5,
+    "checkpoints_kept": 7,
+    "keep_every": 10,
+    "validation_scenes": 1,
+}
+
+
+def test_execution_is_free_and_noted() -> None:
+    """All of it at once, since intervals have to fit each other, and back again."""
+    typed = tiny_run(**EXECUTED)
+    going = going_on(header(), typed, DIGEST, {})
+    assert going.settings == typed and not going.has_decided
+    assert {event.name for event in going.history} == set(EXECUTED)
+    assert {event.kind for event in going.history} == {"execution"}
+    assert "from step 8 on, scenes_per_pass is 1 instead of 16" in going.notes
+    back = going_on(following(header(), going, 9), tiny_run(), DIGEST, {})
+    assert back.settings == tiny_run() and len(back.history) == 2 * len(EXECUTED)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"seed": 1},
+            r"seed is 1, but the checkpoint was made with 0\. Go on as it was with --set seed=0, "
+            "or decide on --change seed=1, which the run records",
+        ),
+        ({"num_steps": 20}, "num_steps is 20, but .* 12.* --set num_steps=12.*change num_steps=20"),
+        ({"betas": (0.9, 0.95)}, r"--set betas=\[0.9, 0.99\].* --change betas=\[0.9, 0.95\]"),
+        ({"schedule": "wsd"}, "--set schedule=cosine, or decide on --change schedule=wsd"),
+        (
+            {"augmentation": AugmentationSettings(mirror=True)},
+            "augmentation.channels is false, .* with true, and augmentation.vertex_order is "
+            "false.*--change augmentation.channels=false --change augmentation.vertex_order=false",
+        ),
+        (
+            {"model": dataclasses.replace(TINY_MODEL, hidden_width=64)},
+            "model.hidden_width is 64, but the checkpoint was made with 48.* another run in",
+        ),
+        ({"run": "other"}, "run is other, but .* tiny.* --set run=tiny, or begin another run"),
+    ],
+)
+def test_other_meaning_is_refused_with_both_values_and_both_ways(
+    changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(TrilightError, match=message):
+        going_on(header(), tiny_run(**changes), DIGEST, {})
+
+
+def test_a_decision_holds_from_its_step_and_is_not_typed_again() -> None:
+    first = going_on(header(), tiny_run(), DIGEST, {"learning_rate": 1e-3, "loss.noise_half": 0.5})
+    assert first.has_decided
+    assert (first.settings.learning_rate, first.settings.loss.noise_half) == (1e-3, 0.5)
+    (event, _) = sorted(first.history, key=lambda event: event.name)
+    assert dataclasses.asdict(event) == {
+        "step": 8, "kind": "meaning", "name": "learning_rate", "before": 2e-3, "after": 1e-3,
+    }  # fmt: skip
+    assert "from step 8 on, learning_rate is 0.001 instead of 0.002" in first.notes
+    later = following(header(), first, 10)
+    for typed in (tiny_run(), first.settings):  # as it was begun, or as it is
+        again = going_on(later, typed, DIGEST, {})
+        assert again.settings == first.settings and again.history == first.history
+        assert not again.has_decided
+        assert "as decided at step 8, learning_rate is 0.001" in again.notes
+    same = going_on(later, tiny_run(), DIGEST, {"learning_rate": 1e-3})
+    assert not same.has_decided and same.history == first.history
+    with pytest.raises(TrilightError, match=r"is 0\.003, but the checkpoint was made with 0\.001"):
+        going_on(later, tiny_run(learning_rate=3e-3), DIGEST, {})
+    second = going_on(later, tiny_run(), DIGEST, {"learning_rate": 5e-4})
+    last = going_on(following(later, second, 11), tiny_run(), DIGEST, {})
+    assert last.settings.learning_rate == 5e-4
+    assert [event.step for event in last.history] == [8, 8, 10]
+
+
+@pytest.mark.parametrize(
+    ("decisions", "message"),
+    [
+        (
+            {"scenes_per_pass": 2},
+            "--change scenes_per_pass: it is execution.* --set scenes_per_pass",
+        ),
+        ({"model.hidden_width": 64}, "model.hidden_width: it is the run's for good.*--from"),
+        ({"from_weights": True}, "from_weights: it is the run's for good"),
+        ({"muon_rate": 3.0}, "muon_rate=3: the checkpoint lacks the memories"),
+        ({"num_steps": 7}, "num_steps=7: 8 steps are done.*--branch"),
+        ({"lossy": 1}, "setting 'lossy' does not exist"),
+        ({"learning_rate": 2}, "'learning_rate' is 2; expected a number above 0, up to 1"),
+        ({"warmup_steps": 12}, "warmup_steps is 12; expected 0 to 11"),
+    ],
+)
+def test_what_cannot_be_decided_is_refused(decisions: dict[str, Any], message: str) -> None:
+    with pytest.raises(TrilightError, match=message):
+        going_on(header(), tiny_run(), DIGEST, decisions)
+
+
+def test_other_data_is_a_decision_by_digest() -> None:
+    with pytest.raises(TrilightError, match="the data are sha256:012345678901, .* sha256:dddddd"):
+        going_on(header(), tiny_run(), OTHER, {})
+    with pytest.raises(TrilightError, match="--change data=sha256:012345678901, which"):
+        going_on(header(), tiny_run(), OTHER, {})
+    for wrong in ("sha256:99999999999", "sha256:01", "new", 12):
+        with pytest.raises(TrilightError, match="--change data is .* the data are sha256:0123456"):
+            going_on(header(), tiny_run(), OTHER, {"data": wrong})
+    going = going_on(header(), tiny_run(), OTHER, {"data": "sha256:012345678901"})
+    (event,) = going.history
+    assert (event.name, event.before, event.after) == ("data", DIGEST, OTHER)
+    assert going.has_decided
+    assert "data is sha256:012345678901 instead of sha256:dddddddddddd" in going.notes[0]
+    listed = going_on(header(), tiny_run(), f"list:{OTHER}", {"data": "list:01234567"})
+    assert listed.history[0].after == f"list:{OTHER}"
+    later = following(header(), going, 9) | {"data_digest": OTHER}
+    assert not going_on(later, tiny_run(), OTHER, {"data": "sha256:012345678901"}).has_decided
+
+
+def test_a_run_from_before_a_setting_stays_as_it_was() -> None:
+    """Even where the named run has another value by now; until that is decided on."""
+    old = header()
+    for later in ("schedule", "decay_share", "recompute_activations"):
+        del old["settings"][later]
+    del old["settings"]["model"]["window_bundles"], old["history"]
+    typed = tiny_run(schedule="wsd")
+    going = going_on(old, typed, DIGEST, {})
+    assert going.settings == tiny_run() and not going.has_decided
+    assert going.notes == (
+        "schedule is cosine and not wsd, since the run is older than that setting; --change "
+        "schedule=wsd changes it",
+    )
+    again = going_on(following(old, going, 9), typed, DIGEST, {})
+    assert again.settings == tiny_run() and again.history == going.history
+    decided = going_on(following(old, going, 9), typed, DIGEST, {"schedule": "wsd"})
+    assert decided.settings == typed and decided.has_decided
+    for either in ("wsd", "cosine"):
+        last = going_on(following(old, decided, 10), tiny_run(schedule=either), DIGEST, {})
+        assert last.settings == typed
+
+
+def test_a_rate_that_rises_again_is_said() -> None:
+    begun = tiny_run(schedule="wsd", num_steps=20)
+    late = going_on(header(begun, step=18), begun, DIGEST, {"num_steps": 40})
+    assert any("the rate had been falling since step 16" in note for note in late.notes)
+    early = going_on(header(begun, step=16), begun, DIGEST, {"num_steps": 40})
+    assert not any("falling" in note for note in early.notes)
+
+
+def test_a_history_that_is_none_is_refused() -> None:
+    with pytest.raises(TrilightError, match="history of the run is not readable"):
+        events_of([{"when": 3}])
