@@ -1,0 +1,99 @@
+"""What the folder of a run tells, read without torch."""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from storage.errors import TrilightError
+from train.folder import RunFolder
+from train.watching.notes import read_notes
+from train.watching.rows import read_rows
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRecord:
+    """A run so far."""
+
+    folder: RunFolder
+    """Where it is."""
+    begun: Row
+    """settings.json: settings, digest of the data, versions, processes."""
+    rows: Sequence[Row]
+    """metrics.jsonl."""
+    notes: Sequence[Row]
+    """notes.jsonl."""
+    summary: Row | None
+    """summary.json of a finished run, else None."""
+
+    @property
+    def settings(self) -> Row:
+        """The settings of the run."""
+        found: Row = self.begun["settings"]
+        return found
+
+    @property
+    def last_step(self) -> int:
+        """Steps that the log reaches."""
+        return max((row["step"] for row in self.rows), default=0)
+
+    def points(self, *names: str) -> list[tuple[int, float]]:
+        """Return step and value of a figure, such as `validation`, `log_l1`, where it is there."""
+        return self.points_of(lambda row: _inner(row, names))
+
+    def points_of(self, value: Callable[[Row], Any]) -> list[tuple[int, float]]:
+        """Return step and what a function makes of each row, where that is a finite number."""
+        found = [(row["step"], value(row)) for row in self.rows]
+        return [
+            (step, number)
+            for step, number in found
+            if isinstance(number, int | float) and math.isfinite(number)
+        ]
+
+    @property
+    def spikes(self) -> list[Row]:
+        """Rows of spikes, oldest first."""
+        return [row for row in self.rows if "spike" in row]
+
+
+def read_record(root: Path) -> RunRecord:
+    """Read the folder of a run.
+
+    Raises:
+        TrilightError: it holds no run, or a file that is damaged.
+    """
+    folder = RunFolder(root)
+    if not is_run(root):
+        raise TrilightError(f"{root}: no run here; expected a folder that `trilight train` wrote.")
+    try:
+        summary = json.loads(folder.summary.read_text()) if folder.summary.exists() else None
+        record = RunRecord(
+            folder=folder,
+            begun=json.loads(folder.settings.read_text()),
+            rows=read_rows(folder.metrics),
+            notes=read_notes(folder.notes),
+            summary=summary,
+        )
+        _ = record.settings["num_steps"], record.last_step
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise TrilightError(
+            f"{root}: settings.json, summary.json or metrics.jsonl of the run is not readable "
+            f"({error}). Restore it from a copy."
+        ) from error
+    return record
+
+
+def is_run(root: Path) -> bool:
+    """Return whether a folder is one that a training wrote."""
+    folder = RunFolder(root)
+    return folder.settings.is_file() and folder.metrics.is_file()
+
+
+def _inner(row: Any, names: Sequence[str]) -> Any:
+    for name in names:
+        row = row.get(name) if isinstance(row, Mapping) else None
+    return row
