@@ -12,7 +12,7 @@ from infra.run_page.thinned import Point, thinned
 from pipeline.documents.html import Markup, element, joined, table
 
 WIDTH, HEIGHT = 460, 230
-LEFT, RIGHT, TOP, BOTTOM = 52, 10, 10, 26
+LEFT, RIGHT, TOP, BOTTOM = 58, 12, 10, 28
 COLOURS = 9
 _TABLE_ROWS = 10
 _STRIPS = 60
@@ -58,9 +58,10 @@ def drawn(chart: Chart, last_step: int) -> Markup:
     svg = element(
         "svg", *body, viewBox=f"0 0 {WIDTH} {HEIGHT}", role="img", **{"aria-label": label}
     )
-    legend = _legend(lines) if len(lines) > 1 else Markup("")
+    legend = _legend(lines, chart.stacked) if len(lines) > 1 else Markup("")
     latest = "" if len(lines) > 1 else f": {short_number(lines[0].points[-1][1])}"
-    caption = element("figcaption", element("b", chart.title), latest, legend)
+    marked = element("span", " ▲ spike", class_="spike") if chart.marks else Markup("")
+    caption = element("figcaption", element("b", chart.title), latest, marked, legend)
     return element("figure", caption, svg, _numbers(lines))
 
 
@@ -108,13 +109,13 @@ def heat_map(title: str, layers: dict[str, Sequence[tuple[int, float]]]) -> Mark
     if not values:
         return Markup("")
     scale = axis_of(values, log=True)
-    row_px, left = 15, 150
+    row_px, left = 17, 165
     columns = [thinned(points, most=50) for points in layers.values()]
     cell = (WIDTH - left - RIGHT) / max(map(len, columns))
     parts = []
     for row, (layer, points) in enumerate(zip(layers, columns, strict=True)):
         top = row * row_px
-        parts.append(_text(left - 6, top + 11, layer, anchor="end"))
+        parts.append(_text(left - 6, top + 13, layer, anchor="end"))
         for column, point in enumerate(points):
             strength = 0.06 + 0.94 * scale.place(point.mean) if point.mean > 0 else 0.0
             tip = element("title", f"{layer}, step {point.step}: {short_number(point.mean)}")
@@ -195,12 +196,19 @@ def _value_at(line: Line, step: int) -> str:
     return short_number(value)
 
 
-def _legend(lines: Sequence[Line]) -> Markup:
+def _legend(lines: Sequence[Line], stacked: bool) -> Markup:
+    """Return the colours with their names and last values; of stacked lines, last shares."""
+    whole = sum(line.points[-1][1] for line in lines) or 1.0
+
+    def last(line: Line) -> str:
+        value = line.points[-1][1]
+        return f"{value / whole:.0%}" if stacked else short_number(value)
+
     entries = [
         element(
             "span",
             element("i", class_="faint" if line.faint else f"c{number % COLOURS}"),
-            f"{line.name} {short_number(line.points[-1][1])}",
+            f"{line.name} {last(line)}",
         )
         for number, line in enumerate(lines)
     ]

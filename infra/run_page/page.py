@@ -23,11 +23,12 @@ nav { display: flex; flex-wrap: wrap; gap: .2rem 1rem; margin: 1rem 0 }
   gap: 1.4rem 2rem }
 figure { margin: 0; min-width: 0 } figcaption { font-size: .9rem; line-height: 1.4 }
 svg { display: block; width: 100%; height: auto; overflow: visible }
-svg text { font: 11px system-ui, sans-serif; fill: var(--soft) }
+svg text { font: 13px system-ui, sans-serif; fill: var(--soft) }
 .rule { stroke: var(--rule); fill: none }
 .line { fill: none; stroke-width: 1.6; stroke: currentColor }
 .band { fill: currentColor; opacity: .18 } .area { fill: currentColor; opacity: .85 }
-.dot { fill: currentColor } .mark { fill: var(--c5) } .tip { fill: transparent }
+.dot { fill: currentColor } .mark { fill: var(--c5) }
+.spike { color: var(--c5) } .tip { fill: transparent }
 .tip:hover { fill: var(--soft); fill-opacity: .15 } .heat rect { fill: var(--c0) }
 .c0 { color: var(--c0) } .c1 { color: var(--c1) } .c2 { color: var(--c2) } .c3 { color: var(--c3) }
 .c4 { color: var(--c4) } .c5 { color: var(--c5) } .c6 { color: var(--c6) } .c7 { color: var(--c7) }
@@ -38,7 +39,9 @@ svg text { font: 11px system-ui, sans-serif; fill: var(--soft) }
   background: currentColor; border-radius: 2px; vertical-align: -.05em }
 details { font-size: .85rem } .scroll { overflow-x: auto }
 .film { display: flex; gap: .5rem; overflow-x: auto; padding-bottom: .5rem }
+.film figure { flex: none }
 .film img { display: block; width: 112px; image-rendering: pixelated; background: #111 }
+.nowrap { white-space: nowrap }
 .film figcaption { white-space: nowrap; font-size: .8rem; color: var(--soft) }
 pre { columns: 22rem; font-size: .8rem; line-height: 1.45; background: var(--box); padding: .7rem;
   white-space: pre-wrap; overflow-wrap: anywhere }

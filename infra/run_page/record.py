@@ -14,6 +14,14 @@ from train.watching.rows import read_rows
 
 Row = Mapping[str, Any]
 
+FIGURES = {
+    "training_loss": ("loss",),
+    "validation_log_l1": ("validation", "log_l1"),
+    "validation_psnr_log_db_median": ("validation", "psnr_log_db_median"),
+    "views_per_s": ("views_per_s",),
+}
+"""What is told first, and where it stands in the log."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
@@ -55,6 +63,11 @@ class RunRecord:
         ]
 
     @property
+    def finished(self) -> bool:
+        """Whether it came to its end."""
+        return self.summary is not None and self.last_step >= self.settings["num_steps"]
+
+    @property
     def spikes(self) -> list[Row]:
         """Rows of spikes, oldest first."""
         return [row for row in self.rows if "spike" in row]
@@ -85,6 +98,21 @@ def read_record(root: Path) -> RunRecord:
             f"({error}). Restore it from a copy."
         ) from error
     return record
+
+
+def facts_of(record: RunRecord) -> dict[str, Any]:
+    """Return how far a run is, as JSON values; what is not known yet is left out."""
+    found: dict[str, Any] = {
+        "run": record.settings.get("run"),
+        "steps": record.last_step,
+        "steps_planned": record.settings["num_steps"],
+        "finished": record.finished,
+        "spikes": len(record.spikes),
+    }
+    for name, names in FIGURES.items():
+        if points := record.points(*names):
+            found[name] = points[-1][1]
+    return found
 
 
 def is_run(root: Path) -> bool:

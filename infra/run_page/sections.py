@@ -7,7 +7,7 @@ from typing import Any
 
 from infra.run_page.axes import short_number
 from infra.run_page.charts import Chart, Line, drawn, heat_map
-from infra.run_page.record import RunRecord
+from infra.run_page.record import FIGURES, RunRecord
 from pipeline.documents.html import Markup, data_uri, element, image, joined, table
 from train.watching.activity import PARTS
 
@@ -17,27 +17,24 @@ MOST_SPIKES = 100
 MOST_KEYS = 16
 """Scenes that one row names; metrics.jsonl has them all."""
 
-_LOG_FIGURES = {"grad_norm": 0, "update_ratio": 2}
+_LABELS = {
+    "training_loss": "training loss",
+    "validation_log_l1": "validation log L1",
+    "validation_psnr_log_db_median": "validation PSNR of log radiance, median dB",
+    "views_per_s": "views per second",
+}
 
 
 def overview(record: RunRecord) -> Markup:
     """Return what a person asks first."""
     step, steps = record.last_step, record.settings["num_steps"]
-    state = "finished" if record.summary is not None and step >= steps else "unfinished"
+    state = "finished" if record.finished else "unfinished"
     rows: list[tuple[str, str | Markup]] = [("steps", f"{step} of {steps}, {state}")]
-    for name, points in (
-        ("training loss", record.points("loss")),
-        ("validation log L1", record.points("validation", "log_l1")),
-        (
-            "validation PSNR of log radiance, median dB",
-            record.points("validation", "psnr_log_db_median"),
-        ),
-        ("views per second", record.points("views_per_s")),
-    ):
-        if points:
-            rows.append((name, short_number(points[-1][1])))
+    for name, label in _LABELS.items():
+        if points := record.points(*FIGURES[name]):
+            rows.append((label, short_number(points[-1][1])))
     if (median := _median_log_l1(record)) is not None:
-        rows.append(("median picture, validation log L1", short_number(median)))
+        rows.append(("the median picture's log L1", short_number(median)))
     skipped = record.points("skipped_steps")
     if skipped and skipped[-1][1]:
         rows.append(("skipped steps", str(skipped[-1][1])))
@@ -133,10 +130,16 @@ def spikes(record: RunRecord) -> Markup:
 def notes(record: RunRecord) -> Markup:
     """Return beginnings, resumes and warnings, oldest first."""
     rows = [
-        (str(note.get("step", "")), _time_of(note.get("at_unix_s")), str(note.get("text", "")))
+        (
+            str(note.get("step", "")),
+            element("span", _time_of(note.get("at_unix_s")), class_="nowrap"),
+            str(note.get("text", "")),
+        )
         for note in record.notes
     ]
-    return table(("step", "when (UTC)", "what"), rows) if rows else element("p", "None.")
+    if not rows:
+        return element("p", "None.")
+    return table(("step", "when (UTC)", "what"), rows, class_="narrow")
 
 
 def _time_of(unix_s: Any) -> str:

@@ -41,6 +41,13 @@ class _Stretch:
     usual_s: float | None
     limit_s: float
 
+    @property
+    def name(self) -> str:
+        """What it is called for people."""
+        if self.kind == "step":
+            return f"step {self.step}"
+        return f"the {self.kind} after step {self.step}"
+
 
 @dataclass(kw_only=True)
 class _Hang:
@@ -126,7 +133,7 @@ class Watchdog:
         while not self._closed.wait(min(POLL_S, self._settings.hang_after_s / 5)):
             now_s, stretch = time.monotonic(), self._stretch
             if hang is not None and stretch is not hang.stretch:
-                self._noted(f"{hang.stretch.kind} of step {hang.stretch.step} went on after all")
+                self._noted(f"{hang.stretch.name} went on after all")
                 hang = None
             if stretch is None or now_s - stretch.since_s < stretch.limit_s:
                 continue
@@ -145,8 +152,8 @@ class Watchdog:
         doing, path = self._activity.now, self._path(stretch.step, self._crew.rank)
         usual = "" if stretch.usual_s is None else f", where {stretch.usual_s:.2g} s is usual"
         line = (
-            f"process {self._crew.rank} of {self._crew.world_size}: the {stretch.kind} of step "
-            f"{stretch.step} has taken {now_s - stretch.since_s:.1f} s{usual}; for "
+            f"process {self._crew.rank} of {self._crew.world_size}: {stretch.name} "
+            f"has taken {now_s - stretch.since_s:.1f} s{usual}; for "
             f"{now_s - doing.since_s:.1f} s it has been in: {PARTS[doing.part]}"
         )
         written = ""
@@ -176,10 +183,7 @@ class Watchdog:
 
     def _stop_if_asked(self, hang: _Hang, now_s: float) -> None:
         if self._settings.on_hang == "stop" and now_s - hang.began_s >= GRACE_S:
-            self._hung(
-                f"training: the {hang.stretch.kind} of step {hang.stretch.step} hangs, and the run "
-                "was asked to stop then"
-            )
+            self._hung(f"training: {hang.stretch.name} hangs, and the run was asked to stop then")
 
 
 def _write_stacks(path: Path, line: str) -> None:

@@ -43,9 +43,9 @@ def test_a_loader_that_sleeps_is_named_with_its_stack(tmp_path: Path) -> None:
         dog.begins("step", 5)
         sleeping_loader(said, 2)
         dog.begins("step", 6)
-        until(lambda: "step of step 5 went on after all" in said)
+        until(lambda: "step 5 went on after all" in said)
     first, again = said[0], said[1]
-    assert first.startswith("process 0 of 1: the step of step 5 has taken ")
+    assert first.startswith("process 0 of 1: step 5 has taken ")
     assert "s is usual; for " in first and "it has been in: waiting for data" in first
     assert again != first, "told again later, with the time of then"
     (path,) = (tmp_path / "watching").iterdir()
@@ -77,7 +77,7 @@ def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
     with dog:
         dog.begins("validation", 7)
         until(lambda: ended)
-    assert "the validation of step 7 hangs" in ended[0]
+    assert "the validation after step 7 hangs" in ended[0]
     passed_on = [text for text in said if text.startswith("process 1 of 2: in the loader")]
     assert len(passed_on) == 1 and str(others) in passed_on[0]
 
