@@ -57,6 +57,10 @@ class _Hang:
     began_s: float
     next_s: float
     """When to speak again."""
+    spoken: bool = False
+    """Whether this process has told of it."""
+    stopped: bool = False
+    """Whether the run was told to stop."""
     told: set[Path] = field(default_factory=set)
     """Files of other processes whose first line was passed on."""
 
@@ -142,14 +146,15 @@ class Watchdog:
                 self._files += 1
             if now_s >= hang.next_s:
                 hang.next_s = stretch.since_s + 2 * (now_s - stretch.since_s)  # ever more rarely
-                self._tell(stretch, now_s)
+                self._tell(hang, now_s)
             if self._crew.is_first:
-                self._pass_on(hang)
+                self._pass_on(hang, now_s)
                 self._stop_if_asked(hang, now_s)
 
-    def _tell(self, stretch: _Stretch, now_s: float) -> None:
+    def _tell(self, hang: _Hang, now_s: float) -> None:
         """Write the stacks, and say in which part this process is."""
-        doing, path = self._activity.now, self._path(stretch.step, self._crew.rank)
+        stretch, doing = hang.stretch, self._activity.now
+        path = self._path(stretch.step, self._crew.rank)
         usual = "" if stretch.usual_s is None else f", where {stretch.usual_s:.2g} s is usual"
         line = (
             f"process {self._crew.rank} of {self._crew.world_size}: {stretch.name} "
@@ -159,8 +164,9 @@ class Watchdog:
         written = ""
         if self._files <= MOST_FILES:
             with suppress(OSError):
-                _write_stacks(path, line)
+                _write_stacks(path, line, again=hang.spoken)
                 written = f". Stacks of its threads: {path}"
+        hang.spoken = True
         self._noted(line + written)
 
     def _noted(self, text: str) -> None:
@@ -170,25 +176,28 @@ class Watchdog:
     def _path(self, step: int, rank: int | str) -> Path:
         return self._folder / f"hang-step-{step:09d}-rank-{rank}.txt"
 
-    def _pass_on(self, hang: _Hang) -> None:
-        """Tell what the other processes wrote of the same step."""
+    def _pass_on(self, hang: _Hang, now_s: float) -> None:
+        """Tell what the other processes wrote of the same step, in this call of the trainer."""
+        began_unix_s = time.time() - (now_s - hang.stretch.since_s)
         hang.told.add(self._path(hang.stretch.step, self._crew.rank))
         pattern = self._path(hang.stretch.step, "*").name
         for path in sorted(set(self._folder.glob(pattern)) - hang.told):
             with suppress(OSError):
                 lines = path.read_text().splitlines()
-                if lines:
+                if lines and path.stat().st_mtime >= began_unix_s:
                     hang.told.add(path)
                     self._noted(f"{lines[0]}. Stacks of its threads: {path}")
 
     def _stop_if_asked(self, hang: _Hang, now_s: float) -> None:
-        if self._settings.on_hang == "stop" and now_s - hang.began_s >= GRACE_S:
+        asked = self._settings.on_hang == "stop" and not hang.stopped
+        if asked and now_s - hang.began_s >= GRACE_S:
+            hang.stopped = True
             self._hung(f"training: {hang.stretch.name} hangs, and the run was asked to stop then")
 
 
-def _write_stacks(path: Path, line: str) -> None:
+def _write_stacks(path: Path, line: str, *, again: bool) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as stream:
+    with path.open("a" if again else "w") as stream:
         stream.write(f"{line}\n\n")
         stream.flush()
         faulthandler.dump_traceback(stream, all_threads=True)

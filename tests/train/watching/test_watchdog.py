@@ -1,5 +1,6 @@
 """A step that does not end is told once, with the part it is in and the stacks, and goes on."""
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -71,13 +72,17 @@ def test_words_of_other_processes_are_passed_on_and_the_run_stops_if_asked(
     ended: list[str] = []
     settings = WatchSettings(hang_after_s=0.1, on_hang="stop")
     others = tmp_path / "hang-step-000000007-rank-1.txt"
-    others.write_text("process 1 of 2: in the loader\n\nThread 1\n")
+    old = tmp_path / "hang-step-000000007-rank-2.txt"
+    for path in (others, old):
+        path.write_text("process 1 of 2: in the loader\n\nThread 1\n")
+    os.utime(others, (time.time() + 60, time.time() + 60))  # written while it hangs
+    os.utime(old, (0, 0))  # of an earlier call
     pair = Crew(device=torch.device("cpu"), world_size=2)
     dog = Watchdog(settings, Activity(), pair, tmp_path, noted=said.append, hung=ended.append)
     with dog:
         dog.begins("validation", 7)
         until(lambda: ended)
-    assert "the validation after step 7 hangs" in ended[0]
+    assert "the validation after step 7 hangs" in ended[0] and len(ended) == 1
     passed_on = [text for text in said if text.startswith("process 1 of 2: in the loader")]
     assert len(passed_on) == 1 and str(others) in passed_on[0]
 
