@@ -34,7 +34,7 @@ def slow_from(crew: Crew) -> None:
         return made(maker, place)
 
     if not crew.is_first:
-        stream._SceneMaker.scene = sleeping  # type: ignore[method-assign]
+        setattr(stream._SceneMaker, "scene", sleeping)  # noqa: B010
 
 
 def main(data: str, out: Path) -> None:

@@ -41,7 +41,7 @@ def test_the_figures_are_those_of_an_update_before_clipping(clip: float) -> None
     stepper.layers.expect(True)
     report = stepper.step([batch], 3e-3)
     row = stepper.layers.row()
-    squared = {}
+    squared: dict[str, np.ndarray] = {}
     for name, weight in state.model.named_parameters():
         old, new = (w.detach().double().numpy().ravel() for w in (before[name], weight))
         sums = squared.setdefault(layer_of(name), np.zeros(2))
