@@ -9,7 +9,7 @@ from train.folder import RunFolder
 from train.loop.crew import Crew
 from train.loop.step import Stepper, StepReport
 from train.settings import TrainSettings
-from train.watching.memory import memory_mb
+from train.watching.process_memory import memory_mb
 from train.watching.profiler import StepProfiler
 from train.watching.ranks import own_seconds, slowest, told
 from train.watching.settings import WatchSettings
