@@ -4,6 +4,7 @@ A chart takes its colours from the page's style (classes c0, c1, ...), says in w
 (aria-label), tells values where a pointer rests (<title>), and has the same in a table below it.
 """
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -192,8 +193,9 @@ def _strips(lines: Sequence[Line], along: Axis) -> list[Markup]:
 
 
 def _value_at(line: Line, step: int) -> str:
-    _, value = min(line.points, key=lambda point: abs(point[0] - step))
-    return short_number(value)
+    """Return the value at a step, or at the next one where there is none."""
+    row = bisect_left(line.points, step, key=lambda point: point[0])
+    return short_number(line.points[min(row, len(line.points) - 1)][1])
 
 
 def _legend(lines: Sequence[Line], stacked: bool) -> Markup:

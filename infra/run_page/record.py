@@ -62,6 +62,15 @@ class RunRecord:
             if isinstance(number, int | float) and math.isfinite(number)
         ]
 
+    def layers(self, column: int) -> dict[str, list[tuple[int, float]]]:
+        """Return step and figure of each layer; `column` is one of watching.rows.LAYER_COLUMNS."""
+        found: dict[str, list[tuple[int, float]]] = {}
+        for row in self.rows:
+            for name, figures in row.get("layers", {}).items():
+                if figures[column] is not None:
+                    found.setdefault(name, []).append((row["step"], figures[column]))
+        return found
+
     @property
     def finished(self) -> bool:
         """Whether it came to its end."""

@@ -10,6 +10,7 @@ from infra.run_page.charts import Chart, Line, drawn, heat_map
 from infra.run_page.record import FIGURES, RunRecord
 from pipeline.documents.html import Markup, data_uri, element, image, joined, table
 from train.watching.activity import PARTS
+from train.watching.rows import LAYER_COLUMNS
 
 MOST_SPIKES = 100
 """Rows of the table of spikes: the newest."""
@@ -73,16 +74,13 @@ def curves(record: RunRecord) -> Markup:
 
 def layers(record: RunRecord) -> Markup:
     """Return gradient and update of each layer over the steps."""
-    names = list(dict.fromkeys(name for row in record.rows for name in row.get("layers", {})))
-    maps = []
-    for title, column in (("length of the gradient", 0), ("update as a share of the weights", 2)):
-        found = {name: _layer_points(record, name, column) for name in names}
-        maps.append(heat_map(title, {name: points for name, points in found.items() if points}))
+    maps = [
+        heat_map("length of the gradient", record.layers(LAYER_COLUMNS.index("grad_norm"))),
+        heat_map(
+            "update as a share of the weights", record.layers(LAYER_COLUMNS.index("update_ratio"))
+        ),
+    ]
     return element("div", *maps, class_="charts")
-
-
-def _layer_points(record: RunRecord, name: str, column: int) -> list[tuple[int, float]]:
-    return record.points_of(lambda row: row.get("layers", {}).get(name, [None] * 3)[column])
 
 
 def pictures(record: RunRecord) -> Markup:

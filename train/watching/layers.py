@@ -7,10 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-COLUMNS = ("grad_norm", "weight_norm", "update_ratio")
-"""What is told of a layer: length of its gradient before clipping, length of its weights, and how
-far the update moved them as a share of that length."""
-
 _GROUP = re.compile(r"[^.]+(\.[^.]+(\.\d+)?)?")
 _DIGITS = 4
 
@@ -46,7 +42,7 @@ class LayerNorms:
 
     @torch.no_grad()
     def row(self) -> dict[str, list[float | None]]:
-        """Return COLUMNS by layer after the update; empty where none was looked at.
+        """Return LAYER_COLUMNS by layer after the update; empty where none was looked at.
 
         A figure that is not finite is None.
         """

@@ -4,6 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+LAYER_COLUMNS = ("grad_norm", "weight_norm", "update_ratio")
+"""What a row tells of a layer: length of its gradient before clipping, length of its weights, and
+how far the update moved them as a share of that length."""
+
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """Return the whole rows of a log; a missing file has none."""

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from train.watching.layers import COLUMNS
+from train.watching.rows import LAYER_COLUMNS
 
 _GROUPED = ("validation", "time_s", "memory_mb")
 
@@ -18,7 +18,7 @@ def scalars(row: Mapping[str, Any]) -> dict[str, float]:
             for layer, figures in value.items():
                 found |= {
                     f"{column}/{layer}": figure
-                    for column, figure in zip(COLUMNS, figures, strict=True)
+                    for column, figure in zip(LAYER_COLUMNS, figures, strict=True)
                 }
         elif name == "own_s":
             found |= {f"own_s/process {rank}": seconds for rank, seconds in enumerate(value)}
