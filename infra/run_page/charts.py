@@ -5,7 +5,7 @@ A chart takes its colours from the page's style (classes c0, c1, ...), says in w
 """
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from infra.run_page.axes import Axis, axis_of, short_number
@@ -104,7 +104,7 @@ def _areas(lines: Sequence[Line], last_step: int) -> list[Markup]:
     return [*parts, _grid(along, down), *_strips(lines, along)]
 
 
-def heat_map(title: str, layers: dict[str, Sequence[tuple[int, float]]]) -> Markup:
+def heat_map(title: str, layers: Mapping[str, Sequence[tuple[int, float]]]) -> Markup:
     """Return a row of cells for each layer, darker for larger values on a logarithmic scale."""
     values = [value for points in layers.values() for _, value in points if value > 0]
     if not values:

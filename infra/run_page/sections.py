@@ -89,7 +89,7 @@ def pictures(record: RunRecord) -> Markup:
     target = record.folder.pictures / "target.png"
     shown = [(f"step {int(path.stem.removeprefix('step-'))}", path) for path in kept]
     if target.exists():
-        shown.append(("target", target))
+        shown.insert(0, ("target", target))  # in sight on a phone, where the rest is scrolled
     if not shown:
         return element("p", "None yet: they come with the first validation.")
     figures = [
