@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from infra.run_page import sections
-from infra.run_page.record import read_record
+from infra.run_page.record import RunRecord, read_record, unreadable
 from pipeline.documents.html import element, joined, page
 from storage.atomic import write_atomically
 
@@ -41,7 +41,8 @@ details { font-size: .85rem } .scroll { overflow-x: auto }
 .film { display: flex; gap: .5rem; overflow-x: auto; padding-bottom: .5rem }
 .film figure { flex: none }
 .film img { display: block; width: 112px; image-rendering: pixelated; background: #111 }
-.nowrap { white-space: nowrap }
+@media (min-width: 30rem) { .nowrap { white-space: nowrap } }
+@media (max-width: 30rem) { table.narrow td, table.narrow th { padding-right: .8rem } }
 .film figcaption { white-space: nowrap; font-size: .8rem; color: var(--soft) }
 pre { columns: 22rem; font-size: .8rem; line-height: 1.45; background: var(--box); padding: .7rem;
   white-space: pre-wrap; overflow-wrap: anywhere }
@@ -65,7 +66,17 @@ def write_run_page(root: Path) -> Path:
         TrilightError: the folder holds no run, a file of it is damaged, or it cannot be written.
     """
     record = read_record(root)
-    title = f"Run {record.settings.get('run', root.name)}"
+    try:
+        data = _encoded(record)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        # a folder from elsewhere may hold anything
+        raise unreadable(root, error) from error
+    write_atomically(record.folder.page, data)
+    return record.folder.page
+
+
+def _encoded(record: RunRecord) -> bytes:
+    title = f"Run {record.settings.get('run', record.folder.root.name)}"
     links = [element("a", name, href=f"#{name}") for name in _SECTIONS]
     parts = [
         element("a", "To the curves", href="#curves", class_="skip"),
@@ -75,6 +86,4 @@ def write_run_page(root: Path) -> Path:
     ]
     for name, made in _SECTIONS.items():
         parts += [element("h2", name.capitalize(), id=name), made(record)]
-    body = element("main", joined(parts))
-    write_atomically(record.folder.page, page(title, body, style=_STYLE))
-    return record.folder.page
+    return page(title, element("main", joined(parts)), style=_STYLE)

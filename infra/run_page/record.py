@@ -102,11 +102,16 @@ def read_record(root: Path) -> RunRecord:
         )
         _ = record.settings["num_steps"], record.last_step
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise TrilightError(
-            f"{root}: settings.json, summary.json or metrics.jsonl of the run is not readable "
-            f"({error}). Restore it from a copy."
-        ) from error
+        raise unreadable(root, error) from error
     return record
+
+
+def unreadable(root: Path, error: Exception) -> TrilightError:
+    """Return the user's view of a damaged file of a run."""
+    return TrilightError(
+        f"{root}: settings.json, summary.json, metrics.jsonl or notes.jsonl of the run is not "
+        f"readable ({error}). Restore it from a copy."
+    )
 
 
 def facts_of(record: RunRecord) -> dict[str, Any]:

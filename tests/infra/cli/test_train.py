@@ -153,7 +153,12 @@ def test_a_run_that_hangs_and_is_to_stop_ends_with_status_1(
 
 def test_how_it_is_watched_is_passed_on_to_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[list[str]] = []
-    monkeypatch.setattr(os, "execv", lambda program, words: seen.append(words) or sys.exit(0))
+
+    def replaced(program: str, words: list[str]) -> NoReturn:
+        seen.append(words)
+        sys.exit(0)
+
+    monkeypatch.setattr(os, "execv", replaced)
     asked = ["train", "smoke", "--processes", "2", "--hang-after", "9", "--profile", "2"]
     assert trilight([*asked, "--wandb", "light"]).exit_code == 0
     assert " ".join(seen[0][6:]) == (

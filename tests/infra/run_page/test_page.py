@@ -58,6 +58,7 @@ def test_other_folders_and_damage_are_named(tmp_path: Path) -> None:
     with pytest.raises(TrilightError, match="no run here; expected a folder that `trilight train`"):
         write_run_page(tmp_path)
     write_run(tmp_path / "run")
-    (tmp_path / "run/metrics.jsonl").write_text("{\n")
-    with pytest.raises(TrilightError, match="is not readable .* Restore it from a copy"):
-        write_run_page(tmp_path / "run")
+    for damaged in ("{\n", "[]\n", '{"step": 1, "layers": [1]}\n', '{"step": 1, "spike": 3}\n'):
+        (tmp_path / "run/metrics.jsonl").write_text(damaged)
+        with pytest.raises(TrilightError, match="is not readable .* Restore it from a copy"):
+            write_run_page(tmp_path / "run")
