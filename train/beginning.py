@@ -34,12 +34,13 @@ from train.loop.checkpoints import (
 )
 from train.loop.crew import Crew
 from train.loop.muon import fitting_precision
-from train.loop.recorder import MetricsLog, read_rows
+from train.loop.recorder import MetricsLog
 from train.loop.state import TrainState, new_state
 from train.progress import TrainProgress
 from train.result import pretty_json
 from train.settings import TrainSettings
 from train.start import Start
+from train.watching.rows import read_rows
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

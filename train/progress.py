@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+from train.folder import RunFolder
+
 
 class TrainProgress:
     """Receives the events of a run: noted, then begin, then advance and validated in turns.
@@ -30,6 +32,15 @@ class TrainProgress:
 
     def validated(self, *, step: int, scores: Mapping[str, float]) -> None:
         """The validation split was judged after `step` steps (evaluation.scores)."""
+
+    def recorded(self, folder: RunFolder) -> None:
+        """Something new stands in the folder of the run: a row of its log, a note, a picture."""
+
+    def hung(self, text: str) -> None:
+        """A step does not end and the run was asked to stop then; called from another thread.
+
+        Whoever runs it ends the process: nothing else ends a call that hangs. Here it goes on.
+        """
 
     def interrupted(self, times: int) -> None:
         """A signal asks to stop, for the `times`-th time; called from another thread."""

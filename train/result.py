@@ -13,9 +13,9 @@ from train.evaluation.scores import Lead
 from train.evaluation.sheet import drawn_validation_sheet, write_picture
 from train.folder import RunFolder
 from train.going_on import Event
-from train.loop.recorder import read_rows
 from train.loop.state import TrainState
 from train.settings import TrainSettings
+from train.watching.rows import read_rows
 
 LOSS_SHARE = 20
 """The loss at start and end is the mean over the first and last 1 / LOSS_SHARE of the log."""

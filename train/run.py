@@ -28,6 +28,9 @@ from train.progress import TrainProgress
 from train.result import TrainResult, finished
 from train.settings import TrainSettings
 from train.start import Start
+from train.watching.notes import add_note
+from train.watching.settings import WatchSettings
+from train.watching.weights_and_biases import require_wandb
 
 MEDIAN_SCENES = 256
 """Training scenes of which the median picture is taken; more would not move it."""
@@ -49,6 +52,7 @@ def train_run(
     start: Start | None = None,
     crew: Crew | None = None,
     workers: int = 1,
+    watched: WatchSettings | None = None,
     progress: TrainProgress | None = None,
 ) -> TrainResult | None:
     """Train a network and judge it.
@@ -62,6 +66,7 @@ def train_run(
         start: how it begins; anew unless said.
         crew: the processes that train together (loop.crew.join_crew); this one unless said.
         workers: threads that read and decode samples; the weights do not depend on them.
+        watched: how the run is watched, which the weights do not depend on either.
         progress: receives the events of the run, in the first process.
 
     Returns:
@@ -73,19 +78,24 @@ def train_run(
             checkpoint that is missing or of another run, LPIPS without its weights, a start that
             went dead, too little memory, or a signal that asked to stop.
     """
-    began = time.monotonic()
+    began, watched = time.monotonic(), watched or WatchSettings()
+    require_wandb(watched.wandb)
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
     progress = progress if progress is not None and crew.is_first else TrainProgress()
     opened, folder = open_training_data(data), RunFolder(out)
+    early = _EarlyNotes(progress)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
-        progress.noted(note)
-    plan = beginning(settings, folder, opened.digest, start, crew, progress)
+        early.noted(note)
+    plan = beginning(settings, folder, opened.digest, start, crew, early)
     settings = plan.settings
     objective = Objective(settings.loss, load_lpips(start.lpips)).to(crew.device)
     _check_data(opened, settings)
-    state = begun(plan, folder, opened.digest, crew, progress)
+    state = begun(plan, folder, opened.digest, crew, early)
     judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
-    recorder = _recorder(state, settings, folder, judge, progress) if crew.is_first else None
+    recorder = None
+    if crew.is_first:
+        recorder = _recorder(state, settings, folder, judge, progress, watched)
+        _note_beginning(folder, state, crew, judge, early.texts, resumed=start.resume)
     trainer = Trainer(
         state=state,
         settings=settings,
@@ -94,6 +104,7 @@ def train_run(
         folder=folder,
         data_digest=opened.digest,
         recorder=recorder,
+        watched=watched,
     )
     batches = stream_batches(
         opened.split("train"),
@@ -109,6 +120,37 @@ def train_run(
         return None
     recorder.close()
     return finished(state, settings, folder, opened, judge, time.monotonic() - began)
+
+
+class _EarlyNotes(TrainProgress):
+    """Passes notes on, and keeps them until the folder of the run is known to be its own."""
+
+    def __init__(self, progress: TrainProgress) -> None:
+        self._progress = progress
+        self.texts: list[str] = []
+
+    def noted(self, text: str) -> None:
+        self._progress.noted(text)
+        self.texts.append(text)
+
+
+def _note_beginning(
+    folder: RunFolder,
+    state: TrainState,
+    crew: Crew,
+    judge: Judge | None,
+    notes: Sequence[str],
+    *,
+    resumed: bool,
+) -> None:
+    """Write down that a call of the trainer began or went on, and what it said until now."""
+    how = "went on" if resumed else "began"
+    many = "process" if crew.world_size == 1 else "processes"
+    began = f"{how} on {crew.device}, {crew.world_size} {many}"
+    rival = {"median_log_l1": judge.median_scores["log_l1"]} if judge else {}
+    add_note(folder.notes, state.step, began, **rival)
+    for text in notes:
+        add_note(folder.notes, state.step, text)
 
 
 def stream_settings(settings: TrainSettings) -> StreamSettings:
@@ -161,6 +203,7 @@ def _recorder(
     folder: RunFolder,
     judge: Judge | None,
     progress: TrainProgress,
+    watched: WatchSettings,
 ) -> Recorder:
     progress.begin(
         step=state.step,
@@ -168,4 +211,4 @@ def _recorder(
         num_parameters=count_parameters(state.model),
         median_scores=judge.median_scores if judge else None,
     )
-    return Recorder(folder, settings, judge, progress, first_step=state.step)
+    return Recorder(folder, settings, judge, progress, first_step=state.step, wandb=watched.wandb)

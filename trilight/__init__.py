@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from trilight.learning import Judgement as Judgement
     from trilight.learning import TrainResult as TrainResult
     from trilight.learning import TrainSettings as TrainSettings
+    from trilight.learning import WatchSettings as WatchSettings
     from trilight.learning import judge_network as judge_network
     from trilight.learning import named_run as named_run
     from trilight.learning import train_network as train_network

@@ -5,10 +5,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from infra.run_page.page import write_run_page
+from infra.run_page.page_progress import PageProgress
 from infra.torch_library import require_torch
 from train.runs import changed_run, named_run
 from train.settings import TrainSettings
 from train.start import Start
+from train.watching.settings import WatchSettings
 
 if TYPE_CHECKING:
     from infra.judging import Judgement
@@ -19,6 +22,7 @@ __all__ = [
     "Judgement",
     "TrainResult",
     "TrainSettings",
+    "WatchSettings",
     "judge_network",
     "named_run",
     "train_network",
@@ -40,6 +44,7 @@ def train_network(
     lpips: str | None = None,
     workers: int = 1,
     device: str | None = None,
+    watched: WatchSettings | None = None,
     progress: "TrainProgress | None" = None,
 ) -> "TrainResult":
     """Train a network on a dataset and judge it, as `trilight train` does, in this process.
@@ -59,7 +64,8 @@ def train_network(
         lpips: folder of LPIPS' weights, or `hub`.
         workers: threads that decode samples.
         device: cpu or cuda; by default cuda where there is one.
-        progress: receives the progress of the run.
+        watched: how the run is watched, such as WatchSettings(profile=5).
+        progress: receives the progress of the run; unless given, the run's page is kept up to date.
 
     Raises:
         TrilightError: PyTorch is not installed, a setting or the data is refused, or the folder
@@ -85,9 +91,11 @@ def train_network(
         start=start,
         crew=Crew(device=choose_device(device)),
         workers=workers,
-        progress=progress,
+        watched=watched,
+        progress=PageProgress() if progress is None else progress,
     )
     assert result is not None  # the first process of a crew of one
+    write_run_page(Path(out))
     return result
 
 

@@ -34,11 +34,13 @@ COMMANDS = {
     "verify": "Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."
     "\n\nAn unfinished dataset is checked as far as it exists; the exit status is 1 then too.",
     "inspect": "Rewrite report, gallery and contact sheet, and print what the dataset holds."
+    "\n\nFor the folder of a training run, its page index.html is rewritten: curves, pictures, "
+    "layers, spikes, notes and settings."
     "\n\nFor a dataset that is read-only or on a server, only a summary is printed, unless --out "
     "names a folder. For a scene file, its summary and what could not be carried over are printed.",
     "model": "Print parameters, FLOPs and memory by precision of a named size or of a checkpoint.",
     "status": "Report a dataset's progress, estimated finish and failures; needs no server.",
-    "train": "Train a model; writes checkpoints, metrics.jsonl, TensorBoard curves and a sheet."
+    "train": "Train a model; writes checkpoints, curves and pictures on one page, and a sheet."
     "\n\nTo train with processes on several machines, run torchrun -m trilight train ...",
     "evaluate": "Evaluate a network; writes evaluation.json, evaluation.md and sheets of pictures.",
     "bench": "Measure cost against error; an interrupted run resumes. Without a name, list all.",

@@ -1,4 +1,4 @@
-"""`trilight inspect`: what is in a dataset or in one scene, for a person."""
+"""`trilight inspect`: what is in a dataset, in a run or in one scene, for a person."""
 
 import os
 import shlex
@@ -18,6 +18,8 @@ from infra.cli.console import (
     progress_bars,
 )
 from infra.cli.options import Shown, command
+from infra.run_page.page import write_run_page
+from infra.run_page.record import facts_of, is_run, read_record
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.statistics import Statistics, dataset_statistics
@@ -36,10 +38,11 @@ _READ_ONLY = "It cannot be written there: choose a folder for report and sheet w
 
 @checked()
 class Inspected:
-    """The dataset or scene, and the pictures to write."""
+    """The dataset, run or scene, and the pictures to write."""
 
     source: str
-    """A dataset (folder or URL), or one scene in any form that render reads."""
+    """A dataset (folder or URL), the folder of a training run, or one scene in any form that render
+    reads."""
     scenes: Annotated[int, Within(1, 10_000, unit="scenes")] = 16
     """Number of scenes on the contact sheet."""
     by_template: Annotated[int | None, Within(1, 1000, unit="scenes")] = None
@@ -59,7 +62,10 @@ def inspect(asked: Inspected, shown: Shown) -> None:
         _inspect_scene(source, asked.turntable, json=shown.json)
         return
     if asked.turntable is not None:
-        raise TrilightError(f"--turntable: {source} is a dataset; expected one scene.")
+        raise TrilightError(f"--turntable: {source} is a folder; expected one scene.")
+    if is_run(Path(source)):
+        _inspect_run(Path(source), json=shown.json)
+        return
     first_words(f"Reading {safe_url(source)}", silent=shown.json)
     opened = open_dataset(source)
     _require_shards(opened)
@@ -78,6 +84,19 @@ def inspect(asked: Inspected, shown: Shown) -> None:
         return
     _print_summary(opened.shown, opened, statistics, found)
     look_at(f"Look at {folder.report} and {folder.contact_sheet}" if folder else _READ_ONLY)
+
+
+def _inspect_run(root: Path, *, json: bool) -> None:
+    """Write the page of a run, and say how far it is."""
+    page = write_run_page(root)
+    record = read_record(root)
+    if json:
+        print_json(facts_of(record))
+        return
+    print_rows(
+        str(root), [(name.replace("_", " "), str(v)) for name, v in facts_of(record).items()]
+    )
+    look_at(f"Look at {page}")
 
 
 def _require_shards(opened: Dataset) -> None:

@@ -33,6 +33,7 @@ ALIASES = {
     "decisions": "--change",
     "error_db": "--error",
     "exposure_ev": "--exposure",
+    "hang_after_s": "--hang-after",
     "min_noise_floor_db": "--min-noise-floor",
     "most_unusable": "--skip-unusable",
     "noise_floor_db": "--noise-floor",

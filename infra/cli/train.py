@@ -5,6 +5,7 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -13,23 +14,26 @@ from rich.progress import TaskID
 from rich.text import Text
 
 from infra.cli.changes import Shared, all_changes, run_record
-from infra.cli.console import console, print_rows, progress_bars
+from infra.cli.console import console, look_at, print_rows, progress_bars
 from infra.cli.options import Shown, command
+from infra.run_page.page import write_run_page
+from infra.run_page.page_progress import PageProgress
+from infra.run_page.record import is_run
 from infra.torch_library import require_torch
 from infra.train_order import TrainOrder
 from storage.errors import TrilightError
 from storage.settings.described import option_words
-from train.progress import TrainProgress
 from train.runs import in_proportion, named_run
 from train.settings import TrainSettings
+from train.watching.settings import WatchSettings
 
 if TYPE_CHECKING:
     from train.going_on import Event
     from train.result import TrainResult
 
 
-class _BarProgress(TrainProgress):
-    """Shows a run as a progress bar, and each validation as a line."""
+class _BarProgress(PageProgress):
+    """Shows a run as a progress bar, each validation as a line, and all of it as a page."""
 
     def __init__(self, bars: Bars) -> None:
         self._bars = bars
@@ -76,22 +80,38 @@ class _BarProgress(TrainProgress):
             )
             return
         self._bars.stop()
-        sys.stderr.write("\ntrilight: ended at once; --resume goes on from the last checkpoint.\n")
-        sys.stderr.flush()
-        os._exit(130)
+        _end("ended at once", 130)
+
+    def hung(self, text: str) -> None:
+        self._bars.stop()
+        _end(text, 1)
+
+
+class _QuietProgress(PageProgress):
+    """Shows nothing but the page."""
+
+    def hung(self, text: str) -> None:
+        _end(text, 1)
+
+
+def _end(text: str, status: int) -> NoReturn:
+    """End a process whose main thread may be in a call that does not return."""
+    sys.stderr.write(f"\ntrilight: {text}; --resume goes on from the last checkpoint.\n")
+    sys.stderr.flush()
+    os._exit(status)
 
 
 @command("run")
-def train(order: TrainOrder, shared: Shared, shown: Shown) -> None:
+def train(order: TrainOrder, watched: WatchSettings, shared: Shared, shown: Shown) -> None:
     if shared.is_given:
         changes = all_changes(named_run(order.run), shared, run_record(shared), order.changes)
         order = dataclasses.replace(order, changes=changes)
     settings = order.settings()  # without torch, so that mistakes are named at once
     if order.processes > 1:
-        _launch(order, shown)
+        _launch(order, watched, shown)
     if os.environ.get("RANK", "0") == "0" and not shown.json:
         _announce(order, settings)
-    result = _trained(order, settings, quiet=shown.json)
+    result = _trained(order, settings, watched, quiet=shown.json)
     if result is None:
         return
     if shown.json:
@@ -100,17 +120,19 @@ def train(order: TrainOrder, shared: Shared, shown: Shown) -> None:
         _report(result)
 
 
-def _launch(order: TrainOrder, shown: Shown) -> NoReturn:
+def _launch(order: TrainOrder, watched: WatchSettings, shown: Shown) -> NoReturn:
     """Become torchrun, which starts this command once for each process."""
     if "RANK" in os.environ:
         raise TrilightError(
             f"--processes is {order.processes} under torchrun, which sets their number; omit it."
         )
-    words = [*order.command(), *option_words(shown)]
+    words = [*order.command(), *option_words(watched), *option_words(shown)]
     os.execv(words[0], words)
 
 
-def _trained(order: TrainOrder, settings: TrainSettings, *, quiet: bool) -> "TrainResult | None":
+def _trained(
+    order: TrainOrder, settings: TrainSettings, watched: WatchSettings, *, quiet: bool
+) -> "TrainResult | None":
     """Train as train.run.train_run does; torch is imported here, which takes seconds."""
     require_torch("train")
     from train.loop.crew import join_crew
@@ -118,7 +140,7 @@ def _trained(order: TrainOrder, settings: TrainSettings, *, quiet: bool) -> "Tra
     from train.run import train_run
 
     with join_crew(order.device) as crew, progress_bars() as bars:
-        progress = None if quiet else _BarProgress(bars)
+        progress = _QuietProgress() if quiet else _BarProgress(bars)
         try:
             return train_run(
                 settings,
@@ -126,6 +148,7 @@ def _trained(order: TrainOrder, settings: TrainSettings, *, quiet: bool) -> "Tra
                 out=Path(order.place),
                 start=order.start(),
                 workers=order.workers,
+                watched=watched,
                 crew=crew,
                 progress=progress,
             )
@@ -137,6 +160,10 @@ def _trained(order: TrainOrder, settings: TrainSettings, *, quiet: bool) -> "Tra
                 f"training: stopped at step {stopped.step}, nothing is lost. To go on: "
                 + shlex.join(["trilight", *typed, "--resume"])
             ) from stopped
+        finally:
+            if crew.is_first and is_run(Path(order.place)):
+                with suppress(TrilightError):  # no reason to lose what else is said
+                    write_run_page(Path(order.place))
 
 
 def _announce(order: TrainOrder, settings: TrainSettings) -> None:
@@ -170,7 +197,7 @@ def _report(result: "TrainResult") -> None:
     ]
     print_rows("Training finished", rows)
     if result.scores is not None:
-        console.print(f"\nLook at {result.folder.sheet}", style="bold")
+        look_at(f"Look at {result.folder.sheet} and {result.folder.page}")
 
 
 def _said(event: "Event") -> str:

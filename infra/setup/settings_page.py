@@ -20,6 +20,7 @@ from storage.settings.described import described, field_sentences
 from storage.settings.ranges import declared_ranges, shown_number
 from train.evaluation.order import EvaluationOrder
 from train.settings import TrainSettings
+from train.watching.settings import WatchSettings
 
 FILE = Path(__file__).parents[2] / "docs/reference/settings.md"
 
@@ -29,7 +30,7 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Revisit": (Revisit,),
     "Render": (Asked,),
     "Plan": (CorePrice,),
-    "Train": (TrainOrder, TrainSettings),
+    "Train": (TrainOrder, TrainSettings, WatchSettings),
     "Evaluate": (EvaluationOrder,),
 }
 """The settings of each command; `reachable` finds the settings within them."""

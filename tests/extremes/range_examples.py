@@ -38,6 +38,7 @@ from storage.settings.ranges import Declared, declared_ranges
 from train.evaluation.order import EvaluationOrder
 from train.runs import named_run
 from train.settings import AugmentationSettings, LossSettings, TrainSettings
+from train.watching.settings import WatchSettings
 
 End = Literal["low", "high"]
 
@@ -84,6 +85,7 @@ EXAMPLES: dict[type, Any] = {
     LossSettings: RUN.loss,
     AugmentationSettings: RUN.augmentation,
     EvaluationOrder: EvaluationOrder(checkpoint="a", data=("b",)),
+    WatchSettings: WatchSettings(),
 }  # fmt: skip
 """A valid value of every class that declares a range, but for `Scene`."""
 

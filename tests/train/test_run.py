@@ -19,12 +19,12 @@ from storage.records.safe_read import safetensors_header
 from tests.command_line import trilight
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.loop.recorder import read_rows
 from train.progress import TrainProgress
 from train.result import TrainResult
 from train.settings import TrainSettings
+from train.watching.rows import read_rows
 
-TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share"}
+TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
 
 
 @pytest.fixture(scope="module")

@@ -46,6 +46,23 @@ class Crew:
         dist.all_reduce(total)
         return [float(value) / self.world_size for value in total]
 
+    def gather_text(self, text: str) -> list[str]:
+        """Return what each process says, by rank, alike on each; all must call it."""
+        if self.world_size == 1:
+            return [text]
+        own = torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8)
+        length = torch.tensor([len(own)], device=self.device)
+        lengths = [torch.zeros_like(length) for _ in range(self.world_size)]
+        dist.all_gather(lengths, length)
+        padded = torch.zeros(max(map(int, lengths)), dtype=torch.uint8, device=self.device)
+        padded[: len(own)] = own.to(self.device)
+        texts = [torch.zeros_like(padded) for _ in range(self.world_size)]
+        dist.all_gather(texts, padded)
+        return [
+            bytes(said[: int(count)].tolist()).decode()
+            for said, count in zip(texts, lengths, strict=True)
+        ]
+
     def any(self, flag: bool) -> bool:
         """Return whether the flag is set in any process, alike on each; all must call it."""
         return self.mean([float(flag)])[0] > 0

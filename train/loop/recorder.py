@@ -1,4 +1,4 @@
-"""What the first process writes during a run, beside checkpoints: metrics.jsonl and TensorBoard."""
+"""What the first process writes during a run beside checkpoints: its log, notes and pictures."""
 
 import json
 from collections.abc import Mapping
@@ -9,12 +9,18 @@ import numpy as np
 from PIL import Image
 
 from storage.atomic import write_atomically, write_error
+from storage.settings.described import settings_record
 from train.evaluation.judge import Judge
 from train.evaluation.sheet import drawn_validation_sheet
 from train.folder import RunFolder
 from train.loop.state import TrainState
 from train.progress import TrainProgress
 from train.settings import TrainSettings
+from train.watching.notes import add_note
+from train.watching.pictures import keep_pictures
+from train.watching.rows import read_rows
+from train.watching.scalars import scalars
+from train.watching.weights_and_biases import BiasesBoard
 
 
 class Board:
@@ -31,13 +37,8 @@ class Board:
     def scalars(self, row: Mapping[str, Any]) -> None:
         """Add a row of the log; values that are not numbers are left out."""
         step = row["step"]
-        flat = {name: value for name, value in row.items() if name != "step"}
-        for name, value in (flat.pop("validation", None) or {}).items():
-            flat[f"validation/{name}"] = value
-        for name, value in flat.items():
-            if isinstance(value, int | float):
-                tag = name if "/" in name else f"train/{name}"
-                self._writer.add_scalar(tag, value, step)
+        for name, value in scalars(row).items():
+            self._writer.add_scalar(name, value, step)
 
     def sheet(self, step: int, sheet: Image.Image) -> None:
         """Add a sheet of validation pictures."""
@@ -49,7 +50,7 @@ class Board:
 
 
 class Recorder:
-    """Writes to metrics.jsonl and TensorBoard, and reports to the progress display."""
+    """Writes log, notes and pictures, and reports to the progress display."""
 
     def __init__(
         self,
@@ -59,17 +60,28 @@ class Recorder:
         progress: TrainProgress,
         *,
         first_step: int,
+        wandb: str | None = None,
     ) -> None:
         self.progress = progress
+        self._folder = folder
         self._settings = settings
         self._judge = judge
         self._log = MetricsLog(folder.metrics, first_step=first_step)
-        self._board = Board(folder.tensorboard, first_step=first_step)
+        self._boards: list[Board | BiasesBoard] = [Board(folder.tensorboard, first_step=first_step)]
+        if wandb is not None:
+            self._boards.append(BiasesBoard(wandb, folder.root, settings_record(settings)))
 
     def row(self, row: Mapping[str, Any]) -> None:
         """Write one row of the log."""
         self._log.append(row)
-        self._board.scalars(row)
+        for board in self._boards:
+            board.scalars(row)
+        self.progress.recorded(self._folder)
+
+    def note(self, step: int, text: str) -> None:
+        """Tell the user something, and keep it; a sentence without its full stop."""
+        self.progress.noted(text)
+        add_note(self._folder.notes, step, text)
 
     def validate(self, state: TrainState) -> None:
         """Judge the network on the validation split, if there is one, and write down how it did."""
@@ -78,12 +90,15 @@ class Recorder:
         judgement = self._judge.judge(state.shown)
         self.row({"step": state.step, "validation": judgement.scores})
         sheet = drawn_validation_sheet(self._settings, self._judge, judgement, state.step)
-        self._board.sheet(state.step, sheet)
+        for board in self._boards:
+            board.sheet(state.step, sheet)
+        keep_pictures(self._folder, self._judge, judgement, state.step)
         self.progress.validated(step=state.step, scores=judgement.scores)
 
     def close(self) -> None:
         """Write what is still in memory."""
-        self._board.close()
+        for board in self._boards:
+            board.close()
 
 
 class MetricsLog:
@@ -105,14 +120,6 @@ class MetricsLog:
                 stream.write(_line(row))
         except OSError as error:
             raise write_error(self.path, error) from error
-
-
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the whole rows of a log; a missing file has none."""
-    if not path.exists():
-        return []
-    whole_lines = path.read_text().split("\n")[:-1]
-    return [json.loads(line) for line in whole_lines]
 
 
 def _line(row: Mapping[str, Any]) -> str:

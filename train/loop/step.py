@@ -15,6 +15,8 @@ from train.loop.crew import Crew
 from train.loop.state import TrainState
 from train.loss.objective import Objective
 from train.settings import Precision, TrainSettings
+from train.watching.activity import Activity
+from train.watching.layers import LayerNorms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +45,8 @@ class Stepper:
         self._settings = settings
         self._objective = objective
         self._crew = crew
+        self.activity = Activity()
+        self.layers = LayerNorms(state.model)
         self._net: nn.Module = state.model
         if crew.world_size > 1:
             # Every weight is used. Told so, torch would regroup the gradients after the first step,
@@ -56,20 +60,26 @@ class Stepper:
 
         Every process must hold equally many views.
         """
-        state = self._state
+        state, activity = self._state, self.activity
         state.updater.zero_grad()
         num_views = sum(batch.noise_BV.numel() for batch in batches)
         sums = torch.zeros(4, dtype=torch.float64, device=self._crew.device)
         for index, batch in enumerate(batches):
             last = index == len(batches) - 1
             with contextlib.nullcontext() if last else self._apart():
-                sums += self._add_gradient(batch.to(self._crew.device), num_views)
-        loss, l1, shown, wanted = self._crew.mean((sums / num_views).tolist())
+                sums += self._add_gradient(batch.to(self._crew.device), num_views, last=last)
+        activity.begin("device")
+        means = (sums / num_views).tolist()
+        activity.begin("exchange")
+        loss, l1, shown, wanted = self._crew.mean(means)
+        activity.begin("optimiser")
+        self.layers.gradients()
         grad_norm = nn.utils.clip_grad_norm_(state.model.parameters(), self._settings.grad_clip)
         applied = bool(torch.isfinite(grad_norm)) and math.isfinite(loss)
         if applied:
             state.updater.step(learning_rate)
             state.follow_with_mean(self._settings.ema_decay)
+        activity.begin("other")
         return StepReport(
             loss=loss,
             l1=l1,
@@ -78,16 +88,30 @@ class Stepper:
             applied=applied,
         )
 
-    def _add_gradient(self, batch: TrainingBatch, num_views: int) -> Tensor:
+    def _add_gradient(self, batch: TrainingBatch, num_views: int, *, last: bool) -> Tensor:
         """Add one batch's part of the gradient; return its sums of loss, L1, shown and wanted."""
+        self.activity.begin("forward")
         resolution = batch.target_BVRR3.shape[2]
         prediction = predicted(self._net, batch, resolution, self._settings.precision)
         losses = self._objective(prediction, batch.target_BVRR3, batch.noise_BV)
+        self.activity.begin("backward")
+        if last and self._crew.world_size > 1:
+            prediction.register_hook(self._note_exchange)
         (losses.total_BV.sum() / num_views).backward()
+        self.activity.begin("other")
         shown_BV = prediction.detach().clamp(min=0).mean(dim=(2, 3, 4))
         wanted_BV = batch.target_BVRR3.mean(dim=(2, 3, 4))
         parts = [losses.total_BV.detach(), losses.l1_BV, shown_BV, wanted_BV]
         return torch.stack([part.sum() for part in parts]).double()
+
+    def _note_exchange(self, _: Tensor) -> None:
+        """Have it noted when this process's gradient is there, before it waits for the others'.
+
+        Torch calls what is queued in a backward pass in turn, and DistributedDataParallel queues
+        its waiting later, when the last gradient is there.
+        """
+        queue = torch.autograd.Variable._execution_engine.queue_callback
+        queue(lambda: self.activity.begin("exchange"))
 
     def _apart(self) -> contextlib.AbstractContextManager[Any]:
         """Return what keeps the processes from exchanging a gradient that is not complete."""

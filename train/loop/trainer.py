@@ -24,6 +24,8 @@ from train.loop.window import Window, device_peak
 from train.loss.objective import Objective
 from train.progress import TrainProgress
 from train.settings import TrainSettings
+from train.watching.settings import WatchSettings
+from train.watching.watch import Watch
 
 WATCHED_STEPS = 50
 """Number of steps after the warm-up that are looked at, once."""
@@ -85,6 +87,7 @@ class Trainer:
         folder: RunFolder,
         data_digest: str,
         recorder: Recorder | None,
+        watched: WatchSettings | None = None,
     ) -> None:
         """Take the parts; the recorder is the first process's, None in the others."""
         self.state = state
@@ -97,6 +100,17 @@ class Trainer:
         self.start_watch = StartWatch(settings)
         self.window = Window()
         self.num_noted = 0
+        progress = TrainProgress() if recorder is None else recorder.progress
+        self.progress = progress
+        self.watch = Watch(
+            settings,
+            watched or WatchSettings(),
+            self.stepper,
+            crew,
+            folder,
+            noted=self._note,
+            hung=progress.hung,
+        )
 
     def run(self, batches: Iterator[list[TrainingScene]]) -> None:
         """Take all remaining steps; `batches` begins with that of the state's step.
@@ -105,28 +119,33 @@ class Trainer:
             TrilightError: a signal asked to stop or the start went dead (the state is saved), or
                 the steps keep failing.
         """
-        progress = TrainProgress() if self.recorder is None else self.recorder.progress
-        with deferred_interrupts(progress.interrupted) as asked_to_stop:
+        with self.watch, deferred_interrupts(self.progress.interrupted) as asked_to_stop:
             while self.state.step < self.settings.num_steps:
                 self._after_step(self._step(batches))
                 if self.state.step == self.settings.num_steps:
                     return
                 # one process may be signalled before another; all stop at the same step
-                if self.crew.any(asked_to_stop()):
+                with self.watch.exchange():
+                    stopping = self.crew.any(asked_to_stop())
+                if stopping:
                     self._leave(Stopped(self.state.step))
                 if verdict := self.start_watch.verdict(self.state.step):
                     self._leave(verdict)
 
     def _leave(self, reason: TrilightError) -> None:
-        self._save()
-        # a barrier: torchrun ends all processes with the first that ends, so wait for the file
-        self.crew.any(False)
+        with self.watch.pause("saving"):
+            self._save()
+            # a barrier: torchrun ends all processes with the first that ends, so wait for the file
+            self.crew.any(False)
         raise reason
 
     def _step(self, batches: Iterator[list[TrainingScene]]) -> StepReport:
+        self.watch.begins(self.state.step + 1)
+        self.stepper.activity.begin("data")
         asked = time.monotonic()
         drawn = next(batches)
         waited_s = time.monotonic() - asked
+        self.stepper.activity.begin("other")
         settings, step = self.settings, self.state.step
         buckets = bucket_scenes(drawn, self._flops, settings.scenes_per_pass)
         with enough_memory(settings, step):
@@ -140,10 +159,12 @@ class Trainer:
         )
         self.start_watch.add(report)
         self.state.step += 1
+        keys = [scene.key for scene in drawn]
+        self.watch.ends(report, keys)
         if report.applied:
             self.state.skipped_in_a_row = 0
         else:
-            self._skip([scene.key for scene in drawn])
+            self._skip(keys)
         return report
 
     def _flops(self, num_triangles: int) -> int:
@@ -158,19 +179,17 @@ class Trainer:
     def _note_unusable(self) -> None:
         """Name each damaged sample or shard once, when it has been left out."""
         messages = self.state.unusable.messages
-        if self.recorder is not None:
-            for message in messages[self.num_noted :]:
-                self.recorder.progress.noted(f"left out: {message.rstrip('.')}")
+        for message in messages[self.num_noted :]:
+            self._note(f"left out: {message.rstrip('.')}")
         self.num_noted = len(messages)
 
     def _skip(self, keys: Sequence[str]) -> None:
         """Count a skipped step, and name this process's scenes."""
         self.state.skipped_steps += 1
-        if self.recorder is not None:
-            self.recorder.progress.noted(
-                f"step {self.state.step} was skipped, since its loss or gradient was not finite; "
-                f"its scenes were {', '.join(keys)}"
-            )
+        self._note(
+            f"step {self.state.step} was skipped, since its loss or gradient was not finite; "
+            f"its scenes were {', '.join(keys)}"
+        )
         self.state.skipped_in_a_row += 1
         if self.state.skipped_in_a_row == MOST_SKIPPED_IN_A_ROW:
             raise TrilightError(
@@ -185,23 +204,29 @@ class Trainer:
     def _after_step(self, report: StepReport) -> None:
         settings, step = self.settings, self.state.step
         last = step == settings.num_steps
-        if self.recorder is not None:
-            self.recorder.progress.advance(
-                step=step,
-                loss=report.loss,
-                learning_rate=learning_rate(step - 1, settings),
-                views_per_s=self.window.views_per_s,
-            )
-            if last or step % settings.log_every == 0:
-                self._write_row(self.recorder)
-            if last or step % settings.validate_every == 0:
-                with self.window.pause():
+        self.progress.advance(
+            step=step,
+            loss=report.loss,
+            learning_rate=learning_rate(step - 1, settings),
+            views_per_s=self.window.views_per_s,
+        )
+        if self.watch.ends_window(step):
+            self._end_window()
+        if last or step % settings.validate_every == 0:
+            with self.window.pause(), self.watch.pause("validation"):
+                if self.recorder is not None:
                     self.recorder.validate(self.state)
         if last or step % settings.checkpoint_every == 0 or step == decay_begins(settings):
-            with self.window.pause():
+            with self.window.pause(), self.watch.pause("saving"):
                 self._save()
 
-    def _write_row(self, recorder: Recorder) -> None:
+    def _end_window(self) -> None:
+        """Exchange what was seen since the last window, and write the row."""
+        seen, spikes = self.watch.window()
+        if self.recorder is None:
+            return
+        for spike in spikes:
+            self.recorder.row(spike)
         peak = device_peak(self.crew.device, PRODUCTS[self.settings.precision])
         row = {
             "step": self.state.step,
@@ -210,8 +235,13 @@ class Trainer:
             **self.window.row(peak),
         }
         assert all(value is None or math.isfinite(value) for value in row.values())
-        recorder.row(row)
+        self.recorder.row({**row, **seen})
         self.window = Window()
+
+    def _note(self, text: str) -> None:
+        """Tell the user, in the first process."""
+        if self.recorder is not None:
+            self.recorder.note(self.state.step, text)
 
     def _save(self) -> None:
         if self.crew.is_first:

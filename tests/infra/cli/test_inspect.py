@@ -11,6 +11,7 @@ import pytest
 from storage.errors import TrilightError
 from storage.records.sample import PartFloor
 from tests.command_line import trilight
+from tests.infra.run_page.run_by_hand import write_run
 from tests.pipeline.documents.dataset_by_hand import (
     five_scenes,
     furnished,
@@ -33,6 +34,14 @@ def test_the_report_stands_in_the_dataset(tmp_path: Path) -> None:
     assert (tmp_path / "report.html").exists()
     assert (tmp_path / "contact_sheet.png").exists()
     assert len(list((tmp_path / "report").iterdir())) == 5
+
+
+def test_the_page_stands_in_a_run(tmp_path: Path) -> None:
+    write_run(tmp_path / "run")
+    printed = inspect(tmp_path / "run")
+    assert "index.html" in printed.replace("\n", "") and "steps planned" in printed
+    assert (tmp_path / "run/index.html").exists()
+    assert json.loads(inspect(tmp_path / "run", "--json"))["steps"] == 12
 
 
 @pytest.mark.usefixtures("bare_reports")

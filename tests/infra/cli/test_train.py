@@ -12,11 +12,13 @@ from typing import NoReturn
 
 import pytest
 
+from infra.cli.console import progress_bars
+from infra.cli.train import _BarProgress, _QuietProgress
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
-from train.loop.recorder import read_rows
+from train.watching.rows import read_rows
 
 TRILIGHT = [sys.executable, "-m", "trilight"]
 TINY = {
@@ -140,6 +142,34 @@ def test_a_second_ctrl_c_ends_a_step_that_does_not(tmp_path: Path) -> None:
     _, mistake = started.communicate(timeout=120)
     assert started.returncode == 130, mistake
     assert "ended at once; --resume goes on from the last checkpoint" in mistake
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_run_that_hangs_and_is_to_stop_ends_with_status_1(
+    quiet: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ended: list[int] = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+    with progress_bars() as bars:
+        (_QuietProgress() if quiet else _BarProgress(bars)).hung("training: step 7 hangs")
+    assert ended == [1]
+    said = capsys.readouterr().err
+    assert "trilight: training: step 7 hangs; --resume goes on from the last checkpoint." in said
+
+
+def test_how_it_is_watched_is_passed_on_to_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[list[str]] = []
+
+    def replaced(program: str, words: list[str]) -> NoReturn:
+        seen.append(words)
+        sys.exit(0)
+
+    monkeypatch.setattr(os, "execv", replaced)
+    asked = ["train", "smoke", "--processes", "2", "--hang-after", "9", "--profile", "2"]
+    assert trilight([*asked, "--wandb", "light"]).exit_code == 0
+    assert " ".join(seen[0][6:]) == (
+        "trilight train smoke --hang-after-s 9.0 --profile 2 --wandb light"
+    )
 
 
 def test_a_wait_policy_of_the_users_own_stays() -> None:

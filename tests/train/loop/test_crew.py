@@ -13,6 +13,7 @@ def test_without_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch) ->
         assert (crew.rank, crew.world_size, crew.is_first) == (0, 1, True)
         assert crew.mean([1.0, 2.0]) == [1.0, 2.0]
         assert crew.any(True) and not crew.any(False)
+        assert crew.gather_text("å") == ["å"]
         assert (crew.share.rank, crew.share.world_size) == (0, 1)
 
 

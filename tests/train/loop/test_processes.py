@@ -16,7 +16,7 @@ from storage.dataset.dataset import Dataset
 from tests.conftest import ROOT
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
-from train.loop.recorder import read_rows
+from train.watching.rows import read_rows
 
 SMALL = {
     "model.rope_num_freqs": 1,

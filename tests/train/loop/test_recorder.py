@@ -8,8 +8,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from storage.dataset.dataset import Dataset
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
-from train.loop.recorder import read_rows
 from train.progress import TrainProgress
+from train.watching.rows import read_rows
 
 
 class Stop(BaseException):

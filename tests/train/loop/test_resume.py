@@ -20,11 +20,12 @@ from train.loop.checkpoints import (
     save_checkpoint,
 )
 from train.loop.crew import Crew
-from train.loop.recorder import MetricsLog, read_rows
+from train.loop.recorder import MetricsLog
 from train.loop.state import TrainState, new_state
 from train.loop.step import Stepper
 from train.loss.objective import Objective
 from train.settings import TrainSettings
+from train.watching.rows import read_rows
 
 DIGEST = "d" * 64
 
