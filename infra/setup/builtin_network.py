@@ -183,10 +183,14 @@ def _worst(views: Sequence[Mapping[str, Any]]) -> str:
     by_error = sorted(views, key=lambda view: view["scores"][NETWORK]["psnr_log_db"])
     each = [
         f"{view['key']} ({view['scores'][NETWORK]['psnr_log_db']:.1f} dB, {view['template']}, "
-        f"{view['num_lights']} lights, mean roughness {view['roughness']:.2f})"
+        f"{_lights(view['num_lights'])}, mean roughness {view['roughness']:.2f})"
         for view in by_error[:WORST]
     ]
     return f"Worst views, by scene: {'; '.join(each)}."
+
+
+def _lights(count: int) -> str:
+    return f"{count} light{'' if count == 1 else 's'}"
 
 
 def _flicker(network: str) -> list[str]:
@@ -204,7 +208,7 @@ def _flicker(network: str) -> list[str]:
         return float(np.median([figures[point]["flicker_db"] for figures in run.turns.values()]))
 
     samples: list[tuple[int, Filtered]] = [(1, "fast"), (4, "fast"), (16, "fast")]
-    rivals = ", ".join(f"{median(name):.1f} by {name}" for name in map(samples_name, samples))
+    rivals = "; ".join(f"{median(name):.1f} by {name}" for name in map(samples_name, samples))
     return [
         "",
         f"Flicker of orbits of 24 frames, {len(run.turns)} scenes of `trilight bench flicker-64` "
