@@ -1,7 +1,7 @@
 """One training run, from a dataset to weights, figures and a sheet: joins the parts."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from model.sky.known import require_known, shining
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
 from train.beginning import beginning, begun
-from train.data.scenes import training_scene
+from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable, first_samples
 from train.evaluation.judge import Judge
@@ -106,20 +106,26 @@ def train_run(
         recorder=recorder,
         watched=watched,
     )
-    batches = stream_batches(
-        opened.split("train"),
+    with closing(_batches(opened, settings, state, crew, workers)) as batches:
+        trainer.run(batches)
+    if recorder is None:
+        return None
+    recorder.close()
+    return finished(state, settings, folder, opened, judge, time.monotonic() - began)
+
+
+def _batches(
+    data: TrainingData, settings: TrainSettings, state: TrainState, crew: Crew, workers: int
+) -> Generator[list[TrainingScene], None, None]:
+    """Return the scenes of this process for each step from the state's on."""
+    return stream_batches(
+        data.split("train"),
         stream_settings(settings),
         state.step,
         share=crew.share,
         workers=workers,
         unusable=state.unusable,
     )
-    with closing(batches):
-        trainer.run(batches)
-    if recorder is None:
-        return None
-    recorder.close()
-    return finished(state, settings, folder, opened, judge, time.monotonic() - began)
 
 
 class _EarlyNotes(TrainProgress):

@@ -22,7 +22,7 @@ class Move:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chart:
+class UvChart:
     """What a texture reads."""
 
     primvar: str
@@ -31,7 +31,7 @@ class Chart:
     """What moves them, the first one first."""
 
 
-def chart_of(shader: Any, time: Any) -> Chart:
+def chart_of(shader: Any, time: Any) -> UvChart:
     """Return the coordinates of a texture's shader; `st` where it states none."""
     from pxr import UsdShade
 
@@ -54,12 +54,12 @@ def chart_of(shader: Any, time: Any) -> Chart:
         name = node.GetInput("varname")
         stated = UsdShade.Utils.GetValueProducingAttributes(name) if name else []
         if stated:
-            return Chart(primvar=str(stated[0].Get(time)), moves=tuple(reversed(moves)))
+            return UvChart(primvar=str(stated[0].Get(time)), moves=tuple(reversed(moves)))
         break
-    return Chart(primvar="st", moves=tuple(reversed(moves)))
+    return UvChart(primvar="st", moves=tuple(reversed(moves)))
 
 
-def coordinates(chart: Chart, surface: MeshToShade, time: Any) -> NDArray[np.float64] | None:
+def coordinates(chart: UvChart, surface: MeshToShade, time: Any) -> NDArray[np.float64] | None:
     """Return coordinates [T, 3, 2] of a mesh; None where it has none, or not for every corner."""
     from pxr import UsdGeom
 

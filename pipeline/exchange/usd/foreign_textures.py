@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES, Pixels, decoded_pixels, is_encoded
-from pipeline.exchange.usd.foreign_coordinates import Chart, chart_of, value_of
+from pipeline.exchange.usd.foreign_coordinates import UvChart, chart_of, value_of
 from pipeline.exchange.usd.stage import OpenedUsd
 from pipeline.exchange.wrapping import Wrap
 from storage.errors import TrilightError
@@ -39,7 +39,7 @@ class ForeignTexture:
     """[4]"""
     bias: NDArray[np.float32]
     """[4]"""
-    chart: Chart
+    chart: UvChart
     """Where it is looked up."""
     output: str
     """rgb, r, g, b or a: what is connected."""
