@@ -74,6 +74,8 @@ def curves(record: RunRecord) -> Markup:
 
 def layers(record: RunRecord) -> Markup:
     """Return gradient and update of each layer over the steps."""
+    if not record.layers(0):
+        return element("p", "None: the log has no figures of layers.")
     maps = [
         heat_map("length of the gradient", record.layers(LAYER_COLUMNS.index("grad_norm"))),
         heat_map(
