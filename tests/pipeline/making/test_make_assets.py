@@ -267,6 +267,7 @@ def test_epsilons_are_shares_or_percent(text: str, share: float) -> None:
     assert settings.budgets == (4096,)
 
 
+@pytest.mark.slow
 def test_own_materials_make_textured_meshes_and_pictures(source: Path, tmp_path: Path) -> None:
     settings = AssetSettings(budgets=(100_000,), own_materials=OwnMaterialSettings(keep=True))
     folder, out = tmp_path / "few", tmp_path / "out"
