@@ -41,7 +41,9 @@ class Submission:
 
     def __post_init__(self) -> None:
         if self.flow not in FLOWS:
-            raise TrilightError(f"flow is {self.flow!r}; expected one of {', '.join(FLOWS)}.")
+            raise TrilightError(
+                f"flow {self.flow!r} is unknown; expected one of {', '.join(FLOWS)}."
+            )
 
 
 @command("flow", "build")
