@@ -1,9 +1,6 @@
 """What a file says of a surface, and what that is in Trilight's columns.
 
-Files speak of Schlick's Fresnel term, F0 + (1 - F0)(1 - cos)^5; our specular lobe reflects the same
-share at every angle. Its albedo is the mean of Schlick's term over cosine-weighted directions,
-F0 + (1 - F0)/21, and the diffuse part gets what is left: base (1 - metal)(1 - F).
-docs/explanation/material.md states what that costs at grazing angles.
+Its Fresnel term becomes albedos that are the same at every angle (storage.records.fresnel).
 """
 
 from dataclasses import dataclass, field
@@ -12,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.assets.own.picture import Picture
+from storage.records.fresnel import constant_albedos
 
 RGB = tuple[float, float, float]
 
@@ -19,9 +17,6 @@ WHITE: RGB = (1.0, 1.0, 1.0)
 
 LEAST_ROUGHNESS = 0.01
 """As of drawn materials (scene_templates.materials)."""
-
-_SCHLICK_MEAN = 1 / 21
-"""Mean of (1 - cos)^5 over cosine-weighted directions: 2 B(2, 6)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,8 +96,7 @@ def columns(material: SourceMaterial, seen: Seen, count: int) -> NDArray[np.floa
     colour = times(material.specular_rgb, seen.specular_colour, slice(0, 3))
     strength = times(material.specular_strength, seen.specular_strength, slice(3, 4))
     dielectric = np.minimum(material.f0 * colour, 1) * strength
-    f0 = np.clip((1 - metal) * dielectric + metal * base, 0, 1)
-    none = f0.max(axis=1, keepdims=True) == 0  # a material without any lobe stays without one
-    specular = np.where(none, 0, f0 + (1 - f0) * _SCHLICK_MEAN)
-    diffuse = base * (1 - metal) * (1 - specular)
+    # what reflects nothing head-on is meant to have no lobe at all
+    grazing = np.where(dielectric.max(axis=1, keepdims=True) > 0, np.clip(strength, 0, 1), 0)
+    diffuse, specular = constant_albedos(base, metal, dielectric, grazing)
     return np.concatenate([diffuse, specular, np.clip(rough, LEAST_ROUGHNESS, 1)], axis=1)

@@ -1,8 +1,7 @@
 """glTF's metal-rough materials as ours: two albedos without a Fresnel term, and a roughness.
 
-glTF reflects more at grazing angles, by Schlick's curve from F0 to F90. Ours reflects its mean over
-cosines everywhere: F = F0 + (F90 - F0) / 21. Then the specular albedo is F, and the diffuse one
-base (1 - metal) (1 - F).
+glTF reflects more at grazing angles, by Schlick's curve; ours reflects its mean everywhere
+(storage.records.fresnel).
 """
 
 from collections.abc import Mapping
@@ -22,10 +21,8 @@ from pipeline.exchange.linear_maps import (
     number_texture,
     on_one_grid,
 )
+from storage.records.fresnel import constant_albedos
 from storage.records.texture import MapSource
-
-_MEAN_OF_SCHLICK = 1 / 21
-"""Mean of (1 - cosine)^5 over directions, weighted by the cosine."""
 
 _ENCODED = frozenset({"base", "tint"})
 _UNDERSTOOD = {"KHR_materials_specular", "KHR_materials_ior", "KHR_materials_emissive_strength"}
@@ -109,12 +106,8 @@ def _albedos(maps: Mapping[str, Map], head_on: float) -> tuple[Map, Map]:
     base, metal, strength, tint = on_one_grid(
         *(maps[name] for name in ("base", "metal", "strength", "tint"))
     )
-    low = np.minimum(head_on * tint, 1) * strength * (1 - metal)
-    if metal.any():
-        low = low + base * metal
-    high = strength * (1 - metal) + metal
-    specular = np.clip(low + (high - low) * np.float32(_MEAN_OF_SCHLICK), 0, 1)
-    diffuse = np.clip(base * (1 - metal) * (1 - specular), 0, 1)
+    f0 = np.minimum(head_on * tint, 1) * strength
+    diffuse, specular = constant_albedos(base, metal, f0, strength)
     return diffuse.astype(np.float32), specular.astype(np.float32)
 
 

@@ -2,8 +2,7 @@
 
 The base colour is sRGB-encoded, all else is linear. Means are of linear values, and of roughness
 the mean is that of the GGX width, its square. There is no Fresnel term here: a surface with a
-metallic map, or with a base colour alone, gets the cosine-weighted mean of Schlick's,
-F0 + (1 - F0) / 21, as its specular albedo; F0 is 0.04 for what is no metal.
+metallic map, or with a base colour alone, gets albedos as storage.records.fresnel has them.
 """
 
 from collections.abc import Mapping
@@ -13,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.objects.maps.resample import area_means
+from storage.records.fresnel import constant_albedos
 from storage.records.texture import content_digest
-
-DIELECTRIC_F0 = 0.04
-"""What glass, plastic, wood and stone reflect head-on, about."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,13 +47,12 @@ def texture_set(pictures: Mapping[str, NDArray[np.float32]], size: int) -> Textu
     colour = _three(means(_linear(base)))
     metallic = means(_grey(pictures["metallic"])) if "metallic" in pictures else np.zeros(1)
     if "specular" in pictures:
-        specular = _three(means(pictures["specular"]))
+        diffuse = colour * (1 - metallic)
+        # where both are over 1, the lobe gives way
+        specular = np.minimum(_three(means(pictures["specular"])), 1 - diffuse)
     else:
-        f0 = DIELECTRIC_F0 * (1 - metallic) + colour * metallic
-        specular = f0 + (1 - f0) / 21
-        colour = colour * (1 - specular)
-    diffuse = colour * (1 - metallic)
-    specular = np.minimum(specular, 1 - diffuse)  # where both are over 1, the lobe gives way
+        diffuse, specular = constant_albedos(colour, metallic)
+        specular = np.broadcast_to(specular, diffuse.shape)
     roughness = None
     if "roughness" in pictures:
         roughness = np.sqrt(means(np.square(_grey(pictures["roughness"]))))

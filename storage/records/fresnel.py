@@ -1,0 +1,42 @@
+"""Materials with a Fresnel term, of other programs, as ours: two albedos, the same at every angle.
+
+Files speak of Schlick's term, F0 + (F90 - F0)(1 - cos)^5. Our specular albedo is its mean over
+cosine-weighted directions, F = F0 + (F90 - F0)/21, and the diffuse part gets what is left:
+base (1 - metal)(1 - F). docs/explanation/material.md states what that costs at grazing angles.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+DIELECTRIC_F0 = 0.04
+"""What glass, plastic, wood and stone reflect head-on, about."""
+
+_MEAN_OF_SCHLICK = 1 / 21
+"""Mean of (1 - cos)^5 over cosine-weighted directions: 2 B(2, 6)."""
+
+
+def constant_albedos(
+    base: NDArray[Any],
+    metal: NDArray[Any],
+    f0: NDArray[Any] | float = DIELECTRIC_F0,
+    f90: NDArray[Any] | float = 1.0,
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return diffuse and specular albedo; they add up to at most 1.
+
+    Where nothing is metal the specular one knows nothing of `base`: its shape is that of the
+    others, so that a texture of the base colour leaves it one number.
+
+    Args:
+        base: [..., 3] linear base colour, 0 to 1.
+        metal: [..., 1] share of metal, 0 to 1, which reflects its base colour head-on.
+        f0, f90: what is no metal reflects head-on and at grazing angles, 0 to 1; they broadcast
+            with `base`.
+    """
+    head_on = (1 - metal) * f0
+    if metal.any():
+        head_on = np.clip(head_on + metal * base, 0, 1)
+    grazing = (1 - metal) * f90 + metal
+    specular = np.clip(head_on + (grazing - head_on) * _MEAN_OF_SCHLICK, 0, 1)
+    return base * (1 - metal) * (1 - specular), specular
