@@ -59,7 +59,7 @@ class PathTracer:
         """All that decides a picture beside scene and camera, as JSON values."""
         self._is_open = False
         self._child = IsolatedChild(
-            limits=_LIMITS, setup=_set_up_child, setup_args=(variant, threads)
+            limits=_LIMITS, setup=set_up_renderer, setup_args=(variant, threads)
         )
 
     def wake(self, name: str) -> None:
@@ -147,7 +147,7 @@ class _ChildState:
 _state = _ChildState()
 
 
-def _set_up_child(variant: Variant, threads: int) -> None:
+def set_up_renderer(variant: Variant, threads: int) -> None:
     activate(variant)
     set_threads(threads)
 

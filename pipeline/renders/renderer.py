@@ -13,6 +13,7 @@ picture is their sum; with `split` direct and indirect light are kept apart, and
 Mitsuba is imported inside functions only: `activate` must come first.
 """
 
+import time
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -86,6 +87,19 @@ class Sampling:
     """The widest gap to a target when the floors were measured last; None before that."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Look(Sampling):
+    """A picture of the samples so far, for whoever watches it become better."""
+
+    radiance_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance that half floats can hold."""
+    floor: MeasuredFloor | None
+    """Its measured error; None where too few samples tell."""
+    core_s: float
+    """Core-seconds that a picture as good as this one takes, without the looks before it and
+    without loading the scene."""
+
+
 _MAX_RAW = 1e13
 """Raw pixels from this radiance on are refused: half floats could not hold the picture even if the
 denoiser spread one of them over 8192 x 8192 pixels. From about 5e36 on the denoiser returns black,
@@ -106,8 +120,16 @@ slower passes cost easier ones 7 to 11 %."""
 class SceneRenderer:
     """A scene loaded once, for any number of views of it."""
 
-    def __init__(self, scene: Scene, settings: RenderSettings) -> None:
+    def __init__(
+        self, scene: Scene, settings: RenderSettings, *, shows_looks: bool = False
+    ) -> None:
         """Load a scene that passes `Scene.check`; `activate` must have been called.
+
+        Args:
+            scene: what is rendered.
+            settings: how well.
+            shows_looks: whether `view_steps` yields a `Look` after each measurement that a target
+                is still missed by; pictures stay the same, each look costs one denoise.
 
         Raises:
             Rejected: "unlit_scene" where no emitter has an area (with `per_light`: where one has
@@ -118,7 +140,7 @@ class SceneRenderer:
             NotImplementedError: RenderSettings.require_variant refuses the variant.
         """
         require_surfaces(scene)
-        self._settings = settings
+        self._settings, self._shows_looks, self._used = settings, shows_looks, _UsedTime()
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
             self._tracer = self._tracer.apart(bounces=settings.split, lobes=settings.split_lobes)
@@ -128,6 +150,16 @@ class SceneRenderer:
             _refuse_sky(scene)
             most = MAX_PICTURES // max(1, len(settings.part_names))
             self._tracers = _tracer_of_each_light(self._tracer, scene, most)
+
+    @property
+    def tracer(self) -> Tracer:
+        """What traces all light of the scene."""
+        return self._tracer
+
+    @property
+    def used_core_s(self) -> float:
+        """Core-seconds of this process since the view at hand began, without its looks."""
+        return self._used.core_s()
 
     def render_view(self, c2w: ArrayLike, fov_deg: float, seed: int) -> RenderedView:
         """Return the picture of one camera; equal arguments give equal bits.
@@ -149,7 +181,7 @@ class SceneRenderer:
         self, c2w: ArrayLike, fov_deg: float, seed: int
     ) -> Generator[Sampling, None, RenderedView]:
         """Do what `render_view` does, yielding after each pass of one half."""
-        settings = self._settings
+        settings, self._used = self._settings, _UsedTime()
         pose = np.asarray(c2w, np.float64)
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
@@ -226,6 +258,8 @@ class SceneRenderer:
                 return floor, self._part_floors(kept, hits)
             goal = Goal(targets_db=targets_db, step=2 * samples.pass_spp, max_spp=max_spp)
             expected, missing_db = expected_spp(measured, goal), max(gaps.values())
+            if self._shows_looks:
+                yield self._look(samples, features, floor, expected, missing_db)
             if expected >= _GUIDED_SPP:
                 samples.guide()
             spp = next_spp(measured, goal)
@@ -233,6 +267,27 @@ class SceneRenderer:
             passes = samples.passes_to(spp) if chosen is None else samples.passes_over(chosen)
             for _ in passes:
                 yield Sampling(spp=samples.spp, expected_spp=expected, missing_db=missing_db)
+
+    def _look(
+        self,
+        samples: HalfSamples,
+        features: Features,
+        floor: MeasuredFloor,
+        expected_spp: int,
+        missing_db: float,
+    ) -> Look:
+        before_s = self._used.core_s()
+        picture = self._stored(self._picture(samples, features))["radiance_rgb"]
+        core_s = self._used.core_s()
+        self._used.leave_out(core_s - before_s)
+        return Look(
+            spp=samples.spp,
+            expected_spp=expected_spp,
+            missing_db=missing_db,
+            radiance_rgb=picture,
+            floor=floor,
+            core_s=core_s,
+        )
 
     def _filter_of_halves(self, spp: int) -> Filtered:
         quality = self._settings.denoiser
@@ -288,6 +343,19 @@ class SceneRenderer:
             for name, lights in zip(names, _by_part(pictures_rgb, len(names)), strict=True)
         ]
         return np.stack(denoised, axis=1).reshape(pictures_rgb.shape)
+
+
+class _UsedTime:
+    """Core-seconds of this process since a view began, less what was left out."""
+
+    def __init__(self) -> None:
+        self._began_s = time.process_time()
+
+    def core_s(self) -> float:
+        return time.process_time() - self._began_s
+
+    def leave_out(self, core_s: float) -> None:
+        self._began_s += core_s
 
 
 def _denoised_lights(
