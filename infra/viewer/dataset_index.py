@@ -7,6 +7,7 @@ triangles there are. All rows stay in memory, a few hundred bytes each.
 import json
 import struct
 import threading
+import time
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -24,6 +25,9 @@ MOST_SCENES = 500_000
 """Rows that are held; of a larger dataset the first ones."""
 
 _MOST_HEADER = 1 << 20
+
+_PATIENCE_S = 20.0
+"""How long a scene is waited for that is not read yet."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -85,9 +89,14 @@ class DatasetIndex:
         return self._rows[:]
 
     def row(self, key: str) -> SceneRow:
-        """Return the row of a scene; raises TrilightError where it is not read, or not there."""
-        if key not in self._by_key:
-            raise TrilightError(f"scene {key:.40}: not in the dataset, or not read yet.")
+        """Return the row of a scene, which is waited for; TrilightError where it does not come."""
+        deadline = time.monotonic() + _PATIENCE_S
+        while key not in self._by_key:
+            if not self._thread.is_alive():
+                raise TrilightError(f"scene {key:.40}: not in the dataset.")
+            if time.monotonic() > deadline:
+                raise TrilightError(f"scene {key:.40}: not read yet; ask for it again.")
+            self._thread.join(0.05)
         return self._by_key[key]
 
     def _read_all(self) -> None:

@@ -8,6 +8,7 @@ Triangles are sorted into groups of one object and one material. What is drawn i
 one's way; the pictures beside it are what counts.
 """
 
+import dataclasses
 import json
 import struct
 from collections.abc import Mapping
@@ -20,6 +21,7 @@ from PIL import Image
 from pipeline.documents.png import encode_png
 from storage.conventions import srgb8
 from storage.errors import TrilightError
+from storage.records.lookup import environment_values
 from storage.records.material import DIFFUSE, EMISSION, ROUGHNESS, SPECULAR
 from storage.records.scene import Scene
 from storage.records.scene_facts import lights
@@ -91,16 +93,33 @@ def texture_png(texture: Texture) -> bytes:
 
 
 def sky_bytes(scene: Scene) -> bytes:
-    """Return the environment [rows, 2 rows, 4] in float32, small, the bottom row first."""
+    """Return the environment as three.js looks it up by directions of our world.
+
+    There u is atan2(z, x) / 2 pi + 1/2 and v is asin(y) / pi + 1/2: small, [rows, 2 rows, 4] in
+    float32, v rising, after its width and height as two unsigned integers.
+    """
     assert scene.environment is not None
-    radiance = scene.environment.radiance_rgb
-    step = max(1, len(radiance) // _SKY_ROWS)
-    rows = len(radiance) // step
-    cut = radiance[: rows * step, : 2 * rows * step]
-    small = cut.reshape(rows, step, 2 * rows, step, 3).mean(axis=(1, 3))
-    rgba = np.ones((*small.shape[:2], 4), "<f4")
-    rgba[..., :3] = small[::-1]
+    sky = dataclasses.replace(
+        scene.environment, radiance_rgb=_reduced(scene.environment.radiance_rgb)
+    )
+    rows = len(sky.radiance_rgb)
+    height = (np.arange(rows) + 0.5) / rows * np.pi - np.pi / 2
+    around = (np.arange(2 * rows) + 0.5) / rows * np.pi - np.pi
+    flat = np.cos(height)[:, None]
+    up = np.broadcast_to(np.sin(height)[:, None], (rows, 2 * rows))
+    directions = np.stack([flat * np.cos(around), up, flat * np.sin(around)], axis=-1)
+    rgba = np.ones((rows, 2 * rows, 4), "<f4")
+    rgba[..., :3] = environment_values(sky, directions)
     return struct.pack("<II", 2 * rows, rows) + rgba.tobytes()
+
+
+def _reduced(radiance_rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a map of at most twice _SKY_ROWS rows, by means of whole texels."""
+    step = max(1, len(radiance_rgb) // _SKY_ROWS)
+    rows = len(radiance_rgb) // step
+    cut = radiance_rgb[: rows * step, : 2 * rows * step]
+    means: NDArray[np.float32] = cut.reshape(rows, step, 2 * rows, step, 3).mean(axis=(1, 3))
+    return means
 
 
 def _groups(scene: Scene) -> tuple[NDArray[np.int64], list[Mapping[str, int]]]:

@@ -125,15 +125,15 @@ class _Handler(BaseHTTPRequestHandler):
         )
         if refused is not None:
             self.close_connection = True
-            self._send(refused.status, _sentence(refused.sentence))
+            self._say(refused.status, refused.sentence)
             return
         with self.server.places:
             try:
                 self._send(HTTPStatus.OK, self._routed(method))
             except NotThere as error:
-                self._send(HTTPStatus.NOT_FOUND, _sentence(str(error)))
+                self._say(HTTPStatus.NOT_FOUND, str(error))
             except TrilightError as error:
-                self._send(HTTPStatus.UNPROCESSABLE_ENTITY, _sentence(str(error)))
+                self._say(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
 
     def _routed(self, method: str) -> Answer:
         path, _, query = self.path.partition("?")
@@ -149,6 +149,13 @@ class _Handler(BaseHTTPRequestHandler):
         except (ValueError, RecursionError) as error:
             raise TrilightError("the request is no JSON.") from error
 
+    def _say(self, status: HTTPStatus, sentence: str) -> None:
+        """Send a sentence: to a script as JSON, to a person as text."""
+        if "text/html" in self.headers.get("Accept", ""):
+            self._send(status, Answer(body=sentence.encode(), kind="text/plain; charset=utf-8"))
+        else:
+            self._send(status, json_answer({"error": sentence}))
+
     def _send(self, status: HTTPStatus, answer: Answer) -> None:
         self.send_response(status)
         headers = {"Content-Type": answer.kind, "Content-Length": str(len(answer.body))}
@@ -156,7 +163,3 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(answer.body)
-
-
-def _sentence(text: str) -> Answer:
-    return json_answer({"error": text})

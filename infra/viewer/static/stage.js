@@ -195,20 +195,20 @@ export class Stage {
     this.renderer.shadowMap.needsUpdate = true;
   }
 
-  // An environment as float RGBA, the bottom row first; its +Z is up, three's is +Y.
+  // An environment as float RGBA, by directions of the scene's own world.
   sky(buffer) {
     const [width, height] = new Uint32Array(buffer, 0, 2);
-    const map = new THREE.DataTexture(new Float32Array(buffer, 8), width, height,
-      THREE.RGBAFormat, THREE.FloatType);
+    const halves = Uint16Array.from(new Float32Array(buffer, 8), (value) =>
+      THREE.DataUtils.toHalfFloat(Math.min(value, 65504)));
+    const map = new THREE.DataTexture(halves, width, height, THREE.RGBAFormat,
+      THREE.HalfFloatType);
+    map.magFilter = map.minFilter = THREE.LinearFilter;
+    map.wrapS = THREE.RepeatWrapping;
     map.mapping = THREE.EquirectangularReflectionMapping;
     map.needsUpdate = true;
     const maker = new THREE.PMREMGenerator(this.renderer);
     this.scene.environment = maker.fromEquirectangular(map).texture;
-    this.scene.environmentRotation.set(Math.PI / 2, 0, 0);
-    if (this.head.sky.seen) {
-      this.scene.background = map;
-      this.scene.backgroundRotation.set(Math.PI / 2, 0, 0);
-    }
+    if (this.head.sky.seen) this.scene.background = map;
     this.draw();
   }
 }
