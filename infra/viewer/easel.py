@@ -15,7 +15,7 @@ from typing import Any, Literal
 from infra.viewer.edits import edited
 from infra.viewer.painters import Painted, Painter
 from infra.viewer.wanted import Wanted
-from pipeline.renders.renderer import Sampling
+from pipeline.renders.results import Sampling
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.scene import Scene

@@ -9,7 +9,7 @@ from infra.viewer.server import Answer, Question, Route, routed
 from infra.viewer.static_files import static_routes
 
 
-class Room(Protocol):
+class PageRoom(Protocol):
     """What a page asks about."""
 
     def gets(self) -> dict[str, Route]:
@@ -37,7 +37,7 @@ class LaterRoom:
 
     def __init__(self, page: str) -> None:
         """Take the page that asks; `opened` gives the room once it is set."""
-        self.opened = Future[Room]()
+        self.opened = Future[PageRoom]()
         self.gets: dict[str, Route] = {
             **static_routes(page), "api/": self._get, "scene/": self._get,
         }  # fmt: skip

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from infra.viewer.dataset_room import DatasetRoom
-from infra.viewer.later import Room, page_of
+from infra.viewer.later import PageRoom, page_of
 from infra.viewer.painters import TargetPainter, painters_of
 from infra.viewer.run_room import RunRoom
 from infra.viewer.scene_room import SceneRoom
@@ -16,7 +16,7 @@ from pipeline.renders.variant import choose_variant
 from storage.dataset.dataset import open_dataset
 
 
-def opened_room(source: str, *, checkpoint: str | None, threads: int | None) -> Room:
+def opened_room(source: str, *, checkpoint: str | None, threads: int | None) -> PageRoom:
     """Open a source.
 
     Args:

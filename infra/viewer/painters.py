@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from infra.viewer.wanted import Wanted
 from pipeline.documents.scene_passes import SHOWN_PASSES, ShownPass
 from pipeline.making.progressive_tracer import ProgressiveTracer
-from pipeline.renders.renderer import Look, Sampling
+from pipeline.renders.results import GrowingPicture, Sampling
 from pipeline.renders.settings import FIRST_SPP, one_picture
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
@@ -93,13 +93,13 @@ class TracedPainter:
             settings = dataclasses.replace(settings, max_depth=2)
 
         def shown(step: Sampling) -> None:
-            show(_traced(step) if isinstance(step, Look) else step)
+            show(_traced(step) if isinstance(step, GrowingPicture) else step)
 
         camera = (wanted.camera.c2w, wanted.camera.fov_deg)
         self._tracer.paint(scene, (self._number, wanted.scene_key), camera, settings, shown)
 
 
-def _traced(look: Look) -> Painted:
+def _traced(look: GrowingPicture) -> Painted:
     floor_db = None if look.floor is None else look.floor.log_db
     few = "a preview: its error is not measured" if floor_db is None else ""
     if floor_db is not None and look.spp < FIRST_SPP:

@@ -27,11 +27,11 @@ from storage.records.scene import Scene
 from train.evaluation.error_colours import ERROR_WHITE, error_picture
 
 EXPORTS = {
-    ".usdz": "USD with its textures, one file",
+    ".usdz": "USD with textures",
     ".usda": "USD as text",
-    ".glb": "glTF, one file",
-    ".h5": "RenderFormer HDF5",
-    ".safetensors": "Trilight scene, exact",
+    ".glb": "glTF",
+    ".h5": "RenderFormer",
+    ".safetensors": "exact",
 }
 """Forms of one file that a page offers, as far as they can be written."""
 

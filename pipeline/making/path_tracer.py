@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.making.environment import environment
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
-from pipeline.renders.renderer import RenderedView, Sampling, SceneRenderer, set_threads
+from pipeline.renders.renderer import SceneRenderer, set_threads
+from pipeline.renders.results import RenderedView, Sampling
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate
 from storage.errors import Rejected, TrilightError

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, with_retries
 from pipeline.making.path_tracer import set_up_renderer
 from pipeline.renders.progressive import ProgressiveRenderer
-from pipeline.renders.renderer import Look, Sampling
+from pipeline.renders.results import GrowingPicture, Sampling
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant
 from storage.errors import Rejected, TrilightError
@@ -89,7 +89,7 @@ class ProgressiveTracer:
 class _ChildOfLooks:
     """What the child holds between two calls."""
 
-    steps: Generator[Sampling, None, Look]
+    steps: Generator[Sampling, None, GrowingPicture]
 
     def __init__(self) -> None:
         self.loaded: dict[Hashable, ProgressiveRenderer] = {}
@@ -123,5 +123,5 @@ def _advance() -> Sampling | None:
         return next(_state.steps)
     except StopIteration as end:
         _state.ended = True
-        last: Look = end.value
+        last: GrowingPicture = end.value
         return last

@@ -14,14 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.noise_floor import MeasuredFloor
 from pipeline.renders.preview import denoised, samples_sum
-from pipeline.renders.renderer import (
-    Look,
-    RenderedView,
-    Sampling,
-    SceneRenderer,
-    representable,
-    require_bounded,
-)
+from pipeline.renders.renderer import SceneRenderer, representable, require_bounded
+from pipeline.renders.results import GrowingPicture, RenderedView, Sampling
 from pipeline.renders.settings import RenderSettings
 from storage.errors import Rejected
 from storage.records.scene import Scene
@@ -41,7 +35,7 @@ class ProgressiveRenderer:
 
     def view_steps(
         self, c2w: ArrayLike, fov_deg: float, seed: int
-    ) -> Generator[Sampling, None, Look]:
+    ) -> Generator[Sampling, None, GrowingPicture]:
         """Yield looks, and how far the samples are between them; the last look is returned.
 
         Args:
@@ -62,7 +56,7 @@ class ProgressiveRenderer:
             linear_db=view.noise_floor_linear_db,
             object_log_db=view.object_noise_floor_db,
         )
-        return Look(
+        return GrowingPicture(
             spp=view.spp,
             expected_spp=view.spp,
             missing_db=None,
@@ -71,7 +65,7 @@ class ProgressiveRenderer:
             core_s=self._measured.used_core_s,
         )
 
-    def _preview(self, camera: Camera, seed: int, spp: int) -> Look:
+    def _preview(self, camera: Camera, seed: int, spp: int) -> GrowingPicture:
         tracer = self._measured.tracer
         began_s, total, done = time.process_time(), np.zeros(3), 0
         while done < spp:
@@ -82,7 +76,7 @@ class ProgressiveRenderer:
             raise Rejected("nonfinite_radiance", "raw samples are not finite")
         require_bounded(mean)
         picture = representable(denoised(tracer, camera, mean, done, "fast"))
-        return Look(
+        return GrowingPicture(
             spp=done,
             expected_spp=self._settings.first_spp,
             missing_db=None,

@@ -13,9 +13,7 @@ picture is their sum; with `split` direct and indirect light are kept apart, and
 Mitsuba is imported inside functions only: `activate` must come first.
 """
 
-import time
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Generator, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,6 +29,7 @@ from pipeline.renders.kept_light import (
 )
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import Half, MeasuredFloor, measure_floor
+from pipeline.renders.results import GrowingPicture, RenderedView, Sampling, UsedTime
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
@@ -39,65 +38,10 @@ from pipeline.renders.tracer import Features, Tracer
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected, TrilightError
 from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
-from storage.records.parts import MAX_PICTURES, Parts
+from storage.records.parts import MAX_PICTURES
 from storage.records.scene import Scene
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RenderedView:
-    """One finished picture and how far to trust it."""
-
-    radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance, finite, at least 0, below HALF_FLOAT_MAX; the background is 0."""
-    spp: int
-    """Samples per pixel that were spent, on each light where they are apart: the mean over the
-    pixels that show anything, rounded down."""
-    noise_floor_db: float
-    """Measured error as psnr_log_db."""
-    noise_floor_linear_db: float
-    """Measured error as psnr_linear_db."""
-    object_noise_floor_db: float
-    """Measured error as object_psnr_log_db, over `hits`."""
-    at_cap: bool
-    """Whether sampling ended at max_spp with a floor below its target."""
-    hits: NDArray[np.bool_]
-    """[R, R] whether the ray through the pixel's centre meets geometry (emitters do not count)."""
-    lights_rgb: NDArray[np.float32] | None = None
-    """With `per_light`: [L, R, R, 3] radiance of each emitter object alone, rounded to half floats;
-    `radiance_rgb` is their storage.records.lights.sum_of_lights in every bit."""
-    parts_rgb: Parts | None = None
-    """With `split` or `split_lobes`: [R, R, 3] radiance of each part, rounded to half floats, or
-    [L, R, R, 3] of lights apart. Their storage.records.parts.sum_of_parts is `radiance_rgb`, or
-    `lights_rgb`, in every bit."""
-    part_floors: Mapping[str, MeasuredFloor] | None = None
-    """Measured error of each part, of all lights together."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sampling:
-    """How far the sampling of a view has come."""
-
-    spp: int
-    """Samples per pixel so far."""
-    expected_spp: int
-    """Samples at which all targets should be reached, or the cap; a guess that improves."""
-    missing_db: float | None
-    """The widest gap to a target when the floors were measured last; None before that."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Look(Sampling):
-    """A picture of the samples so far, for whoever watches it become better."""
-
-    radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance that half floats can hold."""
-    floor: MeasuredFloor | None
-    """Its measured error; None where too few samples tell."""
-    core_s: float
-    """Core-seconds that a picture as good as this one takes, without the looks before it and
-    without loading the scene."""
 
 
 _MAX_RAW = 1e13
@@ -128,8 +72,8 @@ class SceneRenderer:
         Args:
             scene: what is rendered.
             settings: how well.
-            shows_looks: whether `view_steps` yields a `Look` after each measurement that a target
-                is still missed by; pictures stay the same, each look costs one denoise.
+            shows_looks: whether `view_steps` yields a `GrowingPicture` after each measurement by
+                which a target is missed; pictures stay the same, each look costs one denoise.
 
         Raises:
             Rejected: "unlit_scene" where no emitter has an area (with `per_light`: where one has
@@ -140,7 +84,7 @@ class SceneRenderer:
             NotImplementedError: RenderSettings.require_variant refuses the variant.
         """
         require_surfaces(scene)
-        self._settings, self._shows_looks, self._used = settings, shows_looks, _UsedTime()
+        self._settings, self._shows_looks, self._used = settings, shows_looks, UsedTime()
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
             self._tracer = self._tracer.apart(bounces=settings.split, lobes=settings.split_lobes)
@@ -181,7 +125,7 @@ class SceneRenderer:
         self, c2w: ArrayLike, fov_deg: float, seed: int
     ) -> Generator[Sampling, None, RenderedView]:
         """Do what `render_view` does, yielding after each pass of one half."""
-        settings, self._used = self._settings, _UsedTime()
+        settings, self._used = self._settings, UsedTime()
         pose = np.asarray(c2w, np.float64)
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
@@ -275,12 +219,12 @@ class SceneRenderer:
         floor: MeasuredFloor,
         expected_spp: int,
         missing_db: float,
-    ) -> Look:
+    ) -> GrowingPicture:
         before_s = self._used.core_s()
         picture = self._stored(self._picture(samples, features))["radiance_rgb"]
         core_s = self._used.core_s()
         self._used.leave_out(core_s - before_s)
-        return Look(
+        return GrowingPicture(
             spp=samples.spp,
             expected_spp=expected_spp,
             missing_db=missing_db,
@@ -343,19 +287,6 @@ class SceneRenderer:
             for name, lights in zip(names, _by_part(pictures_rgb, len(names)), strict=True)
         ]
         return np.stack(denoised, axis=1).reshape(pictures_rgb.shape)
-
-
-class _UsedTime:
-    """Core-seconds of this process since a view began, less what was left out."""
-
-    def __init__(self) -> None:
-        self._began_s = time.process_time()
-
-    def core_s(self) -> float:
-        return time.process_time() - self._began_s
-
-    def leave_out(self, core_s: float) -> None:
-        self._began_s += core_s
 
 
 def _denoised_lights(

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from infra.viewer.later import LaterRoom, Room
+from infra.viewer.later import LaterRoom, PageRoom
 from infra.viewer.server import PageServer
 
 
@@ -38,7 +38,7 @@ class Asker:
 
 
 @contextlib.contextmanager
-def served(room: Room, page: str = "scene.html") -> Iterator[Asker]:
+def served(room: PageRoom, page: str = "scene.html") -> Iterator[Asker]:
     """Serve a room for the block."""
     later = LaterRoom(page)
     later.opened.set_result(room)

@@ -10,7 +10,7 @@ from infra.viewer.easel import Easel, Job, agreement_db
 from infra.viewer.painters import Painted, Show, TargetPainter
 from infra.viewer.scene_room import SceneRoom
 from infra.viewer.wanted import Wanted, wanted_of
-from pipeline.renders.renderer import Sampling
+from pipeline.renders.results import Sampling
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 from tests.infra.viewer.served_kit import served

@@ -6,7 +6,8 @@ import pytest
 from pipeline.making import progressive_tracer as module
 from pipeline.making.progressive_tracer import ProgressiveTracer
 from pipeline.renders.progressive import FIRST_LOOKS_SPP, ProgressiveRenderer
-from pipeline.renders.renderer import Look, Sampling, SceneRenderer, finished
+from pipeline.renders.renderer import SceneRenderer, finished
+from pipeline.renders.results import GrowingPicture, Sampling
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
@@ -19,7 +20,7 @@ GROWING = RenderSettings(
 )
 
 
-def looks(scene: Scene) -> list[Look]:
+def looks(scene: Scene) -> list[GrowingPicture]:
     found: list[Sampling] = []
     steps = ProgressiveRenderer(scene, GROWING).view_steps(scene.c2w[0], 45.0, 7)
     try:
@@ -27,7 +28,7 @@ def looks(scene: Scene) -> list[Look]:
             found.append(next(steps))
     except StopIteration as end:
         found.append(end.value)
-    return [step for step in found if isinstance(step, Look)]
+    return [step for step in found if isinstance(step, GrowingPicture)]
 
 
 def test_the_last_look_is_the_picture_and_the_others_come_nearer() -> None:
@@ -66,7 +67,7 @@ def test_the_child_keeps_the_scene_and_ends_where_it_is_told_to() -> None:
             tracer.paint(scene, "a", camera, GROWING, stop)
         tracer.paint(scene, "a", camera, GROWING, told.append)
         last = told[-1]
-        assert isinstance(last, Look)
+        assert isinstance(last, GrowingPicture)
         expected = looks(scene)[-1].radiance_rgb
         assert psnr_log_db(last.radiance_rgb, expected) > 30
         dark = tiny_scene(faces=tiny_scene().faces[2:], material_index=np.array([1], np.uint16),
