@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from infra.viewer.easel import Easel, Job, agreement_db
-from infra.viewer.painters import Painted, Show, TargetPainter
+from infra.viewer.painters import Painted, Painter, Show, TargetPainter
 from infra.viewer.scene_room import SceneRoom
 from infra.viewer.wanted import Wanted, wanted_of
 from pipeline.renders.results import Sampling
@@ -96,7 +96,7 @@ def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
 
 
 def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_one() -> None:
-    painters = {
+    painters: dict[str, Painter] = {
         "traced": GreyPainter(0.4, floor_db=40.0),
         "hits": GreyPainter(0.3),
         "target": TargetPainter(TARGETS, [33.0, 34.0]),
@@ -135,7 +135,10 @@ def test_a_wish_that_means_nothing_is_refused(changes: dict[str, Any]) -> None:
 
 
 def test_the_page_of_a_scene_is_told_all_of_it() -> None:
-    painters = {"traced": GreyPainter(0.4, floor_db=40.0), "target": TargetPainter(TARGETS, ())}
+    painters: dict[str, Painter] = {
+        "traced": GreyPainter(0.4, floor_db=40.0),
+        "target": TargetPainter(TARGETS, ()),
+    }
     room = SceneRoom(
         name="tiny", scene=tiny_scene(), notes=("a note",), painters=painters, target_px=16
     )
