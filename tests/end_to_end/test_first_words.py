@@ -24,6 +24,7 @@ LONG = {
     "verify": ("verify", "SILENT"),
     "evaluate": ("evaluate", "builtin:", "--data", "nowhere"),
     "doctor": ("doctor",),
+    "view": ("view", "SILENT", "--no-browser"),
 }
 
 
