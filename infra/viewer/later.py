@@ -7,6 +7,11 @@ from typing import Protocol
 from infra.run_page.record import is_run
 from infra.viewer.server import Answer, Question, Route, routed
 from infra.viewer.static_files import static_routes
+from storage.dataset.layout import DatasetFolder
+from storage.errors import TrilightError
+
+_KEY = "::"
+"""Between the file of many scenes and the key of one."""
 
 
 class PageRoom(Protocol):
@@ -23,13 +28,24 @@ class PageRoom(Protocol):
 
 
 def page_of(source: str) -> str:
-    """Return the name of the page that shows a source."""
-    path = Path(source)
+    """Return the name of the page that shows a source; TrilightError where nothing is there."""
     if "://" in source:
         return "dataset.html"
-    if is_run(path):
-        return "run.html"
-    return "dataset.html" if path.is_dir() else "scene.html"
+    path = Path(source)
+    if path.is_dir():
+        if is_run(path):
+            return "run.html"
+        if DatasetFolder(path).manifest.exists():
+            return "dataset.html"
+        raise TrilightError(
+            f"{source}: neither a dataset nor a run; expected a folder that `trilight generate` or "
+            "`trilight train` wrote, or the file of a scene."
+        )
+    if not Path(source.rpartition(_KEY)[0] or source).exists():
+        raise TrilightError(
+            f"{source}: no such file; expected a scene, or the folder of a dataset or a run."
+        )
+    return "scene.html"
 
 
 class LaterRoom:
