@@ -4,6 +4,7 @@ import dataclasses
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,7 +93,7 @@ def test_what_is_lost_is_said(tmp_path: Path) -> None:
 def test_a_stranger_reads_it(tmp_path: Path) -> None:
     """trimesh, which knows nothing of ours, sees the triangles with +Y up."""
     (tmp_path / "a.glb").write_bytes(encode_scene_glb(textured_scene()))
-    seen = trimesh.load_scene(tmp_path / "a.glb").to_geometry()
+    seen: Any = trimesh.load_scene(tmp_path / "a.glb").to_geometry()
     assert len(seen.faces) == 3
     assert seen.bounds[1][1] == pytest.approx(2) and seen.bounds[0][1] == pytest.approx(0)
 
