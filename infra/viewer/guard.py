@@ -60,13 +60,14 @@ def refusal(
         word: password of the address.
     """
     here = f"{HOST}:{port}"
+    headers = {name.lower(): value for name, value in headers.items()}
     if len(path) > MAX_PATH:
         return Refusal(status=HTTPStatus.REQUEST_URI_TOO_LONG, sentence="The address is too long.")
-    if headers.get("Host") != here:
+    if headers.get("host") != here:
         return _forbidden(f"Only http://{here} is answered, and no other name of this machine.")
-    origin, site = headers.get("Origin"), headers.get("Sec-Fetch-Site", "none")
+    origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
     # a link with the whole address may stand anywhere: who follows it leaves the other page
-    followed = method == "GET" and headers.get("Sec-Fetch-Dest") == "document"
+    followed = method == "GET" and headers.get("sec-fetch-dest") == "document"
     near = site in ("none", "same-origin") or followed
     if origin not in (None, f"http://{here}") or not near:
         return _forbidden("Pages of other origins are not answered.")
@@ -76,7 +77,7 @@ def refusal(
     if not hmac.compare_digest(given.encode(), word.encode()):
         return _forbidden("Open the whole address that `trilight view` printed.")
     if method == "POST":
-        return _too_large(headers.get("Content-Length", ""))
+        return _too_large(headers.get("content-length", ""))
     return None
 
 

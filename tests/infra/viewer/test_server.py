@@ -55,6 +55,8 @@ def asker() -> Iterator[Asker]:
         (False, "GET", f"/{WORD}/", {"Host": f"evil.example:{PORT}"}),
         (False, "GET", f"/{WORD}/", {"Origin": "http://evil.example"}),
         (False, "GET", f"/{WORD}/", {"Origin": "null"}),
+        (False, "GET", f"/{WORD}/", {"origin": "http://evil.example"}),
+        (False, "GET", f"/{WORD}/", {"sec-fetch-site": "cross-site"}),
         (False, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}),
         (False, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Dest": "script"}),
         (False, "GET", f"/{WORD}/{'x' * MAX_PATH}", {}),
