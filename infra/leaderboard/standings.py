@@ -65,10 +65,7 @@ def standings_of(judged: JudgedWidth, kinds: Mapping[str, str], rival: str) -> W
         rival: name of the one that all others are compared with.
     """
     names = [name for name in judged.views[0].scores if name != NOISE]
-    pairs = {
-        (first, second): pair(judged.views, first, second)
-        for first, second in itertools.permutations(names, 2)
-    }
+    pairs = {two: pair(judged.views, *two) for two in itertools.permutations(names, 2)}
     front = _front(judged, names)
     found = [
         Standing(
