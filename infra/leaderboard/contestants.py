@@ -135,6 +135,7 @@ class NetworkContestant(RungContestant):
             notes=notes,
         )
         self._renderer = renderer
+        self.most_triangles = renderer.trained.max_triangles
 
     def why_not(self, width: int) -> str:
         from storage.errors import TrilightError

@@ -52,7 +52,7 @@ class FolderContestant:
                 "Put those of each width into a folder of their own."
             )
         (self._width,) = found
-        self.notes = (
+        self.notes: Sequence[str] = (
             f"{self.name} were made elsewhere: what they cost is not known, and they are judged at "
             f"{self._width} pixels alone",
         )

@@ -14,6 +14,7 @@ from infra.bench.sides.rung_pictures import lamps_rung, network_rung, physics_al
 from infra.leaderboard.chart import plot_leaderboard
 from infra.leaderboard.contest import (
     BoardContest,
+    JudgedWidth,
     Told,
     first_keys,
     judge_all,
@@ -37,7 +38,7 @@ from pipeline.renders.variant import choose_variant
 from storage.atomic import write_atomically
 from storage.dataset.training_data import TrainingData, open_training_data
 from storage.errors import TrilightError
-from train.evaluation.evaluate import make_rivals, stored_resolution
+from train.evaluation.evaluate import RIVAL_SCENES, make_rivals, stored_resolution
 from train.loop.checkpoints import network_of_run
 from train.loss.lpips import load_lpips
 
@@ -149,7 +150,10 @@ def _nearest(order: LeaderboardOrder, opened: TrainingData) -> NearestContestant
             "look up the other scenes of the set."
         )
     name = NEAREST_TRAINED if trained else NEAREST_OTHER
-    note = f"{name} is found by the target itself; no way to look up a picture can do better"
+    note = (
+        f"{name} is found by the target itself, among the first {RIVAL_SCENES} scenes of the "
+        f"{split} split: no way to look one of them up can do better"
+    )
     if not trained:
         note += ". The set has no training split, so that its other scenes are looked up"
     return NearestContestant(
@@ -200,7 +204,7 @@ def _written(
         "scenes": str(len(contest.keys)),
         "processor": processor(),
     }
-    notes = tuple(dict.fromkeys(_notes(contest, tables)))
+    notes = tuple(dict.fromkeys([*_notes(contest, tables), *_beyond(contest, judged)]))
     write_atomically(order.out / "leaderboard.md", page(about, tables, notes, rival).encode())
     write_atomically(order.out / "leaderboard.csv", standings_csv(tables))
     write_atomically(order.out / "pairs.csv", pairs_csv(tables))
@@ -231,3 +235,16 @@ def _notes(contest: BoardContest, tables: Sequence[WidthStandings]) -> Iterator[
         "In log_l1 it is an upper bound, and in SSIM, LPIPS and HDR-FLIP that of independent noise "
         "of its size, where a denoiser's is smoother: a row may score better than it"
     )
+
+
+def _beyond(contest: BoardContest, judged: Sequence[JudgedWidth]) -> Iterator[str]:
+    """Yield which networks were shown larger scenes than they were trained on."""
+    sizes = {view.key: view.num_triangles for one in judged for view in one.views}
+    for one in contest.contestants:
+        most = one.most_triangles if isinstance(one, NetworkContestant) else None
+        larger = 0 if most is None else sum(size > most for size in sizes.values())
+        if larger:
+            yield (
+                f"{larger} of {len(sizes)} scenes have more triangles than any that {one.name} was "
+                "trained on"
+            )

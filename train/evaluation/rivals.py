@@ -4,6 +4,7 @@ The nearest training view is the training picture closest to the target itself. 
 up a training picture by the scene can do better.
 """
 
+import functools
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -25,11 +26,13 @@ class Rivals:
     def __init__(self, scenes: Iterable[TrainingScene]) -> None:
         # half floats: a rival that is off by a thousandth is as good, and takes half the memory
         named = [(scene.key, scene.target_VRR3.numpy().astype(np.float16)) for scene in scenes]
-        found = [pictures for _, pictures in named]
         self._keys_M = np.array([key for key, pictures in named for _ in pictures])
-        self._log10_MRR3 = np.concatenate(found)
+        self._log10_MRR3 = np.concatenate([pictures for _, pictures in named])
         self._small_MRR3 = _small(self._log10_MRR3)
-        self._median_RR3 = median_picture(found)
+
+    @functools.cached_property
+    def _median_RR3(self) -> NDArray[np.float64]:
+        return median_picture([self._log10_MRR3])
 
     def pictures(self, target_rgb: NDArray) -> dict[str, NDArray[np.float64]]:
         """Return what each rival shows in place of a target [R, R, 3], linear radiance."""

@@ -134,8 +134,10 @@ def test_names_pair_and_targets_are_bit_for_bit(exported: Path) -> None:
 def _same_scene(path: Path, sample: Sample) -> bool:
     found = load_source(scene_source(str(path))).scene
     ours = sample.scene
-    corners = [np.sort(s.vertex_positions[s.faces].reshape(-1, 9), axis=0) for s in (found, ours)]
-    return np.allclose(*corners, atol=1e-6) and np.allclose(found.c2w, ours.c2w, atol=1e-5)
+    theirs, mine = (
+        np.sort(each.vertex_positions[each.faces].reshape(-1, 9), axis=0) for each in (found, ours)
+    )
+    return np.allclose(theirs, mine, atol=1e-6) and np.allclose(found.c2w, ours.c2w, atol=1e-5)
 
 
 def test_many_losses_are_counted_once_each_is_told() -> None:
