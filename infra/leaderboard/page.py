@@ -10,7 +10,7 @@ from infra.leaderboard.standings import Standing, WidthStandings
 from pipeline.documents.attribution import inert
 from pipeline.documents.markdown import table, text
 from train.evaluation.metrics import METRICS
-from train.evaluation.pairs import METRIC, Pair
+from train.evaluation.pairs import METRIC, PairedLead
 from train.evaluation.published import PUBLISHED, PUBLISHED_ROWS, PUBLISHED_WHERE
 
 _NONE = "n/a"
@@ -86,7 +86,7 @@ def _pairs_of(one: WidthStandings) -> str:
     return table(["", "more, dB", "95 % interval by scene", "better in"], rows, numbers=3)
 
 
-def _pair_cells(lead: Pair) -> list[str]:
+def _pair_cells(lead: PairedLead) -> list[str]:
     interval = f"{lead.low:+.2f} to {lead.high:+.2f}"
     return [f"{lead.mean:+.2f}", interval, f"{lead.share_better:.0%}"]
 
@@ -149,7 +149,7 @@ def pairs_csv(widths: Sequence[WidthStandings]) -> bytes:
     return _csv(head, rows)
 
 
-def _lead_cells(lead: Pair | None) -> list[float | None]:
+def _lead_cells(lead: PairedLead | None) -> list[float | None]:
     return [None] * 4 if lead is None else [lead.mean, lead.low, lead.high, lead.share_better]
 
 

@@ -55,7 +55,7 @@ NEAREST_TRAINED, NEAREST_OTHER = "nearest training view", "nearest other scene"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Board:
+class Leaderboard:
     """A finished leaderboard."""
 
     widths: tuple[WidthStandings, ...]
@@ -68,7 +68,7 @@ class Board:
     """Its folder."""
 
 
-def make_leaderboard(order: LeaderboardOrder, told: Told) -> Board:
+def make_leaderboard(order: LeaderboardOrder, told: Told) -> Leaderboard:
     """Judge what is missing, and write leaderboard.md, .csv and .png and pairs.csv.
 
     Raises:
@@ -191,7 +191,7 @@ def _about_network(name: str, renderer: "NeuralRenderer") -> str:
 
 def _written(
     order: LeaderboardOrder, opened: TrainingData, contest: BoardContest, rival: str
-) -> Board:
+) -> Leaderboard:
     kinds = {one.name: one.kind for one in contest.contestants}
     judged = [judged_width(contest, width) for width in contest.widths]
     tables = tuple(standings_of(one, kinds, rival) for one in judged if one.views)
@@ -210,7 +210,7 @@ def _written(
     write_atomically(order.out / "pairs.csv", pairs_csv(tables))
     title = f"{opened.build or 'leaderboard'}: what core-seconds buy"
     plot_leaderboard(tables, title, order.out / "leaderboard.png")
-    return Board(widths=tables, notes=notes, rival=rival, out=order.out)
+    return Leaderboard(widths=tables, notes=notes, rival=rival, out=order.out)
 
 
 FEW_SCENES = 10

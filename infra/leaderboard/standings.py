@@ -10,7 +10,7 @@ import numpy as np
 from infra.bench.curve import on_front
 from infra.leaderboard.contest import NOISE, JudgedWidth
 from train.evaluation.judged_view import summary
-from train.evaluation.pairs import METRIC, Pair, pair
+from train.evaluation.pairs import METRIC, PairedLead, pair
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Standing:
     """Scenes that these are medians of."""
     scores: Mapping[str, Any]
     """As train.evaluation.judged_view.summary."""
-    lead: Pair | None
+    lead: PairedLead | None
     """What it has more than the rival; None for the rival itself and for NOISE."""
     on_front: bool | None
     """Whether no other one is as good at its price; None where the price is not known."""
@@ -52,7 +52,7 @@ class WidthStandings:
     """Views of them."""
     standings: tuple[Standing, ...]
     """The best one first; NOISE before all others."""
-    pairs: Mapping[tuple[str, str], Pair]
+    pairs: Mapping[tuple[str, str], PairedLead]
     """What the first one has more than the second, of every two."""
 
 

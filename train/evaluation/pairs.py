@@ -13,7 +13,7 @@ METRIC = "psnr_log_db"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pair:
+class PairedLead:
     """The difference of METRIC over the views that have both."""
 
     mean: float
@@ -26,13 +26,13 @@ class Pair:
     """Share of the views in which the first one is better."""
 
 
-def pair(views: Sequence[JudgedView], first: str, second: str) -> Pair:
+def pair(views: Sequence[JudgedView], first: str, second: str) -> PairedLead:
     """Return what the contestant `first` has more than `second`, on views that have both."""
     leads_db = [
         (view.scores[first][METRIC] or 0.0) - (view.scores[second][METRIC] or 0.0) for view in views
     ]
     low, high = mean_interval(leads_db, [view.key for view in views])
-    return Pair(
+    return PairedLead(
         mean=float(np.mean(leads_db)),
         low=low,
         high=high,

@@ -18,7 +18,7 @@ from infra.leaderboard.order import LeaderboardOrder
 from infra.leaderboard.run import (
     NEAREST_OTHER,
     NEAREST_TRAINED,
-    Board,
+    Leaderboard,
     _nearest,
     make_leaderboard,
     widths_of,
@@ -70,7 +70,7 @@ def short(order: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch) -> Leaderboa
     return order
 
 
-def board_of(order: LeaderboardOrder) -> Board:
+def board_of(order: LeaderboardOrder) -> Leaderboard:
     return make_leaderboard(order, lambda now, total, what: None)
 
 
