@@ -5,6 +5,7 @@ A picture counts as its slot says: base and specular colours are sRGB-encoded, a
 
 import base64
 import copy
+import dataclasses
 import json
 import struct
 from collections.abc import Callable, Mapping
@@ -77,12 +78,14 @@ class GltfMaterials:
         ior = float(extensions.get("KHR_materials_ior", {}).get("ior", 1.5))
         base = _numbers(metal.get("baseColorFactor", [1, 1, 1, 1]), 4)
         red, green, blue = _numbers(specular.get("specularColorFactor", [1, 1, 1]), 3)
+        both = self._slot(metal.get("metallicRoughnessTexture"))
         return SourceMaterial(
             base_rgb=(base[0], base[1], base[2]),
             base=self._slot(metal.get("baseColorTexture"), is_srgb=True),
             metallic=float(metal.get("metallicFactor", 1)),
             roughness=float(metal.get("roughnessFactor", 1)),
-            metallic_roughness=self._slot(metal.get("metallicRoughnessTexture")),
+            metallic_map=None if both is None else dataclasses.replace(both, channel=2),
+            roughness_map=None if both is None else dataclasses.replace(both, channel=1),
             f0=((ior - 1) / (ior + 1)) ** 2 if ior > 0 else 1.0,
             specular_rgb=(red, green, blue),
             specular_colour=self._slot(specular.get("specularColorTexture"), is_srgb=True),

@@ -1,5 +1,7 @@
-"""Materials of an OBJ: its MTL, with the extension for metal and roughness (Pm, Pr).
+"""Materials of an OBJ: its MTL, with the extension for metal and roughness (Pm, Pr, their maps).
 
+A map stands in the first channel of its picture, times the number, which is 1 where only the map is
+there.
 Without those, `Ks` and `Ns` are taken as today's exporters write them: Ks is half of white for an
 ordinary dielectric, F0 = 0.08 Ks, and Ns is 1000 (1 - roughness)^2. `illum` 0 and 1 mean that there
 is no highlight.
@@ -20,6 +22,8 @@ _F0_OF_KS = 0.08
 _MOST_NS = 1000.0
 _USEMTL = re.compile(rb"^[ \t]*usemtl[ \t]+([^\r\n]+)", re.MULTILINE)
 _LIBRARY = "trilight.mtl"
+_PHYSICAL = {"pm", "pr", "map_pm", "map_pr"}
+"""What makes a material one of metal and roughness."""
 
 Fields = dict[str, str]
 Decode = Callable[[bytes, str], NDArray]
@@ -79,14 +83,15 @@ class _Reader:
         lost = _lost(fields)
         base = self._slot(fields.get("map_kd"), is_srgb=True)
         base_rgb = WHITE if base is not None and "kd" not in fields else _rgb(fields, "kd", 0.8)
-        if "pm" in fields or "pr" in fields:
-            if "map_pm" in fields or "map_pr" in fields:
-                lost = (*lost, "maps of metal and roughness")
+        if _PHYSICAL & set(fields):
+            metallic, roughness = (self._slot(fields.get(name)) for name in ("map_pm", "map_pr"))
             return SourceMaterial(
                 base_rgb=base_rgb,
                 base=base,
-                metallic=_number(fields, "pm", 0.0),
-                roughness=_number(fields, "pr", 0.5),
+                metallic=_number(fields, "pm", 0.0 if metallic is None else 1.0),
+                metallic_map=metallic,
+                roughness=_number(fields, "pr", 0.5 if roughness is None else 1.0),
+                roughness_map=roughness,
                 lost=lost,
             )
         shiny = fields.get("illum", "2") not in ("0", "1")
@@ -102,7 +107,7 @@ class _Reader:
             lost=lost,
         )
 
-    def _slot(self, text: str | None, *, is_srgb: bool) -> Slot | None:
+    def _slot(self, text: str | None, *, is_srgb: bool = False) -> Slot | None:
         if text is None:
             return None
         options, name = map_words(text)

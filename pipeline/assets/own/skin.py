@@ -17,6 +17,7 @@ from pipeline.assets.own.parts import TexturedParts, load_parts
 from pipeline.assets.own.picture import Decoder
 from pipeline.assets.own.source_material import SourceMaterial
 from pipeline.assets.own.source_surface import SourceSurface, source_surface
+from pipeline.assets.own.usd_materials import usd_parts
 from pipeline.assets.reading.gltf_tree import read_tree
 from pipeline.assets.reading.source_file import SourceFile
 from pipeline.assets.settings import OwnMaterialSettings
@@ -93,6 +94,8 @@ def skin_maker(
 
 
 def _parts(source: SourceFile, decode: Callable[[bytes, str], NDArray]) -> TexturedParts:
+    if source.usd is not None:
+        return usd_parts(source.usd, decode)
     if source.kind == "obj":
         materials = obj_materials(source.data, source.materials, decode)
         data, files = bare_obj(source.data)

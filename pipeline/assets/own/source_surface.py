@@ -58,8 +58,15 @@ class SourceSurface:
         own: NDArray[np.float64],
         cell: float,
     ) -> NDArray[np.float64]:
+        known: dict[tuple[object, ...], NDArray[np.float32]] = {}
+
         def shown(slot: Slot | None) -> NDArray[np.float32] | None:
-            return None if slot is None else self._shown(slot, origin, own, cell)
+            if slot is None:
+                return None
+            place = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
+            if place not in known:  # one picture often holds several numbers
+                known[place] = self._shown(slot, origin, own, cell)
+            return known[place]
 
         base = shown(material.base)
         if self.parts.colour is not None:
@@ -68,7 +75,8 @@ class SourceSurface:
             base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
         seen = Seen(
             base=base,
-            metallic_roughness=shown(material.metallic_roughness),
+            metallic=shown(material.metallic_map),
+            roughness=shown(material.roughness_map),
             specular_colour=shown(material.specular_colour),
             specular_strength=shown(material.specular_strength_map),
             glossiness=shown(material.glossiness),
