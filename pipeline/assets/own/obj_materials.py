@@ -7,6 +7,7 @@ ordinary dielectric, F0 = 0.08 Ks, and Ns is 1000 (1 - roughness)^2. `illum` 0 a
 is no highlight.
 """
 
+import dataclasses
 import re
 from collections.abc import Callable, Iterator, Sequence
 
@@ -29,8 +30,10 @@ Fields = dict[str, str]
 Decode = Callable[[bytes, str], NDArray]
 
 
-def obj_materials(data: bytes, files: MaterialFiles, decode: Decode) -> dict[str, SourceMaterial]:
-    """Return the materials that the faces of an OBJ use, by name.
+def obj_materials(
+    data: bytes, files: MaterialFiles, decode: Decode, *, emission: bool = False
+) -> dict[str, SourceMaterial]:
+    """Return the materials that the faces of an OBJ use, by name; what they emit only if asked.
 
     Raises:
         Rejected: no_materials where it has none, materials_unreadable, or as reading a picture.
@@ -45,7 +48,10 @@ def obj_materials(data: bytes, files: MaterialFiles, decode: Decode) -> dict[str
         raise Rejected("materials_unreadable", f"no library has the material {missing[0]!r:.80}")
     reader = _Reader(files, decode)
     try:
-        return {name: reader.material(known[name]) for name in used}
+        found = {name: reader.material(known[name]) for name in used}
+        if emission:
+            found = {name: reader.emitting(found[name], known[name]) for name in used}
+        return found
     except ValueError as error:
         raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.120})") from error
 
@@ -106,6 +112,15 @@ class _Reader:
             specular_strength=float(shiny),
             lost=lost,
         )
+
+    def emitting(self, found: SourceMaterial, fields: Fields) -> SourceMaterial:
+        """Return a material with what it emits; a map alone is as it is."""
+        picture = self._slot(fields.get("map_ke"), is_srgb=True)
+        factor = _rgb(fields, "ke", 0.0 if picture is None else 1.0)
+        red, green, blue = (max(value, 0.0) for value in factor)
+        if picture is not None and not any(factor):  # as exporters write it that know maps alone
+            red, green, blue = WHITE
+        return dataclasses.replace(found, emission_rgb=(red, green, blue), emission=picture)
 
     def _slot(self, text: str | None, *, is_srgb: bool = False) -> Slot | None:
         if text is None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.bake import bake
+from pipeline.assets.own.glow import level_emission
 from pipeline.assets.own.gltf_materials import GltfMaterials, bare_gltf, data_uri_bytes
 from pipeline.assets.own.measure import skin_quality
 from pipeline.assets.own.nearest import NearestPlaces
@@ -54,7 +55,8 @@ class SkinMaker:
         quality = skin_quality(mesh, baked, self._surface, self._nearest, reach)
         self._require_near(quality, level.record.budget)
         first, second, third = map(pack_texture, baked.textures)
-        skin = LevelSkin(uv=baked.uv, packed=(first, second, third), quality=quality)
+        glow = level_emission(mesh, self._surface, self._nearest, reach)
+        skin = LevelSkin(uv=baked.uv, packed=(first, second, third), quality=quality, emission=glow)
         return dataclasses.replace(level, skin=skin)
 
     def _require_near(self, quality: SkinQuality, budget: int) -> None:
@@ -87,17 +89,20 @@ def skin_maker(
             texture_too_large, texture_unreadable, no_texture_coordinates or
             texture_coordinates_not_finite.
     """
-    parts = _parts(source, Decoder(settings.max_pixels))
-    lost = sorted({word for material in parts.materials for word in material.lost})
+    parts = _parts(source, Decoder(settings.max_pixels), emission=settings.emission)
+    lost = {word for material in parts.materials for word in material.lost}
+    lost -= {"emission"} if settings.emission else set()
     surface = source_surface(mesh, parts)
-    return SkinMaker(surface, settings), OwnMaterials(lost=tuple(lost))
+    return SkinMaker(surface, settings), OwnMaterials(lost=tuple(sorted(lost)))
 
 
-def _parts(source: SourceFile, decode: Callable[[bytes, str], NDArray]) -> TexturedParts:
+def _parts(
+    source: SourceFile, decode: Callable[[bytes, str], NDArray], *, emission: bool
+) -> TexturedParts:
     if source.usd is not None:
-        return usd_parts(source.usd, decode)
+        return usd_parts(source.usd, decode, emission=emission)
     if source.kind == "obj":
-        materials = obj_materials(source.data, source.materials, decode)
+        materials = obj_materials(source.data, source.materials, decode, emission=emission)
         data, files = bare_obj(source.data)
         return load_parts(data, source.kind, files, materials, SourceMaterial())
     if source.kind not in ("glb", "gltf"):
@@ -105,7 +110,13 @@ def _parts(source: SourceFile, decode: Callable[[bytes, str], NDArray]) -> Textu
     tree = read_tree(source.data, f".{source.kind}")
     if not tree.get("materials"):
         raise Rejected("no_materials", "the glTF has no materials")
-    reader = GltfMaterials(tree, lambda row: _buffer(source, tree, row), source.materials, decode)
+    reader = GltfMaterials(
+        tree,
+        lambda row: _buffer(source, tree, row),
+        source.materials,
+        decode,
+        emission=emission,
+    )
     data = bare_gltf(source.data, tree, f".{source.kind}")
     default = SourceMaterial(metallic=1.0)  # what glTF says of a mesh without a material
     return load_parts(data, source.kind, source.buffers, reader.by_name(), default)

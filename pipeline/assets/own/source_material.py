@@ -70,7 +70,7 @@ class SourceMaterial:
 
     @property
     def slots(self) -> tuple[Slot, ...]:
-        """The pictures of what it reflects."""
+        """The pictures that it has."""
         found = (
             self.base,
             self.metallic_map,
@@ -78,6 +78,7 @@ class SourceMaterial:
             self.specular_colour,
             self.specular_strength_map,
             self.glossiness,
+            self.emission,
         )
         return tuple(slot for slot in found if slot is not None)
 

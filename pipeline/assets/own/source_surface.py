@@ -51,6 +51,30 @@ class SourceSurface:
             )
         return found
 
+    @property
+    def emits(self) -> bool:
+        """Whether any of its materials says so."""
+        return any(material.emits for material in self.parts.materials)
+
+    def emission(
+        self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
+    ) -> NDArray[np.float64]:
+        """Return the radiance [N, 3] at places on faces; arguments as those of `columns`."""
+        origin = self.origin[faces]
+        own = np.zeros((len(faces), 3))
+        np.put_along_axis(own, self.turn[faces], weights, axis=1)
+        found = np.zeros((len(faces), 3))
+        for row, material in enumerate(self.parts.materials):
+            chosen = np.flatnonzero(self.parts.material[origin] == row)
+            if not material.emits or not len(chosen):
+                continue
+            found[chosen] = material.emission_rgb
+            if material.emission is not None:
+                found[chosen] *= self._shown(material.emission, origin[chosen], own[chosen], cell)[
+                    :, :3
+                ]
+        return found
+
     def _of_material(
         self,
         material: SourceMaterial,

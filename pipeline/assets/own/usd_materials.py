@@ -28,8 +28,8 @@ _UNBOUND = 0.18
 Decode = Callable[[bytes, str], NDArray]
 
 
-def usd_parts(source: UsdSource, decode: Decode) -> TexturedParts:
-    """Return the triangles of a USD file with their materials.
+def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> TexturedParts:
+    """Return the triangles of a USD file with their materials; what they emit only if asked.
 
     Raises:
         Rejected: no_materials, materials_unreadable, no_texture_coordinates, or as reading a
@@ -42,6 +42,9 @@ def usd_parts(source: UsdSource, decode: Decode) -> TexturedParts:
         raise Rejected("no_texture_coordinates", f"textures lie on {len(primvars)} sets of them")
     reader = _Reader(looks.pictures, primvars, decode)
     materials = [reader.material(stated) for stated in looks.materials]
+    if emission:
+        pairs = zip(materials, looks.materials, strict=True)
+        materials = [reader.emitting(found, stated) for found, stated in pairs]
     plain = len(materials)
     rows, colours, coordinates = [], [], []
     for part in source.parts:
@@ -88,19 +91,13 @@ class _Reader:
     def material(self, stated: StatedMaterial) -> SourceMaterial:
         base = self._colour(stated, "diffuseColor")
         base_rgb = WHITE if base is not None else _rgb(stated, "diffuseColor")
-        emission = self._colour(stated, "emissiveColor")
-        strength = float(stated.constants["strength"][0]) if stated.has_strength else 1.0
-        glow = np.maximum(stated.constants["emissiveColor"] if emission is None else 1, 0)
-        red, green, blue = np.broadcast_to(glow * max(strength, 0), 3).tolist()
         roughness = self._number(stated, "roughness")
         common = SourceMaterial(
             base_rgb=base_rgb,
             base=base,
             roughness=1.0 if roughness is not None else _of(stated, "roughness"),
             roughness_map=roughness,
-            emission_rgb=(red, green, blue),
-            emission=emission,
-            lost=stated.lost if not any((red, green, blue)) else ("emission", *stated.lost),
+            lost=("emission", *stated.lost) if any(_glow(stated)) else stated.lost,
         )
         if stated.constants["useSpecularWorkflow"].any():
             return self._specular(stated, common)
@@ -111,6 +108,13 @@ class _Reader:
             metallic_map=metallic,
             f0=((ior - 1) / (ior + 1)) ** 2 if ior > 0 else 1.0,
         )
+
+    def emitting(self, found: SourceMaterial, stated: StatedMaterial) -> SourceMaterial:
+        """Return a material with what it emits."""
+        if not any(_glow(stated)):
+            return found
+        picture = self._colour(stated, "emissiveColor")
+        return dataclasses.replace(found, emission_rgb=_glow(stated), emission=picture)
 
     def _specular(self, stated: StatedMaterial, common: SourceMaterial) -> SourceMaterial:
         colour = self._colour(stated, "specularColor")
@@ -185,6 +189,15 @@ def _moves(chart: UvChart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def _rgb(stated: StatedMaterial, name: str) -> RGB:
     red, green, blue = np.maximum(stated.constants[name], 0).tolist()
+    return red, green, blue
+
+
+def _glow(stated: StatedMaterial) -> RGB:
+    """Return what times the picture, if there is one, a material emits."""
+    strength = max(_of(stated, "strength"), 0.0) if stated.has_strength else 1.0
+    if "emissiveColor" in stated.textures:
+        return (strength, strength, strength)
+    red, green, blue = (strength * value for value in _rgb(stated, "emissiveColor"))
     return red, green, blue
 
 

@@ -15,7 +15,7 @@ from pipeline.assets.settings import AssetSettings
 from storage.records.asset import decode_asset
 from tests.pipeline.assets.child_kit import Bench
 from tests.pipeline.assets.meshes_by_hand import as_rows, cube, geometry, moved, prepare, reason_of
-from tests.pipeline.assets.own.textured_kit import CORNERS, KEEP, lost, picture_bytes
+from tests.pipeline.assets.own.textured_kit import CORNERS, KEEP, UV_UP, lost, picture_bytes
 from tests.pipeline.assets.own.usd_kit import (
     MESH,
     SHADER,
@@ -130,8 +130,10 @@ REFUSED: dict[str, tuple[str, Callable[[Usd.Stage], object]]] = {
     "a point that is no number": ("load_error", _broken("points", [(np.nan, 0, 0)] * 24)),
     "no polygons": (
         "no_faces",
-        lambda stage: stage.GetPrimAtPath(MESH).GetAttribute("faceVertexCounts").Block()
-        or stage.GetPrimAtPath(MESH).GetAttribute("faceVertexIndices").Block(),
+        lambda stage: (
+            stage.GetPrimAtPath(MESH).GetAttribute("faceVertexCounts").Block()
+            or stage.GetPrimAtPath(MESH).GetAttribute("faceVertexIndices").Block()
+        ),
     ),
     "a solid": ("unsupported_primitive", lambda stage: UsdGeom.Cube.Define(stage, "/W/cube")),
     "bones": ("skinned_mesh", _skinned),
@@ -219,7 +221,7 @@ def test_coordinates_that_are_absent_or_no_numbers(tmp_path: Path) -> None:
 
     for change in (absent, too_few):
         assert lost(textured_usd(tmp_path / "a.usda", picture, change)) == "no_texture_coordinates"
-    path = textured_usd(tmp_path / "b.usda", picture, uv=[[0, 0], [np.inf, 0], [1, 1], [0, 1]])
+    path = textured_usd(tmp_path / "b.usda", picture, uv=np.where(UV_UP == 1, np.inf, UV_UP))
     assert lost(path) == "texture_coordinates_not_finite"
 
 

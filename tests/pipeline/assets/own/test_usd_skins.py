@@ -1,4 +1,4 @@
-"""USD objects keep their colours: by quads whose colours are known, and beside their glTF twins."""
+"""USD objects keep their colours: quads whose colours are known, and twins of glTF files."""
 
 import zlib
 from pathlib import Path
@@ -12,7 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 from storage.conventions import linear_from_srgb8
 from storage.records.asset import Asset
 from tests.pipeline.assets.meshes_by_hand import geometry, prepare, sphere, write_glb
-from tests.pipeline.assets.own.test_own_skins import F, SLOPE, STORED
+from tests.pipeline.assets.own.test_own_skins import SLOPE, STORED, F
 from tests.pipeline.assets.own.textured_kit import (
     CORNERS,
     GREEN,
