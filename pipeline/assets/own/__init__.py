@@ -2,7 +2,7 @@
 
 - `picture`: the bytes of a picture to values, within limits.
 - `source_material`: what a file says of a surface, and what that is here.
-- `gltf_materials`, `obj_materials`, `usd_materials`: materials as files have them.
+- `gltf_materials`, `obj_materials`, `usd_materials`, `ply_colours`: materials as files have them.
 - `parts`: the triangles of a file with their materials and texture coordinates.
 - `source_surface`: the cleaned source with a colour at every place.
 - `nearest`: which place of the source a place of a level shows.

@@ -16,6 +16,7 @@ from pipeline.assets.own.nearest import NearestPlaces
 from pipeline.assets.own.obj_materials import bare_obj, obj_materials
 from pipeline.assets.own.parts import TexturedParts, load_parts
 from pipeline.assets.own.picture import Decoder
+from pipeline.assets.own.ply_colours import ply_parts
 from pipeline.assets.own.source_material import SourceMaterial
 from pipeline.assets.own.source_surface import SourceSurface, source_surface
 from pipeline.assets.own.usd_materials import usd_parts
@@ -105,6 +106,8 @@ def _parts(
         materials = obj_materials(source.data, source.materials, decode, emission=emission)
         data, files = bare_obj(source.data)
         return load_parts(data, source.kind, files, materials, SourceMaterial())
+    if source.kind == "ply":
+        return ply_parts(source.data)
     if source.kind not in ("glb", "gltf"):
         raise Rejected("no_materials", f"a .{source.kind} file has no materials that are read")
     tree = read_tree(source.data, f".{source.kind}")
