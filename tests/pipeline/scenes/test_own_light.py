@@ -12,6 +12,7 @@ from pipeline.scenes.pool import PooledAsset
 from pipeline.scenes.redrawn import with_new_lights
 from scene_templates.layout import Emitter
 from storage.records.material import EMISSION
+from storage.records.objects import locked_uids
 from storage.records.scene import Scene, SceneObject
 from storage.records.texture import Texture
 from storage.settings.changes import changed
@@ -138,6 +139,8 @@ def test_an_object_all_of_which_emits_stays_in_its_place() -> None:
     pieces, more = with_own_light([_object([[1, 0, 0], [0, 1, 0]])], [lamp], share=0.1)
     assert [piece.entry.kind for piece in pieces] == ["emitter"] and not more
     assert len(pieces[0].materials) == 2 and pieces[0].skin is None
+    entry = pieces[0].entry
+    assert locked_uids([(entry.kind, entry.uid), ("emitter", "")], {}) == ["made/screen"]
 
 
 @pytest.mark.parametrize(("lamps", "share"), [(True, 0.0), (False, 1.0)])
