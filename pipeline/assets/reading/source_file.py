@@ -15,13 +15,13 @@ from pipeline.assets.reading.gltf_tree import buffer_paths, check_tree, read_tre
 from pipeline.assets.reading.headers import check_header
 from pipeline.assets.reading.material_files import MaterialFiles, gltf_files, obj_files
 from pipeline.assets.settings import AssetSettings
+from pipeline.usd.stage import SUFFIXES as USD_SUFFIXES
 from storage.errors import Rejected
 
 if TYPE_CHECKING:
     from pipeline.assets.reading.usd_source import UsdSource
 
-_USD = (".usd", ".usda", ".usdc", ".usdz")
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", *_USD)
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", *USD_SUFFIXES)
 """Formats that we read. The suffix decides: a file that lies about it is refused or fails to load,
 and is never handed to the loader of another format."""
 
@@ -47,7 +47,7 @@ class SourceFile:
 
 def needs_child(path: Path) -> bool:
     """Return whether native code reads the file at once, so that only children may."""
-    return path.suffix.lower() in _USD
+    return path.suffix.lower() in USD_SUFFIXES
 
 
 def read_source(path: Path, settings: AssetSettings) -> SourceFile:

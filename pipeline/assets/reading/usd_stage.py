@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.usd.placed import Placed, placed_prims
-from pipeline.usd.stage import SUFFIXES, OpenedUsd, OutsideFile, quietly
+from pipeline.usd.stage import OpenedUsd, OutsideFile, quietly
 from storage.errors import Rejected, TrilightError
 
 _SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane", "NurbsPatch", "TetMesh")
@@ -33,11 +33,6 @@ class UsdStage:
     """What is seen of it, into metres with +Z up."""
     time: Any
     """The first of a stage that moves."""
-
-
-def is_usd(path: Path) -> bool:
-    """Return whether a file is USD by its suffix."""
-    return path.suffix.lower() in SUFFIXES
 
 
 def open_stage(path: Path, settings: AssetSettings) -> UsdStage:
