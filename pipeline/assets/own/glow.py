@@ -6,11 +6,14 @@ from numpy.typing import NDArray
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.nearest import NearestPlaces
 from pipeline.assets.own.source_surface import SourceSurface
+from storage.errors import Rejected
 
 _STEPS = 8
 """Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""
 _LEAST = 0.05
 """Share of the radiance of the brightest triangle below which one emits nothing."""
+_MOST = 1e30
+"""Radiance from which on a number is no light."""
 
 
 def level_emission(
@@ -23,6 +26,9 @@ def level_emission(
         source: what it was made from.
         nearest: the places of that.
         reach: how far the source may be away, in the unit box.
+
+    Raises:
+        Rejected: materials_unreadable where that is no number, or too large for single precision.
     """
     if not source.emits:
         return None
@@ -36,6 +42,8 @@ def level_emission(
     cell = float(np.sqrt(np.median(areas) / len(weights)))
     seen = source.emission(places.faces, places.weights, cell).reshape(len(corners), -1, 3)
     mean = seen.mean(axis=1)
+    if not mean.max() < _MOST:  # or not a number
+        raise Rejected("materials_unreadable", f"a surface emits {mean.max():.3g}; < {_MOST:g}")
     brightness = mean.mean(axis=1)
     mean[brightness < _LEAST * brightness.max()] = 0
     return mean.astype(np.float32) if mean.any() else None

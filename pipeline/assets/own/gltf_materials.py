@@ -103,7 +103,7 @@ class GltfMaterials:
         if not self._emission:
             return found
         strength = entry.get("extensions", {}).get("KHR_materials_emissive_strength", {})
-        times = float(strength.get("emissiveStrength", 1))
+        (times,) = _numbers([strength.get("emissiveStrength", 1)], 1)
         red, green, blue = (
             max(value * times, 0.0) for value in _numbers(entry.get("emissiveFactor", [0] * 3), 3)
         )

@@ -17,6 +17,7 @@ from tests.pipeline.assets.meshes_by_hand import geometry, prepare, sphere, writ
 from tests.pipeline.assets.own.textured_kit import (
     KEEP,
     OWN,
+    lost,
     picture_bytes,
     textured_obj,
     textured_tree,
@@ -88,6 +89,11 @@ def test_strength_scales_it(tmp_path: Path) -> None:
     once, _ = emission(glb(tmp_path / "a.glb"))
     often, _ = emission(glb(tmp_path / "b.glb", strength=12.5))
     assert np.allclose(often, 12.5 * once)
+
+
+@pytest.mark.parametrize("strength", [float("nan"), float("inf"), 1e300])
+def test_strength_that_is_no_light(tmp_path: Path, strength: float) -> None:
+    assert lost(glb(tmp_path / "a.glb", strength), GLOW) == "materials_unreadable"
 
 
 def test_what_is_far_darker_than_the_brightest_triangle_emits_nothing(tmp_path: Path) -> None:
