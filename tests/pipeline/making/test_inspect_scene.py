@@ -64,7 +64,7 @@ def test_walls_before_the_objects_are_left_out() -> None:
     corners = [*walls, [[0, 0, 0.1], [0.1, 0, 0.1], [0, 0.1, 0.3]], [[1, 0, 0], [0, 1, 0], [0] * 3]]
     room = tiny_scene(
         vertex_positions=np.array(corners, np.float32).reshape(-1, 3),
-        vertex_normals=np.tile(np.float32([0, 0, 1]), (12, 1)),
+        vertex_normals=np.tile(np.array([0, 0, 1], np.float32), (12, 1)),
         faces=np.arange(12, dtype=np.uint32).reshape(4, 3),
         material_index=np.zeros(4, np.uint16),
         object_index=np.array([1, 1, 2, 0], np.uint16),
