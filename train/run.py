@@ -9,7 +9,8 @@ import torch
 
 from model.renderformer import count_parameters
 from model.sky.known import require_known, shining
-from storage.dataset.training_data import TrainingData, open_training_data
+from storage.dataset.mixed_data import open_mixture
+from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from train.beginning import beginning, begun
 from train.data.scenes import TrainingScene, training_scene
@@ -59,9 +60,9 @@ def train_run(
 
     Args:
         settings: the run; `train.runs.named_run` returns those that have a name.
-        data: root of a dataset, or a list of shards (storage.dataset.training_data), with a train
-        split; without a
-            validation split nothing is judged.
+        data: root of a dataset, or of several that are mixed (storage.dataset.mixed_data), or a
+            list of shards (storage.dataset.training_data), with a train split; without a validation
+            split nothing is judged.
         out: folder of the run (train.folder), new unless it resumes.
         start: how it begins; anew unless said.
         crew: the processes that train together (loop.crew.join_crew); this one unless said.
@@ -82,7 +83,7 @@ def train_run(
     require_wandb(watched.wandb)
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
     progress = progress if progress is not None and crew.is_first else TrainProgress()
-    opened, folder = open_training_data(data), RunFolder(out)
+    opened, folder = open_mixture(data), RunFolder(out)
     early = _EarlyNotes(progress)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         early.noted(note)
@@ -90,7 +91,7 @@ def train_run(
     settings = plan.settings
     objective = Objective(settings.loss, load_lpips(start.lpips)).to(crew.device)
     _check_data(opened, settings)
-    state = begun(plan, folder, opened.digest, crew, early)
+    state = begun(plan, folder, opened, crew, early)
     judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
     recorder = None
     if crew.is_first:
@@ -125,6 +126,7 @@ def _batches(
         share=crew.share,
         workers=workers,
         unusable=state.unusable,
+        mixture=state.mixture,
     )
 
 
@@ -175,17 +177,20 @@ def stream_settings(settings: TrainSettings) -> StreamSettings:
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:
     """Refuse data that lacks views or lights before any work; damage is counted when it is read."""
-    data.split("train")
-    num_views = data.num_views
+    shards = data.split("train")
     lights_apart = settings.augmentation.light_mix > 1
-    if num_views is None or lights_apart:
-        (sample,) = first_samples(data.split("train"), 1, Unusable(settings.most_unusable))
-        num_views = sample.scene.num_views
-        training_scene(sample, settings.resolution, lights_apart=lights_apart)
-    if settings.views_per_scene > num_views:
+    num_views = [source.num_views for source in data.sources]
+    if None in num_views or lights_apart:
+        unusable = Unusable(settings.most_unusable)
+        samples = list(first_samples(shards, len(data.sources), unusable))
+        num_views = [sample.scene.num_views for sample in samples]
+        for sample in samples:
+            training_scene(sample, settings.resolution, lights_apart=lights_apart)
+    fewest = min(count for count in num_views if count is not None)
+    if settings.views_per_scene > fewest:
         raise TrilightError(
             f"views_per_scene is {settings.views_per_scene}, but scenes of {data.shown} "
-            f"have {num_views} views; expected at most that many."
+            f"have {fewest} views; expected at most that many."
         )
 
 
