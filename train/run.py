@@ -16,6 +16,7 @@ from train.beginning import beginning, begun
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable, first_samples
+from train.data.workers import fitting_workers, this_machine
 from train.evaluation.judge import Judge
 from train.evaluation.rivals import median_picture
 from train.folder import RunFolder
@@ -52,7 +53,7 @@ def train_run(
     out: Path,
     start: Start | None = None,
     crew: Crew | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     watched: WatchSettings | None = None,
     progress: TrainProgress | None = None,
 ) -> TrainResult | None:
@@ -66,7 +67,8 @@ def train_run(
         out: folder of the run (train.folder), new unless it resumes.
         start: how it begins; anew unless said.
         crew: the processes that train together (loop.crew.join_crew); this one unless said.
-        workers: threads that read and decode samples; the weights do not depend on them.
+        workers: threads that read and decode samples; as many as fit unless said. The weights do
+            not depend on them.
         watched: how the run is watched, which the weights do not depend on either.
         progress: receives the events of the run, in the first process.
 
@@ -87,6 +89,8 @@ def train_run(
     early = _EarlyNotes(progress)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         early.noted(note)
+    if workers is None:
+        workers = _fitting_workers(settings, crew, early)
     plan = beginning(settings, folder, opened.digest, start, crew, early)
     settings = plan.settings
     objective = Objective(settings.loss, load_lpips(start.lpips)).to(crew.device)
@@ -113,6 +117,18 @@ def train_run(
         return None
     recorder.close()
     return finished(state, settings, folder, opened, judge, time.monotonic() - began)
+
+
+def _fitting_workers(settings: TrainSettings, crew: Crew, progress: TrainProgress) -> int:
+    """Return how many threads decode, and say why."""
+    fitting = fitting_workers(
+        this_machine(),
+        settings,
+        on_card=crew.device.type == "cuda",
+        busy_threads=torch.get_num_threads(),
+    )
+    progress.noted(fitting.because)
+    return fitting.threads
 
 
 def _batches(

@@ -12,12 +12,14 @@ import heapq
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from train.data.order import Place
-from train.settings import TrainSettings
+
+if TYPE_CHECKING:
+    from train.settings import TrainSettings
 
 RECORD = "mixture"
 """Entry of a checkpoint's header, and of settings.json."""
@@ -113,7 +115,7 @@ def mixed_places(
 
 
 def mixture_of(
-    data: TrainingData, settings: TrainSettings, header: Mapping[str, Any] | None
+    data: TrainingData, settings: "TrainSettings", header: Mapping[str, Any] | None
 ) -> Mixture | None:
     """Return how a run's datasets are mixed from here on; None of a run that has only had one.
 
