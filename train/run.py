@@ -1,5 +1,7 @@
 """One training run, from a dataset to weights, figures and a sheet: joins the parts."""
 
+import dataclasses
+import functools
 import time
 from collections.abc import Generator, Sequence
 from contextlib import closing
@@ -13,6 +15,7 @@ from storage.dataset.mixed_data import open_mixture
 from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from train.beginning import beginning, begun
+from train.data.arrival import looks_up_itself, step_scenes
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable, first_samples
@@ -23,7 +26,7 @@ from train.folder import RunFolder
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
-from train.loop.trainer import Trainer
+from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.objective import Objective
 from train.progress import TrainProgress
@@ -112,7 +115,10 @@ def train_run(
         watched=watched,
     )
     with closing(_batches(opened, settings, state, crew, workers)) as batches:
-        trainer.run(batches)
+        cost = functools.partial(scene_flops, settings)
+        most = settings.scenes_per_pass
+        with closing(step_scenes(batches, cost, most, crew.device)) as steps:
+            trainer.run(steps)
     if recorder is None:
         return None
     recorder.close()
@@ -135,9 +141,12 @@ def _batches(
     data: TrainingData, settings: TrainSettings, state: TrainState, crew: Crew, workers: int
 ) -> Generator[list[TrainingScene], None, None]:
     """Return the scenes of this process for each step from the state's on."""
+    asked = dataclasses.replace(
+        stream_settings(settings), looked_up=not looks_up_itself(crew.device)
+    )
     return stream_batches(
         data.split("train"),
-        stream_settings(settings),
+        asked,
         state.step,
         share=crew.share,
         workers=workers,

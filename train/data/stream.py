@@ -71,6 +71,8 @@ class StreamSettings:
     """Samples with more are unusable; 0: none is."""
     augmentation: "AugmentationSettings | None" = None
     """Symmetries that are drawn at each visit; none by default."""
+    looked_up: bool = True
+    """Whether targets are looked up in the decoding threads, and not where batches arrive."""
     network: "ModelConfig | None" = None
     """The network that is trained: what it wants traced of its views, is traced here."""
 
@@ -204,7 +206,7 @@ class _SceneMaker:
         seen, rng = self._usable(place)
         if settings.augmentation:
             seen = augmented(seen, settings.augmentation, rng)
-        return self._prepared(with_target(seen), rng)
+        return self._prepared(with_target(seen) if settings.looked_up else seen, rng)
 
     def _prepared(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
         """Return a scene with all that its network wants to be told."""
