@@ -52,9 +52,10 @@ class TrainOrder:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Changes to the run's settings, by dotted name, such as loss.perceptual=none or model=large
     (values are JSON); by default there are none."""
-    workers: Annotated[int | None, Within(1, 1024, unit="threads")] = None
-    """Threads of each process that decode samples; by default as many as its share of the cores
-    leaves beside the network, at most 8. Batches are the same with any number."""
+    workers: Annotated[int | None, Within(0, 1024, unit="threads")] = None
+    """Threads of each process that decode samples, with 0 the main one; by default as many as its
+    share of the cores leaves beside the network, at most 8. Batches are the same with any number.
+    """
     processes: Annotated[int, Within(1, 1024, unit="processes")] = 1
     """Number of processes on this machine, which torchrun starts; use one for each graphics card.
     """

@@ -10,10 +10,10 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -100,7 +100,8 @@ def stream_batches(
         settings: what decides the order and the scenes.
         first: number of a global batch.
         share: which part of each batch; the ranks' parts are equally large and make up the batch.
-        workers: threads that read and decode; what comes out does not depend on them.
+        workers: threads that read and decode, 0: the caller's own; what comes out does not depend
+            on them.
         mixture: how the parts of the shards are mixed, where these are several datasets.
         unusable: counts damaged data, or stops at it. An unusable sample is replaced by the next
             usable one of its shard, a shard that cannot be opened by the one of the next number.
@@ -110,12 +111,13 @@ def stream_batches(
             when it is reached.
     """
     share.require_equal(settings.batch_size)
-    with OpenShards(shards) as opened, ThreadPoolExecutor(workers, "decode") as decoders:
+    pool = ThreadPoolExecutor(workers, "decode") if workers else _CallersThread()
+    with OpenShards(shards) as opened, pool as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
         counted = _Counted(shards, unusable)
         plan = _planned(counted, settings, mixture, first, share, opened)
         waiting: deque[tuple[list[Place], list[Future[TrainingScene]]]] = deque()
-        depth = -(-PREFETCHED_SCENES * share.world_size // settings.batch_size)
+        depth = -(-PREFETCHED_SCENES * share.world_size // settings.batch_size) if workers else 0
         try:
             with closing(prefetched(plan, _plan_ahead(counted, settings, mixture))) as batches:
                 for mine in batches:
@@ -127,6 +129,20 @@ def stream_batches(
                         yield ready
         finally:
             decoders.shutdown(wait=True, cancel_futures=True)
+
+
+class _CallersThread(Executor):
+    """Does at once what it is asked."""
+
+    def submit(
+        self, function: Callable[..., Item], /, *arguments: Any, **named: Any
+    ) -> Future[Item]:
+        done: Future[Item] = Future()
+        try:
+            done.set_result(function(*arguments, **named))
+        except Exception as error:
+            done.set_exception(error)
+        return done
 
 
 class _Counted:
