@@ -209,6 +209,7 @@ EXPERIMENTS = (
         points=lambda effort: [Point(name=name, settings=load) for name, load in LOADS.items()],
         turns=repeats,
         measure=one_by_one(_point),
+        warm_up=True,
         needs=("torch",),
     ),
     Experiment(
