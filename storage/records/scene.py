@@ -63,13 +63,18 @@ class SceneObject:
     kind: ObjectKind
     """`object` for an asset, `shell` for a floor or wall, `emitter` for a light."""
     uid: str = ""
-    """The asset's uid; empty for shells and emitters."""
+    """The asset's uid, also of its parts that emit; empty for shells and lamps."""
     licence: str = "CC0-1.0"
-    """SPDX identifier, or `LicenseRef-...`; shells and emitters are ours, hence CC0."""
+    """SPDX identifier, or `LicenseRef-...`; shells and lamps are ours, hence CC0."""
     attribution: str = ""
     """Whom to name, as the source states it."""
     source_url: str = ""
     """Where the object came from."""
+
+    @property
+    def is_lamp(self) -> bool:
+        """Whether it is an emitter of the layout, and no part of an object that emits."""
+        return self.kind == "emitter" and not self.uid
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -190,8 +195,10 @@ def _check_arrays(scene: Scene) -> None:
         values = getattr(scene, field.name)
         if values is None:
             continue
-        part = "" if field.part is None else f"{field.part.name} "
-        require_law(~field.outside(values), field.name, values, f"{part}{field.within}")
+        outside = field.outside(values)
+        if outside.any():  # what was expected is put into words only then
+            part = "" if field.part is None else f"{field.part.name} "
+            require_law(~outside, field.name, values, f"{part}{field.within}")
     for name, other in (("vertex_normals", "vertex_positions"), ("fov_deg", "c2w")):
         _same_length(scene, name, other)
     for name in ("material_index", "object_index"):

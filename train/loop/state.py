@@ -12,6 +12,7 @@ import torch
 
 from model.renderformer import RenderFormer
 from storage.seeds import seed_for
+from train.data.mixture import Mixture
 from train.data.unusable import Unusable
 from train.going_on import Event
 from train.loop.optim import Updater
@@ -43,6 +44,8 @@ class TrainState:
     """Those of them since the last update, or since a decision about the run."""
     history: tuple[Event, ...] = ()
     """What happened to the run beside its steps, oldest first."""
+    mixture: Mixture | None = None
+    """How its datasets are mixed; None where there has only been one."""
 
     @property
     def shown(self) -> RenderFormer:
