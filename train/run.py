@@ -1,8 +1,10 @@
 """One training run, from a dataset to weights, figures and a sheet: joins the parts."""
 
+import dataclasses
 import time
 from collections.abc import Generator, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,6 +20,7 @@ from train.data.unusable import Unusable, first_samples
 from train.evaluation.judge import Judge
 from train.evaluation.rivals import median_picture
 from train.folder import RunFolder
+from train.loop.checkpoints import saved_steps
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
@@ -83,12 +86,16 @@ def train_run(
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
     progress = progress if progress is not None and crew.is_first else TrainProgress()
     opened, folder = open_training_data(data), RunFolder(out)
+    if start.restartable:  # a network file system shows a file to one machine before another
+        found = crew.any(bool(saved_steps(folder.checkpoints)))
+        start = dataclasses.replace(start, resume=start.resume or found, restartable=False)
     early = _EarlyNotes(progress)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         early.noted(note)
     plan = beginning(settings, folder, opened.digest, start, crew, early)
     settings = plan.settings
-    objective = Objective(settings.loss, load_lpips(start.lpips)).to(crew.device)
+    lpips = crew.once_a_machine(partial(load_lpips, start.lpips))
+    objective = Objective(settings.loss, lpips).to(crew.device)
     _check_data(opened, settings)
     state = begun(plan, folder, opened.digest, crew, early)
     judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
