@@ -86,9 +86,7 @@ def train_run(
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
     progress = progress if progress is not None and crew.is_first else TrainProgress()
     opened, folder = open_training_data(data), RunFolder(out)
-    if start.restartable:  # a network file system shows a file to one machine before another
-        found = crew.any(bool(saved_steps(folder.checkpoints)))
-        start = dataclasses.replace(start, resume=start.resume or found, restartable=False)
+    start = _decided(start, folder, crew)
     early = _EarlyNotes(progress)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         early.noted(note)
@@ -119,6 +117,16 @@ def train_run(
         return None
     recorder.close()
     return finished(state, settings, folder, opened, judge, time.monotonic() - began)
+
+
+def _decided(start: Start, folder: RunFolder, crew: Crew) -> Start:
+    """Return how all processes begin, where one may begin or resume.
+
+    All must ask, since torchrun counts its restarts for each machine apart, and a network file
+    system shows a file to one machine before another.
+    """
+    found = crew.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    return dataclasses.replace(start, resume=start.resume or found, restartable=False)
 
 
 def _batches(

@@ -74,7 +74,8 @@ class Judge:
         sizes = [len(scene.target_VRR3) for scene in self.scenes]
         ahead = lead(views, self.median_views, sizes)
         return ValidationJudgement(
-            pictures=tuple(pictures), views=tuple(views), scores=scores, lead=ahead)
+            pictures=tuple(pictures), views=tuple(views), scores=scores, lead=ahead
+        )
 
 
 def judged_scene(sample: Sample, resolution: int) -> JudgedScene:

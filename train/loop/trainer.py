@@ -3,8 +3,9 @@
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from typing import Any
 
 import torch
 
@@ -99,7 +100,7 @@ class Trainer:
         self.recorder = recorder
         self.stepper = Stepper(state, settings, objective, crew)
         self.start_watch = StartWatch(settings)
-        self.window = Window()
+        self.window = Window(state.reports)
         self.num_noted = 0
         self.saved_step: int | None = None
         progress = TrainProgress() if recorder is None else recorder.progress
@@ -252,10 +253,16 @@ class Trainer:
     def _end_window(self) -> None:
         """Exchange what was seen since the last window, and write the row."""
         seen, spikes = self.watch.window()
-        if self.recorder is None:
-            return
+        if self.recorder is not None:
+            self._write_window(self.recorder, seen, spikes)
+        self.state.reports = []
+        self.window = Window(self.state.reports)
+
+    def _write_window(
+        self, recorder: Recorder, seen: Mapping[str, Any], spikes: Sequence[Mapping[str, Any]]
+    ) -> None:
         for spike in spikes:
-            self.recorder.row(spike)
+            recorder.row(spike)
         peak = device_peak(self.crew.device, PRODUCTS[self.settings.precision])
         row = {
             "step": self.state.step,
@@ -264,8 +271,7 @@ class Trainer:
             **self.window.row(peak),
         }
         assert all(value is None or math.isfinite(value) for value in row.values())
-        self.recorder.row({**row, **seen})
-        self.window = Window()
+        recorder.row({**row, **seen})
 
     def _note(self, text: str) -> None:
         """Tell the user, in the first process."""

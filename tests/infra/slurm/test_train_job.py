@@ -17,7 +17,8 @@ SCRIPT = ROOT / "infra" / "slurm" / "train.sbatch"
 PYTHON = """#!/bin/bash
 # in place of Python: works until it is asked to stop, or does what $BEHAVES says
 trap 'exit 1' USR1 TERM
-{ printf '%s\\n' "$SLURM_NODEID" "$OMP_NUM_THREADS" "$@"; echo; } >> "$FAKE_SLURM/node-$SLURM_NODEID"
+said=$FAKE_SLURM/node-$SLURM_NODEID
+{ printf '%s\\n' "$SLURM_NODEID" "$OMP_NUM_THREADS" "$@"; echo; } >> "$said"
 [ "$BEHAVES" != fails ] || exit 1
 mkdir -p "$OUT/checkpoints"
 count=$(ls "$OUT/checkpoints" | wc -l)
@@ -52,7 +53,7 @@ class Job(NamedTuple):
 
 
 @pytest.fixture
-def submit(tmp_path: Path):  # noqa: ANN201
+def submit(tmp_path: Path):
     def submitted(*words: str, behaves: str = "works", **variables: str) -> Job:
         place = tmp_path / "slurm"
         place.mkdir()
@@ -78,7 +79,7 @@ def submit(tmp_path: Path):  # noqa: ANN201
     return submitted
 
 
-def test_each_node_starts_torchrun_and_a_job_whose_time_is_up_goes_on(submit) -> None:  # noqa: ANN001
+def test_each_node_starts_torchrun_and_a_job_whose_time_is_up_goes_on(submit) -> None:
     job = submit(str(SCRIPT), "pretrain", "--data", "a b")
     job.when("time-is-up", "../runs/pretrain/checkpoints/step-000000000.safetensors")
     assert job.process.wait() == 0, "the second start ends the run"
@@ -97,7 +98,7 @@ def test_each_node_starts_torchrun_and_a_job_whose_time_is_up_goes_on(submit) ->
         assert run == ["trilight", "train", "pretrain", "--data", "a b", *rest]
 
 
-def test_what_is_said_otherwise_holds(submit) -> None:  # noqa: ANN001
+def test_what_is_said_otherwise_holds(submit) -> None:
     job = submit("--cpus-per-task=6", "--gpus-per-node=2", str(SCRIPT), "mine.py:mine",
                  "--workers", "5", behaves="fails", OUT="elsewhere", RESTARTS="0")  # fmt: skip
     assert job.process.wait() == 1
@@ -109,7 +110,7 @@ def test_what_is_said_otherwise_holds(submit) -> None:  # noqa: ANN001
 
 
 @pytest.mark.parametrize("name", ["cancel", "time-is-up"])
-def test_a_job_that_was_cancelled_or_saved_nothing_is_not_queued_again(submit, name: str) -> None:  # noqa: ANN001
+def test_a_job_that_was_cancelled_or_saved_nothing_is_not_queued_again(submit, name: str) -> None:
     behaves = "works" if name == "cancel" else "idles"
     job = submit(str(SCRIPT), "smoke", behaves=behaves)
     job.when(name, "../runs/smoke/checkpoints")
@@ -117,7 +118,7 @@ def test_a_job_that_was_cancelled_or_saved_nothing_is_not_queued_again(submit, n
     assert not any(words[:2] == ["scontrol", "requeue"] for words in job.calls())
 
 
-def test_python_that_is_not_there_is_named(submit) -> None:  # noqa: ANN001
+def test_python_that_is_not_there_is_named(submit) -> None:
     job = submit(str(SCRIPT), "smoke", PYTHON="/nowhere/python")
     assert job.process.wait() == 2
     assert job.process.stderr is not None
