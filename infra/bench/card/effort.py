@@ -47,7 +47,7 @@ CARD = CardEffort(
 )
 PROCESSOR = dataclasses.replace(
     CARD, name="processor", steps=2, warm_steps=1, product_width=512, copied_mib=64, shrunk=True,
-    scenes=1, picture_px=64, noise_floor_db=25.0, loader_s=1.0,
+    scenes=2, picture_px=64, noise_floor_db=25.0, loader_s=1.0,
 )  # fmt: skip
 
 SHRUNK_PX, SHRUNK_TRIANGLES, SHRUNK_SCENES = 32, 64, 2

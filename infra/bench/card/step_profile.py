@@ -14,7 +14,7 @@ from train.loss.objective import Objective
 
 MARK = "trilight: "
 """Before the names of parts in a trace."""
-REST = "backward pass and the rest"
+REST = "backward and rest"
 DEAREST, NAME_CHARACTERS = 20, 100
 """Kernels that are listed by name, and how much of a name is kept."""
 
@@ -22,7 +22,7 @@ KINDS = (
     ("attention", r"attention|flash|fmha|mem_eff"),
     ("optimiser", r"multi_tensor|foreach|fused_adam"),
     ("convolution", r"conv|wgrad|dgrad|winograd|cudnn"),
-    ("product", r"gemm|cutlass|xmma|nvjet|cublas|matmul|aten::(add|ba)?[bm]mm|aten::linear"),
+    ("product", r"gemm|cutlass|xmma|nvjet|cublas|matmul|aten::(addmm|mm|bmm|baddbmm)$"),
     ("norm", r"norm"),
     ("copy or cast", r"copy|memcpy|memset|cast|_to_|aten::(cat|stack|fill|zero)"),
     ("sum", r"reduce|softmax|aten::(sum|mean)"),
