@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,8 +53,12 @@ class Job(NamedTuple):
         return [block.split("\n") for block in blocks if block]
 
 
+Submit = Callable[..., Job]
+"""Takes the words for sbatch, what each node does, and variables."""
+
+
 @pytest.fixture
-def submit(tmp_path: Path):
+def submit(tmp_path: Path) -> Submit:
     def submitted(*words: str, behaves: str = "works", **variables: str) -> Job:
         place = tmp_path / "slurm"
         place.mkdir()
@@ -79,7 +84,7 @@ def submit(tmp_path: Path):
     return submitted
 
 
-def test_each_node_starts_torchrun_and_a_job_whose_time_is_up_goes_on(submit) -> None:
+def test_each_node_starts_torchrun_and_a_job_whose_time_is_up_goes_on(submit: Submit) -> None:
     job = submit(str(SCRIPT), "pretrain", "--data", "a b")
     job.when("time-is-up", "../runs/pretrain/checkpoints/step-000000000.safetensors")
     assert job.process.wait() == 0, "the second start ends the run"
@@ -98,7 +103,7 @@ def test_each_node_starts_torchrun_and_a_job_whose_time_is_up_goes_on(submit) ->
         assert run == ["trilight", "train", "pretrain", "--data", "a b", *rest]
 
 
-def test_what_is_said_otherwise_holds(submit) -> None:
+def test_what_is_said_otherwise_holds(submit: Submit) -> None:
     job = submit("--cpus-per-task=6", "--gpus-per-node=2", str(SCRIPT), "mine.py:mine",
                  "--workers", "5", behaves="fails", OUT="elsewhere", RESTARTS="0")  # fmt: skip
     assert job.process.wait() == 1
@@ -110,7 +115,9 @@ def test_what_is_said_otherwise_holds(submit) -> None:
 
 
 @pytest.mark.parametrize("name", ["cancel", "time-is-up"])
-def test_a_job_that_was_cancelled_or_saved_nothing_is_not_queued_again(submit, name: str) -> None:
+def test_a_job_that_was_cancelled_or_saved_nothing_is_not_queued_again(
+    submit: Submit, name: str
+) -> None:
     behaves = "works" if name == "cancel" else "idles"
     job = submit(str(SCRIPT), "smoke", behaves=behaves)
     job.when(name, "../runs/smoke/checkpoints")
@@ -118,7 +125,7 @@ def test_a_job_that_was_cancelled_or_saved_nothing_is_not_queued_again(submit, n
     assert not any(words[:2] == ["scontrol", "requeue"] for words in job.calls())
 
 
-def test_python_that_is_not_there_is_named(submit) -> None:
+def test_python_that_is_not_there_is_named(submit: Submit) -> None:
     job = submit(str(SCRIPT), "smoke", PYTHON="/nowhere/python")
     assert job.process.wait() == 2
     assert job.process.stderr is not None

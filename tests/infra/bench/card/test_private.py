@@ -9,7 +9,7 @@ from infra.bench.card.private import own_names, without_traces
     ("text", "left"),
     [
         ("llvm_ad_rgb, /usr/lib/x86_64/libLLVM.so.19", "llvm_ad_rgb, <path>"),
-        ("/home/anna/My work/x.so: cannot open", "<path>: cannot open"),
+        ("/srv/anna/My work/x.so: cannot open", "<path>: cannot open"),
         ("C:\\Users\\anna\\cache", "<path>"),
         ("~/.cache/trilight", "<path>"),
         ("anna@annas-box", "<name>@<name>"),

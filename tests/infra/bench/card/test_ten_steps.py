@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from infra.bench.card.effort import CARD, PROCESSOR, sized
 from infra.bench.card.drawn_batch import workloads
+from infra.bench.card.effort import CARD, PROCESSOR, sized
 from infra.bench.card.predicted import least_ms
 from infra.bench.card.step_profile import REST, kind_of, summed
 from infra.bench.card.ten_steps import steps_of_run
