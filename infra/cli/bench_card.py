@@ -28,7 +28,7 @@ def bench_card(
     if files:
         _show_files([Path(name) for name in files], write_docs=write_docs)
         return
-    first_words("Measuring the card: about fifteen minutes; nothing else should run")
+    first_words("Measuring the card: 15 to 30 minutes; nothing else should run")
     from infra.torch_library import require_torch
 
     require_torch("bench card")

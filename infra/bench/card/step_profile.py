@@ -60,22 +60,20 @@ def _parts(model: Any, objective: Objective) -> Iterator[tuple[str, nn.Module]]:
 
 
 @contextmanager
-def _marked(name: str, module: nn.Module) -> Iterator[None]:
-    open_ranges: list[Any] = []
+def _marked(name: str, module: Any) -> Iterator[None]:
+    """Mark every call of a module, from outside: hooks would be a part of what is compiled."""
+    before = module._compiled_call_impl  # what a call of a compiled module calls
+    call = before or module._call_impl
 
-    def begin(*_: Any) -> None:
-        open_ranges.append(torch.profiler.record_function(MARK + name))
-        open_ranges[-1].__enter__()
+    def marked_call(*given: Any, **named: Any) -> Any:
+        with torch.profiler.record_function(MARK + name):
+            return call(*given, **named)
 
-    def end(*_: Any) -> None:
-        open_ranges.pop().__exit__(None, None, None)
-
-    handles = [module.register_forward_pre_hook(begin), module.register_forward_hook(end)]
+    module._compiled_call_impl = marked_call
     try:
         yield
     finally:
-        for handle in handles:
-            handle.remove()
+        module._compiled_call_impl = before
 
 
 def profiled(work: Callable[[], object], device: torch.device) -> dict[str, Any]:
