@@ -102,6 +102,7 @@ def test_stopped_and_resumed_is_uninterrupted_to_the_bit(
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
     run(tiny_run(), dataset, tmp_path, resume=True)
     same_as_uninterrupted(tmp_path, whole)
+    assert curve(tmp_path) == curve(whole.folder.root), "a row half full is filled"
 
 
 def test_killed_and_resumed_repeats_at_most_one_checkpoint(
