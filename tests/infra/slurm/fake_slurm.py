@@ -25,6 +25,8 @@ from pathlib import Path
 
 PLACE, JOB = Path(os.environ.get("FAKE_SLURM", "")), "4711"
 POLL_S, KILL_WAIT_S = 0.02, 0.5
+MOST_STARTS = 5
+"""A job that is queued again more often than that would never end."""
 OPTIONS = {
     "sbatch": {
         "job-name", "nodes", "ntasks-per-node", "gpus-per-node", "cpus-per-task", "time", "signal",
@@ -57,7 +59,7 @@ def sbatch(words: list[str]) -> int:
     to, name, _ = re.fullmatch(r"(B:)?(\w+)@(\d+)", options["signal"]).groups()  # type: ignore[union-attr]
     assert to, "srun's own way with signals is not imitated"
     starts = 0
-    while True:
+    while starts < MOST_STARTS:
         environment = os.environ | _variables(options, starts)
         with subprocess.Popen(["bash", script, *arguments], env=environment) as shell:
             while shell.poll() is None:
@@ -70,6 +72,7 @@ def sbatch(words: list[str]) -> int:
         starts += 1
         if not ("requeue" in options and _taken("requeue")):
             return shell.returncode
+    sys.exit(f"sbatch: job {JOB} was queued again {MOST_STARTS} times")
 
 
 def _variables(options: Mapping[str, str], starts: int) -> dict[str, str]:

@@ -87,7 +87,7 @@ def submit(tmp_path: Path) -> Submit:
 def test_each_node_starts_torchrun_and_a_job_whose_time_is_up_goes_on(submit: Submit) -> None:
     job = submit(str(SCRIPT), "pretrain", "--data", "a b")
     job.when("time-is-up", "../runs/pretrain/checkpoints/step-000000000.safetensors")
-    assert job.process.wait() == 0, "the second start ends the run"
+    assert job.process.wait(timeout=60) == 0, "the second start ends the run"
     (step, *_) = [words for words in job.calls() if words[0] == "srun"]
     assert "--cpus-per-task=64" in step
     for node in (0, 1):
@@ -106,7 +106,7 @@ def test_each_node_starts_torchrun_and_a_job_whose_time_is_up_goes_on(submit: Su
 def test_what_is_said_otherwise_holds(submit: Submit) -> None:
     job = submit("--cpus-per-task=6", "--gpus-per-node=2", str(SCRIPT), "mine.py:mine",
                  "--workers", "5", behaves="fails", OUT="elsewhere", RESTARTS="0")  # fmt: skip
-    assert job.process.wait() == 1
+    assert job.process.wait(timeout=60) == 1
     ((_, _, *words),) = job.starts(0)
     assert {"--nproc-per-node=2", "--max-restarts=0"} < set(words)
     run = ["mine.py:mine", "--workers", "5", "--out", "elsewhere", "--restartable"]
@@ -122,12 +122,12 @@ def test_a_job_that_was_cancelled_or_saved_nothing_is_not_queued_again(
     job = submit(str(SCRIPT), "smoke", behaves=behaves)
     saved = "/step-000000000.safetensors" if name == "cancel" else ""
     job.when(name, f"../runs/smoke/checkpoints{saved}")
-    assert job.process.wait() != 0
+    assert job.process.wait(timeout=60) != 0
     assert not any(words[:2] == ["scontrol", "requeue"] for words in job.calls())
 
 
 def test_python_that_is_not_there_is_named(submit: Submit) -> None:
     job = submit(str(SCRIPT), "smoke", PYTHON="/nowhere/python")
-    assert job.process.wait() == 2
+    assert job.process.wait(timeout=60) == 2
     assert job.process.stderr is not None
     assert "PYTHON=/nowhere/python: no such program" in job.process.stderr.read()
