@@ -101,6 +101,9 @@ class Experiment:
     what a dataset order says, `train.` as in `--set` of train, `render.` an option."""
     cluster: Callable[[str], str] = str
     """Names what turns have in common whose figures are alike; by default nothing."""
+    by_point: bool = False
+    """Whether a point is measured without the others of its turn: a run that was interrupted then
+    measures again only what is missing of a turn."""
     warm_up: bool = False
     """Whether one turn that is not counted comes first, where all turns are repeats."""
     takes_scenes: bool = False
