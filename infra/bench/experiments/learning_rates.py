@@ -55,8 +55,8 @@ EXTENTS = {
         steps=200,
         widths=(64, 128, 256),
         seeds=1,
-        compared_widths=(64, 128),
-        compared_seeds=3,
+        compared_widths=(64,),
+        compared_seeds=4,
         held_out=32,
     ),
     "careful": Extent(
