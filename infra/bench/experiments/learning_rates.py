@@ -22,8 +22,8 @@ Turns = Mapping[str, Mapping[str, Figures]]
 """Figures by turn and point."""
 
 RATES: Mapping["Optimiser", tuple[float, ...]] = {
-    "AdamW": (1e-3, 2e-3, 4e-3, 8e-3),
-    "Muon": (5e-4, 1e-3, 2e-3, 4e-3),
+    "AdamW": (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3),
+    "Muon": (1.25e-4, 2.5e-4, 5e-4, 1e-3, 2e-3),
 }
 """Peak learning rates, doubling."""
 
