@@ -102,6 +102,17 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     assert calls[0] == ("a", "cheap")
 
 
+def test_where_points_stand_alone_only_what_a_turn_lacks_is_measured_again(tmp_path: Path) -> None:
+    one = dataclasses.replace(experiment("a", "killed", "c"), by_point=True)
+    with pytest.raises(KeyboardInterrupt):
+        measured(tmp_path, one)
+    assert calls[-1] == ("killed", "waste")
+    calls.clear()
+    with pytest.raises(KeyboardInterrupt):
+        measured(tmp_path, one)
+    assert calls == [("killed", "waste")]
+
+
 @settings(max_examples=30, deadline=None)  # each writes a dozen lines to the disk
 @given(cut=st.integers(0, 900))
 def test_whatever_is_left_of_a_file_can_be_gone_on_with(
