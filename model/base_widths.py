@@ -18,8 +18,8 @@ class BaseWidths:
     """Widths of the network whose learning rates and initial weights are stated."""
 
     width: Annotated[int, Within(0, 16_384)] = 0
-    """Width of tokens at which rates were measured; at other widths they and the initial weights
-    follow the maximal update parametrisation (Yang et al. 2021). With 0, they follow no width."""
+    """Width of tokens at which the rates were measured; at other widths they and the initial
+    weights follow the maximal update parametrisation (Yang et al. 2021), and with 0 no width."""
     head_width: Annotated[int, Within(2 * VERTEX_COORDINATES, 16_384)] = 64
     """Width of an attention head there; it divides `width`."""
     pixel_width: Annotated[int, Within(1, 4096)] = 64

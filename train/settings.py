@@ -122,7 +122,8 @@ class TrainSettings:
     """Learning rate of Muon, which updates the matrices, as a multiple of `learning_rate`; with 0,
     AdamW updates every weight."""
     base_widths: BaseWidths = field(default_factory=BaseWidths)
-    """Widths for which the rates above and the initial weights are stated."""
+    """Widths for which the rates above and the initial weights are stated; no other width of the
+    network changes them unless `width` is one."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear warm-up to the peak learning rate."""
     schedule: Schedule = "cosine"

@@ -94,6 +94,9 @@ class Experiment:
     kind: Callable[[str], str] | None = None
     """Names what a point is one of. The figure then shows every cost as a series of its own, in
     its unit, and a colour for each kind; without it, cost ratios."""
+    line_of: Callable[[Point], tuple[str, float]] | None = None
+    """Names the line that a point stands on, and where on it. The figure then shows each further
+    column along the lines, and no costs."""
     because: str = ""
     """The default and its reason, or what the figures mean."""
     covers: tuple[str, ...] = ()

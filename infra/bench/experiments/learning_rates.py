@@ -171,6 +171,10 @@ def _rate_points(effort: Effort) -> list[Point]:
     ]
 
 
+def _rule(point: Point) -> str:
+    return BY_WIDTH if point.settings["by_width"] else ONE_RATE
+
+
 COMPARED: Mapping[str, Mapping[str, object]] = {
     "AdamW": {"optimiser": "AdamW"},
     "Muon": {"optimiser": "Muon"},
@@ -226,7 +230,12 @@ EXPERIMENTS = (
         error=Column(name=f"{_L1}, mean of all widths", figure="log_l1", over="mean"),
         against=_AGAINST,
         columns=tuple(
-            Column(name=f"width {width}", figure=f"w{width}", over="mean") for width in WIDTHS
+            Column(name=f"{_L1}, width {width}", figure=f"w{width}", over="mean")
+            for width in WIDTHS
+        ),
+        line_of=lambda point: (
+            f"{point.settings['optimiser']}, {_rule(point)}",
+            point.settings["learning_rate"],
         ),
         because="A rate transfers where the same row is the best of its kind in every column. The "
         "defaults rest on this and on what DECISIONS says beside it; with one seed, rows that are "

@@ -199,6 +199,26 @@ def test_a_figure_of_kinds_shows_every_cost(tmp_path: Path) -> None:
         assert picture.width > 800 and (red[..., 0] - red[..., 2] > 100).sum() > 50
 
 
+def test_a_figure_of_lines_has_a_panel_for_every_column_that_was_measured(tmp_path: Path) -> None:
+    def shape(*figures: str) -> tuple[int, int]:
+        one = dataclasses.replace(
+            experiment("a", "c"),
+            columns=tuple(Column(name=f"of {figure}", figure=figure) for figure in figures),
+            line_of=lambda point: (
+                "others" if point.name == "waste" else "line",
+                1.0 + len(point.name),
+            ),
+        )
+        measured(tmp_path, one)
+        with Image.open(tmp_path / "made-up-quick.png") as picture:
+            colours = set(picture.convert("RGB").get_flattened_data())
+            assert {(31, 119, 180), (255, 127, 14)} <= colours  # both lines
+            return picture.size
+
+    (one, high), (two, same) = shape("db", "absent"), shape("db", "core_s")
+    assert high == same and 1.6 * one < two < 2 * one
+
+
 def test_points_of_what_is_asked_for_come_first_and_names_are_of_one_thing(tmp_path: Path) -> None:
     asked = Asked(checkpoint=("runs/x/model.safetensors", "builtin:", "y"))
     assert asked.network == "runs/x/model.safetensors"
