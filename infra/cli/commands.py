@@ -30,6 +30,7 @@ COMMANDS = {
     "render": "Render scenes: path traced to a measured noise floor, or by a trained network.",
     "convert": "Convert by extension, and report what could not be carried over.",
     "export": "Write a dataset as files that nerfstudio, COCO tools or Hugging Face datasets open.",
+    "push": "Upload a finished dataset, a network or a page to the Hugging Face hub.",
     "passes": "Write depth, normals, ids and more of stored scenes as OpenEXR.",
     "verify": "Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."
     "\n\nAn unfinished dataset is checked as far as it exists; the exit status is 1 then too.",
