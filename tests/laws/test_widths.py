@@ -142,7 +142,10 @@ def test_steps_move_layers_and_pictures_as_far_at_any_width(sized: Sized, muon_r
     assert stages and max(stages.values()) < 0.5, stages
 
 
-@pytest.mark.parametrize(("sized", "muon_rate"), CASES)
+@pytest.mark.parametrize(
+    ("sized", "muon_rate"),
+    [*CASES[:4], pytest.param(hits_of, 0.0, id="hits, AdamW", marks=pytest.mark.slow), CASES[5]],
+)
 def test_without_the_rules_wider_networks_change_more(sized: Sized, muon_rate: float) -> None:
     """So the law above is one that a network can break: twice the width, half as much more."""
     found = slopes(sized, muon_rate, BaseWidths())
