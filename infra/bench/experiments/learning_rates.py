@@ -216,7 +216,13 @@ def _rate_turns(effort: Effort) -> list[str]:
     return [_turn(width, seed) for seed in range(extent.seeds) for width in extent.widths]
 
 
-_L1 = "held-out log L1"
+_L1 = "held-out log L1, thousandths"
+
+
+def thousandths(value: float) -> float:
+    """Return a number in thousandths, for `Column.then`."""
+    return 1000 * value
+
 
 EXPERIMENTS = (
     Experiment(
@@ -227,19 +233,21 @@ EXPERIMENTS = (
         "64 on (`base_widths`). Muon's own rate is three times the stated one.",
         covers=("train.learning_rate", "train.muon_rate", "train.base_widths.width"),
         cost=Column(name="core-seconds of a training", figure="core_s", over="mean"),
-        error=Column(name=f"{_L1}, mean of all widths", figure="log_l1", over="mean"),
+        error=Column(
+            name=f"{_L1}, mean of all widths", figure="log_l1", over="mean", then=thousandths
+        ),
         against=_AGAINST,
         columns=tuple(
-            Column(name=f"{_L1}, width {width}", figure=f"w{width}", over="mean")
+            Column(name=f"width {width}", figure=f"w{width}", over="mean", then=thousandths)
             for width in WIDTHS
         ),
         line_of=lambda point: (
             f"{point.settings['optimiser']}, {_rule(point)}",
             point.settings["learning_rate"],
         ),
-        because="A rate transfers where the same row is the best of its kind in every column. The "
-        "defaults rest on this and on what DECISIONS says beside it; with one seed, rows that are "
-        "a percent apart are equal.",
+        because="A rate transfers where the same row is the best of its kind in every column. With "
+        "one seed, rows that are 2 % apart are equal. The rate of `pretrain` is the best one of "
+        "Muon at width 64.",
         points=_rate_points,
         turns=_rate_turns,
         measure=_measure_rates,
@@ -254,7 +262,7 @@ EXPERIMENTS = (
         "turn is a width and a seed of weights, order and symmetries.",
         covers=("train.muon_rate", "train.schedule", "train.decay_share", "train.num_steps"),
         cost=Column(name="core-seconds of a training", figure="core_s", over="mean"),
-        error=Column(name=_L1, figure="log_l1", over="mean"),
+        error=Column(name=_L1, figure="log_l1", over="mean", then=thousandths),
         against=_AGAINST,
         rival=lambda asked: RIVAL,
         columns=(
@@ -263,8 +271,9 @@ EXPERIMENTS = (
             Column(name="%, low", figure="beside_wsd", over="low"),
             Column(name="%, high", figure="beside_wsd", over="high"),
         ),
-        because="Differences are of pairs of one width and seed, 95 % intervals of their mean, "
-        "bootstrapped over the pairs.",
+        because="Differences are of pairs of one width and seed, with bootstrapped 95 % intervals "
+        "of their mean, which are too narrow for so few pairs as --quick has: docs/log has those "
+        "of Student's t. A schedule is tried at the peak rate that is best with wsd.",
         points=lambda effort: [
             Point(name=name, settings=settings, default=name == "Muon")
             for name, settings in COMPARED.items()
