@@ -22,8 +22,8 @@ COMMANDS = {
     "assets": "Turn objects into clean meshes within a budget or an error; writes quality.html.",
     "generate": "Turn objects into a verified, resumable dataset; run it again to resume after any "
     "stop.",
-    "submit": "Run a flow on the workers of a Prefect server, and watch it: what generate does, "
-    "elsewhere.",
+    "submit": "Do elsewhere what generate does: by a flow on the workers of a Prefect server, and "
+    "watch it, or by an array job of a Slurm cluster.",
     "revisit": "Render the scenes of a finished dataset again, with new cameras, lights, materials "
     "or another resolution; pictures that stay the same are copied.",
     "plan": "Measure a few scenes and predict time, bytes and cost of all, each with an interval.",
