@@ -233,10 +233,8 @@ EXPERIMENTS = (
         "64 on (`base_widths`). Muon's own rate is three times the stated one.",
         covers=("train.learning_rate", "train.muon_rate", "train.base_widths.width"),
         cost=Column(name="core-seconds of a training", figure="core_s", over="mean"),
-        error=Column(
-            name=f"{_L1}, mean of all widths", figure="log_l1", over="mean", then=thousandths
-        ),
-        against=_AGAINST,
+        error=Column(name=_L1, figure="log_l1", over="mean", then=thousandths),
+        against=f"{_AGAINST}; the mean of the widths",
         columns=tuple(
             Column(name=f"width {width}", figure=f"w{width}", over="mean", then=thousandths)
             for width in WIDTHS
