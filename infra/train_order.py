@@ -21,8 +21,8 @@ class TrainOrder:
     run: str = "smoke"
     """Name of a run (a named set of settings), such as smoke or pretrain."""
     data: tuple[str, ...] = ("data/smoke",)
-    """Dataset (a folder or a URL), or shards by name or pattern, such as
-    s3://b/{train,validation}-{000000..000007}.tar."""
+    """Dataset (a folder or a URL); several, which are mixed as the setting data_weights says; or
+    shards by name or pattern, such as s3://b/{train,validation}-{000000..000007}.tar."""
     out: str | None = None
     """Folder for the run, on the machine that trains; by default runs/RUN."""
     resume: bool = False
@@ -52,8 +52,10 @@ class TrainOrder:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Changes to the run's settings, by dotted name, such as loss.perceptual=none or model=large
     (values are JSON); by default there are none."""
-    workers: Annotated[int, Within(1, 1024, unit="threads")] = 1
-    """Threads that decode samples."""
+    workers: Annotated[int | None, Within(0, 1024, unit="threads")] = None
+    """Threads of each process that decode samples, with 0 the main one; by default as many as its
+    share of the cores leaves beside the network, at most 8. Batches are the same with any number.
+    """
     processes: Annotated[int, Within(1, 1024, unit="processes")] = 1
     """Number of processes on this machine, which torchrun starts; use one for each graphics card.
     """

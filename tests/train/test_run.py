@@ -205,7 +205,8 @@ def test_data_without_a_validation_split_trains_and_says_so(
     few = write_toy_dataset(tmp_path / "data", train=7, validation=0, per_shard=3)
     out, listener = tmp_path / "out", Listener()
     result = run(tiny_run(), few, out, progress=listener)
-    (note,) = listener.notes
+    note, workers = listener.notes
+    assert "decode" in workers and "cores" in workers, "the default of --workers is said"
     assert "no validation split" in note and "more scenes" in note
     assert (result.scores, result.median_scores, result.beats_median) == (None, None, None)
     summary = json.loads(result.folder.summary.read_text())

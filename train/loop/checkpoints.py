@@ -26,6 +26,7 @@ from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
 from storage.records.safe_read import read_safetensors
 from storage.settings.described import settings_record
+from train.data.mixture import RECORD
 from train.folder import RunFolder
 from train.going_on import GoingOn, event_records
 from train.loop.crew import Crew
@@ -37,8 +38,9 @@ PREFIX, SUFFIX = "step-", ".safetensors"
 """Names of the files, around the number of the step."""
 
 HEADER_KEY = "trilight_checkpoint"
-"""Metadata entry with counters, damage met, settings, digest of the data, the run's history, and
-how it was executed: number of processes and threads, precision of Muon's products."""
+"""Metadata entry with counters, damage met, settings, digest of the data, how datasets are mixed,
+the run's history, and how it was executed: number of processes and threads, precision of Muon's
+products."""
 
 UNSEALED = "0" * 64
 """Placeholder for the sha256 while it is computed. Old checkpoints have no sha256."""
@@ -62,6 +64,7 @@ def save_checkpoint(
         "settings": settings_record(settings),
         "model": encode_config(settings.model),
         "data_digest": data_digest,
+        **({RECORD: state.mixture.record()} if state.mixture else {}),
         "history": event_records(state.history),
         "world_size": world_size,
         "threads": torch.get_num_threads(),

@@ -13,6 +13,7 @@ import torch
 from model.renderformer import RenderFormer
 from model.width_scales import scale_start, width_scales
 from storage.seeds import seed_for
+from train.data.mixture import Mixture
 from train.data.unusable import Unusable
 from train.going_on import Event
 from train.loop.optim import Updater
@@ -44,6 +45,8 @@ class TrainState:
     """Those of them since the last update, or since a decision about the run."""
     history: tuple[Event, ...] = ()
     """What happened to the run beside its steps, oldest first."""
+    mixture: Mixture | None = None
+    """How its datasets are mixed; None where there has only been one."""
 
     @property
     def shown(self) -> RenderFormer:

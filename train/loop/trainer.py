@@ -9,8 +9,7 @@ import torch
 
 from model.costs import Workload, training_flops
 from storage.errors import TrilightError
-from train.data.buckets import bucket_scenes
-from train.data.scenes import TrainingScene
+from train.data.arrival import CopyStream, StepScenes
 from train.folder import RunFolder
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.crew import Crew
@@ -74,6 +73,16 @@ MOST_SKIPPED_IN_A_ROW = 10
 """A few steps may overflow; this many in a row mean that the weights themselves are lost."""
 
 
+def scene_flops(settings: TrainSettings, num_triangles: int) -> int:
+    """Return what a scene of so many triangles costs in a step of a run."""
+    workload = Workload(
+        triangles=num_triangles,
+        views=settings.views_per_scene,
+        resolution=settings.resolution,
+    )
+    return training_flops(settings.model, workload)
+
+
 class Trainer:
     """Drives one run from the state's step to its last one, in step with the other processes."""
 
@@ -97,6 +106,7 @@ class Trainer:
         self.data_digest = data_digest
         self.recorder = recorder
         self.stepper = Stepper(state, settings, objective, crew)
+        self.copies = CopyStream(crew.device)
         self.start_watch = StartWatch(settings)
         self.window = Window()
         self.num_noted = 0
@@ -112,8 +122,8 @@ class Trainer:
             hung=progress.hung,
         )
 
-    def run(self, batches: Iterator[list[TrainingScene]]) -> None:
-        """Take all remaining steps; `batches` begins with that of the state's step.
+    def run(self, steps: Iterator[StepScenes]) -> None:
+        """Take all remaining steps; `steps` begins with that of the state's step.
 
         Raises:
             TrilightError: a signal asked to stop or the start went dead (the state is saved), or
@@ -121,7 +131,7 @@ class Trainer:
         """
         with self.watch, deferred_interrupts(self.progress.interrupted) as asked_to_stop:
             while self.state.step < self.settings.num_steps:
-                self._after_step(self._step(batches))
+                self._after_step(self._step(steps))
                 if self.state.step == self.settings.num_steps:
                     return
                 # one process may be signalled before another; all stop at the same step
@@ -139,42 +149,32 @@ class Trainer:
             self.crew.any(False)
         raise reason
 
-    def _step(self, batches: Iterator[list[TrainingScene]]) -> StepReport:
+    def _step(self, steps: Iterator[StepScenes]) -> StepReport:
         self.watch.begins(self.state.step + 1)
         self.stepper.activity.begin("data")
         asked = time.monotonic()
-        drawn = next(batches)
+        drawn = next(steps)
         waited_s = time.monotonic() - asked
         self.stepper.activity.begin("other")
         settings, step = self.settings, self.state.step
-        buckets = bucket_scenes(drawn, self._flops, settings.scenes_per_pass)
         with enough_memory(settings, step):
-            report = self.stepper.step(buckets, learning_rate(step, settings))
+            batches = self.copies.send(drawn.batches)
+            report = self.stepper.step(batches, learning_rate(step, settings))
         self._note_unusable()
         self.window.add(
             report,
             views=settings.scenes_per_step * settings.views_per_scene,
             waited_s=waited_s,
-            flops=sum(self._flops(scene.tensors.num_triangles) for scene in drawn),
+            flops=sum(scene_flops(settings, count) for count in drawn.num_triangles),
         )
         self.start_watch.add(report)
         self.state.step += 1
-        keys = [scene.key for scene in drawn]
-        self.watch.ends(report, keys)
+        self.watch.ends(report, drawn.keys)
         if report.applied:
             self.state.skipped_in_a_row = 0
         else:
-            self._skip(keys)
+            self._skip(drawn.keys)
         return report
-
-    def _flops(self, num_triangles: int) -> int:
-        settings = self.settings
-        workload = Workload(
-            triangles=num_triangles,
-            views=settings.views_per_scene,
-            resolution=settings.resolution,
-        )
-        return training_flops(settings.model, workload)
 
     def _note_unusable(self) -> None:
         """Name each damaged sample or shard once, when it has been left out."""
