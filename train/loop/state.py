@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from model.renderformer import RenderFormer
+from model.width_scales import scale_start, width_scales
 from storage.seeds import seed_for
 from train.data.mixture import Mixture
 from train.data.unusable import Unusable
@@ -93,6 +94,7 @@ def new_state(
     model = RenderFormer(settings.model)
     if begin_with is None:
         model.initialise(torch.Generator().manual_seed(seed_for(settings.seed, "weights")))
+        scale_start(model, width_scales(model, settings.base_widths))
     else:
         model.load_state_dict(begin_with.state_dict())
     model.recompute_activations(settings.recompute_activations)
