@@ -65,11 +65,13 @@ PRODUCT_SHARE = {"bfloat16": 0.65, "tf32": 0.5, "float32": 0.7}
 ATTENTION_SHARE = {
     ("flash", "forward"): 0.40,
     ("flash", "backward"): 0.30,
+    ("packed", "forward"): 0.32,
+    ("packed", "backward"): 0.24,
     ("masked", "forward"): 0.20,
     ("masked", "backward"): 0.12,
 }
-"""Share of the bfloat16 peak that attention reaches: flash, and the memory-efficient kernel, which
-torch takes where there is a mask or float32."""
+"""Share of the bfloat16 peak that attention reaches: flash, flash on packed sequences, and the
+memory-efficient kernel, which torch takes where there is a mask or float32."""
 
 LAUNCH_S = 4e-6
 """Least time of a kernel, however little it does."""

@@ -16,8 +16,9 @@ from infra.bench.roofline.cards import (
 )
 from infra.bench.roofline.trace import Kernel, Traced
 
-TF32_PARTS = ("LPIPS",)
-"""Parts whose float32 convolutions torch computes in TF32, its default; the network forbids it."""
+TF32_PARTS = ("LPIPS", "head")
+"""Parts whose float32 convolutions torch computes in TF32, its default. The network forbids it, but
+in its own way forward while it trains in bfloat16."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +82,7 @@ def kernel_s(kernel: Kernel, card: Card) -> float:
 def _rate(kernel: Kernel, card: Card) -> float:
     if kernel.kind == "attention":
         which = "masked" if "efficient" in kernel.name else "flash"
+        which = "packed" if "varlen" in kernel.name else which
         way = "backward" if "backward" in kernel.name else "forward"
         return ATTENTION_SHARE[which, way] * card.bfloat16
     if kernel.product_type in ("bfloat16", "float16"):

@@ -176,8 +176,11 @@ class Tracer(TorchDispatchMode):
         writes: tuple[Access, ...],
     ) -> None:
         read = [tensor for tensor in inputs if tensor.device.type == "cuda"]
-        counted = flop_registry.get(func._overloadpacket)
-        flops = counted(*args, **(kwargs or {}), out_val=out) if counted else 0
+        if "_varlen_attn" in name:
+            flops = _packed_flops(args, is_backward="backward" in name)
+        else:
+            counted = flop_registry.get(func._overloadpacket)
+            flops = counted(*args, **(kwargs or {}), out_val=out) if counted else 0
         kind = _kind(name, flops)
         floating = next((each for each in read if each.is_floating_point()), None)
         many = _tensors(out) or read
@@ -247,6 +250,17 @@ def _written(func: Any, args: Any) -> list[Tensor]:
     places = zip(func._schema.arguments, args, strict=False)
     written = [arg for place, arg in places if place.alias_info and place.alias_info.is_write]
     return [tensor for tensor in _tensors(written) if tensor.device.type == "cuda"]
+
+
+def _packed_flops(args: Any, *, is_backward: bool) -> int:
+    """Return the FLOPs of packed attention, whose sequences are about equally long.
+
+    torch counts the longest for each, since fake tensors hold no lengths.
+    """
+    query, key, starts = (args[1], args[2], args[7]) if is_backward else (args[0], args[1], args[4])
+    products = 10 if is_backward else 4  # as torch counts five and two products of matrices
+    pairs = query.shape[0] * key.shape[0] // (len(starts) - 1)
+    return int(products * pairs * query.shape[1] * query.shape[2])
 
 
 def _kind(name: str, flops: int) -> Kind:
