@@ -6,6 +6,7 @@ the places where they start. Packing and unpacking read memory once, both on the
 add nothing up: they are exact, and the same in every run.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -139,4 +140,4 @@ def attend_packed(
 
 def _spans(starts_S1: Tensor) -> list[tuple[int, int]]:
     starts = starts_S1.tolist()
-    return list(zip(starts, starts[1:], strict=False))
+    return list(itertools.pairwise(starts))

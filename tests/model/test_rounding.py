@@ -1,4 +1,4 @@
-"""Weights rounded together are those that autocast rounds one by one, and so are their gradients."""
+"""Weights rounded together are those that autocast rounds one by one; gradients too."""
 
 import pytest
 import torch

@@ -1,7 +1,8 @@
 """What moves the weights: AdamW, and Muon for the matrices."""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -33,15 +34,33 @@ class Updater:
 
     def __init__(self, model: nn.Module, settings: TrainSettings, precision: Precision) -> None:
         """Take the network, the run, and the precision of Muon's products (loop.muon)."""
+        device = next(model.parameters()).device
         self._names: dict[Tensor, str] = {weight: name for name, weight in model.named_parameters()}
         muon_rate = settings.muon_rate
-        matrices = [weight for weight in self._names if muon_rate and weight.ndim == 2]
-        others = [weight for weight in self._names if not (muon_rate and weight.ndim == 2)]
-        adamw = torch.optim.AdamW(others, betas=settings.betas, weight_decay=settings.weight_decay)
+        matrices = [
+            w for w, name in self._names.items() if muon_rate and _muon_takes(name, w, settings)
+        ]
+        moved = {id(weight) for weight in matrices}
+        others = [weight for weight in self._names if id(weight) not in moved]
+        adamw = torch.optim.AdamW(
+            self._by_decay(others, settings),
+            betas=settings.betas,
+            fused=True if device.type == "cuda" else None,
+        )
         self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
         self.muon_precision = precision if matrices else None
         if matrices:
-            self._optimizers.append((muon(matrices, settings.weight_decay, precision), muon_rate))
+            thirds = [w for w in matrices if _is_qkv(self._names[w], settings)]
+            optimizer = muon(matrices, settings.weight_decay, precision, thirds=thirds)
+            self._optimizers.append((optimizer, muon_rate))
+
+    def _by_decay(self, weights: Sequence[Tensor], settings: TrainSettings) -> list[dict[str, Any]]:
+        """Return AdamW's groups: weights that decay, and the others."""
+        kept = [w for w in weights if settings.decayed == "all" or _is_matrix(self._names[w], w)]
+        chosen = {id(weight) for weight in kept}
+        rest = [weight for weight in weights if id(weight) not in chosen]
+        groups = ((kept, settings.weight_decay), (rest, 0.0))
+        return [{"params": some, "weight_decay": decay} for some, decay in groups if some]
 
     def zero_grad(self) -> None:
         """Forget the gradient."""
@@ -74,8 +93,30 @@ class Updater:
                     for kind in _kept(optimizer)
                 }
                 if isinstance(optimizer, torch.optim.AdamW):
-                    memory["step"] = torch.tensor(float(updates))
+                    fused = optimizer.defaults["fused"]  # it counts on the card
+                    memory["step"] = torch.tensor(
+                        float(updates), device=weight.device if fused else None
+                    )
                 optimizer.state[weight] = memory
+
+
+_TOKENS = "registers_NW"
+"""End of the name of the learned tokens that come as a matrix, and are none."""
+
+_LAYERS, _QKV = ".layers.", ".qkv.weight"
+"""Parts of the names of the matrices of both stages' layers, and of those that hold three."""
+
+
+def _is_matrix(name: str, weight: Tensor) -> bool:
+    return weight.ndim > 1 and not name.endswith(_TOKENS)
+
+
+def _muon_takes(name: str, weight: Tensor, settings: TrainSettings) -> bool:
+    return weight.ndim == 2 and (settings.muon_takes == "matrices" or _LAYERS in name)
+
+
+def _is_qkv(name: str, settings: TrainSettings) -> bool:
+    return settings.muon_takes == "hidden" and name.endswith(_QKV)
 
 
 def _kept(optimizer: torch.optim.Optimizer) -> tuple[str, ...]:

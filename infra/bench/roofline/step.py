@@ -1,5 +1,6 @@
 """One step of a run on the card that is not there: as train.loop does it, and seen by a Tracer."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -17,6 +18,7 @@ from model.renderformer import RenderFormer
 from model.scene_tensors import SceneTensors, batch_scenes
 from storage.records.material import material_width
 from train.data.buckets import TrainingBatch
+from train.loop.compiled import compiled_parts
 from train.loop.crew import Crew
 from train.loop.state import new_state
 from train.loop.step import Stepper
@@ -34,6 +36,7 @@ what buckets of `pretrain` have (docs/log)."""
 
 def traced_step(settings: TrainSettings, scenes: int) -> Traced:
     """Return the second step of a run, of one pass of so many scenes: all memories are there."""
+    settings = dataclasses.replace(settings, compile="no")  # it is estimated, see fusion
     with fake_card(), cuda_kernels():
         state = new_state(settings, CARD)
         lpips = _lpips() if settings.loss.perceptual == "lpips" else None
@@ -55,16 +58,8 @@ def parts_of(model: RenderFormer, objective: Objective) -> Iterator[tuple[str, n
     """Yield the parts by which time is counted: name, module, and the method that is one visit."""
     if model.encoder is not None:
         yield "tokens", model.encoder, "forward"
-        for layer in model.encoder.layers:
-            yield "encoder layers", layer, "forward"
-        yield "keys and values", model.decoder, "keys_values"
-    for layer in model.decoder.layers:
-        yield "decoder layers", layer, "forward"
-    yield "head", model.decoder.head, "forward"
     yield "loss", objective, "forward"
-    for module in objective.modules():
-        if isinstance(module, Lpips):
-            yield "LPIPS", module, "forward"
+    yield from compiled_parts(model, objective)
 
 
 def _as_part(tracer: Tracer, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
