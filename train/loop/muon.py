@@ -74,13 +74,12 @@ class StackedMuon(torch.optim.Muon):
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Move every matrix along the gradient it holds; one without a gradient stays."""
         for group in self.param_groups:
+            moved = [weight for weight in group["params"] if weight.grad is not None]
             by_shape = defaultdict[torch.Size, list[tuple[Tensor, Tensor]]](list)
-            for weight in group["params"]:
-                if weight.grad is not None:
-                    wanted = self._wanted(weight, group["momentum"])
-                    parts = 3 if id(weight) in self._thirds else 1
-                    for pair in zip(weight.chunk(parts), wanted.chunk(parts), strict=True):
-                        by_shape[pair[0].shape].append(pair)
+            for weight, wanted in zip(moved, self._wanted(moved, group["momentum"]), strict=True):
+                parts = 3 if id(weight) in self._thirds else 1
+                for pair in zip(weight.chunk(parts), wanted.chunk(parts), strict=True):
+                    by_shape[pair[0].shape].append(pair)
             for pairs in by_shape.values():
                 self._move([w for w, _ in pairs], [wanted for _, wanted in pairs], group)
 
@@ -97,16 +96,19 @@ class StackedMuon(torch.optim.Muon):
         torch._foreach_mul_(weights, 1 - group["lr"] * group["weight_decay"])
         torch._foreach_add_(weights, list(steps_SMN.to(weights[0].dtype)), alpha=-rate)
 
-    def _wanted(self, weight: Tensor, momentum: float) -> Tensor:
-        """Return the gradient [M, N] with Nesterov's momentum, and remember it."""
-        gradient = weight.grad
-        assert gradient is not None
-        memory = self.state[weight]
-        if "momentum_buffer" not in memory:
-            memory["momentum_buffer"] = torch.zeros_like(gradient)
-        mean: Tensor = memory["momentum_buffer"]
-        mean.lerp_(gradient, 1 - momentum)
-        return gradient.lerp(mean, momentum)
+    def _wanted(self, weights: Sequence[Tensor], momentum: float) -> Sequence[Tensor]:
+        """Return the gradients [M, N] with Nesterov's momentum, and remember it."""
+        if not weights:
+            return []
+        gradients: list[Tensor] = []
+        for weight in weights:
+            assert weight.grad is not None
+            gradients.append(weight.grad)
+            if "momentum_buffer" not in self.state[weight]:
+                self.state[weight]["momentum_buffer"] = torch.zeros_like(weight.grad)
+        means: list[Tensor] = [self.state[weight]["momentum_buffer"] for weight in weights]
+        torch._foreach_lerp_(means, gradients, 1 - momentum)
+        return torch._foreach_lerp(gradients, means, momentum)
 
 
 def shared_out(
