@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: setup setup-all dataset test test-slow test-elsewhere train serve stop lint lock third-party settings docs clean
+.PHONY: setup setup-all dataset test test-slow test-elsewhere train release serve stop lint lock third-party settings docs clean
 
 setup: $(VENV)/.dataset-ready  ## what making data needs
 
@@ -29,6 +29,16 @@ test-elsewhere: setup-all  ## the most telling ones, as other processors would r
 
 train: setup-all  ## the smoke model on what `make dataset` made
 	trilight train smoke --data data/smoke --out runs/smoke $(if $(wildcard runs/smoke/checkpoints/*),--resume)
+
+RELEASE := data/release
+RELEASE_SCENES := 1024
+RELEASE_PIXELS := 128
+RELEASE_SHARD := 32
+
+release: setup-all  ## dataset, network and pictures to publish, in $(RELEASE); an hour or two of two cores, goes on where it stopped
+	trilight generate smoke --objects builtin: --out $(RELEASE)/dataset --scenes $(RELEASE_SCENES) --resolution $(RELEASE_PIXELS) \
+		--set splits.scenes_per_shard=$(RELEASE_SHARD) --set 'storage.passes=[depth,normal,object]'
+	python -m infra.release $(RELEASE)
 
 serve: setup  ## Prefect's server, a pool, a worker and the flows as deployments, on this machine
 	python -m infra.serving.local start

@@ -58,6 +58,7 @@ SCENES_V1 = SceneSettings(
         smooth_angle_deg=30.0,
         source="drawn",
         own_share=1.0,
+        own_emission=0.0,
     ),
     textures=TextureSettings(
         share=0.0, own_share=0.0, tile_m=(0.4, 1.6), surfaces=SurfaceMapSettings()

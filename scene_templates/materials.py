@@ -48,12 +48,17 @@ class MaterialSettings:
     an object without any, and floors and walls, get drawn ones in either case."""
     own_share: Share = 1.0
     """Share of the objects that keep their own materials where `source` is `object`."""
+    own_emission: Share = 0.0
+    """Light that the emissive parts of such objects give together, as a share of that of the drawn
+    lamps; 0 for none. Less where they would be brighter than the brightest lamp. A part that emits
+    is a lamp: the camera does not see it."""
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out the source where materials are drawn: digests of earlier builds stay."""
         record: dict[str, Any] = as_usual(self)
-        absent = ("source", "own_share") if self.source == "drawn" else ()
+        absent = ("source", "own_share", "own_emission") if self.source == "drawn" else ()
+        absent = absent if self.own_emission else (*absent, "own_emission")
         return {name: value for name, value in record.items() if name not in absent}
 
     def __post_init__(self) -> None:

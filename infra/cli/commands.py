@@ -22,14 +22,15 @@ COMMANDS = {
     "assets": "Turn objects into clean meshes within a budget or an error; writes quality.html.",
     "generate": "Turn objects into a verified, resumable dataset; run it again to resume after any "
     "stop.",
-    "submit": "Run a flow on the workers of a Prefect server, and watch it: what generate does, "
-    "elsewhere.",
+    "submit": "Do elsewhere what generate does: by a flow on the workers of a Prefect server, and "
+    "watch it, or by an array job of a Slurm cluster.",
     "revisit": "Render the scenes of a finished dataset again, with new cameras, lights, materials "
     "or another resolution; pictures that stay the same are copied.",
     "plan": "Measure a few scenes and predict time, bytes and cost of all, each with an interval.",
     "render": "Render scenes: path traced to a measured noise floor, or by a trained network.",
     "convert": "Convert by extension, and report what could not be carried over.",
     "export": "Write a dataset as files that nerfstudio, COCO tools or Hugging Face datasets open.",
+    "push": "Upload a finished dataset, a network or a page to the Hugging Face hub.",
     "passes": "Write depth, normals, ids and more of stored scenes as OpenEXR.",
     "verify": "Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."
     "\n\nAn unfinished dataset is checked as far as it exists; the exit status is 1 then too.",

@@ -3,12 +3,14 @@
 import dataclasses
 import shlex
 import time
+from typing import Annotated
 
-from infra.cli.console import look_at, next_step, print_json, print_rows
+from infra.cli.console import console, look_at, next_step, print_json, print_rows
 from infra.cli.options import Shown, command
 from pipeline.making.price import CorePrice
-from storage.dataset.progress import DatasetStatus, read_status
+from storage.dataset.progress import DatasetStatus, missing_shards, number_ranges, read_status
 from storage.settings.described import checked
+from storage.settings.ranges import Within
 
 
 @checked()
@@ -17,10 +19,18 @@ class StatusOrder:
 
     dataset: str
     """The dataset, a folder or a URL."""
+    missing: bool = False
+    """Print only the numbers of the missing shards, such as 0-3,7, and nothing if none is: what a
+    scheduler needs to start them again."""
+    shards_per_task: Annotated[int, Within(1, 10**6, unit="shards")] = 1
+    """With --missing: print instead the numbers of the tasks that make so many shards each."""
 
 
 @command("dataset")
 def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
+    if watched.missing:
+        _print_missing(watched, as_json=shown.json)
+        return
     found = read_status(watched.dataset)
     cost = None if found.core_hours is None else found.core_hours * core.price
     if shown.json:
@@ -43,6 +53,15 @@ def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
         next_step(found.next_words)
     else:
         look_at(_next(found))
+
+
+def _print_missing(watched: StatusOrder, *, as_json: bool) -> None:
+    each = watched.shards_per_task
+    tasks = sorted({shard // each for shard in missing_shards(watched.dataset)})
+    if as_json:
+        print_json({"missing": tasks, "array": number_ranges(tasks)})
+    elif tasks:
+        console.print(number_ranges(tasks), soft_wrap=True)
 
 
 def _next(found: DatasetStatus) -> str:

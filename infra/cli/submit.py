@@ -1,4 +1,4 @@
-"""`trilight submit`: what `generate` does, by the workers of a Prefect server."""
+"""`trilight submit`: what `generate` does, by a Prefect server's workers or a Slurm cluster."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,6 +16,7 @@ from infra.cli.console import (
 )
 from infra.cli.dataset_changes import with_shared
 from infra.cli.options import Shown, command
+from infra.cli.submit_slurm import SLURM, ArrayAsked, submit_to_slurm
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -32,7 +33,8 @@ class Submission:
     """Who is to make it."""
 
     flow: str
-    """Flow to run: generate-scenes, prepare-assets (objects alone) or build-dataset."""
+    """Flow to run: generate-scenes, prepare-assets (objects alone) or build-dataset; or slurm, an
+    array job of what is missing, without any server."""
     deployment: str | None = None
     """Name of its deployment; by default local, which make serve makes, or the only one there
     is."""
@@ -40,14 +42,28 @@ class Submission:
     """Return as soon as the server has the run, instead of watching it to its end."""
 
     def __post_init__(self) -> None:
-        if self.flow not in FLOWS:
+        if self.flow not in (*FLOWS, SLURM):
             raise TrilightError(
-                f"flow {self.flow!r} is unknown; expected one of {', '.join(FLOWS)}."
+                f"flow {self.flow!r} is unknown; expected one of {', '.join(FLOWS)}, or {SLURM}."
             )
 
 
 @command("flow", "build")
-def submit(submission: Submission, order: DatasetOrder, shared: Shared, shown: Shown) -> None:
+def submit(
+    submission: Submission,
+    order: DatasetOrder,
+    shared: Shared,
+    array: ArrayAsked,
+    shown: Shown,
+) -> None:
+    if submission.flow == SLURM:
+        submit_to_slurm(with_shared(order, shared), array, as_json=shown.json)
+        return
+    if array != ArrayAsked():
+        raise TrilightError(
+            f"submit {submission.flow}: --shards-per-task, --at-once, --sbatch and --dry-run are "
+            "options of submit slurm; leave them out."
+        )
     first_words(f"Submitting {submission.flow} with the build {order.build}", silent=shown.json)
     from pipeline.flows import submission as prefect  # reads its settings now
 

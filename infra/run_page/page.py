@@ -8,15 +8,10 @@ from pipeline.documents.html import element, joined, page
 from storage.atomic import write_atomically
 
 _STYLE = """
-:root { color-scheme: light dark; --paper: #fff; --ink: #222; --soft: #667; --rule: #ddd;
-  --box: #f6f6f6; --link: #1f5f99; --c0: #3b6ea5; --c1: #d08a1c; --c2: #4c8f5e; --c3: #9a5bab;
-  --c4: #777; --c5: #c8443f; --c6: #2f98a0; --c7: #7a6650; --c8: #b0528a }
-@media (prefers-color-scheme: dark) { :root { --paper: #16181c; --ink: #e4e6ea; --soft: #a2a8b4;
-  --rule: #383c44; --box: #1f2228; --link: #8ab8ee; --c0: #6fa4dd; --c1: #e3aa4d; --c2: #7cbd8d;
+:root { --c0: #3b6ea5; --c1: #d08a1c; --c2: #4c8f5e; --c3: #9a5bab; --c4: #777; --c5: #c8443f;
+  --c6: #2f98a0; --c7: #7a6650; --c8: #b0528a }
+@media (prefers-color-scheme: dark) { :root { --c0: #6fa4dd; --c1: #e3aa4d; --c2: #7cbd8d;
   --c3: #c290d2; --c4: #a5a5a5; --c5: #ec7b76; --c6: #5cc5cd; --c7: #b39f86; --c8: #df8dbb } }
-body { background: var(--paper); color: var(--ink) }
-a, summary { color: var(--link) } td, th { border-color: var(--rule) }
-:focus-visible { outline: 2px solid var(--link); outline-offset: 2px }
 nav { display: flex; flex-wrap: wrap; gap: .2rem 1rem; margin: 1rem 0 }
 .skip { position: absolute; left: -99rem } .skip:focus { position: static }
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 23rem), 1fr));
@@ -42,9 +37,8 @@ details { font-size: .85rem } .scroll { overflow-x: auto }
 .film figure { flex: none }
 .film img { display: block; width: 112px; image-rendering: pixelated; background: #111 }
 @media (min-width: 30rem) { .nowrap { white-space: nowrap } }
-@media (max-width: 30rem) { table.narrow td, table.narrow th { padding-right: .8rem } }
 .film figcaption { white-space: nowrap; font-size: .8rem; color: var(--soft) }
-pre { columns: 22rem; font-size: .8rem; line-height: 1.45; background: var(--box); padding: .7rem;
+pre { columns: 22rem; font-size: .8rem; line-height: 1.45; padding: .7rem;
   white-space: pre-wrap; overflow-wrap: anywhere }
 """
 

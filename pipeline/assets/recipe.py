@@ -57,14 +57,20 @@ _IMPORT = re.compile(
 """A statement as ruff writes it. Python 3.11's `ast` fails now and then where threads parse."""
 
 
+_HERE = Path(__file__).parent
+
+
 @functools.cache
-def code_sha256(folder: Path = Path(__file__).parent) -> str:
+def code_sha256(*folders: Path) -> str:
     """Return the digest of this stage's own source: another program may give another outcome.
+
+    By default that is this folder and the one that reads USD.
 
     Import statements are left out: they say where things are, not what they do, and differ between
     a checkout and a wheel.
     """
     digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
-        digest.update(_IMPORT.sub(b"", path.read_bytes()))
+    for folder in folders or (_HERE, _HERE.parent / "usd"):
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(_IMPORT.sub(b"", path.read_bytes()))
     return digest.hexdigest()

@@ -59,9 +59,18 @@ class OwnMaterialSettings:
     max_missed: Annotated[float, PART] = 0.1
     """Largest accepted share of texels for which the source has no surface nearby that faces the
     same way."""
+    emission: bool = False
+    """Whether it is kept what surfaces emit, as one radiance for each triangle of a level. Implied
+    by `scenes.materials.own_emission`."""
     if_lost: Literal["drawn", "reject"] = "drawn"
     """What becomes of an object whose materials are missing, unreadable or too far off: `drawn`
     accepts it, to be given drawn ones, with the reason in its record; `reject` refuses it."""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `emission` that nobody keeps: digests of earlier builds stay."""
+        record: dict[str, Any] = as_usual(self)
+        return {name: value for name, value in record.items() if name != "emission" or value}
 
 
 @checked()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.assets.reading.source_file import needs_child, read_source
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.store import AssetStore
@@ -86,14 +87,14 @@ def _prepare_once(
 ) -> PreparedAsset:
     """Find or make the outcome of an object; raises Rejected where there is no asset."""
     source = Path(record.path)
-    key = _key(source, settings, store)
+    key = _key(source, settings, store, borrow_child)
     path = store.asset_path(key)
     with store.making(key):
         if refusal := store.refusal(key):
             raise refusal
         if not path.exists():
             outcome = _outcome(source, settings, methods, borrow_child)
-            if _key(source, settings, store) != key:
+            if _key(source, settings, store, borrow_child) != key:
                 raise Rejected("unreadable_file", "it changed while it was being prepared")
             if isinstance(outcome, Rejected):
                 store.refuse(key, outcome.reason, outcome.message)
@@ -110,11 +111,32 @@ def _prepare_once(
     )
 
 
-def _key(source: Path, settings: AssetSettings, store: AssetStore) -> str:
+def _key(
+    source: Path, settings: AssetSettings, store: AssetStore, borrow_child: BorrowChild
+) -> str:
+    """Return the name of the outcome of a source, which its pre-flight may refuse (Rejected)."""
     try:
-        return store.key(source, settings)
+        if not needs_child(source):
+            kind, digest = source_digest(source, settings)
+        else:
+            with borrow_child() as child:
+                kind, digest = call_with_retries(child, source_digest, source, settings)
+    except ChildFailed as failure:
+        raise Rejected(failure.reason, failure.message) from failure
     except OSError as error:
         raise Rejected("unreadable_file", f"cannot be read ({error.strerror})") from error
+    return store.key(kind, digest, settings)
+
+
+def source_digest(source: Path, settings: AssetSettings) -> tuple[str, str]:
+    """Return kind and digest of a source after the checks that come before any mesh library.
+
+    Raises:
+        Rejected: as `read_source`.
+        OSError: it cannot be read.
+    """
+    found = read_source(source, settings)
+    return found.kind, found.sha256
 
 
 def _outcome(

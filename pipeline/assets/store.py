@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pipeline.assets.reading.source_file import read_source
 from pipeline.assets.recipe import RECIPE, code_sha256
 from pipeline.assets.settings import AssetSettings
 from storage.atomic import TEMPORARY_SUFFIX, write_atomically, write_error
@@ -40,15 +39,9 @@ class AssetStore:
     root: Path
     """Shared by everybody who names it; file locks must work there."""
 
-    def key(self, source: Path, settings: AssetSettings) -> str:
-        """Return the name of the outcome of a source file.
-
-        Raises:
-            Rejected: the pre-flight refuses the file.
-            OSError: it cannot be read.
-        """
-        found = read_source(source, settings)
-        parts = [found.kind, found.sha256, asdict(settings), RECIPE, code_sha256()]
+    def key(self, kind: str, source_sha256: str, settings: AssetSettings) -> str:
+        """Return the name of the outcome of a source file of a kind and a digest."""
+        parts = [kind, source_sha256, asdict(settings), RECIPE, code_sha256()]
         return sha256_hex(canonical_json(parts))[:32]
 
     def asset_path(self, key: str) -> Path:

@@ -57,6 +57,7 @@ BUILD_V1 = BuildSettings(
             max_pixels=67_108_864,
             max_colour_error=0.05,
             max_missed=0.1,
+            emission=False,
             if_lost="drawn",
         ),
     ),

@@ -62,8 +62,10 @@ class BuildSettings:
     def mesh_settings(self) -> AssetSettings:
         """Settings of the mesh stage: objects keep their materials where scenes ask for those."""
         own = self.assets.own_materials
-        keep = own.keep or self.scenes.materials.source == "object"
-        return dataclasses.replace(self.assets, own_materials=dataclasses.replace(own, keep=keep))
+        asked = self.scenes.materials.source == "object"
+        emission = own.emission or (asked and self.scenes.materials.own_emission > 0)
+        own = dataclasses.replace(own, keep=own.keep or asked, emission=emission)
+        return dataclasses.replace(self.assets, own_materials=own)
 
     def as_json(self) -> dict[str, Any]:
         """Return the settings as JSON values."""

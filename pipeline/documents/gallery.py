@@ -1,8 +1,10 @@
 """The gallery of a report: cards that lead to a page of each scene."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
+from pipeline.documents.gallery_controls import CardFacts, card_facts, gallery_controls
 from pipeline.documents.html import Markup, element, image, joined, png_uri
 from pipeline.documents.scene_page import Neighbours, encode_scene_page, preview
 from storage.atomic import write_atomically
@@ -18,9 +20,19 @@ MOST_SCENES = 1000
 _CARD_PX = 176
 
 
+@dataclass(frozen=True, kw_only=True)
+class Gallery:
+    """Cards that lead to the pages of scenes."""
+
+    markup: Markup
+    """The cards with their filters."""
+    style: str
+    """What the filters need in the page's style."""
+
+
 def write_gallery(
     dataset: Dataset, failures: Sequence[Failure], out: DatasetFolder, max_scenes: int
-) -> Markup:
+) -> Gallery:
     """Write the pages of up to `max_scenes` scenes and return the cards that lead to them.
 
     Pages of scenes that are no longer shown are deleted.
@@ -36,7 +48,8 @@ def write_gallery(
     chosen = choose_scenes(dataset.manifest, max_scenes)
     rejected = _by_scene(failures, chosen)
     names = [f"{entry.key}.html" for entry in chosen]
-    cards: dict[str, list[Markup]] = {}
+    cards: list[tuple[Markup, str]] = []
+    facts: list[CardFacts] = []
     for row, (entry, sample) in enumerate(read_chosen(dataset, chosen)):
         links = Neighbours(
             report=f"../{out.report.name}#gallery",
@@ -45,23 +58,28 @@ def write_gallery(
         )
         page = encode_scene_page(sample, entry.split, rejected[entry.key], links)
         write_atomically(out.report_pages / names[row], page)
-        link = f"{out.report_pages.name}/{names[row]}"
-        cards.setdefault(entry.split, []).append(_card(sample, link))
+        cards.append((_card(sample, entry.split), f"{out.report_pages.name}/{names[row]}"))
+        facts.append(card_facts(sample, entry.split))
     _remove_others(out, names)
     shown = f"{len(chosen)} of {dataset.manifest.num_samples} scenes, by their first view."
-    parts = [element("p", shown)]
-    for split, of_split in cards.items():
-        parts += [element("h3", split), element("div", *of_split, class_="cards")]
-    return joined(parts)
+    controls = gallery_controls(facts)
+    rows = zip(cards, controls.classes, controls.places, strict=True)
+    linked = [
+        element("a", card, href=link, class_=classes, style=places)
+        for (card, link), classes, places in rows
+    ]
+    parts = [element("p", shown), controls.markup, element("div", *linked, class_="cards")]
+    return Gallery(markup=joined(parts), style=controls.style)
 
 
-def _card(sample: Sample, link: str) -> Markup:
+def _card(sample: Sample, split: str) -> Markup:
     picture = image(png_uri(preview(sample.radiance_rgb[0], _CARD_PX)), f"scene {sample.key}")
     template = sample.scene.provenance.get("template", "")
     num_objects = sum(entry.kind == "object" for entry in sample.scene.objects)
     caption = f"{template}, {num_objects} {'object' if num_objects == 1 else 'objects'}"
-    text = element("span", sample.key, Markup("<br>"), element("span", caption, class_="faint"))
-    return element("a", picture, text, href=link, class_="card")
+    name = f"{sample.key} {split}"
+    text = element("span", name, Markup("<br>"), element("span", caption, class_="faint"))
+    return joined([picture, text], "")
 
 
 def _by_scene(failures: Sequence[Failure], chosen: Sequence[Chosen]) -> Mapping[str, list[Failure]]:

@@ -24,20 +24,36 @@ class Markup(str):
 
 
 STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; color: #222;
-  padding: 0 1rem }
+:root { color-scheme: light dark; --paper: #fff; --ink: #222; --soft: #667; --rule: #ddd;
+  --box: #f6f6f6; --link: #1f5f99 }
+@media (prefers-color-scheme: dark) { :root { --paper: #16181c; --ink: #e4e6ea; --soft: #a2a8b4;
+  --rule: #383c44; --box: #1f2228; --link: #8ab8ee }
+  img.wide { filter: invert(.9) hue-rotate(180deg) } }
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem;
+  color: var(--ink); background: var(--paper); padding: 0 1rem }
 h1, h2, h3 { font-weight: 600; line-height: 1.25 } h2 { margin: 2.4rem 0 .6rem }
 h3 { font-size: 1rem; margin: 1.2rem 0 .2rem }
-a { color: #1f5f99; text-decoration: none } a:hover { text-decoration: underline }
+a, summary { color: var(--link); text-decoration: none } a:hover { text-decoration: underline }
+:focus-visible { outline: 2px solid var(--link); outline-offset: 2px }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums }
-td, th { text-align: left; padding: .2rem .7rem .2rem 0; border-bottom: 1px solid #ddd;
+td, th { text-align: left; padding: .2rem .7rem .2rem 0; border-bottom: 1px solid var(--rule);
   vertical-align: top; overflow-wrap: anywhere }
 th { font-weight: 600; overflow-wrap: normal }
 td.n, th.n { text-align: right; overflow-wrap: normal }
-.faint { color: #777 } img.wide { max-width: 100% }
-@media (max-width: 40rem) { table:not(.narrow) { display: block; overflow-x: auto }
+.faint { color: var(--soft) } img.wide { max-width: 100% }
+.command { user-select: all; background: var(--box); padding: .15rem .4rem; border-radius: 3px;
+  overflow-wrap: anywhere }
+pre { background: var(--box) } label:has(.zoom) { cursor: zoom-in }
+.zoom { position: absolute; opacity: 0 }
+.zoom:focus-visible + img { outline: 2px solid var(--link) }
+.zoom:checked + img { position: fixed; inset: 0; margin: auto; z-index: 9; cursor: zoom-out;
+  width: min(100vw, 100vh); height: min(100vw, 100vh); object-fit: contain; background: #000c;
+  image-rendering: pixelated }
+@media (max-width: 40rem) { body { margin-top: 1rem }
+  table:not(.narrow) { display: block; overflow-x: auto }
   table:not(.narrow) td { overflow-wrap: normal } }
 table.narrow { width: auto } table.narrow td, table.narrow th { padding-right: 1.6rem }
+@media (max-width: 30rem) { table.narrow td, table.narrow th { padding-right: .8rem } }
 """
 """What all pages look like."""
 
@@ -61,6 +77,13 @@ def element(tag: str, *content: object, **attributes: object) -> Markup:
 def image(uri: str, alt: str, **attributes: object) -> Markup:
     """Return a picture."""
     return Markup(f"<img{_attributes({'alt': alt, **attributes, 'src': uri})}>")
+
+
+def enlargeable(uri: str, alt: str) -> Markup:
+    """Return a picture that fills the window after a click or the space bar, and goes back so."""
+    mark = f"{html.escape(alt)}, fill the window"
+    box = Markup(f'<input type="checkbox" class="zoom" aria-label="{mark}">')
+    return element("label", box, image(uri, alt))
 
 
 def table(

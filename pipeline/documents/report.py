@@ -1,4 +1,4 @@
-"""`report.html`: the distributions of a dataset and a gallery, for people to look at.
+"""`report.html`: a gallery of a dataset and its distributions, for people to look at.
 
 The report is one file without scripts; the pages of its gallery lie beside it in `report/`. It
 tells nothing of the clock or the machine: equal datasets give equal reports.
@@ -26,11 +26,12 @@ _STYLE = """
 @media (max-width: 60rem) { .pair { display: block } .figure { width: auto } }
 .toc { display: flex; flex-wrap: wrap; gap: 0 1rem }
 .bar { display: inline-block; height: .7em; background: #3b6ea5 }
-.cards { display: flex; flex-wrap: wrap; gap: 1rem }
-.card { width: 176px; overflow-wrap: anywhere; font-size: .85rem; line-height: 1.35 }
-.card img { display: block; width: 176px; background: #111; margin-bottom: .25rem }
-pre { columns: 2; font-size: .8rem; line-height: 1.45; background: #f6f6f6; padding: .7rem;
-  white-space: pre-wrap;  overflow-wrap: anywhere }
+.cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: 1rem }
+.card { overflow-wrap: anywhere; font-size: .85rem; line-height: 1.35 }
+.card img { display: block; width: 100%; background: #111; margin-bottom: .25rem }
+.digest { overflow-wrap: anywhere }
+pre { columns: 22rem; font-size: .8rem; line-height: 1.45; padding: .7rem;
+  white-space: pre-wrap; overflow-wrap: anywhere }
 """
 
 _SECTIONS = {
@@ -67,21 +68,35 @@ def write_report(
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
     """
     folder = out or dataset.folder
-    cards = write_gallery(dataset, found.failures, folder, max_scenes)
+    gallery = write_gallery(dataset, found.failures, folder, max_scenes)
     made = {name: make(found) for name, make in _SECTIONS.items()} if found.scenes else {}
-    anchors = [*(name for name, section in made.items() if section), "gallery", "settings"]
+    anchors = ["gallery", *(name for name, section in made.items() if section), "settings"]
     body = [
         element("h1", f"Dataset {dataset.manifest.build}"),
-        _overview(dataset, found),
+        element("p", _in_one_line(dataset, found), class_="faint"),
         element("p", *(element("a", name, href=f"#{name}") for name in anchors), class_="toc"),
-        *made.values(),
         element("h2", "Gallery", id="gallery"),
-        cards,
+        gallery.markup,
+        element("h2", "In numbers"),
+        _overview(dataset, found),
+        *made.values(),
         _settings(dataset),
     ]
-    data = page(f"Dataset {dataset.manifest.build}", joined(body), style=_STYLE)
+    title = f"Dataset {dataset.manifest.build}"
+    data = page(title, joined(body), style=_STYLE + gallery.style)
     write_atomically(folder.report, data)
     return folder.report
+
+
+def _in_one_line(dataset: Dataset, found: Distributions) -> str:
+    """Return what the dataset is, above its pictures."""
+    manifest = dataset.manifest
+    floors = summary(found.all("noise_floor_db"))
+    median = f", median noise floor {floors['median']:.1f} dB" if floors["count"] else ""
+    views = len(found.all("noise_floor_db"))
+    return (
+        f"{manifest.num_samples} scenes, {views} views{median}, {manifest.num_bytes / 1e6:.1f} MB"
+    )
 
 
 def _overview(dataset: Dataset, found: Distributions) -> Markup:
@@ -123,11 +138,14 @@ def _settings(dataset: Dataset) -> Markup:
     return joined(
         [
             element("h2", "Settings", id="settings"),
-            element("pre", *_lines(_own_settings(dataset.manifest.settings))),
-            element("h3", "What the bytes depend on besides"),
-            element("pre", *_lines(dataset.manifest.environment)),
+            _folded("Of the build", _own_settings(dataset.manifest.settings)),
+            _folded("What the bytes depend on besides", dataset.manifest.environment),
         ]
     )
+
+
+def _folded(title: str, values: Mapping[str, object]) -> Markup:
+    return element("details", element("summary", title), element("pre", *_lines(values)))
 
 
 def _own_settings(settings: Mapping[str, object]) -> Mapping[str, object]:

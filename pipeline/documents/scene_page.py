@@ -12,7 +12,7 @@ from pipeline.documents.html import (
     Cell,
     Markup,
     element,
-    image,
+    enlargeable,
     joined,
     outside_link,
     page,
@@ -33,8 +33,8 @@ _PICTURE_PX = 384
 _MOST_SWATCHES = 128
 _STYLE = """
 .views { display: flex; flex-wrap: wrap; gap: 1rem }
-figure { margin: 0 } figure img { display: block; width: 272px; background: #111 }
-figcaption { font-size: .85rem; color: #555; margin-top: .2rem }
+figure { margin: 0 } figure img { display: block; width: min(272px, 42vw); background: #111 }
+figcaption { font-size: .85rem; color: var(--soft); margin-top: .2rem }
 .swatches { font-size: 0; line-height: 0 }
 .swatches i, .id { display: inline-block; width: 13px; height: 13px; margin: 1px }
 nav { display: flex; gap: 1.5rem } td:first-child { min-width: 9rem }
@@ -117,7 +117,7 @@ def _figures(sample: Sample) -> list[Markup]:
         mark = ", at the cap" if record.at_cap else ""
         caption = f"view {view}: {float(record.noise_floor_db):.1f} dB, {record.spp} spp{mark}"
         figures.append(
-            element("figure", image(uri, f"view {view}"), element("figcaption", caption))
+            element("figure", enlargeable(uri, f"view {view}"), element("figcaption", caption))
         )
     return figures
 
@@ -161,7 +161,7 @@ def _parts(sample: Sample) -> list[Markup]:
             picture = sample.parts_rgb[part][view]
             together = picture.sum(axis=0) if picture.ndim == 4 else picture
             name = f"view {view}, {part}"
-            shown = image(png_uri(preview(together, _PICTURE_PX)), name)
+            shown = enlargeable(png_uri(preview(together, _PICTURE_PX)), name)
             figures.append(element("figure", shown, element("figcaption", name)))
             floors = (
                 floor.noise_floor_db,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.documents.html import Markup, element, image, png_uri
+from pipeline.documents.html import Markup, element, enlargeable, png_uri
 from pipeline.documents.pass_colours import (
     albedo_colours,
     depth_greys,
@@ -121,6 +121,6 @@ def _view(sample: Sample, view: int, words: Sequence[str]) -> Markup:
         met = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
         means = shown.caption(values) if met else "nothing is met"
         title = f"view {view}, {shown.title}"
-        picture = image(png_uri(shown.pixels(values)), title)
+        picture = enlargeable(png_uri(shown.pixels(values)), title)
         figures.append(element("figure", picture, element("figcaption", f"{title}: {means}")))
     return element("div", *figures, class_="passes")

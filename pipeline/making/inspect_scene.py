@@ -1,5 +1,6 @@
 """What one scene holds, and a sheet of it from all sides; in a child process with limits."""
 
+import dataclasses
 import math
 from collections import Counter
 from collections.abc import Mapping
@@ -28,6 +29,8 @@ VIEWS, ROWS = 8, 2
 
 _RESOLUTION, _SPP = 192, 64
 _FOV_DEG, _ELEVATION_DEG = 40.0, 25.0
+_ROOM_AROUND = 1.03
+"""Of the least distance from which everything is within the picture."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +113,10 @@ def _maps(scene: Scene) -> dict[str, Any]:
 
 
 def _turntable(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
-    """Return a sheet [H, W, 3] of the scene from all sides, lit by its own lights."""
+    """Return a sheet [H, W, 3] of the scene from all sides, lit by its own lights.
+
+    Walls that stand before what they hold are left out of a picture, and with them their light.
+    """
     from pipeline.renders.renderer import SceneRenderer
 
     activate(variant)
@@ -122,11 +128,10 @@ def _turntable(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
         max_spp=_SPP,
         min_mean_radiance=0.0,
     )
-    renderer = SceneRenderer(scene, settings)
-    pictures = [
-        preview_srgb8(renderer.render_view(pose, _FOV_DEG, 0).radiance_rgb)
-        for pose in turntable_poses(scene)
-    ]
+    pictures = []
+    for pose in turntable_poses(scene):
+        renderer = SceneRenderer(seen_into(scene, pose), settings)
+        pictures.append(preview_srgb8(renderer.render_view(pose, _FOV_DEG, 0).radiance_rgb))
     rows = [
         np.concatenate(pictures[at * VIEWS // ROWS : (at + 1) * VIEWS // ROWS], axis=1)
         for at in range(ROWS)
@@ -134,19 +139,50 @@ def _turntable(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
     return np.concatenate(rows, axis=0)
 
 
+def seen_into(scene: Scene, pose: NDArray[np.float32]) -> Scene:
+    """Return a scene without the triangles of its shell that hide what stands in it.
+
+    Their planes part the camera of the pose [4, 4] from the middle of what stands there.
+    """
+    shells = np.array([entry.kind == "shell" for entry in scene.objects])[scene.object_index]
+    inside = scene.vertex_positions[scene.faces[~shells & ~scene.triangle_emits]].reshape(-1, 3)
+    if not shells.any() or not len(inside):
+        return scene
+    middle = (inside.min(axis=0) + inside.max(axis=0)).astype(np.float64) / 2
+    corners = scene.vertex_positions[scene.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    before, within = (
+        np.einsum("ti,ti->t", normals, point - corners[:, 0])
+        for point in (pose[:3, 3].astype(np.float64), middle)
+    )
+    keep = ~(shells & (before * within < 0))
+    uv = None if scene.uv is None else scene.uv.reshape(-1, 3, 2)[keep].reshape(-1, 2)
+    return dataclasses.replace(
+        scene,
+        faces=scene.faces[keep],
+        material_index=scene.material_index[keep],
+        object_index=scene.object_index[keep],
+        uv=uv,
+    )
+
+
 def turntable_poses(scene: Scene) -> list[NDArray[np.float32]]:
     """Return poses [4, 4] around what reflects, so that each sees all of it."""
     points = scene.vertex_positions[np.unique(scene.faces[~scene.triangle_emits])]
     if not len(points):
         points = scene.vertex_positions
-    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-    middle, reach = (low + high) / 2, max(float(np.sqrt(np.square(high - low).sum())) / 2, 1e-3)
-    distance = reach / math.sin(math.radians(_FOV_DEG) / 2)
+    middle = (points.min(axis=0) + points.max(axis=0)).astype(np.float64) / 2
+    tangent = math.tan(math.radians(_FOV_DEG) / 2)
     poses = []
     for turn in 2 * np.pi * np.arange(VIEWS) / VIEWS:
         up = math.sin(math.radians(_ELEVATION_DEG))
         flat = math.cos(math.radians(_ELEVATION_DEG))
         away = np.array([flat * math.sin(turn), -flat * math.cos(turn), up])
+        turned = look_at_c2w(eye=middle + away, target=middle, up=[0, 0, 1])
+        # in the camera's axes about the middle: what lies nearer has to lie nearer the axis
+        local = np.einsum("pi,ij->pj", points - middle, turned[:3, :3])
+        needed = np.abs(local[:, :2]).max(axis=1) / tangent + local[:, 2]
+        distance = max(_ROOM_AROUND * float(needed.max()), 1e-3)
         pose = look_at_c2w(eye=middle + distance * away, target=middle, up=[0, 0, 1])
         poses.append(pose.astype(np.float32))
     return poses

@@ -35,7 +35,10 @@ def failure(uid: str, reason: str, message: str) -> Failure:
     return Failure(stage="objects", item=uid, reason=reason, message=message)
 
 
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+SUFFIXES = (
+    *(".glb", ".gltf", ".obj", ".ply", ".stl", ".off"),
+    *(".usd", ".usda", ".usdc", ".usdz"),
+)
 """Suffixes of object files, compared in lower case."""
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
 from pipeline.scenes.drawn_columns import with_drawn_columns
 from pipeline.scenes.laws import require_laws
+from pipeline.scenes.own_light import with_own_light
 from pipeline.scenes.own_materials import own_skins
 from pipeline.scenes.pieces import (
     ScenePiece,
@@ -173,7 +174,8 @@ def scene_pieces(
 ) -> list[ScenePiece]:
     """Return floor and walls, objects and emitters of a layout, the objects as `shapes`.
 
-    Where an object has one of `skins`, that is what it looks like.
+    Where an object has one of `skins`, that is what it looks like; its parts that emit become
+    emitters at the end, where that is asked for.
 
     Raises:
         Rejected: "no_faces" where no triangle of an object has an area.
@@ -191,7 +193,8 @@ def scene_pieces(
         surface = placement.surface
         piece = object_piece(entry, positions, shape.faces, surface, rng, angle_deg)
         objects.append(piece if skin is None else dressed(piece, positions, shape.faces, skin))
-    pieces = [*shell, *objects, *emitters]
+    objects, lights = with_own_light(objects, emitters, settings.materials.own_emission)
+    pieces = [*shell, *objects, *emitters, *lights]
     return pieces if settings.fill_to is None else filled(pieces, settings.fill_to)
 
 

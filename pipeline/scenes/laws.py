@@ -36,8 +36,8 @@ def require_laws(scene: Scene, settings: SceneSettings, *, in_budget: bool = Tru
 def _require_emitters_outside(scene: Scene, num_inside: int) -> None:
     kinds = [entry.kind for entry in scene.objects]
     boxes = [_box(scene, row) for row, kind in enumerate(kinds) if kind == "object"]
-    emitters = [row for row, kind in enumerate(kinds) if kind == "emitter"]
-    for row in emitters[num_inside:]:
+    lamps = [row for row, entry in enumerate(scene.objects) if entry.is_lamp]
+    for row in lamps[num_inside:]:
         low, high = _box(scene, row)
         for other_low, other_high in boxes:
             if (low < other_high).all() and (other_low < high).all():

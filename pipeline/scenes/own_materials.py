@@ -59,4 +59,4 @@ def _skin(skin: LevelSkin, locked: LockedObject) -> Skin:
         )
         for texture, column in zip(skin.textures, TEXTURED, strict=True)
     )
-    return Skin(uv=skin.uv.reshape(-1, 2), textures=(first, second, third))
+    return Skin(uv=skin.uv.reshape(-1, 2), textures=(first, second, third), emission=skin.emission)

@@ -27,6 +27,8 @@ class Skin:
     """Diffuse, specular and roughness."""
     uid: str = ""
     """Of a user's own texture, as objects.lock.jsonl names it."""
+    emission: NDArray[np.float32] | None = None
+    """[T, 3] what the triangles of an object are said to emit, until that is made light."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,7 +79,8 @@ def dressed(
     """Return the piece of `object_piece` in a skin of all its faces, slivers included."""
     kept = not_slivers(positions, faces)
     uv = skin.uv.reshape(-1, 3, 2)[kept].reshape(-1, 2)
-    return with_skin(piece, dataclasses.replace(skin, uv=uv))
+    emission = None if skin.emission is None else skin.emission[kept]
+    return with_skin(piece, dataclasses.replace(skin, uv=uv, emission=emission))
 
 
 def with_skin(piece: ScenePiece, skin: Skin) -> ScenePiece:

@@ -1,7 +1,8 @@
 """Finished scenes with new materials or lights, drawn as composition would draw them.
 
 Geometry stays: the triangles of surfaces keep their order, their normals, and which of them share a
-colour. All lights are the scene's emitters; new ones take their place at the end.
+colour. All lamps are the scene's emitters that are part of no object; new ones take their place at
+the end.
 """
 
 import dataclasses
@@ -78,7 +79,9 @@ def with_new_lights(
     index: int,
     attempt: int,
 ) -> Scene:
-    """Return the scene with its emitters replaced by ones drawn as its layout is lit.
+    """Return the scene with its lamps replaced by ones drawn as its layout is lit.
+
+    Parts of objects that emit stay as bright as they are.
 
     Args:
         scene: lawful.
@@ -93,11 +96,12 @@ def with_new_lights(
     if name not in TEMPLATES:
         raise Rejected("no_layout", f"{name!r} is no layout that draws lights; keep its lights")
     kinds = np.array([entry.kind for entry in scene.objects])
-    count = int((kinds == "emitter").sum()) if num_lights is None else num_lights
+    lit = np.array([entry.is_lamp for entry in scene.objects])
+    count = int(lit.sum()) if num_lights is None else num_lights
     rng = rng_for(seed, "new lights", index, attempt)
     emitters = emitters_rand(rng, settings, TEMPLATES[name].lights, count, _centres(scene, kinds))
     lamps = [emitter_piece(emitter, row) for row, emitter in enumerate(emitters)]
-    dark, new = _without(scene, kinds == "emitter"), joined(lamps)
+    dark, new = _without(scene, lit), joined(lamps)
     vertices, rows = len(dark.vertex_positions), len(dark.materials)
     triangles, materials = (
         np.append(np.arange(count), np.full(len(more), NEW))

@@ -61,9 +61,10 @@ def with_drawn_textures(
     for row, (frame, origin) in enumerate(zip(frames, origins, strict=True)):
         rng = rng_for(seed, "texture", scene_index, attempt, row)
         look = draw_look(rng, settings, own, licences) if textured < MOST_TEXTURED else None
-        if look is not None and pieces[row].skin is None:  # its own materials come first
+        piece = pieces[row]  # whose own materials come first
+        if look is not None and piece.skin is None and piece.entry.kind != "emitter":
             licences.append(look.maps.source.licence)
-            found[row] = _textured(pieces[row], look, frame, origin)
+            found[row] = _textured(piece, look, frame, origin)
             textured += 1
     return found
 

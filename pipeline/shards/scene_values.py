@@ -20,7 +20,7 @@ def asked_values(record: SceneRecord, split: str, names: Collection[str]) -> Map
         "split": split,
         "template": str(scene.provenance.get("template", "")),
         "excursion": str((scene.provenance.get("excursion") or {}).get("axis", "")),
-        "uid": [entry.uid for entry in scene.objects if entry.kind == "object"],
+        "uid": [entry.uid for entry in scene.objects if entry.kind == "object" or entry.uid],
         "licence": [entry.licence for entry in scene.objects],
         "at_cap": [view.at_cap for view in record.views],
     }

@@ -6,11 +6,12 @@ scene: times, hosts, retries.
 
 import contextlib
 import functools
+import itertools
 import json
 import os
 import socket
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -158,6 +159,38 @@ def shards_there(folder: DatasetFolder) -> set[str]:
         return here
     sent = folder.staged_sent
     return here | {path.relative_to(sent).as_posix() for path in sent.rglob("*.tar")}
+
+
+def missing_shards(url: str) -> list[int]:
+    """Return the indices of the shards that are not there, of a dataset that is begun.
+
+    Where all are there and the dataset is still not finished, its first shard counts as missing:
+    whoever makes it finishes the dataset.
+
+    Raises:
+        TrilightError: there is no readable manifest, or the URL is refused.
+    """
+    dataset = open_dataset(url)
+    planned = list(planned_shards(dataset.manifest))
+    local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
+    there = shards_there(local) if local else {entry.name for entry in dataset.manifest.shards}
+    missing = [index for index, name in enumerate(planned) if name not in there]
+    return missing or ([] if _is_finished(dataset, len(planned)) else [0])
+
+
+def number_ranges(numbers: Iterable[int]) -> str:
+    """Return numbers as schedulers write them, such as 0-3,7; an empty text for none."""
+    pairs = enumerate(sorted(set(numbers)))
+    runs = (
+        [number for _, number in run]
+        for _, run in itertools.groupby(pairs, key=lambda pair: pair[1] - pair[0])
+    )
+    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
+
+
+def _is_finished(dataset: Dataset, planned: int) -> bool:
+    """Return whether every shard is listed, and the documents are there."""
+    return len(dataset.manifest.shards) >= planned and dataset.files.read("README.md") is not None
 
 
 def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
@@ -317,8 +350,7 @@ def read_status(url: str) -> DatasetStatus:
         scenes_done=done,
         scenes_planned=manifest.num_scenes,
         num_views=manifest.num_views,
-        finished=len(manifest.shards) >= len(planned)
-        and dataset.files.read("README.md") is not None,
+        finished=_is_finished(dataset, len(planned)),
         views_per_hour=views_per_hour,
         remaining_s=remaining_s,
         core_hours=sum(row.seconds * row.cores for row in logs) / share / 3600 if share else None,

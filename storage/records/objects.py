@@ -60,16 +60,22 @@ class LockedObject(NamedObject):
     """object, texture or sky; only the latter two are written."""
 
 
+EMITTER = "emitter"
+"""Kind of a scene's objects that emit, parts of objects among them."""
+
+
 def locked_uids(objects: Iterable[tuple[str, str]], provenance: Mapping[str, Any]) -> list[str]:
     """Return the uids of all that a scene has of a lock, sorted: objects, textures and a map.
 
     Args:
-        objects: kind and uid of each row of the scene's objects; floors and emitters are in none.
+        objects: kind and uid of each row of the scene's objects; floors and lamps are in none, what
+            an object emits is of that.
         provenance: of the scene, perhaps from outside; what `maps` says counts where it is text.
     """
     maps = provenance.get("maps", ())
     own = [uid for uid in maps if isinstance(uid, str)] if isinstance(maps, list | tuple) else []
-    return sorted({*(uid for kind, uid in objects if kind == OBJECT), *own})
+    parts = (uid for kind, uid in objects if kind == OBJECT or (kind == EMITTER and uid))
+    return sorted({*parts, *own})
 
 
 @dataclass(frozen=True, kw_only=True)

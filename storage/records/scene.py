@@ -63,13 +63,18 @@ class SceneObject:
     kind: ObjectKind
     """`object` for an asset, `shell` for a floor or wall, `emitter` for a light."""
     uid: str = ""
-    """The asset's uid; empty for shells and emitters."""
+    """The asset's uid, also of its parts that emit; empty for shells and lamps."""
     licence: str = "CC0-1.0"
-    """SPDX identifier, or `LicenseRef-...`; shells and emitters are ours, hence CC0."""
+    """SPDX identifier, or `LicenseRef-...`; shells and lamps are ours, hence CC0."""
     attribution: str = ""
     """Whom to name, as the source states it."""
     source_url: str = ""
     """Where the object came from."""
+
+    @property
+    def is_lamp(self) -> bool:
+        """Whether it is an emitter of the layout, and no part of an object that emits."""
+        return self.kind == "emitter" and not self.uid
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -63,6 +63,9 @@ class LevelSkin:
     """Bytes of the textures."""
     quality: SkinQuality
     """Measured against the source."""
+    emission: NDArray[np.float32] | None = None
+    """[F, 3] what each face emits, in the units of the source; None where nothing does, or where
+    nobody asked."""
 
     @cached_property
     def textures(self) -> SkinTextures:
@@ -73,15 +76,18 @@ class LevelSkin:
     @property
     def num_bytes(self) -> int:
         """Bytes as they are stored."""
-        return self.uv.nbytes + sum(map(len, self.packed))
+        glow = 0 if self.emission is None else self.emission.nbytes
+        return self.uv.nbytes + sum(map(len, self.packed)) + glow
 
 
 def skin_arrays(skin: LevelSkin, name: str) -> dict[str, NDArray]:
     """Return the arrays of a skin for the file of its asset; `name` ends the name of each."""
-    maps = {
+    maps: dict[str, NDArray] = {
         f"{column}_{name}": np.frombuffer(data, np.uint8)
         for column, data in zip(TEXTURED, skin.packed, strict=True)
     }
+    if skin.emission is not None:
+        maps[f"emission_{name}"] = np.ascontiguousarray(skin.emission)
     return {f"uv_{name}": np.ascontiguousarray(skin.uv), **maps}
 
 
@@ -92,6 +98,7 @@ def read_skin(arrays: Mapping[str, NDArray], quality: Mapping[str, Any], name: s
         uv=arrays[f"uv_{name}"],
         packed=(first, second, third),
         quality=SkinQuality(**quality),
+        emission=arrays.get(f"emission_{name}"),
     )
 
 

@@ -46,8 +46,7 @@ class Outcome:
 def smaller_limits() -> None:
     """Prepare a child."""
     from pipeline.exchange import pictures
-    from pipeline.exchange.usd import composition
-    from pipeline.exchange.usd import foreign_placed as placed
+    from pipeline.usd import composition, placed
 
     composition.MAX_PRIMS, composition.MAX_COMPOSITION_S = 2000, 0.3
     placed.MAX_PLACED, pictures.MAX_PIXELS = 2000, 1 << 20

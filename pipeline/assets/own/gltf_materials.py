@@ -5,6 +5,7 @@ A picture counts as its slot says: base and specular colours are sRGB-encoded, a
 
 import base64
 import copy
+import dataclasses
 import json
 import struct
 from collections.abc import Callable, Mapping
@@ -37,6 +38,8 @@ class GltfMaterials:
         buffers: Callable[[int], bytes],
         pictures: MaterialFiles,
         decode: Decode,
+        *,
+        emission: bool = False,
     ) -> None:
         """Read nothing yet.
 
@@ -45,7 +48,9 @@ class GltfMaterials:
             buffers: the bytes of a buffer by its number.
             pictures: files beside it.
             decode: what makes values of the bytes of a picture.
+            emission: whether what emits is read too.
         """
+        self._emission = emission
         self._tree, self._buffers = tree, buffers
         self._files, self._decode = pictures, decode
         self._values: dict[int, NDArray] = {}
@@ -69,26 +74,45 @@ class GltfMaterials:
     def _material(self, entry: dict[str, Any]) -> SourceMaterial:
         extensions = entry.get("extensions", {})
         glossy = extensions.get("KHR_materials_pbrSpecularGlossiness")
-        lost = _lost(entry)
         if glossy is not None:
-            return self._specular_workflow(glossy, lost)
+            return self._with_emission(self._specular_workflow(glossy, _lost(entry)), entry)
         metal = entry.get("pbrMetallicRoughness", {})
         specular = extensions.get("KHR_materials_specular", {})
         ior = float(extensions.get("KHR_materials_ior", {}).get("ior", 1.5))
         base = _numbers(metal.get("baseColorFactor", [1, 1, 1, 1]), 4)
         red, green, blue = _numbers(specular.get("specularColorFactor", [1, 1, 1]), 3)
-        return SourceMaterial(
+        both = self._slot(metal.get("metallicRoughnessTexture"))
+        found = SourceMaterial(
             base_rgb=(base[0], base[1], base[2]),
             base=self._slot(metal.get("baseColorTexture"), is_srgb=True),
             metallic=float(metal.get("metallicFactor", 1)),
             roughness=float(metal.get("roughnessFactor", 1)),
-            metallic_roughness=self._slot(metal.get("metallicRoughnessTexture")),
+            metallic_map=None if both is None else dataclasses.replace(both, channel=2),
+            roughness_map=None if both is None else dataclasses.replace(both, channel=1),
             f0=((ior - 1) / (ior + 1)) ** 2 if ior > 0 else 1.0,
             specular_rgb=(red, green, blue),
             specular_colour=self._slot(specular.get("specularColorTexture"), is_srgb=True),
             specular_strength=float(specular.get("specularFactor", 1)),
             specular_strength_map=self._slot(specular.get("specularTexture")),
-            lost=lost,
+            lost=_lost(entry),
+        )
+        return self._with_emission(found, entry)
+
+    def _with_emission(self, found: SourceMaterial, entry: dict[str, Any]) -> SourceMaterial:
+        """Return a material with what it emits, where that is asked for."""
+        if not self._emission:
+            return found
+        strength = entry.get("extensions", {}).get("KHR_materials_emissive_strength", {})
+        (times,) = _numbers([strength.get("emissiveStrength", 1)], 1)
+        red, green, blue = (
+            max(value * times, 0.0) for value in _numbers(entry.get("emissiveFactor", [0] * 3), 3)
+        )
+        if not any((red, green, blue)):
+            return found
+        return dataclasses.replace(
+            found,
+            emission_rgb=(red, green, blue),
+            emission=self._slot(entry.get("emissiveTexture"), is_srgb=True),
         )
 
     def _specular_workflow(self, entry: dict[str, Any], lost: tuple[str, ...]) -> SourceMaterial:

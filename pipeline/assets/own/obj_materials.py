@@ -1,10 +1,13 @@
-"""Materials of an OBJ: its MTL, with the extension for metal and roughness (Pm, Pr).
+"""Materials of an OBJ: its MTL, with the extension for metal and roughness (Pm, Pr, their maps).
 
+A map stands in the first channel of its picture, times the number, which is 1 where only the map is
+there.
 Without those, `Ks` and `Ns` are taken as today's exporters write them: Ks is half of white for an
 ordinary dielectric, F0 = 0.08 Ks, and Ns is 1000 (1 - roughness)^2. `illum` 0 and 1 mean that there
 is no highlight.
 """
 
+import dataclasses
 import re
 from collections.abc import Callable, Iterator, Sequence
 
@@ -20,13 +23,17 @@ _F0_OF_KS = 0.08
 _MOST_NS = 1000.0
 _USEMTL = re.compile(rb"^[ \t]*usemtl[ \t]+([^\r\n]+)", re.MULTILINE)
 _LIBRARY = "trilight.mtl"
+_PHYSICAL = {"pm", "pr", "map_pm", "map_pr"}
+"""What makes a material one of metal and roughness."""
 
 Fields = dict[str, str]
 Decode = Callable[[bytes, str], NDArray]
 
 
-def obj_materials(data: bytes, files: MaterialFiles, decode: Decode) -> dict[str, SourceMaterial]:
-    """Return the materials that the faces of an OBJ use, by name.
+def obj_materials(
+    data: bytes, files: MaterialFiles, decode: Decode, *, emission: bool = False
+) -> dict[str, SourceMaterial]:
+    """Return the materials that the faces of an OBJ use, by name; what they emit only if asked.
 
     Raises:
         Rejected: no_materials where it has none, materials_unreadable, or as reading a picture.
@@ -41,7 +48,10 @@ def obj_materials(data: bytes, files: MaterialFiles, decode: Decode) -> dict[str
         raise Rejected("materials_unreadable", f"no library has the material {missing[0]!r:.80}")
     reader = _Reader(files, decode)
     try:
-        return {name: reader.material(known[name]) for name in used}
+        found = {name: reader.material(known[name]) for name in used}
+        if emission:
+            found = {name: reader.emitting(found[name], known[name]) for name in used}
+        return found
     except ValueError as error:
         raise Rejected("materials_unreadable", f"the MTL is malformed ({error!s:.120})") from error
 
@@ -79,14 +89,15 @@ class _Reader:
         lost = _lost(fields)
         base = self._slot(fields.get("map_kd"), is_srgb=True)
         base_rgb = WHITE if base is not None and "kd" not in fields else _rgb(fields, "kd", 0.8)
-        if "pm" in fields or "pr" in fields:
-            if "map_pm" in fields or "map_pr" in fields:
-                lost = (*lost, "maps of metal and roughness")
+        if _PHYSICAL & set(fields):
+            metallic, roughness = (self._slot(fields.get(name)) for name in ("map_pm", "map_pr"))
             return SourceMaterial(
                 base_rgb=base_rgb,
                 base=base,
-                metallic=_number(fields, "pm", 0.0),
-                roughness=_number(fields, "pr", 0.5),
+                metallic=_number(fields, "pm", 0.0 if metallic is None else 1.0),
+                metallic_map=metallic,
+                roughness=_number(fields, "pr", 0.5 if roughness is None else 1.0),
+                roughness_map=roughness,
                 lost=lost,
             )
         shiny = fields.get("illum", "2") not in ("0", "1")
@@ -102,7 +113,16 @@ class _Reader:
             lost=lost,
         )
 
-    def _slot(self, text: str | None, *, is_srgb: bool) -> Slot | None:
+    def emitting(self, found: SourceMaterial, fields: Fields) -> SourceMaterial:
+        """Return a material with what it emits; a map alone is as it is."""
+        picture = self._slot(fields.get("map_ke"), is_srgb=True)
+        factor = _rgb(fields, "ke", 0.0 if picture is None else 1.0)
+        red, green, blue = (max(value, 0.0) for value in factor)
+        if picture is not None and not any(factor):  # as exporters write it that know maps alone
+            red, green, blue = WHITE
+        return dataclasses.replace(found, emission_rgb=(red, green, blue), emission=picture)
+
+    def _slot(self, text: str | None, *, is_srgb: bool = False) -> Slot | None:
         if text is None:
             return None
         options, name = map_words(text)

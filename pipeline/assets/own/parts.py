@@ -59,7 +59,7 @@ def load_parts(
     """
     rows = {name: row for row, name in enumerate(materials)}
     start, found = 0, []
-    for part in _dumped(data, kind, files):
+    for part in dumped(data, kind, files):
         found.append(_part(part, start, rows.get(_material_name(part), len(rows)), kind))
         start += len(part.vertices)
     if not found:
@@ -74,11 +74,19 @@ def load_parts(
     )
 
 
-def _dumped(data: bytes, kind: str, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
-    """Return the meshes of a file, each as often as it is placed."""
+def dumped(data: bytes, kind: str, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
+    """Return the meshes of a file, each as often as it is placed.
+
+    Raises:
+        Rejected: materials_unreadable where the library cannot read it.
+    """
     try:
         scene = trimesh.load_scene(
-            io.BytesIO(data), file_type=kind, resolver=dict(files), process=False
+            io.BytesIO(data),
+            file_type=kind,
+            resolver=dict(files),
+            process=False,
+            skip_materials=kind == "ply",  # an OBJ needs its names
         )
         return [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
     except MemoryError:

@@ -17,7 +17,8 @@ from PIL import Image
 from storage.conventions import linear_from_srgb8
 from storage.errors import Rejected
 
-Wrap = Literal["repeat", "clamp", "mirror"]
+Wrap = Literal["repeat", "clamp", "mirror", "black"]
+"""`black` is nothing beyond the picture, alpha included."""
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TGA", "BMP", "TIFF")
 """What is decoded; a file of another format is refused by its content."""
@@ -66,6 +67,20 @@ def decoded(data: bytes, name: str, max_pixels: int) -> NDArray:
         raise Rejected(
             "texture_unreadable", f"{name!r:.80}: {type(error).__name__}: {error!s:.120}"
         ) from error
+
+
+def has_colours(data: bytes) -> bool:
+    """Return whether a picture of 8 bits has colours: what USD takes as sRGB where nothing is said.
+
+    False too for bytes that are no picture.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+                return image.mode in ("RGB", "RGBA", "P", "CMYK", "YCbCr")
+    except Exception:  # decoders of other people's files fail in every way
+        return False
 
 
 def _values(image: Image.Image) -> NDArray:
@@ -133,6 +148,7 @@ class Picture:
 
     def _at(self, uv: NDArray[np.float64], texels: NDArray) -> NDArray[np.float32]:
         height, width = texels.shape[:2]
+        beyond = np.zeros(len(uv), np.bool_)
         x = _wrapped(uv[:, 0], self.wrap[0]) * width - 0.5
         y = _wrapped(uv[:, 1], self.wrap[1]) * height - 0.5
         if self.is_nearest:
@@ -144,9 +160,14 @@ class Picture:
             rows = _within(row + up, height, self.wrap[1])
             return self.linear(texels[rows, _within(column + right, width, self.wrap[0])])
 
+        for axis in range(2):
+            if self.wrap[axis] == "black":
+                beyond |= (uv[:, axis] < 0) | (uv[:, axis] > 1)
         low = (1 - along) * texel(0, 0) + along * texel(0, 1)
         high = (1 - along) * texel(1, 0) + along * texel(1, 1)
-        return ((1 - across) * low + across * high).astype(np.float32)
+        found: NDArray[np.float32] = ((1 - across) * low + across * high).astype(np.float32)
+        found[beyond] = 0
+        return found
 
 
 def _from_srgb(coded: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -167,7 +188,7 @@ def _halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _wrapped(at: NDArray[np.float64], wrap: Wrap) -> NDArray[np.float64]:
-    if wrap == "clamp":
+    if wrap in ("clamp", "black"):
         return np.clip(at, 0, 1)
     if wrap == "mirror":
         mirrored: NDArray[np.float64] = 1 - np.abs(np.mod(at, 2) - 1)

@@ -9,14 +9,17 @@ from numpy.typing import NDArray
 
 from pipeline.assets.mesh import TriangleMesh
 from pipeline.assets.own.bake import bake
+from pipeline.assets.own.glow import level_emission
 from pipeline.assets.own.gltf_materials import GltfMaterials, bare_gltf, data_uri_bytes
 from pipeline.assets.own.measure import skin_quality
 from pipeline.assets.own.nearest import NearestPlaces
 from pipeline.assets.own.obj_materials import bare_obj, obj_materials
 from pipeline.assets.own.parts import TexturedParts, load_parts
 from pipeline.assets.own.picture import Decoder
+from pipeline.assets.own.ply_colours import ply_parts
 from pipeline.assets.own.source_material import SourceMaterial
 from pipeline.assets.own.source_surface import SourceSurface, source_surface
+from pipeline.assets.own.usd_materials import usd_parts
 from pipeline.assets.reading.gltf_tree import read_tree
 from pipeline.assets.reading.source_file import SourceFile
 from pipeline.assets.settings import OwnMaterialSettings
@@ -53,7 +56,8 @@ class SkinMaker:
         quality = skin_quality(mesh, baked, self._surface, self._nearest, reach)
         self._require_near(quality, level.record.budget)
         first, second, third = map(pack_texture, baked.textures)
-        skin = LevelSkin(uv=baked.uv, packed=(first, second, third), quality=quality)
+        glow = level_emission(mesh, self._surface, self._nearest, reach)
+        skin = LevelSkin(uv=baked.uv, packed=(first, second, third), quality=quality, emission=glow)
         return dataclasses.replace(level, skin=skin)
 
     def _require_near(self, quality: SkinQuality, budget: int) -> None:
@@ -86,23 +90,36 @@ def skin_maker(
             texture_too_large, texture_unreadable, no_texture_coordinates or
             texture_coordinates_not_finite.
     """
-    parts = _parts(source, Decoder(settings.max_pixels))
-    lost = sorted({word for material in parts.materials for word in material.lost})
+    parts = _parts(source, Decoder(settings.max_pixels), emission=settings.emission)
+    lost = {word for material in parts.materials for word in material.lost}
+    lost -= {"emission"} if settings.emission else set()
     surface = source_surface(mesh, parts)
-    return SkinMaker(surface, settings), OwnMaterials(lost=tuple(lost))
+    return SkinMaker(surface, settings), OwnMaterials(lost=tuple(sorted(lost)))
 
 
-def _parts(source: SourceFile, decode: Callable[[bytes, str], NDArray]) -> TexturedParts:
+def _parts(
+    source: SourceFile, decode: Callable[[bytes, str], NDArray], *, emission: bool
+) -> TexturedParts:
+    if source.usd is not None:
+        return usd_parts(source.usd, decode, emission=emission)
     if source.kind == "obj":
-        materials = obj_materials(source.data, source.materials, decode)
+        materials = obj_materials(source.data, source.materials, decode, emission=emission)
         data, files = bare_obj(source.data)
         return load_parts(data, source.kind, files, materials, SourceMaterial())
+    if source.kind == "ply":
+        return ply_parts(source.data)
     if source.kind not in ("glb", "gltf"):
         raise Rejected("no_materials", f"a .{source.kind} file has no materials that are read")
     tree = read_tree(source.data, f".{source.kind}")
     if not tree.get("materials"):
         raise Rejected("no_materials", "the glTF has no materials")
-    reader = GltfMaterials(tree, lambda row: _buffer(source, tree, row), source.materials, decode)
+    reader = GltfMaterials(
+        tree,
+        lambda row: _buffer(source, tree, row),
+        source.materials,
+        decode,
+        emission=emission,
+    )
     data = bare_gltf(source.data, tree, f".{source.kind}")
     default = SourceMaterial(metallic=1.0)  # what glTF says of a mesh without a material
     return load_parts(data, source.kind, source.buffers, reader.by_name(), default)

@@ -31,6 +31,8 @@ class Slot:
     """[2, 2] applied to those coordinates first,"""
     shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     """[2] and then added; both with v up."""
+    channel: int = 0
+    """Which channel of the picture a number is in."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,8 +44,9 @@ class SourceMaterial:
     """sRGB-encoded; times `base_rgb`."""
     metallic: float = 0.0
     roughness: float = 1.0
-    metallic_roughness: Slot | None = None
-    """Linear: roughness in green and metal in blue, times the factors."""
+    metallic_map: Slot | None = None
+    roughness_map: Slot | None = None
+    """Linear: each in its channel, times its factor."""
     f0: float = 0.04
     """What a dielectric reflects head-on, before the two below."""
     specular_rgb: RGB = WHITE
@@ -54,18 +57,28 @@ class SourceMaterial:
     """Linear, in alpha; times `specular_strength`."""
     glossiness: Slot | None = None
     """Linear, in alpha: roughness is 1 - (1 - roughness) x alpha. Of the specular workflow."""
+    emission_rgb: RGB = (0.0, 0.0, 0.0)
+    emission: Slot | None = None
+    """sRGB-encoded; times `emission_rgb`. No column: it becomes light where that is asked for."""
     lost: tuple[str, ...] = ()
     """What else it says."""
+
+    @property
+    def emits(self) -> bool:
+        """Whether it says that it does."""
+        return any(self.emission_rgb)
 
     @property
     def slots(self) -> tuple[Slot, ...]:
         """The pictures that it has."""
         found = (
             self.base,
-            self.metallic_roughness,
+            self.metallic_map,
+            self.roughness_map,
             self.specular_colour,
             self.specular_strength_map,
             self.glossiness,
+            self.emission,
         )
         return tuple(slot for slot in found if slot is not None)
 
@@ -75,7 +88,8 @@ class Seen:
     """What the pictures of a material show at N places; None where it has no such picture."""
 
     base: NDArray[np.float32] | None
-    metallic_roughness: NDArray[np.float32] | None
+    metallic: NDArray[np.float32] | None
+    roughness: NDArray[np.float32] | None
     specular_colour: NDArray[np.float32] | None
     specular_strength: NDArray[np.float32] | None
     glossiness: NDArray[np.float32] | None
@@ -88,9 +102,13 @@ def columns(material: SourceMaterial, seen: Seen, count: int) -> NDArray[np.floa
         whole = np.broadcast_to(np.asarray(factor, np.float64), (count, part.stop - part.start))
         return whole if found is None else whole * found[:, part]
 
+    def number(factor: float, found: NDArray[np.float32] | None, slot: Slot | None) -> NDArray:
+        channel = 0 if slot is None else slot.channel
+        return times(factor, found, slice(channel, channel + 1))
+
     base = np.clip(times(material.base_rgb, seen.base, slice(0, 3)), 0, 1)
-    rough = times(material.roughness, seen.metallic_roughness, slice(1, 2))
-    metal = np.clip(times(material.metallic, seen.metallic_roughness, slice(2, 3)), 0, 1)
+    rough = number(material.roughness, seen.roughness, material.roughness_map)
+    metal = np.clip(number(material.metallic, seen.metallic, material.metallic_map), 0, 1)
     if seen.glossiness is not None:
         rough = 1 - (1 - material.roughness) * seen.glossiness[:, 3:4]
     colour = times(material.specular_rgb, seen.specular_colour, slice(0, 3))

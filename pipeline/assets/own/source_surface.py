@@ -51,6 +51,30 @@ class SourceSurface:
             )
         return found
 
+    @property
+    def emits(self) -> bool:
+        """Whether any of its materials says so."""
+        return any(material.emits for material in self.parts.materials)
+
+    def emission(
+        self, faces: NDArray[np.int64], weights: NDArray[np.float64], cell: float
+    ) -> NDArray[np.float64]:
+        """Return the radiance [N, 3] at places on faces; arguments as those of `columns`."""
+        origin = self.origin[faces]
+        own = np.zeros((len(faces), 3))
+        np.put_along_axis(own, self.turn[faces], weights, axis=1)
+        found = np.zeros((len(faces), 3))
+        for row, material in enumerate(self.parts.materials):
+            chosen = np.flatnonzero(self.parts.material[origin] == row)
+            if not material.emits or not len(chosen):
+                continue
+            found[chosen] = material.emission_rgb
+            if material.emission is not None:
+                found[chosen] *= self._shown(material.emission, origin[chosen], own[chosen], cell)[
+                    :, :3
+                ]
+        return found
+
     def _of_material(
         self,
         material: SourceMaterial,
@@ -58,8 +82,15 @@ class SourceSurface:
         own: NDArray[np.float64],
         cell: float,
     ) -> NDArray[np.float64]:
+        known: dict[tuple[object, ...], NDArray[np.float32]] = {}
+
         def shown(slot: Slot | None) -> NDArray[np.float32] | None:
-            return None if slot is None else self._shown(slot, origin, own, cell)
+            if slot is None:
+                return None
+            place = (id(slot.picture), slot.uv_set, slot.turn.tobytes(), slot.shift.tobytes())
+            if place not in known:  # one picture often holds several numbers
+                known[place] = self._shown(slot, origin, own, cell)
+            return known[place]
 
         base = shown(material.base)
         if self.parts.colour is not None:
@@ -68,7 +99,8 @@ class SourceSurface:
             base = np.concatenate([base[:, :3] * tint, base[:, 3:]], axis=1).astype(np.float32)
         seen = Seen(
             base=base,
-            metallic_roughness=shown(material.metallic_roughness),
+            metallic=shown(material.metallic_map),
+            roughness=shown(material.roughness_map),
             specular_colour=shown(material.specular_colour),
             specular_strength=shown(material.specular_strength_map),
             glossiness=shown(material.glossiness),

@@ -13,12 +13,16 @@ from storage.errors import Rejected
 def load_mesh(source: SourceFile) -> TriangleMesh:
     """Return all triangles of a source in its own units, node transforms applied, +Z up.
 
-    glTF defines +Y as up and is turned; the other formats define nothing and stay as they are. The
+    glTF defines +Y as up and is turned; USD says which axis is up, and its units, and comes in
+    metres; the other formats define nothing and stay as they are. The
     vertices are as the file has them: unwelded, some unused, possibly not finite.
 
     Raises:
-        Rejected: load_error, index_range, point_cloud, no_faces.
+        Rejected: load_error, index_range, point_cloud, no_faces; of USD also too_many_faces and
+            offset_precision.
     """
+    if source.usd is not None:
+        return source.usd.mesh
     try:
         scene = trimesh.load_scene(
             io.BytesIO(source.data),

@@ -15,7 +15,7 @@ from storage.errors import Rejected
 
 _MTLLIB = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 _MAP = re.compile(rb"^[ \t]*((?:map_|norm|bump|disp|refl)\w*)[ \t]+([^\r\n]+)", re.MULTILINE)
-_READ_MAPS = (b"map_kd", b"map_ks", b"map_pr", b"map_pm")
+_READ_MAPS = (b"map_kd", b"map_ks", b"map_pr", b"map_pm", b"map_ke")
 _ARGUMENTS = {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}
 
 ReadFile = Callable[[Path, int], bytes]

@@ -1,7 +1,7 @@
 """Reading a source: one bounded read of one regular file, and of the buffers that a glTF names.
 
 Everything that is read of an object is read here. The mesh library is given bytes, never a path,
-so that no file can make it open another one.
+so that no file can make it open another one. USD alone is given paths, which it checks first.
 """
 
 import hashlib
@@ -9,14 +9,19 @@ import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.assets.reading.gltf_tree import buffer_paths, check_tree, read_tree
 from pipeline.assets.reading.headers import check_header
 from pipeline.assets.reading.material_files import MaterialFiles, gltf_files, obj_files
 from pipeline.assets.settings import AssetSettings
+from pipeline.usd.stage import SUFFIXES as USD_SUFFIXES
 from storage.errors import Rejected
 
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+if TYPE_CHECKING:
+    from pipeline.assets.reading.usd_source import UsdSource
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off", *USD_SUFFIXES)
 """Formats that we read. The suffix decides: a file that lies about it is refused or fails to load,
 and is never handed to the loader of another format."""
 
@@ -35,11 +40,20 @@ class SourceFile:
     """Digest of the file and of its buffers in the order of their names; and of the files of its
     materials, where those are kept."""
     materials: MaterialFiles = field(default_factory=MaterialFiles)
-    """Files that its materials name; empty where nobody keeps them."""
+    """Files that its materials name; empty where nobody keeps them. USD has its own."""
+    usd: "UsdSource | None" = None
+    """What a USD file holds; `data` is empty then."""
+
+
+def needs_child(path: Path) -> bool:
+    """Return whether native code reads the file at once, so that only children may."""
+    return path.suffix.lower() in USD_SUFFIXES
 
 
 def read_source(path: Path, settings: AssetSettings) -> SourceFile:
     """Return a source after the checks that need no mesh library.
+
+    Where `needs_child`, it may only run in one.
 
     Raises:
         Rejected: missing_file, unsupported_format, too_large_bytes, archive_refused,
@@ -51,6 +65,8 @@ def read_source(path: Path, settings: AssetSettings) -> SourceFile:
     if suffix not in SUFFIXES:
         raise Rejected("unsupported_format", f"suffix {suffix!r}; expected one of {SUFFIXES}")
     data = _read_regular(path, settings.max_source_bytes)
+    if needs_child(path):
+        return _usd_file(path, settings)
     check_header(data, suffix, settings.max_source_faces)
     buffers: dict[str, bytes] = {}
     materials, keep = MaterialFiles(), settings.own_materials.keep
@@ -77,6 +93,14 @@ def read_source(path: Path, settings: AssetSettings) -> SourceFile:
         sha256=digest.hexdigest(),
         materials=materials,
     )
+
+
+def _usd_file(path: Path, settings: AssetSettings) -> SourceFile:
+    from pipeline.assets.reading.usd_source import UsdSource
+
+    usd = UsdSource(path, settings)
+    kind = path.suffix.lower()[1:]
+    return SourceFile(kind=kind, data=b"", buffers={}, sha256=usd.sha256, usd=usd)
 
 
 def _read_regular(path: Path, max_bytes: int) -> bytes:

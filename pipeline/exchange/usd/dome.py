@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd.authoring import Attributes, add_attributes, add_prim
-from pipeline.exchange.usd.foreign_textures import asset_bytes
 from pipeline.exchange.usd.names import MAP_TEXTS, SKY_ROWS, SKY_VISIBLE, VISIBLE_TO_CAMERA
-from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.usd.stage import OpenedUsd
+from pipeline.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
 from storage.records.environment import Environment
 from storage.records.exr import MAX_RESOLUTION, decode_exr, encode_channels
@@ -78,7 +79,7 @@ def sky_attributes(sky: Environment | None) -> Attributes:
 def dome_as_written(prim: Any, layer: Any, opened: OpenedUsd) -> Environment:
     """Return the environment of a prim that `add_dome` wrote; raises LookupError without a file."""
     found = opened.inside(layer, prim.attributes[_PATH].default.path)
-    data = None if found is None else asset_bytes(found)
+    data = None if found is None else asset_bytes(found, MAX_BYTES)
     if data is None:
         raise LookupError(_PATH)
     matrix = np.array(prim.attributes["xformOp:transform"].default).T
@@ -146,7 +147,7 @@ def _picture(light: Any, time: Any, opened: OpenedUsd) -> NDArray[np.float64] | 
         return None
     specs = attribute.GetPropertyStack(time)
     found = opened.inside(specs[0].layer if specs else opened.root, asset.path)
-    data = None if found is None else asset_bytes(found)
+    data = None if found is None else asset_bytes(found, MAX_BYTES)
     if data is None:
         opened.lost.append(f"{place}: map {asset.path!r:.100} is missing")
         return None

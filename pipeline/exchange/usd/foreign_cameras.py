@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.usd.foreign_placed import Placed
+from pipeline.usd.placed import Placed
 from storage.conventions import look_at_c2w
 
 _FOV_DEG = 40.0

@@ -17,81 +17,42 @@ from pipeline.exchange.linear_maps import (
 from pipeline.exchange.usd.foreign_coordinates import coordinates
 from pipeline.exchange.usd.foreign_meshes import MeshToShade
 from pipeline.exchange.usd.foreign_textures import ForeignTexture, read_texture
-from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.usd.shaders import StatedInputs
+from pipeline.usd.stage import OpenedUsd
 from storage.records.texture import MapSource, Texture
-
-PREVIEW = "UsdPreviewSurface"
-NAMES: Mapping[str, Mapping[str, str]] = {
-    PREVIEW: {},
-    "ND_open_pbr_surface_surfaceshader": {
-        "diffuseColor": "base_color",
-        "metallic": "base_metalness",
-        "roughness": "specular_roughness",
-        "ior": "specular_ior",
-        "emissiveColor": "emission_color",
-        "strength": "emission_luminance",
-    },
-    "ND_standard_surface_surfaceshader": {
-        "diffuseColor": "base_color",
-        "metallic": "metalness",
-        "roughness": "specular_roughness",
-        "ior": "specular_IOR",
-        "emissiveColor": "emission_color",
-        "strength": "emission",
-    },
-}
-"""How shaders call what UsdPreviewSurface calls by the first name."""
-
-_DEFAULTS: Mapping[str, Any] = {
-    "diffuseColor": (0.18, 0.18, 0.18),
-    "specularColor": 0.0,
-    "metallic": 0.0,
-    "roughness": 0.5,
-    "ior": 1.5,
-    "emissiveColor": 0.0,
-    "strength": 0.0,
-    "useSpecularWorkflow": 0.0,
-}
 
 
 class ShaderInputs:
     """What a shader is fed with."""
 
-    def __init__(self, shader: Any, names: Mapping[str, str], time: Any, opened: OpenedUsd) -> None:
+    def __init__(self, shader: Any, time: Any, opened: OpenedUsd) -> None:
         """Remember it; nothing is read yet.
 
         Args:
             shader: the shader of a material.
-            names: how it calls its inputs (NAMES).
             time: of the values.
             opened: the file; what is lost is noted there.
         """
-        self._shader, self._names, self._time, self._opened = shader, names, time, opened
-        self._read: dict[str, ForeignTexture | NDArray[np.float64] | None] = {}
-
-    def has(self, name: str) -> bool:
-        """Return whether this kind of shader has the input under a name of its own."""
-        return name in self._names
+        self._stated, self._time, self._opened = StatedInputs(shader, time, opened), time, opened
+        self._read: dict[str, ForeignTexture | None] = {}
 
     def textures(self, names: Collection[str]) -> dict[str, ForeignTexture]:
         """Return the textures that inputs are connected to, by their names."""
-        found = {name: self._connected(name) for name in names}
-        return {name: each for name, each in found.items() if isinstance(each, ForeignTexture)}
+        found = {name: self._texture(name) for name in names}
+        return {name: each for name, each in found.items() if each is not None}
 
     def constant(self, name: str) -> NDArray[np.float32]:
         """Return the value [3] of an input without a texture; a number stands in every channel."""
-        fallback = self._connected(name)
-        if isinstance(fallback, np.ndarray):
-            return self._finite(name, fallback[:3])
-        sources = self._sources(name)
-        stated = sources[0].Get(self._time) if sources and not _is_output(sources[0]) else None
-        return self._finite(name, _DEFAULTS[name] if stated is None else stated)
+        node = self._stated.texture(name)
+        if node is not None and node.fallback is not None and self._texture(name) is None:
+            return self._stated.finite(name, node.fallback[:3])
+        return self._stated.constant(name)
 
     def emission(self, surface: MeshToShade) -> NDArray[np.float32]:
         """Return the radiance [T, 3] of triangles: of a texture its mean over each."""
         count = len(surface.soup.polygons)
-        texture = self._connected("emissiveColor")
-        if isinstance(texture, ForeignTexture):
+        texture = self._texture("emissiveColor")
+        if texture is not None:
             uv = coordinates(texture.chart, surface, self._time)
             if uv is None:
                 uv = np.broadcast_to(np.float64(0.5), (count, 3, 2))
@@ -101,48 +62,14 @@ class ShaderInputs:
             )
         else:
             glow = np.broadcast_to(self.constant("emissiveColor"), (count, 3))
-        strength = self.constant("strength") if self.has("strength") else np.float32(1)
+        strength = self.constant("strength") if self._stated.has("strength") else np.float32(1)
         return np.maximum(glow * strength, 0).astype(np.float32)
 
-    def _connected(self, name: str) -> ForeignTexture | NDArray[np.float64] | None:
-        """Return the texture of an input, or its fallback [4]; None where it has neither."""
+    def _texture(self, name: str) -> ForeignTexture | None:
         if name not in self._read:
-            self._read[name] = self._texture(name)
+            node = self._stated.texture(name)
+            self._read[name] = None if node is None else read_texture(node, self._opened)
         return self._read[name]
-
-    def _texture(self, name: str) -> ForeignTexture | NDArray[np.float64] | None:
-        from pxr import UsdShade
-
-        sources = self._sources(name)
-        if not sources or not _is_output(sources[0]):
-            return None
-        output = UsdShade.Output(sources[0])
-        node = UsdShade.Shader(sources[0].GetPrim())
-        if node.GetShaderId() == "UsdUVTexture":
-            found = read_texture(node, output.GetBaseName(), self._time, self._opened)
-            if found is not None:
-                return found
-        self._lose(name, "a network that is not read")
-        return None
-
-    def _sources(self, name: str) -> Any:
-        from pxr import UsdShade
-
-        known = self._shader.GetInput(self._names.get(name, name))
-        return UsdShade.Utils.GetValueProducingAttributes(known) if known else []
-
-    def _finite(self, name: str, stated: Any) -> NDArray[np.float32]:
-        value = np.array(stated, np.float32)
-        if value.ndim > 1 or value.shape not in ((), (3,)) or not np.isfinite(value).all():
-            self._lose(name, "no finite number or colour")
-            value = np.array(_DEFAULTS[name], np.float32)
-        return np.broadcast_to(value, 3).astype(np.float32)
-
-    def _lose(self, name: str, why: str) -> None:
-        called = self._names.get(name, name)
-        self._opened.lost.append(
-            f"{self._shader.GetPath()}.{called}: {why}; {_DEFAULTS[name]} taken"
-        )
 
 
 def worn_textures(
@@ -205,9 +132,3 @@ def _metallic(
 
 def _one_texel(texture: Texture) -> bool:
     return is_constant(texture.texels)  # type: ignore[arg-type]
-
-
-def _is_output(attribute: Any) -> bool:
-    from pxr import UsdShade
-
-    return bool(UsdShade.Output.IsOutput(attribute))

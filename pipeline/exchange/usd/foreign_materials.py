@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.dressed import PLAIN, Worn
-from pipeline.exchange.usd.foreign_inputs import NAMES as _NAMES
-from pipeline.exchange.usd.foreign_inputs import PREVIEW as _PREVIEW
 from pipeline.exchange.usd.foreign_inputs import ShaderInputs, worn_textures
-from pipeline.exchange.usd.foreign_meshes import MeshToShade, per_corner
+from pipeline.exchange.usd.foreign_meshes import MeshToShade
 from pipeline.exchange.usd.foreign_skins import CHANNELS, skinned
 from pipeline.exchange.usd.names import added_column
-from pipeline.exchange.usd.stage import OpenedUsd
+from pipeline.usd.polygons import primvar_corners
+from pipeline.usd.shaders import surface_shader, without_place
+from pipeline.usd.stage import OpenedUsd
 from storage.records.material import (
     DIFFUSE,
     EMISSION,
@@ -32,17 +32,6 @@ from storage.records.material import (
 from storage.records.texture import MapSource
 
 _DEFAULT_DIFFUSE = (0.18, 0.18, 0.18)
-_LOST = {
-    "opacity": 1.0,
-    "clearcoat": 0.0,
-    "displacement": 0.0,
-    "transmission_weight": 0.0,
-    "transmission": 0.0,
-    "coat_weight": 0.0,
-    "coat": 0.0,
-    "subsurface_weight": 0.0,
-}
-"""Inputs that have no place here, with the value at which they do nothing."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,21 +114,26 @@ def _shaded(
     material: Any, surface: MeshToShade, time: Any, opened: OpenedUsd, licence: str
 ) -> _Shaded:
     """Return a material over the whole mesh; its display colour without one."""
-    shader = _shader(material, opened.lost) if material else None
+    shader = surface_shader(material) if material else None
+    if material and shader is None:
+        opened.lost.append(
+            f"{material.GetPath()}: no shader that is understood; display colour taken"
+        )
     count = len(surface.soup.polygons)
     rows, nowhere = default_rows(count), np.zeros((count, 3, 2), np.float32)
     if shader is None:
         rows[:, DIFFUSE] = _display_colour(surface, time)
         rows[:, SPECULAR], rows[:, ROUGHNESS] = 0.04, 0.5
         return _Shaded(rows=rows, uv=nowhere, worn=PLAIN)
-    inputs = ShaderInputs(shader, _NAMES[shader.GetShaderId()], time, opened)
+    inputs = ShaderInputs(shader, time, opened)
     source = MapSource(name=str(material.GetPrim().GetName()), licence=licence)
     skin = skinned(inputs.textures(CHANNELS), surface, time, source, opened.lost)
     worn = worn_textures(inputs, skin.textures, source, f"{surface.prim.GetPath()}", opened.lost)
     for part, texture in zip((DIFFUSE, SPECULAR, ROUGHNESS), worn, strict=True):
         rows[:, part] = texture.mean if part != ROUGHNESS else texture.mean[0]
     rows[:, EMISSION] = inputs.emission(surface)
-    _note_losses(shader, time, opened.lost)
+    for name in without_place(shader, time):
+        opened.lost.append(f"{shader.GetPath()}.{name}: has no place here")
     _take_added_columns(rows, material, time, opened.lost)
     kept = [texture if texture.constant is None else None for texture in worn]
     return _Shaded(
@@ -178,38 +172,12 @@ def _numbers(value: Any) -> NDArray[np.float64]:
         return np.zeros(0)
 
 
-def _shader(material: Any, lost: list[str]) -> Any:
-    """Return the shader of a material that is understood, a preview before others."""
-    found = None
-    for context in ("", "mtlx"):
-        source = material.ComputeSurfaceSource(context)[0]
-        known = source and source.GetShaderId() in _NAMES
-        if known and (found is None or source.GetShaderId() == _PREVIEW):
-            found = source
-    if found is None:
-        lost.append(f"{material.GetPath()}: no shader that is understood; display colour taken")
-    return found
-
-
 def _display_colour(surface: MeshToShade, time: Any) -> NDArray[np.float32]:
-    from pxr import UsdGeom
-
-    primvar = UsdGeom.PrimvarsAPI(surface.prim).FindPrimvarWithInheritance("displayColor")
     rows = np.full((len(surface.soup.polygons), 3), _DEFAULT_DIFFUSE, np.float32)
-    if primvar and primvar.HasValue():
-        values = np.array(primvar.ComputeFlattened(time), np.float32).reshape(-1, 3)
-        interpolation = str(primvar.GetInterpolation())
-        found = per_corner(values, interpolation, surface.indices, surface.soup)
-        if found is not None:
-            rows = np.clip(found.mean(axis=1), 0, 0.96).astype(np.float32)
+    soup = surface.soup
+    found = primvar_corners(
+        surface.prim, "displayColor", surface.indices, soup.corners, soup.polygons, time
+    )
+    if found is not None and found.ndim == 3 and found.shape[2] == 3:
+        rows = np.clip(found.mean(axis=1), 0, 0.96).astype(np.float32)
     return rows
-
-
-def _note_losses(shader: Any, time: Any, lost: list[str]) -> None:
-    for name, neutral in _LOST.items():
-        known = shader.GetInput(name)
-        if known and (known.HasConnectedSource() or known.Get(time) not in (None, neutral)):
-            lost.append(f"{shader.GetPath()}.{name}: has no place here")
-    bump = shader.GetInput("normal")
-    if bump and bump.HasConnectedSource():
-        lost.append(f"{shader.GetPath()}.normal: bumps have no place here")

@@ -4,25 +4,20 @@ Where nothing is scaled, the bytes of a picture stay as they are. What a colour 
 as said; without one, colours in 8 bits are sRGB-encoded, as USD states.
 """
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.pictures import MAX_BYTES, Pixels, decoded_pixels, is_encoded
-from pipeline.exchange.usd.foreign_coordinates import UvChart, chart_of, value_of
-from pipeline.exchange.usd.stage import OpenedUsd
 from pipeline.exchange.wrapping import Wrap
-from storage.errors import TrilightError
+from pipeline.usd.stage import OpenedUsd
+from pipeline.usd.texture_nodes import TextureNode, UvChart, asset_bytes
 from storage.records.texture import MapSource, Texture
 
 _STEPS = 8
 """Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""
-
-_WRAPS = ("repeat", "mirror", "clamp", "black")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,66 +84,31 @@ class ForeignTexture:
         return whole * self.scale + self.bias
 
 
-def read_texture(
-    shader: Any, output: str, time: Any, opened: OpenedUsd
-) -> ForeignTexture | NDArray[np.float64] | None:
-    """Return the texture of a UsdUVTexture shader.
-
-    Where it is not readable, a note says so, and its `fallback` [4] is returned if it states one;
-    else None.
+def read_texture(node: TextureNode, opened: OpenedUsd) -> ForeignTexture | None:
+    """Return the texture of a node, or None with a note where its picture is not readable.
 
     Raises:
-        TrilightError: its file is outside of the folder or on the network, or too large.
+        TrilightError: it is too large.
     """
-    attribute = shader.GetInput("file")
-    asset = attribute.Get(time) if attribute else None
-    named = "" if asset is None else asset.path
-    pixels = None
-    if named:
-        specs = attribute.GetAttr().GetPropertyStack(time)
-        found = opened.inside(specs[0].layer if specs else opened.root, named)
-        data = None if found is None else asset_bytes(found)
-        pixels = None if data is None else decoded_pixels(data, Path(named).name)
+    data = None if node.resolved is None else asset_bytes(node.resolved, MAX_BYTES)
+    pixels = None if data is None else decoded_pixels(data, Path(node.named).name)
     if pixels is None:
         opened.lost.append(
-            f"texture {named!r:.100}: missing or not readable as a picture"
-            if named
-            else f"{shader.GetPath()}: a texture without a file"
+            f"texture {node.named!r:.100}: missing or not readable as a picture"
+            if node.named
+            else "a texture without a file"
         )
-        fallback = value_of(shader, "fallback", time, None)
-        return None if fallback is None else np.array(fallback, np.float64)
-    space = str(value_of(shader, "sourceColorSpace", time, "auto"))
-    is_srgb = is_encoded(pixels) if space not in ("sRGB", "raw") else space == "sRGB"
+        return None
+    space = node.colour_space
     return ForeignTexture(
         pixels=pixels[::-1],
-        is_srgb=is_srgb,
-        wrap=(_wrap(shader, "wrapS", time), _wrap(shader, "wrapT", time)),
-        scale=np.array(value_of(shader, "scale", time, (1, 1, 1, 1)), np.float32),
-        bias=np.array(value_of(shader, "bias", time, (0, 0, 0, 0)), np.float32),
-        chart=chart_of(shader, time),
-        output=output if output in ("r", "g", "b", "a") else "rgb",
+        is_srgb=is_encoded(pixels) if space not in ("sRGB", "raw") else space == "sRGB",
+        wrap=node.wrap,
+        scale=node.scale,
+        bias=node.bias,
+        chart=node.chart,
+        output=node.output,
     )
-
-
-def asset_bytes(resolved: str) -> bytes | None:
-    """Return the bytes of a plain file, or of a member of an archive; None where there are none."""
-    name = Path(resolved).name
-    outer, _, member = resolved.partition("[")
-    try:
-        if member:
-            with zipfile.ZipFile(outer) as archive:
-                return archive.read(member.rstrip("]"))
-        if Path(outer).stat().st_size > MAX_BYTES:
-            raise TrilightError(f"{name}: expected at most {MAX_BYTES} bytes.")
-        return Path(outer).read_bytes()
-    except (OSError, KeyError, zipfile.BadZipFile):
-        return None
-
-
-def _wrap(shader: Any, name: str, time: Any) -> Wrap:
-    """Return a wrap mode; `useMetadata` and what is unknown repeat."""
-    mode = str(value_of(shader, name, time, "repeat"))
-    return cast(Wrap, mode) if mode in _WRAPS else "repeat"
 
 
 def _channels(values: NDArray, output: str, channels: int, opaque: int) -> NDArray:

@@ -6,14 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.exchange.pictures import MAX_BYTES
 from pipeline.exchange.usd import names
 from pipeline.exchange.usd.authoring import as_expected
 from pipeline.exchange.usd.exact_layer import children_of, numbered, require, require_plain
-from pipeline.exchange.usd.foreign_textures import asset_bytes
-from pipeline.exchange.usd.stage import OpenedUsd
 from pipeline.exchange.usd.texture_files import decoded_texture
 from pipeline.exchange.usd.write_materials import material_tables
 from pipeline.exchange.usd.write_textures import SHADERS, Used, material_links
+from pipeline.usd.stage import OpenedUsd
+from pipeline.usd.texture_nodes import asset_bytes
 from storage.records.material import PUBLISHED_COLUMNS, declared_column, default_rows, laid_out
 from storage.records.texture import CONSTANT, TEXTURED, MapSource, Texture
 
@@ -97,7 +98,7 @@ def _used(prim: Any, textures: dict[int, Texture], opened: OpenedUsd | None) -> 
 def _texture(attributes: Any, layer: Any, opened: OpenedUsd) -> Texture:
     named = attributes["inputs:file"].default.path
     found = opened.inside(layer, named)
-    data = None if found is None else asset_bytes(found)
+    data = None if found is None else asset_bytes(found, MAX_BYTES)
     if data is None:
         raise LookupError(named)
     texts = {field: attributes[name].default for field, name in names.MAP_TEXTS.items()}

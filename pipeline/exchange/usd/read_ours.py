@@ -25,10 +25,10 @@ from pipeline.exchange.usd.exact_layer import (
     whole_numbers,
 )
 from pipeline.exchange.usd.read_our_materials import materials_as_written
-from pipeline.exchange.usd.stage import OpenedUsd
 from pipeline.exchange.usd.write import ENVIRONMENT, camera_attributes
 from pipeline.exchange.usd.write_meshes import MESH, SUBSET, object_attributes
 from pipeline.exchange.usd.write_textures import ST
+from pipeline.usd.stage import OpenedUsd
 from storage.conventions import require_readable
 from storage.errors import TrilightError
 from storage.records.environment import Environment

@@ -34,3 +34,16 @@ def test_a_build_that_draws_its_materials_says_nothing_of_them() -> None:
         assert not {"source", "own_share"} & set(record["scenes"]["materials"])
     smoke = named_build("smoke")
     assert smoke.mesh_settings == smoke.assets
+
+
+def test_a_share_of_light_asks_for_what_objects_emit_too() -> None:
+    plain = named_build("smoke", changes=OWN)
+    lit = named_build("smoke", changes={**OWN, "scenes.materials.own_emission": 0.2})
+    assert lit.mesh_settings.own_materials.emission and lit.digest != plain.digest
+    assert not plain.mesh_settings.own_materials.emission
+    assert "emission" not in plain.as_json()["assets"]["own_materials"]
+    assert "own_emission" not in plain.as_json()["scenes"]["materials"]
+    drawn = named_build("smoke", changes={"scenes.materials.own_emission": 0.2})
+    assert (
+        drawn.digest == named_build("smoke").digest and not drawn.mesh_settings.own_materials.keep
+    )

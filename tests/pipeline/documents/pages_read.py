@@ -3,7 +3,7 @@
 from html.parser import HTMLParser
 
 HARM = """<script>alert(1)</script><img src=x onerror=alert(2)>"'&"""
-VOID = {"meta", "img", "br"}
+VOID = {"meta", "img", "br", "input"}
 
 
 class Tags(HTMLParser):

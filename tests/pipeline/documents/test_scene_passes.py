@@ -41,7 +41,8 @@ def page_of(shown: Sample) -> str:
 
 def figures(page: str) -> dict[str, tuple[NDArray[np.uint8], str]]:
     """Return the pictures of a page with their captions, by what stands for them."""
-    form = r'<figure><img alt="(.+?)" src="data:image/png;base64,(.+?)"><figcaption>(.+?)</'
+    picture = r'<img alt="([^"]+?)" src="data:image/png;base64,([^"]+?)"></label>'
+    form = rf"<figure><label><input [^>]+>{picture}<figcaption>(.+?)</"
     return {
         alt: (np.asarray(Image.open(io.BytesIO(base64.b64decode(data)))), caption)
         for alt, data, caption in re.findall(form, page)

@@ -8,10 +8,18 @@ import pytest
 from PIL import Image
 
 from pipeline.exchange.usd.write import write_usd
-from pipeline.making.inspect_scene import ROWS, VIEWS, turntable_poses
+from pipeline.making.inspect_scene import ROWS, VIEWS, seen_into, turntable_poses
+from storage.conventions import look_at_c2w
 from storage.errors import TrilightError
+from storage.records.scene import ObjectKind, SceneObject
 from tests.command_line import trilight
 from tests.scenes_by_hand import tiny_scene
+
+KINDS: tuple[tuple[str, ObjectKind], ...] = (
+    ("floor", "shell"),
+    ("walls", "shell"),
+    ("thing", "object"),
+)
 
 
 def test_a_summary_and_a_sheet(tmp_path: Path) -> None:
@@ -48,3 +56,24 @@ def test_mistakes(tmp_path: Path) -> None:
         assert isinstance(result.exception, TrilightError)
         with pytest.raises(TrilightError, match=message):
             raise result.exception
+
+
+def test_walls_before_the_objects_are_left_out() -> None:
+    floor, wall, thing = (SceneObject(name=name, kind=kind) for name, kind in KINDS)
+    walls = [[[x, -1, 0], [x, 1, 0], [x, 0, 1]] for x in (1, -1)]
+    corners = [*walls, [[0, 0, 0.1], [0.1, 0, 0.1], [0, 0.1, 0.3]], [[1, 0, 0], [0, 1, 0], [0] * 3]]
+    room = tiny_scene(
+        vertex_positions=np.array(corners, np.float32).reshape(-1, 3),
+        vertex_normals=np.tile(np.array([0, 0, 1], np.float32), (12, 1)),
+        faces=np.arange(12, dtype=np.uint32).reshape(4, 3),
+        material_index=np.zeros(4, np.uint16),
+        object_index=np.array([1, 1, 2, 0], np.uint16),
+        objects=(floor, wall, thing),
+    )
+    for x, kept in ((5, [1, 2, 3]), (-5, [0, 2, 3]), (0.5, [0, 1, 2, 3])):
+        pose = look_at_c2w(eye=[x, 0.2, 0.5], target=[0, 0, 0], up=[0, 0, 1])
+        shown = seen_into(room, pose.astype(np.float32))
+        assert shown.faces[:, 0].tolist() == [3 * row for row in kept]
+        assert shown.object_index.tolist() == room.object_index[kept].tolist()
+    floor_only = tiny_scene()
+    assert seen_into(floor_only, floor_only.c2w[0]) is floor_only

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from pipeline.exchange.usd.foreign_meshes import triangulated
 from pipeline.exchange.usd.read import UsdScene, read_usd, usd_keys
 from pipeline.exchange.usd.write import SUFFIXES, write_usd, write_usd_shard
+from pipeline.usd.polygons import triangulated
 from storage.errors import TrilightError
 from storage.records.material import EMISSION
 from storage.records.scene import Scene

@@ -5,7 +5,7 @@ be known beforehand, so every file that any layer names for composition, used or
 the path that USD's own resolver gives, is refused outside of the folder, and is opened here first:
 the closure of all names holds every file that composition can ask for. When the stage stands, its
 layers are compared with the folder once more, before anything of it is used.
-`pipeline.exchange.usd.composition` bounds the size of the stage. The bytes are still parsed by
+`pipeline.usd.composition` bounds the size of the stage. The bytes are still parsed by
 native code, so untrusted files are opened in a child process with limits (pipeline.isolation).
 `quietly` turns USD's own errors into one line that names the file and no folder of this machine.
 """
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from pipeline.exchange.usd.composition import composition_errors
+from pipeline.usd.composition import composition_errors
 from storage.errors import TrilightError
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -26,18 +26,28 @@ MAX_LAYERS = 1000
 MAX_MEMBERS = 10_000
 """Maximum number of members in a usdz archive."""
 
+_LOOKS = (".mtlx",)
+"""Files that hold materials only: without them a stage has all of its surfaces."""
+
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
+
+
+class OutsideFile(TrilightError):
+    """A file that is named and may not be read: elsewhere, on the network, or no plain file."""
 
 
 class OpenedUsd:
     """A root layer, and the only way to the files that it names."""
 
-    def __init__(self, path: Path, folder: Path | None = None) -> None:
+    def __init__(
+        self, path: Path, folder: Path | None = None, *, max_file_bytes: int = MAX_FILE_BYTES
+    ) -> None:
         """Open the root layer alone.
 
         Args:
             path: the file.
             folder: files below it may be read; the folder of `path` by default.
+            max_file_bytes: maximum size of every file.
 
         Raises:
             TrilightError: not a readable USD file, or larger than it may be.
@@ -47,15 +57,23 @@ class OpenedUsd:
         self.path = path.resolve()
         self.folder = (folder or self.path.parent).resolve()
         self.lost: list[str] = []
+        self.unresolved: list[str] = []
+        self._max_file_bytes = max_file_bytes
         self._layers: dict[str, Any] = {}
         self._context = Ar.GetResolver().CreateDefaultContextForAsset(str(self.path))
         self.root = self._open(str(self.path))
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are open, the root first and the others sorted."""
+        outer = {Path(name.partition("[")[0]) for name in self._layers}
+        return [self.path, *sorted(outer - {self.path})]
 
     def inside(self, layer: Any, asset_path: str) -> str | None:
         """Return where USD finds a file that a layer names, or None where there is none.
 
         Raises:
-            TrilightError: it is on the network, outside of the folder, no plain file, or named by a
+            OutsideFile: it is on the network, outside of the folder, no plain file, or named by a
                 variable expression.
         """
         from pxr import Ar, Sdf
@@ -141,7 +159,7 @@ class OpenedUsd:
             raise TrilightError(f"{self.path.name}: refers to itself in a circle ({text:.160}).")
         if isinstance(error, Pcp.ErrorCapacityExceeded):
             raise TrilightError(f"{self.path.name}: too many arcs meet in one prim ({text:.160}).")
-        self.lost.append(f"composition: {text:.160}")
+        self._miss(f"composition: {text:.160}")
 
     def _named_layer(self, anchor: Any, asset_path: str) -> Any:
         """Return the layer that another one names, or None where it is missing (it is noted)."""
@@ -150,12 +168,20 @@ class OpenedUsd:
         found = self.inside(anchor, asset_path)
         if found is None or Sdf.FileFormat.FindByExtension(found) is None:
             why = "is missing" if found is None else "is no USD file"
-            self.lost.append(f"file {asset_path!r:.100} {why}")
+            note = f"file {asset_path!r:.100} {why}"
+            if asset_path.endswith(_LOOKS):
+                self.lost.append(note)
+            else:
+                self._miss(note)
             return None
         return self._open(found)
 
+    def _miss(self, note: str) -> None:
+        self.lost.append(note)
+        self.unresolved.append(note)
+
     def _refuse(self, named: str, why: str) -> NoReturn:
-        raise TrilightError(f"{self.path.name}: names {named!r:.100}{why}.")
+        raise OutsideFile(f"{self.path.name}: names {named!r:.100}{why}.")
 
     def _open(self, resolved: str) -> Any:
         from pxr import Sdf, Tf
@@ -165,9 +191,12 @@ class OpenedUsd:
         if len(self._layers) >= MAX_LAYERS:
             raise TrilightError(f"{self.path.name}: names more than {MAX_LAYERS} layers.")
         outer = Path(resolved.partition("[")[0])
-        _check_file(outer)
+        _check_file(outer, self._max_file_bytes)
         try:
-            layer = Sdf.Layer.FindOrOpen(resolved)
+            if layer := Sdf.Layer.Find(resolved):  # as an earlier call of this process read it
+                layer.Reload(force=True)
+            else:
+                layer = Sdf.Layer.FindOrOpen(resolved)
         except Tf.ErrorException as error:
             why = said(error, outer)
             raise TrilightError(f"{outer.name}: not readable as USD ({why}).") from error
@@ -177,14 +206,12 @@ class OpenedUsd:
         return layer
 
 
-def _check_file(path: Path) -> None:
+def _check_file(path: Path, max_bytes: int) -> None:
     """Refuse what is too large; and an archive that is compressed, or names what is not in it."""
     try:
         size = path.stat().st_size
-        if not path.is_file() or not 0 < size <= MAX_FILE_BYTES:
-            raise TrilightError(
-                f"{path.name}: {size} bytes; expected a file of 1 to {MAX_FILE_BYTES}."
-            )
+        if not path.is_file() or not 0 < size <= max_bytes:
+            raise TrilightError(f"{path.name}: {size} bytes; expected a file of 1 to {max_bytes}.")
         if path.suffix.lower() == ".usdz":
             _check_package(path, size)
     except OSError as error:

@@ -1,7 +1,7 @@
 """Every mesh, light and camera of a composed stage with its place in our world, instances too."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,8 @@ MAX_PLACED = 100_000
 MAX_NESTED = 150
 """Maximum nesting of prims, through prototypes too."""
 
-_READ = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight", "DomeLight")
+SCENE_KINDS = ("Mesh", "Camera", "RectLight", "DiskLight", "SphereLight", "DomeLight")
+"""Kinds of prims that a scene is made of."""
 _SILENT = ("Xform", "Scope", "Material", "Shader", "NodeGraph", "GeomSubset", "SkelRoot", "")
 
 
@@ -27,8 +28,10 @@ class Placed:
     to_world: NDArray[np.float64]  # [4, 4], for column vectors, into metres with +Z up
 
 
-def placed_prims(stage: Any, time: Any, lost: list[str]) -> list[Placed]:
-    """Return what is seen of a stage at a time, in its own order.
+def placed_prims(
+    stage: Any, time: Any, lost: list[str], kinds: Collection[str] = SCENE_KINDS
+) -> list[Placed]:
+    """Return the prims of some kinds that are seen of a stage at a time, in its own order.
 
     Invisible prims, guides and proxies are left out; kinds of prims that cannot be read are noted.
 
@@ -44,7 +47,7 @@ def placed_prims(stage: Any, time: Any, lost: list[str]) -> list[Placed]:
         if visits > MAX_PLACED:
             raise TrilightError(f"more than {MAX_PLACED} prims with all instances.")
         kind = str(prim.GetTypeName())
-        if kind in _READ:
+        if kind in kinds:
             if not np.isfinite(to_world).all():
                 raise TrilightError(f"{prim.GetPath()}: its place is not finite.")
             found.append(Placed(prim=prim, to_world=to_world))

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.exchange.usd import stage as opening
-from pipeline.exchange.usd.stage import OpenedUsd, quietly
 from pipeline.exchange.usd.write import write_usd
+from pipeline.usd import stage as opening
+from pipeline.usd.stage import OpenedUsd, quietly
 from storage.errors import TrilightError
 from tests.scenes_by_hand import tiny_scene
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.exchange.usd import composition
+from pipeline.usd import composition
 from storage.errors import TrilightError
-from tests.pipeline.exchange.usd.test_stage import HEAD, prims_of
+from tests.pipeline.usd.test_stage import HEAD, prims_of
 
 
 def bomb() -> str:

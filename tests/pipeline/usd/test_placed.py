@@ -3,7 +3,7 @@
 import pytest
 from pxr import Usd, UsdGeom
 
-from pipeline.exchange.usd import foreign_placed as placed
+from pipeline.usd import placed
 from storage.errors import TrilightError
 
 

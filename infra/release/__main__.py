@@ -1,0 +1,103 @@
+"""`make release`: beside a finished dataset, the network and a page, checked and summed.
+
+    python -m infra.release FOLDER
+
+FOLDER holds `dataset`, as `trilight generate` made it. `network` and `gallery` are written beside
+it; each of the three is a repository of a hub.
+"""
+
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import cyclopts
+from cyclopts import Parameter
+
+from infra.cli.console import first_words, next_step, print_rows, progress_bars
+from infra.release.hub_limits import require_within_limits, uploaded_files
+from infra.release.page import write_page
+from infra.release.pictures import chosen_scenes, pictures_beside
+from infra.release.push import NETWORK_FILE, kind_of
+from model.open import BUILTIN_NETWORKS
+from pipeline.documents.markdown import front_matter
+from storage.atomic import write_atomically
+from storage.dataset.dataset import open_dataset
+from storage.dataset.verify import verify_dataset
+from storage.digests import sha256_of_file
+from storage.errors import TrilightError
+from storage.records.objects import read_objects_lock
+
+SUMS = "SHA256SUMS"
+
+FREE = {"CC0-1.0"}
+"""Licences under which pictures are published."""
+
+_CHECKPOINT = "builtin:hits"
+
+
+def main(
+    folder: Annotated[Path, Parameter(help="folder that holds dataset")],
+    pictures: Annotated[int, Parameter(help="scenes on the page")] = 24,
+) -> None:
+    """Write network, gallery and sums beside a finished dataset."""
+    first_words(f"Releasing {folder}")
+    place = folder / "dataset"
+    dataset = open_dataset(str(place))
+    found = verify_dataset(dataset)
+    if found.problems or not found.is_finished:
+        raise TrilightError(f"{place}: unfinished or damaged; see trilight verify {place}.")
+    licences = {entry.licence for entry in read_objects_lock(dataset.folder.objects_lock)}
+    if licences - FREE:
+        named = ", ".join(sorted(licences - FREE))
+        raise TrilightError(f"{place}: objects under {named}; a release has CC0 only.")
+    _write_network(folder / "network")
+    chosen = chosen_scenes(dataset, pictures)
+    with progress_bars() as bars:
+        task = bars.add_task("scenes", total=len(chosen), note="")
+        shown = list(
+            pictures_beside(
+                dataset, chosen, checkpoint=_CHECKPOINT, done=lambda: bars.advance(task)
+            )
+        )
+    about = [
+        ("dataset", f"{dataset.manifest.build}, digest {dataset.digest}"),
+        ("network", _CHECKPOINT),
+        ("scenes", f"{len(shown)} of {dataset.manifest.num_samples}"),
+    ]
+    write_page(folder / "gallery", shown, about=about)
+    _sum_and_say(folder)
+
+
+def _write_network(folder: Path) -> None:
+    source = BUILTIN_NETWORKS[_CHECKPOINT]
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, folder / NETWORK_FILE)
+    front = front_matter(
+        {"license": "mit", "library_name": "trilight", "tags": ["neural-rendering", "trilight"]}
+    )
+    card = source.with_name("README.md").read_text()
+    write_atomically(folder / "README.md", f"{front}\n{card}".encode())
+
+
+def _sum_and_say(folder: Path) -> None:
+    parts = [folder / name for name in ("dataset", "network", "gallery")]
+    rows = []
+    for part in parts:
+        lines = [
+            f"{sha256_of_file(path)}  {path.relative_to(part).as_posix()}\n"
+            for path in uploaded_files(part)
+            if path.name != SUMS
+        ]
+        write_atomically(part / SUMS, "".join(lines).encode())
+        files, num_bytes = require_within_limits(part)
+        size = f"{files} files, {num_bytes / 1e6:.1f} MB, a {kind_of(part)}"
+        rows.append((str(part), size))
+    print_rows("Ready for a hub", rows)
+    next_step(*(["push", str(part), f"USER/{part.name}", "--dry-run"] for part in parts))
+
+
+if __name__ == "__main__":
+    try:
+        cyclopts.run(main)
+    except TrilightError as mistake:
+        raise SystemExit(str(mistake)) from mistake

@@ -1,0 +1,54 @@
+"""What a repository of the Hugging Face hub should keep within, as its documents say.
+
+Source: https://huggingface.co/docs/hub/storage-limits, "Repository limitations" (2026-11).
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+
+from storage.errors import TrilightError
+
+MOST_FILES = 100_000
+"""Of a repository."""
+MOST_ENTRIES = 10_000
+"""Of one folder."""
+MOST_FILE_BYTES = 20_000_000_000
+"""Of one file."""
+
+IGNORED = ("logs/*", ".staging/*", ".cache/*", "*.part", "*.tmp")
+"""Never uploaded: how the files came to be, and what is not finished."""
+
+
+def uploaded_files(folder: Path) -> Iterator[Path]:
+    """Yield the files of a folder that are uploaded, in order."""
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and not any(fnmatch(name, pattern) for pattern in IGNORED):
+            yield path
+
+
+def require_within_limits(folder: Path) -> tuple[int, int]:
+    """Return how many files and bytes a folder uploads.
+
+    Raises:
+        TrilightError: nothing is there, or more than the hub takes.
+    """
+    files = list(uploaded_files(folder))
+    sizes = {path: path.stat().st_size for path in files}
+    entries = Counter(path.parent for path in files).most_common(1)
+    largest = max(sizes, key=lambda path: sizes[path], default=None)
+    for got, limit, what in (
+        (len(files), MOST_FILES, "files"),
+        (entries[0][1] if entries else 0, MOST_ENTRIES, "entries in one folder"),
+        (sizes[largest] if largest else 0, MOST_FILE_BYTES, f"bytes in one file, {largest}"),
+    ):
+        if got > limit:
+            raise TrilightError(
+                f"{folder}: {got} {what}; the hub takes at most {limit}. Make larger or smaller "
+                "shards: trilight shards reshard."
+            )
+    if not files:
+        raise TrilightError(f"{folder}: holds no file; expected a finished dataset or a network.")
+    return len(files), sum(sizes.values())

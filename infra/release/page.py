@@ -1,0 +1,90 @@
+"""The page of a release: traced, network, error and few samples, side by side, from disk."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from infra.release.pictures import NETWORK, Beside
+from pipeline.documents.html import Markup, element, enlargeable, joined, page, table
+from pipeline.documents.markdown import front_matter
+from pipeline.documents.png import encode_png
+from storage.atomic import write_atomically
+from storage.conventions import preview_srgb8
+from train.evaluation.sheet import ERROR_WHITE, error_picture
+
+_TITLE = "Trilight: traced, learned and filtered"
+
+_STYLE = """
+.row { display: grid; grid-template-columns: repeat(auto-fill, minmax(9rem, 1fr)); gap: .6rem;
+  margin-bottom: .4rem }
+figure { margin: 0 } figure img { display: block; width: 100%; background: #111;
+  image-rendering: pixelated }
+figcaption { font-size: .85rem; color: var(--soft); margin-top: .2rem }
+"""
+
+
+def write_page(folder: Path, shown: Sequence[Beside], *, about: Sequence[tuple[str, str]]) -> Path:
+    """Write `index.html`, its pictures and the card of a static space, and return the page.
+
+    Args:
+        folder: where they go.
+        shown: the scenes, each by the same ones.
+        about: what the pictures are of, as names and values.
+
+    Raises:
+        TrilightError: the folder cannot be written.
+    """
+    rows = [part for each in shown for part in _scene(folder, each)]
+    body = [
+        element("h1", _TITLE),
+        element("p", _EXPLAINED),
+        table((), about, class_="narrow"),
+        element("h2", "In the median"),
+        _medians(shown),
+        *rows,
+    ]
+    path = folder / "index.html"
+    write_atomically(path, page(_TITLE, joined(body), style=_STYLE))
+    card = front_matter({"title": _TITLE, "sdk": "static", "license": "cc0-1.0"})
+    write_atomically(folder / "README.md", f"{card}\n# {_TITLE}\n\n{_EXPLAINED}\n".encode())
+    return path
+
+
+_EXPLAINED = (
+    "First views of scenes of built-in objects, which are CC0. The figure below a picture is its "
+    "psnr_log_db to the traced one, whose own is that of its noise. In error pictures white is a "
+    f"difference of {ERROR_WHITE} in log10(1 + radiance)."
+)
+
+
+def _scene(folder: Path, each: Beside) -> list[Markup]:
+    error = error_picture(each.pictures_rgb[NETWORK], each.target_rgb)
+    pictures = [
+        ("traced", preview_srgb8(each.target_rgb), f"traced, noise floor {each.floor_db:.1f} dB")
+    ]
+    for place, (name, shown) in enumerate(each.pictures_rgb.items()):
+        caption = f"{name}, {each.psnr_db[name]:.1f} dB"
+        pictures.append((str(place), preview_srgb8(shown), caption))
+        if name == NETWORK:
+            pictures.append(("error", error, "error of the network"))
+    figures = []
+    for name, pixels, caption in pictures:
+        relative = f"pictures/{each.key}-{name}.png"
+        write_atomically(folder / relative, encode_png(pixels))
+        figure = enlargeable(relative, f"{each.key}, {caption}")
+        figures.append(element("figure", figure, element("figcaption", caption)))
+    heading = element("h3", f"Scene {each.key}: {each.caption}")
+    return [heading, element("div", *figures, class_="row")]
+
+
+def _medians(shown: Sequence[Beside]) -> Markup:
+    names = list(shown[0].psnr_db)
+    rows = []
+    for name in names:
+        values = [each.psnr_db[name] for each in shown]
+        better = sum(each.psnr_db[name] > each.psnr_db[NETWORK] for each in shown)
+        beaten = "" if name == NETWORK else f"{better} of {len(shown)}"
+        rows.append((name, f"{np.median(values):.1f}", f"{np.min(values):.1f}", beaten))
+    head = ("picture", "median psnr_log_db, dB", "worst, dB", "better than the network in")
+    return table(head, rows, numbers=3, class_="narrow")

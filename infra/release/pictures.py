@@ -1,0 +1,123 @@
+"""Pictures of a release: traced to a floor, by the network, and by few samples."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.rendering.cameras import own_camera
+from infra.rendering.engines import Engine, MitsubaPlan, NeuralPlan
+from model.weights import MAX_LIGHTS
+from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
+from pipeline.renders.preview import PreviewSettings
+from pipeline.renders.variant import choose_variant
+from storage.dataset.dataset import Dataset
+from storage.metrics import psnr_log_db
+from storage.records.sample import Sample
+
+RIVALS = (1, 4, 16)
+"""Samples a pixel of the previews beside the network, filtered by Open Image Denoise."""
+
+NETWORK = "network"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Beside:
+    """The first view of one scene, by everybody."""
+
+    key: str
+    """Of the scene."""
+    caption: str
+    """What it shows."""
+    target_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance, as the dataset has it."""
+    floor_db: float
+    """Of the target."""
+    pictures_rgb: Mapping[str, NDArray[np.float32]]
+    """[R, R, 3] linear radiance, by who made it."""
+    psnr_db: Mapping[str, float]
+    """psnr_log_db to the target, by who made it."""
+
+
+def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
+    """Return up to `count` scenes that no network of this dataset learned from, if there are any.
+
+    They are those of the test split; of all splits where it is empty.
+    """
+    everything = choose_scenes(dataset.manifest, dataset.manifest.num_samples)
+    held = [entry for entry in everything if entry.split == "test"] or everything
+    rows = np.linspace(0, len(held) - 1, min(count, len(held))).round().astype(int)
+    return [held[row] for row in rows]
+
+
+def pictures_beside(
+    dataset: Dataset, chosen: Sequence[Chosen], *, checkpoint: str, done: Callable[[], None]
+) -> Iterator[Beside]:
+    """Yield the first view of each scene.
+
+    Args:
+        dataset: the dataset.
+        chosen: its scenes.
+        checkpoint: the network, as `trilight render --checkpoint` takes it.
+        done: called after each scene.
+
+    Raises:
+        TrilightError: a sample is unreadable, or the network or the path tracer cannot show it.
+    """
+    by_width: dict[int, Mapping[str, Engine]] = {}
+    with contextlib.ExitStack() as stack:
+        for entry, sample in read_chosen(dataset, chosen):
+            width = int(sample.radiance_rgb.shape[1])
+            if width not in by_width:
+                by_width[width] = _engines(width, checkpoint)
+                for engine in by_width[width].values():
+                    stack.callback(engine.close)
+            yield _beside(sample, entry.split, by_width[width])
+            done()
+
+
+def _engines(resolution: int, checkpoint: str) -> Mapping[str, Engine]:
+    variant = choose_variant()
+    tracers = {
+        f"{spp} {'sample' if spp == 1 else 'samples'}, filtered": MitsubaPlan(
+            settings=PreviewSettings(resolution=resolution, spp=spp),
+            seed=0,
+            threads=1,
+            variant=variant,
+        )
+        for spp in RIVALS
+    }
+    network = NeuralPlan(
+        checkpoint=checkpoint,
+        precision="float32",
+        resolution=resolution,
+        lights_per_pass=MAX_LIGHTS,
+        skip_empty_bundles=False,
+        threads=None,
+    )
+    started = {NETWORK: network.start(_unwatched)}
+    return started | {name: plan.start(_unwatched) for name, plan in tracers.items()}
+
+
+def _unwatched(_sampling: object) -> None:
+    """Say nothing of the samples."""
+
+
+def _beside(sample: Sample, split: str, engines: Mapping[str, Engine]) -> Beside:
+    camera = own_camera(sample.scene, 0)
+    target = sample.radiance_rgb[0]
+    pictures = {
+        name: engine.open(sample.scene, sample.key).render(camera, sample.key).radiance_rgb
+        for name, engine in engines.items()
+    }
+    template = sample.scene.provenance.get("template", "")
+    return Beside(
+        key=sample.key,
+        caption=f"{split}, {template}, {sample.scene.num_triangles} triangles",
+        target_rgb=target,
+        floor_db=float(sample.views[0].noise_floor_db),
+        pictures_rgb=pictures,
+        psnr_db={name: float(psnr_log_db(shown, target)) for name, shown in pictures.items()},
+    )

@@ -1,0 +1,132 @@
+"""Uploads a folder to a repository of the Hugging Face hub, by its own package."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from infra.release.hub_limits import IGNORED, require_within_limits
+from storage.dataset.layout import DatasetFolder
+from storage.dataset.verify import verify_dataset
+from storage.errors import TrilightError
+
+RepositoryKind = Literal["dataset", "model", "space"]
+
+NETWORK_FILE = "model.safetensors"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Upload:
+    """What goes where."""
+
+    folder: Path
+    """All of it is uploaded, but for what is ignored."""
+    repository: str
+    """USER/NAME."""
+    kind: RepositoryKind
+    """Of the repository."""
+    files: int
+    """Number of files."""
+    num_bytes: int
+    """Of all files together."""
+
+
+def kind_of(folder: Path) -> RepositoryKind:
+    """Return what kind of repository a folder makes; raises TrilightError where it is none."""
+    if DatasetFolder(folder).manifest.is_file():
+        return "dataset"
+    if (folder / NETWORK_FILE).is_file():
+        return "model"
+    if (folder / "index.html").is_file():
+        return "space"
+    raise TrilightError(
+        f"{folder}: expected a dataset (manifest.json), a network ({NETWORK_FILE}) or a page "
+        "(index.html); make one with trilight generate, trilight train or make release."
+    )
+
+
+def planned_upload(folder: Path, repository: str) -> Upload:
+    """Return what would be uploaded, after looking whether it should be.
+
+    Raises:
+        TrilightError: the name is none, the folder is no release, an unfinished or damaged dataset,
+            a network without its card, or more than the hub takes.
+    """
+    owner, _, name = repository.partition("/")
+    if not owner or not name or "/" in name:
+        raise TrilightError(f"repository is {repository}; expected USER/NAME.")
+    kind = kind_of(folder)
+    if kind == "dataset":
+        _require_sound(folder)
+    if not (folder / "README.md").is_file():
+        raise TrilightError(
+            f"{folder}: has no README.md, the card that the hub shows; a dataset's is written by "
+            "trilight inspect, those of a release by make release."
+        )
+    files, num_bytes = require_within_limits(folder)
+    return Upload(folder=folder, repository=repository, kind=kind, files=files, num_bytes=num_bytes)
+
+
+def push(upload: Upload, *, private: bool) -> str:
+    """Upload a folder, as far as the repository does not have it, and return its address.
+
+    The token is that of HF_TOKEN or of `hf auth login`; the hub is HF_ENDPOINT or the usual one.
+
+    Raises:
+        TrilightError: the package is missing, or the hub refuses.
+    """
+    try:
+        from huggingface_hub import HfApi
+        from huggingface_hub.errors import HfHubHTTPError, LocalTokenNotFoundError
+    except ImportError as error:
+        raise TrilightError("push: needs huggingface_hub; pip install huggingface_hub.") from error
+    hub = HfApi()
+    try:
+        made = hub.create_repo(
+            upload.repository,
+            repo_type=upload.kind,
+            private=private,
+            exist_ok=True,
+            space_sdk="static" if upload.kind == "space" else None,
+        )
+        hub.upload_folder(
+            repo_id=upload.repository,
+            repo_type=upload.kind,
+            folder_path=upload.folder,
+            ignore_patterns=list(IGNORED),
+            commit_message=f"Upload of {upload.files} files",
+        )
+    except LocalTokenNotFoundError as error:
+        raise TrilightError(_NO_TOKEN.format(repository=upload.repository)) from error
+    except HfHubHTTPError as error:
+        if error.response is not None and error.response.status_code in (401, 403):
+            raise TrilightError(_NO_TOKEN.format(repository=upload.repository)) from error
+        raise _broken_off(upload, "the hub refused", error) from error
+    except Exception as error:  # of whichever library the package speaks HTTP with
+        raise _broken_off(upload, "the upload broke off", error) from error
+    return str(made.url)
+
+
+_NO_TOKEN = (
+    "{repository}: the hub takes uploads from its owner alone; set HF_TOKEN to a token that may "
+    "write there, or run hf auth login."
+)
+
+
+def _broken_off(upload: Upload, what: str, error: Exception) -> TrilightError:
+    said = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+    return TrilightError(
+        f"{upload.repository}: {what} ({said}). What it has already is kept: run it again."
+    )
+
+
+def _require_sound(folder: Path) -> None:
+    found = verify_dataset(str(folder), fast=True)
+    if not found.is_finished:
+        raise TrilightError(
+            f"{folder}: is not finished; expected a whole dataset. Run its trilight generate again."
+        )
+    if found.problems:
+        raise TrilightError(
+            f"{folder}: is damaged ({found.problems[0].rstrip('.')}); expected a whole dataset. "
+            f"See trilight verify {folder}."
+        )

@@ -1,0 +1,56 @@
+"""What the triangles of a level emit: the mean over each of what its source emits there."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.own.nearest import NearestPlaces
+from pipeline.assets.own.source_surface import SourceSurface
+from storage.errors import Rejected
+
+_STEPS = 8
+"""Points along an edge of the grid over a triangle; (8 + 1) 8 / 2 of them in all."""
+_LEAST = 0.05
+"""Share of the radiance of the brightest triangle below which one emits nothing."""
+_MOST = 1e30
+"""Radiance from which on a number is no light."""
+
+
+def level_emission(
+    level: TriangleMesh, source: SourceSurface, nearest: NearestPlaces, reach: float
+) -> NDArray[np.float32] | None:
+    """Return the radiance [F, 3] of a level's triangles; None where nothing emits.
+
+    Args:
+        level: in the unit box.
+        source: what it was made from.
+        nearest: the places of that.
+        reach: how far the source may be away, in the unit box.
+
+    Raises:
+        Rejected: materials_unreadable where that is no number, or too large for single precision.
+    """
+    if not source.emits:
+        return None
+    weights = _grid()
+    corners = level.corners
+    points = np.einsum("pc,fcd->fpd", weights, corners)
+    normal = level.double_area_vectors
+    areas = 0.5 * np.linalg.norm(normal, axis=1)
+    normals = np.repeat(normal / (2 * areas[:, None]), len(weights), axis=0)
+    places = nearest.of(points.reshape(-1, 3), normals, reach)
+    cell = float(np.sqrt(np.median(areas) / len(weights)))
+    seen = source.emission(places.faces, places.weights, cell).reshape(len(corners), -1, 3)
+    mean = seen.mean(axis=1)
+    if not mean.max() < _MOST:  # or not a number
+        raise Rejected("materials_unreadable", f"a surface emits {mean.max():.3g}; < {_MOST:g}")
+    brightness = mean.mean(axis=1)
+    mean[brightness < _LEAST * brightness.max()] = 0
+    return mean.astype(np.float32) if mean.any() else None
+
+
+def _grid() -> NDArray[np.float64]:
+    """Return barycentric coordinates [P, 3] of points spread evenly over a triangle."""
+    rows = [(i, j) for i in range(_STEPS) for j in range(_STEPS - i)]
+    u, v = (np.array(rows, np.float64).T + 1 / 3) / _STEPS
+    return np.stack([u, v, 1 - u - v], axis=1)

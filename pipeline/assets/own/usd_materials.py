@@ -1,0 +1,205 @@
+"""Materials of a USD stage: UsdPreviewSurface in both workflows, with its UsdUVTextures.
+
+A colour space counts as the shader says; without one, colours in 8 bits are sRGB-encoded, as USD
+states, and what the picture says of itself counts nothing.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.own.parts import MOST_UV_SETS, TexturedParts
+from pipeline.assets.own.picture import Picture, has_colours
+from pipeline.assets.own.source_material import RGB, WHITE, Slot, SourceMaterial
+from pipeline.assets.reading.material_files import MaterialFiles
+from pipeline.assets.reading.usd_looks import Binding, StatedMaterial
+from pipeline.assets.reading.usd_meshes import PlacedPart
+from pipeline.assets.reading.usd_source import UsdSource
+from pipeline.usd.texture_nodes import TextureNode, UvChart
+from storage.errors import Rejected
+
+_CHANNELS = {"rgb": 0, "r": 0, "g": 1, "b": 2, "a": 3}
+_STRIP = 256
+_UNBOUND = 0.18
+"""What USD shows of a mesh without a material and a display colour."""
+
+Decode = Callable[[bytes, str], NDArray]
+
+
+def usd_parts(source: UsdSource, decode: Decode, *, emission: bool = False) -> TexturedParts:
+    """Return the triangles of a USD file with their materials; what they emit only if asked.
+
+    Raises:
+        Rejected: no_materials, materials_unreadable, no_texture_coordinates, or as reading a
+            picture.
+    """
+    looks, time = source.looks(), source.stage.time
+    nodes = [node for stated in looks.materials for node in stated.textures.values()]
+    primvars = list(dict.fromkeys(node.chart.primvar for node in nodes))
+    if len(primvars) > MOST_UV_SETS:
+        raise Rejected("no_texture_coordinates", f"textures lie on {len(primvars)} sets of them")
+    reader = _Reader(looks.pictures, primvars, decode)
+    materials = [reader.material(stated) for stated in looks.materials]
+    if emission:
+        pairs = zip(materials, looks.materials, strict=True)
+        materials = [reader.emitting(found, stated) for found, stated in pairs]
+    plain = len(materials)
+    rows, colours, coordinates = [], [], []
+    for part in source.parts:
+        mine = _rows(looks.bindings[part.number], part, plain)
+        rows.append(mine)
+        colours.append(_colours(part, mine == plain, time))
+        coordinates.append(part.coordinates(primvars or ["st"], time))
+    material, colour = np.concatenate(rows), np.concatenate(colours)
+    if (material == plain).all() and (colour == _UNBOUND).all():
+        raise Rejected("no_materials", "the stage has no materials and no display colours")
+    return TexturedParts(
+        mesh=source.mesh,
+        material=material,
+        materials=(*materials, SourceMaterial(roughness=0.5)),
+        uv=np.concatenate(coordinates),
+        colour=None if (colour == 1).all() else colour,
+    )
+
+
+def _rows(bindings: Sequence[Binding], part: PlacedPart, plain: int) -> NDArray[np.int64]:
+    found = np.full(len(part.corners), plain)
+    for row, polygons in bindings:
+        chosen = slice(None) if polygons is None else np.isin(part.polygons, polygons)
+        found[chosen] = plain if row < 0 else row
+    return found
+
+
+def _colours(part: PlacedPart, is_plain: NDArray[np.bool_], time: object) -> NDArray[np.float64]:
+    """Return what tints corners [T, 3, 3]: display colours, where there is no material."""
+    found = np.ones((len(is_plain), 3, 3))
+    if is_plain.any():
+        shown = part.display_colour(time)
+        found[is_plain] = _UNBOUND if shown is None else shown[is_plain]
+    return found
+
+
+class _Reader:
+    """Makes materials of one stage, each picture once."""
+
+    def __init__(self, files: MaterialFiles, primvars: Sequence[str], decode: Decode) -> None:
+        self._files, self._primvars, self._decode = files, primvars, decode
+        self._values: dict[str, NDArray] = {}
+
+    def material(self, stated: StatedMaterial) -> SourceMaterial:
+        base = self._colour(stated, "diffuseColor")
+        base_rgb = WHITE if base is not None else _rgb(stated, "diffuseColor")
+        roughness = self._number(stated, "roughness")
+        common = SourceMaterial(
+            base_rgb=base_rgb,
+            base=base,
+            roughness=1.0 if roughness is not None else _of(stated, "roughness"),
+            roughness_map=roughness,
+            lost=("emission", *stated.lost) if any(_glow(stated)) else stated.lost,
+        )
+        if stated.constants["useSpecularWorkflow"].any():
+            return self._specular(stated, common)
+        ior, metallic = _of(stated, "ior"), self._number(stated, "metallic")
+        return dataclasses.replace(
+            common,
+            metallic=1.0 if metallic is not None else _of(stated, "metallic"),
+            metallic_map=metallic,
+            f0=((ior - 1) / (ior + 1)) ** 2 if ior > 0 else 1.0,
+        )
+
+    def emitting(self, found: SourceMaterial, stated: StatedMaterial) -> SourceMaterial:
+        """Return a material with what it emits."""
+        if not any(_glow(stated)):
+            return found
+        picture = self._colour(stated, "emissiveColor")
+        return dataclasses.replace(found, emission_rgb=_glow(stated), emission=picture)
+
+    def _specular(self, stated: StatedMaterial, common: SourceMaterial) -> SourceMaterial:
+        colour = self._colour(stated, "specularColor")
+        return dataclasses.replace(
+            common,
+            f0=1.0,
+            specular_rgb=WHITE if colour is not None else _rgb(stated, "specularColor"),
+            specular_colour=colour,
+        )
+
+    def _colour(self, stated: StatedMaterial, name: str) -> Slot | None:
+        """Return the picture of a colour; a single channel stands in all of them."""
+        node = stated.textures.get(name)
+        return None if node is None else self._slot(node, is_grey=node.output != "rgb")
+
+    def _number(self, stated: StatedMaterial, name: str) -> Slot | None:
+        node = stated.textures.get(name)
+        return None if node is None else self._slot(node, is_grey=False)
+
+    def _slot(self, node: TextureNode, *, is_grey: bool) -> Slot:
+        values, is_srgb = self._picture(node), self._is_srgb(node)
+        channel = _CHANNELS[node.output]
+        if is_grey:
+            values = np.ascontiguousarray(values[..., [channel] * 3 + [3]])
+            is_srgb = is_srgb and channel != 3
+        picture = Picture(values=values, is_srgb=is_srgb, wrap=node.wrap)
+        if (node.scale != 1).any() or node.bias.any():
+            scale, bias = node.scale, node.bias
+            if is_grey:
+                scale, bias = scale[[channel] * 3 + [3]], bias[[channel] * 3 + [3]]
+            picture = _scaled(picture, scale, bias)
+        turn, shift = _moves(node.chart)
+        return Slot(
+            picture=picture,
+            uv_set=self._primvars.index(node.chart.primvar),
+            turn=turn,
+            shift=shift,
+            channel=channel,
+        )
+
+    def _picture(self, node: TextureNode) -> NDArray:
+        place = node.resolved or node.named
+        if place not in self._values:
+            self._values[place] = self._decode(self._files.of(place), node.named)
+        return self._values[place]
+
+    def _is_srgb(self, node: TextureNode) -> bool:
+        if node.colour_space in ("sRGB", "raw"):
+            return node.colour_space == "sRGB"
+        return has_colours(self._files.of(node.resolved or node.named))
+
+
+def _scaled(picture: Picture, scale: NDArray[np.float32], bias: NDArray[np.float32]) -> Picture:
+    """Return a picture of linear values in float32, scaled and moved, none below 0."""
+    if not (np.isfinite(scale).all() and np.isfinite(bias).all()):
+        raise Rejected("materials_unreadable", "a texture is scaled by what is no number")
+    values = np.zeros((*picture.values.shape[:2], 4), np.float32)
+    for row in range(0, len(values), _STRIP):
+        part = slice(row, row + _STRIP)
+        values[part] = np.maximum(picture.linear(picture.values[part]) * scale + bias, 0)
+    return Picture(values=values, is_srgb=False, wrap=picture.wrap)
+
+
+def _moves(chart: UvChart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    turn, shift = np.eye(2), np.zeros(2)
+    for move in chart.moves:
+        turn, shift = move.turn @ turn, move.turn @ shift + move.translation
+    if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+        raise Rejected("materials_unreadable", "coordinates are moved by what is no number")
+    return turn, shift
+
+
+def _rgb(stated: StatedMaterial, name: str) -> RGB:
+    red, green, blue = np.maximum(stated.constants[name], 0).tolist()
+    return red, green, blue
+
+
+def _glow(stated: StatedMaterial) -> RGB:
+    """Return what times the picture, if there is one, a material emits."""
+    strength = max(_of(stated, "strength"), 0.0) if stated.has_strength else 1.0
+    if "emissiveColor" in stated.textures:
+        return (strength, strength, strength)
+    red, green, blue = (strength * value for value in _rgb(stated, "emissiveColor"))
+    return red, green, blue
+
+
+def _of(stated: StatedMaterial, name: str) -> float:
+    return float(stated.constants[name][0])

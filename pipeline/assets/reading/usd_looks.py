@@ -1,0 +1,154 @@
+"""What the materials of a USD stage state, by mesh and polygon, with the bytes of pictures."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets.reading.material_files import MaterialFiles
+from pipeline.assets.reading.usd_stage import UsdStage
+from pipeline.usd.placed import Placed
+from pipeline.usd.polygons import as_array
+from pipeline.usd.shaders import StatedInputs, surface_shader, without_place
+from pipeline.usd.stage import OutsideFile
+from pipeline.usd.texture_nodes import TextureNode, asset_bytes
+from storage.errors import Rejected, TrilightError
+
+COLOURS = ("diffuseColor", "specularColor", "emissiveColor")
+NUMBERS = ("metallic", "roughness", "ior", "strength", "useSpecularWorkflow")
+_TEXTURED = (*COLOURS, "metallic", "roughness")
+_LOST = {
+    "opacity": "transparency",
+    "transmission": "transmission",
+    "clearcoat": "clearcoat",
+    "coat": "clearcoat",
+    "subsurface": "subsurface",
+    "displacement": "displacement",
+    "normal": "normal map",
+}
+"""Words for inputs without a place here, by how those begin."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StatedMaterial:
+    """One material before its pictures are decoded."""
+
+    constants: dict[str, NDArray[np.float32]]
+    """[3] by names of UsdPreviewSurface."""
+    textures: dict[str, TextureNode]
+    """Likewise; they stand before constants."""
+    has_strength: bool
+    """Whether emission is times `strength`."""
+    lost: tuple[str, ...]
+    """What else it states."""
+
+
+Binding = tuple[int, NDArray[np.int64] | None]
+"""Row of a material, or -1 for none, and the polygons of a mesh that have it; None for all."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StageLooks:
+    """The materials of a stage."""
+
+    materials: tuple[StatedMaterial, ...]
+    """Each once."""
+    bindings: tuple[tuple[Binding, ...], ...]
+    """Of each mesh; later ones stand before earlier ones."""
+    pictures: MaterialFiles
+    """Bytes by where they were found."""
+
+
+def stage_looks(stage: UsdStage, max_bytes: int) -> StageLooks:
+    """Return the materials of what is seen of a stage.
+
+    Args:
+        stage: the open stage.
+        max_bytes: bound of all pictures together.
+
+    Raises:
+        Rejected: texture_outside, materials_unreadable.
+    """
+    reader = _Reader(stage)
+    try:
+        bindings = tuple(tuple(reader.bindings(each)) for each in stage.meshes)
+    except OutsideFile as error:
+        raise Rejected("texture_outside", f"{error!s:.200}") from error
+    except TrilightError as error:
+        raise Rejected("materials_unreadable", f"{error!s:.200}") from error
+    materials = tuple(reader.found)
+    nodes = [node for material in materials for node in material.textures.values()]
+    return StageLooks(materials=materials, bindings=bindings, pictures=_pictures(nodes, max_bytes))
+
+
+class _Reader:
+    """Reads each material once."""
+
+    def __init__(self, stage: UsdStage) -> None:
+        self._stage = stage
+        self._rows: dict[str, int] = {}
+        self.found: list[StatedMaterial] = []
+
+    def bindings(self, placed: Placed) -> Iterator[Binding]:
+        from pxr import UsdShade
+
+        binding = UsdShade.MaterialBindingAPI(placed.prim)
+        yield self._row(binding.ComputeBoundMaterial()[0]), None
+        for subset in binding.GetMaterialBindSubsets():
+            bound = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0]
+            if bound:
+                chosen = subset.GetIndicesAttr().Get(self._stage.time)
+                yield self._row(bound), as_array(chosen, np.int64, (-1,))
+
+    def _row(self, material: Any) -> int:
+        if not material:
+            return -1
+        name = str(material.GetPath())
+        if name not in self._rows:
+            self._rows[name] = len(self.found)
+            self.found.append(self._stated(material))
+        return self._rows[name]
+
+    def _stated(self, material: Any) -> StatedMaterial:
+        opened, time = self._stage.opened, self._stage.time
+        shader = surface_shader(material)
+        if shader is None:
+            name = str(material.GetPath())
+            raise TrilightError(f"{name!r:.100} has no shader that is understood")
+        inputs, notes = StatedInputs(shader, time, opened), len(opened.lost)
+        textures = {name: inputs.texture(name) for name in _TEXTURED}
+        constants = {name: inputs.constant(name) for name in (*COLOURS, *NUMBERS)}
+        lost = {_word(name) for name in without_place(shader, time)}
+        if len(opened.lost) > notes:
+            lost.add("networks of shaders")
+        return StatedMaterial(
+            constants=constants,
+            textures={name: node for name, node in textures.items() if node is not None},
+            has_strength=inputs.has("strength"),
+            lost=tuple(sorted(lost)),
+        )
+
+
+def _word(name: str) -> str:
+    return next(word for start, word in _LOST.items() if name.startswith(start))
+
+
+def _pictures(nodes: Sequence[TextureNode], left: int) -> MaterialFiles:
+    data, refused = dict[str, bytes](), dict[str, Rejected]()
+    for node in nodes:
+        place = node.resolved or node.named
+        if place in data or place in refused:
+            continue
+        try:
+            found = None if node.resolved is None else asset_bytes(node.resolved, left)
+        except TrilightError as error:
+            refused[place] = Rejected("texture_too_large", f"{error!s:.200}")
+            continue
+        if found is None:
+            why = f"{node.named!r:.80} is not beside the object"
+            refused[place] = Rejected("texture_missing", why)
+        else:
+            data[place], left = found, left - len(found)
+    return MaterialFiles(data=data, refused=refused)

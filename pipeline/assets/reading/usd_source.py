@@ -1,0 +1,73 @@
+"""`UsdSource`: a USD file of an object, its triangles and its materials; only children make one."""
+
+import hashlib
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+
+from pipeline.assets.mesh import TriangleMesh
+from pipeline.assets.reading.usd_looks import StageLooks, stage_looks
+from pipeline.assets.reading.usd_meshes import PlacedPart, joined, placed_parts
+from pipeline.assets.reading.usd_stage import UsdStage, open_stage, refusing
+from pipeline.assets.settings import AssetSettings
+from storage.errors import Rejected
+
+
+class UsdSource:
+    """What a USD file holds. The materials are looked at where settings keep them."""
+
+    def __init__(self, path: Path, settings: AssetSettings) -> None:
+        """Open the file and those that it names.
+
+        Raises:
+            Rejected: as `open_stage`, or too_large_bytes for all layers together.
+        """
+        self._path, self._settings = path, settings
+        self.stage: UsdStage = open_stage(path, settings)
+        self._digest, left = _digest(self.stage.opened.files, settings.max_source_bytes)
+        self._looks: StageLooks | Rejected | None = None
+        if settings.own_materials.keep:
+            try:
+                self._looks = refusing(path, lambda: stage_looks(self.stage, left))
+            except Rejected as why:
+                self._looks = Rejected(why.reason, why.message)  # its traceback holds the stage
+
+    @property
+    def sha256(self) -> str:
+        """Digest of all layers, the root first, and of the pictures that materials name."""
+        digest = self._digest.copy()
+        if isinstance(self._looks, StageLooks):
+            pictures = self._looks.pictures.data
+            for place in sorted(pictures):
+                digest.update(pictures[place])
+        return digest.hexdigest()
+
+    @cached_property
+    def parts(self) -> tuple[PlacedPart, ...]:
+        """Its meshes; raises Rejected as `placed_parts`, or load_error."""
+        return refusing(self._path, lambda: placed_parts(self.stage, self._settings))
+
+    @cached_property
+    def mesh(self) -> TriangleMesh:
+        """All of them as one, in metres, +Z up; raises Rejected as `parts`."""
+        return joined(self.parts)
+
+    def looks(self) -> StageLooks:
+        """Return its materials; raises Rejected as `stage_looks`, or where nobody keeps them."""
+        if isinstance(self._looks, Rejected):
+            raise self._looks
+        if self._looks is None:
+            raise Rejected("no_materials", "materials were not asked for")
+        return self._looks
+
+
+def _digest(files: Sequence[Path], left: int) -> "tuple[hashlib._Hash, int]":
+    """Return the digest of files, and how many bytes are left of a bound on them."""
+    digest = hashlib.sha256()
+    for path in files:
+        data = path.read_bytes()
+        if len(data) > left:
+            raise Rejected("too_large_bytes", f"the layers together; {left} bytes are left")
+        digest.update(data)
+        left -= len(data)
+    return digest, left

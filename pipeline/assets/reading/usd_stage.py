@@ -1,0 +1,77 @@
+"""A USD file as an object: opened within bounds, with what is seen of it, and refused by name.
+
+USD resolves what a file names by itself, so it is given a path; every file that it may open is
+checked first (pipeline.usd.stage). What would give a plausible but wrong mesh is refused: a missing
+reference, solids that are no meshes, bones.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pipeline.assets.settings import AssetSettings
+from pipeline.usd.placed import Placed, placed_prims
+from pipeline.usd.stage import OpenedUsd, OutsideFile, quietly
+from storage.errors import Rejected, TrilightError
+
+_SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane", "NurbsPatch", "TetMesh")
+_BONES = "primvars:skel:jointIndices"
+
+Read = TypeVar("Read")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UsdStage:
+    """An open stage."""
+
+    opened: OpenedUsd
+    """Its files."""
+    composed: Any
+    """The stage itself, without which its prims expire."""
+    meshes: tuple[Placed, ...]
+    """What is seen of it, into metres with +Z up."""
+    time: Any
+    """The first of a stage that moves."""
+
+
+def open_stage(path: Path, settings: AssetSettings) -> UsdStage:
+    """Return the stage of a file.
+
+    Raises:
+        Rejected: external_uri, load_error, missing_file, too_many_instances,
+            unsupported_primitive, skinned_mesh.
+    """
+    return refusing(path, lambda: _opened(path, settings))
+
+
+def refusing(path: Path, read: Callable[[], Read]) -> Read:
+    """Return what `read` makes of a USD file; its errors become reasons.
+
+    Raises:
+        Rejected: external_uri, load_error, or as `read`.
+    """
+    try:
+        return quietly(path, read)
+    except TrilightError as error:
+        reason = "external_uri" if isinstance(error, OutsideFile) else "load_error"
+        raise Rejected(reason, f"{error!s:.300}") from error
+
+
+def _opened(path: Path, settings: AssetSettings) -> UsdStage:
+    from pxr import Usd
+
+    opened = OpenedUsd(path, max_file_bytes=settings.max_source_bytes)
+    stage, time = opened.compose(), Usd.TimeCode.EarliestTime()
+    if opened.unresolved:
+        raise Rejected("missing_file", f"{opened.unresolved[0]}; an object needs all of its parts")
+    placed = placed_prims(stage, time, opened.lost, ("Mesh", *_SOLIDS))
+    if len(placed) > settings.max_instances:
+        raise Rejected("too_many_instances", f"{len(placed)} meshes; <= {settings.max_instances}")
+    for each in placed:
+        kind, where = each.prim.GetTypeName(), str(each.prim.GetPath())
+        if kind != "Mesh":
+            raise Rejected("unsupported_primitive", f"{where!r:.100} is a {kind}; make it a mesh")
+        if each.prim.GetAttribute(_BONES).HasValue():
+            raise Rejected("skinned_mesh", "bones pose a mesh; apply the skin before exporting")
+    return UsdStage(opened=opened, composed=stage, meshes=tuple(placed), time=time)

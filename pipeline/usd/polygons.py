@@ -1,0 +1,227 @@
+"""A mesh of a stage as polygons with its numbers checked, and polygons as triangles.
+
+Fans where they are convex, cut-off ears where they are not.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import TrilightError
+
+MAX_EAR_CORNERS = 2000
+"""Maximum corners of a polygon that is not convex; larger polygons are cut as fans."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeshPolygons:
+    """The arrays of a mesh, which fit each other."""
+
+    points: NDArray[np.float64]  # [P, 3] in the units of the mesh, finite
+    counts: NDArray[np.int64]  # [F] corners of each polygon
+    indices: NDArray[np.int64]  # [sum of counts] rows of `points`
+
+
+def mesh_polygons(prim: Any, time: Any) -> MeshPolygons:
+    """Return the polygons of a mesh at a time.
+
+    Raises:
+        TrilightError: its arrays contradict each other, or are not finite.
+    """
+    from pxr import UsdGeom
+
+    mesh = UsdGeom.Mesh(prim)
+    points = as_array(mesh.GetPointsAttr().Get(time), np.float64, (-1, 3))
+    counts = as_array(mesh.GetFaceVertexCountsAttr().Get(time), np.int64, (-1,))
+    indices = as_array(mesh.GetFaceVertexIndicesAttr().Get(time), np.int64, (-1,))
+    _check(prim, points, counts, indices)
+    return MeshPolygons(points=points, counts=counts, indices=indices)
+
+
+def mesh_triangles(
+    prim: Any, found: MeshPolygons, to_world: NDArray[np.float64], time: Any
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the triangles of a mesh in its place, holes left out.
+
+    Args:
+        prim: the mesh.
+        found: its polygons.
+        to_world: [4, 4] its place; a mirrored one turns windings round.
+        time: of the holes.
+
+    Returns:
+        Corners [T, 3] as rows of `indices`, counter-clockwise from outside, and the polygon [T] of
+        each.
+    """
+    from pxr import UsdGeom
+
+    mesh = UsdGeom.Mesh(prim)
+    corners, polygons = triangulated(found.points, found.counts, found.indices)
+    holes = as_array(mesh.GetHoleIndicesAttr().Get(time), np.int64, (-1,))
+    kept = ~np.isin(polygons, holes)
+    corners, polygons = corners[kept], polygons[kept]
+    mirrored = np.linalg.det(to_world[:3, :3]) < 0
+    if mirrored != (mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
+        corners = corners[:, ::-1]
+    return corners, polygons
+
+
+def moved(points: NDArray[np.float64], to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points [P, 3] in their place."""
+    placed: NDArray[np.float64] = np.einsum("ij,vj->vi", to_world[:3, :3], points)
+    return placed + to_world[:3, 3]
+
+
+def as_array(values: Any, dtype: type, shape: tuple[int, ...]) -> NDArray:
+    """Return values of USD as an array of a kind and shape; raises TypeError for another kind."""
+    found = np.zeros(0, dtype) if values is None else np.array(values)
+    return found.astype(dtype, casting="same_kind").reshape(shape)
+
+
+def per_corner(
+    values: NDArray,
+    interpolation: str,
+    indices: NDArray[np.int64],
+    corners: NDArray[np.int64],
+    polygons: NDArray[np.int64],
+) -> NDArray | None:
+    """Return values at the corners [T, 3, ...] of triangles; None where their number is wrong.
+
+    Args:
+        values: [N, ...].
+        interpolation: constant, uniform, vertex, varying or faceVarying.
+        indices: point of each corner of the mesh.
+        corners, polygons: the triangles, as `mesh_triangles` returns them.
+    """
+    where = {
+        "constant": np.zeros_like(corners),
+        "uniform": np.repeat(polygons[:, None], 3, axis=1),
+        "vertex": indices[corners],
+        "varying": indices[corners],
+        "faceVarying": corners,
+    }.get(interpolation)
+    if where is None or (where.size and where.max() >= len(values)):
+        return None
+    return values[where]
+
+
+def primvar_corners(
+    prim: Any,
+    name: str,
+    indices: NDArray[np.int64],
+    corners: NDArray[np.int64],
+    polygons: NDArray[np.int64],
+    time: Any,
+) -> NDArray | None:
+    """Return a primvar of a mesh, or of what is above it, at the corners of triangles.
+
+    None where it has none, or not for every corner; arguments as of `per_corner`.
+    """
+    from pxr import UsdGeom
+
+    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
+    if not primvar or not primvar.HasValue():
+        return None
+    values = np.array(primvar.ComputeFlattened(time))
+    if values.ndim == 0 or values.dtype.kind not in "fiu":
+        return None
+    return per_corner(values, str(primvar.GetInterpolation()), indices, corners, polygons)
+
+
+def triangulated(
+    points: NDArray[np.float64], counts: NDArray[np.int64], indices: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the triangles of polygons.
+
+    Args:
+        points: [P, 3].
+        counts: [F] corners of each polygon.
+        indices: [sum of counts] rows of `points`.
+
+    Returns:
+        Corners [T, 3], as positions within `indices`, and the polygon [T] of each. Polygons of
+        fewer than three corners give none.
+    """
+    starts = np.cumsum(counts) - counts
+    corners: list[NDArray[np.int64]] = []
+    owners: list[NDArray[np.int64]] = []
+    for count in np.unique(counts[counts >= 3]):
+        faces = np.flatnonzero(counts == count)
+        fan = np.array([[0, i, i + 1] for i in range(1, count - 1)])
+        cut = starts[faces, None, None] + fan
+        if 3 < count <= MAX_EAR_CORNERS:
+            for row in np.flatnonzero(_folded(points[indices[cut]])):
+                ring = starts[faces[row]] + np.arange(count)
+                cut[row] = ring[_ears(points[indices[ring]])]
+        corners.append(cut.reshape(-1, 3))
+        owners.append(np.repeat(faces, count - 2))
+    if not corners:
+        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
+    joined, owner = np.concatenate(corners), np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    return joined[order], owner[order]
+
+
+def _folded(fans: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return for fans [F, N, 3, 3] whether a triangle faces away from its polygon."""
+    cross = np.cross(fans[:, :, 1] - fans[:, :, 0], fans[:, :, 2] - fans[:, :, 0])
+    facing = np.einsum("fni,fi->fn", cross, cross.sum(axis=1))
+    return np.asarray((facing < 0).any(axis=1))
+
+
+def _ears(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the triangles [N - 2, 3] of one polygon [N, 3], by cutting off ears."""
+    flat = _flattened(points)
+    ring = list(range(len(flat)))
+    found = []
+    while len(ring) > 3:
+        at = next((i for i in range(len(ring)) if _is_ear(flat, ring, i)), 0)
+        found.append([ring[at - 1], ring[at], ring[(at + 1) % len(ring)]])
+        del ring[at]
+    return np.array([*found, ring])
+
+
+def _flattened(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a polygon [N, 2] in the plane of its normal, counter-clockwise."""
+    ahead = np.roll(points, -1, axis=0)
+    normal = np.cross(points, ahead).sum(axis=0)
+    axis = int(np.argmax(np.abs(normal)))
+    flat = np.delete(points, axis, axis=1)
+    mirrored = (normal[axis] < 0) != (axis == 1)
+    return flat * np.array([-1.0, 1.0]) if mirrored else flat
+
+
+def _is_ear(flat: NDArray[np.float64], ring: list[int], at: int) -> bool:
+    before, here, after = ring[at - 1], ring[at], ring[(at + 1) % len(ring)]
+    a, b, c = flat[before], flat[here], flat[after]
+    if _turn(a, b, c) <= 0:
+        return False
+    others = [i for i in ring if i not in (before, here, after)]
+    return not any(
+        _turn(a, b, flat[i]) >= 0 and _turn(b, c, flat[i]) >= 0 and _turn(c, a, flat[i]) >= 0
+        for i in others
+    )
+
+
+def _turn(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> float:
+    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+
+def _check(
+    prim: Any, points: NDArray[np.float64], counts: NDArray[np.int64], indices: NDArray[np.int64]
+) -> None:
+    where = prim.GetPath()
+    if (counts < 0).any() or counts.sum() != len(indices):
+        raise TrilightError(
+            f"{where}: faceVertexCounts add up to {counts.sum()}; expected {len(indices)}, the "
+            "number of faceVertexIndices."
+        )
+    if len(indices) and not (0 <= indices.min() and indices.max() < len(points)):
+        raise TrilightError(
+            f"{where}: faceVertexIndices go from {indices.min()} to {indices.max()}; expected 0 to "
+            f"{len(points) - 1}."
+        )
+    if not np.isfinite(points).all():
+        raise TrilightError(f"{where}: points are not finite.")

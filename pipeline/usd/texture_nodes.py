@@ -1,0 +1,188 @@
+"""A UsdUVTexture as its shader states it: the file, its colour space, and where it is looked up."""
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.usd.polygons import primvar_corners
+from pipeline.usd.stage import OpenedUsd
+from storage.errors import TrilightError
+
+_MOST_NODES = 8
+"""Maximum number of transforms in a row."""
+
+NodeWrap = Literal["repeat", "mirror", "clamp", "black"]
+_WRAPS = ("repeat", "mirror", "clamp", "black")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Move:
+    """A UsdTransform2d: scaled, turned counter-clockwise, and shifted, in this order."""
+
+    scale: tuple[float, float]
+    rotation_deg: float
+    translation: tuple[float, float]
+
+    @property
+    def turn(self) -> NDArray[np.float64]:
+        """[2, 2] what scales and turns, for column vectors."""
+        cos, sin = np.cos(np.radians(self.rotation_deg)), np.sin(np.radians(self.rotation_deg))
+        return np.array([[cos, -sin], [sin, cos]]) * self.scale
+
+
+@dataclass(frozen=True, kw_only=True)
+class UvChart:
+    """What a texture reads."""
+
+    primvar: str
+    """Name of the coordinates of the mesh."""
+    moves: tuple[Move, ...]
+    """What moves them, the first one first."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TextureNode:
+    """A texture before its picture is opened."""
+
+    named: str
+    """The file as the shader names it; empty where it names none."""
+    resolved: str | None
+    """Where that is, below the folder of the stage; None where it is missing."""
+    colour_space: str
+    """`sRGB`, `raw`, or anything else for `auto`."""
+    wrap: tuple[NodeWrap, NodeWrap]
+    """Along s and t; `useMetadata` and what is unknown repeat."""
+    scale: NDArray[np.float32]
+    """[4]"""
+    bias: NDArray[np.float32]
+    """[4]"""
+    chart: UvChart
+    """Where it is looked up."""
+    output: str
+    """rgb, r, g, b or a: what is connected."""
+    fallback: NDArray[np.float64] | None
+    """[4] what stands where there is no picture."""
+
+
+def texture_node(shader: Any, output: str, time: Any, opened: OpenedUsd) -> TextureNode:
+    """Return what a UsdUVTexture shader states.
+
+    Args:
+        shader: the node.
+        output: which of its outputs is connected.
+        time: of the values.
+        opened: the file, which says where others are.
+
+    Raises:
+        TrilightError: its picture is outside of the folder, or on the network.
+    """
+    attribute = shader.GetInput("file")
+    asset = attribute.Get(time) if attribute else None
+    named, resolved = "" if asset is None else asset.path, None
+    if named:
+        specs = attribute.GetAttr().GetPropertyStack(time)
+        resolved = opened.inside(specs[0].layer if specs else opened.root, named)
+    fallback = value_of(shader, "fallback", time, None)
+    return TextureNode(
+        named=named,
+        resolved=resolved,
+        colour_space=str(value_of(shader, "sourceColorSpace", time, "auto")),
+        wrap=(_wrap(shader, "wrapS", time), _wrap(shader, "wrapT", time)),
+        scale=np.array(value_of(shader, "scale", time, (1, 1, 1, 1)), np.float32),
+        bias=np.array(value_of(shader, "bias", time, (0, 0, 0, 0)), np.float32),
+        chart=chart_of(shader, time),
+        output=output if output in ("r", "g", "b", "a") else "rgb",
+        fallback=None if fallback is None else np.array(fallback, np.float64),
+    )
+
+
+def chart_of(shader: Any, time: Any) -> UvChart:
+    """Return the coordinates of a texture's shader; `st` where it states none."""
+    from pxr import UsdShade
+
+    st, moves = shader.GetInput("st"), list[Move]()
+    for _ in range(_MOST_NODES):
+        source = st.GetConnectedSources()[0] if st and st.HasConnectedSource() else []
+        if not source:
+            break
+        node = UsdShade.Shader(source[0].source.GetPrim())
+        if node.GetIdAttr().Get() == "UsdTransform2d":
+            moves.append(
+                Move(
+                    scale=_pair(value_of(node, "scale", time, (1, 1))),
+                    rotation_deg=float(value_of(node, "rotation", time, 0)),
+                    translation=_pair(value_of(node, "translation", time, (0, 0))),
+                )
+            )
+            st = node.GetInput("in")
+            continue
+        name = node.GetInput("varname")
+        stated = UsdShade.Utils.GetValueProducingAttributes(name) if name else []
+        if stated:
+            return UvChart(primvar=str(stated[0].Get(time)), moves=tuple(reversed(moves)))
+        break
+    return UvChart(primvar="st", moves=tuple(reversed(moves)))
+
+
+def chart_corners(
+    chart: UvChart,
+    prim: Any,
+    indices: NDArray[np.int64],
+    corners: NDArray[np.int64],
+    polygons: NDArray[np.int64],
+    time: Any,
+) -> NDArray[np.float64] | None:
+    """Return the coordinates [T, 3, 2] of a chart, before its moves; not all need be finite.
+
+    None where the mesh has none, or not for every corner. Arguments as of `primvar_corners`.
+    """
+    found = primvar_corners(prim, chart.primvar, indices, corners, polygons, time)
+    if found is None or found.ndim != 3 or found.shape[2] < 2:
+        return None
+    return np.asarray(found[..., :2], np.float64)
+
+
+def asset_bytes(resolved: str, max_bytes: int) -> bytes | None:
+    """Return the bytes of a plain file, or of a member of an archive; None where there are none.
+
+    Raises:
+        TrilightError: there are more than `max_bytes`.
+    """
+    name = Path(resolved).name
+    outer, _, member = resolved.partition("[")
+    try:
+        if member:
+            with zipfile.ZipFile(outer) as archive:
+                found = archive.getinfo(member.rstrip("]"))
+                _require_size(found.file_size, max_bytes, name)
+                return archive.read(found)
+        _require_size(Path(outer).stat().st_size, max_bytes, name)
+        return Path(outer).read_bytes()
+    except (OSError, KeyError, zipfile.BadZipFile):
+        return None
+
+
+def _require_size(size: int, max_bytes: int, name: str) -> None:
+    if size > max_bytes:
+        raise TrilightError(f"{name}: {size} bytes; expected at most {max_bytes}.")
+
+
+def value_of(shader: Any, name: str, time: Any, default: Any) -> Any:
+    """Return an input of a shader, or the default where it is not stated."""
+    attribute = shader.GetInput(name)
+    value = attribute.Get(time) if attribute else None
+    return default if value is None else value
+
+
+def _wrap(shader: Any, name: str, time: Any) -> NodeWrap:
+    mode = str(value_of(shader, name, time, "repeat"))
+    return cast(NodeWrap, mode) if mode in _WRAPS else "repeat"
+
+
+def _pair(value: Any) -> tuple[float, float]:
+    one, two = value
+    return float(one), float(two)

@@ -1,0 +1,44 @@
+"""A dataset's report in a browser: what a person filters, sorts and enlarges, without a script."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.documents.distributions import dataset_distributions
+from pipeline.documents.report import write_report
+from tests.end_to_end.browser_kit import browser
+from tests.pipeline.documents.dataset_by_hand import five_scenes
+
+SHOWN = """[...document.querySelectorAll('.card')].filter(card => card.offsetParent)
+    .sort((a, b) => a.offsetTop - b.offsetTop || a.offsetLeft - b.offsetLeft)
+    .map(card => card.innerText.slice(0, 9)).join()"""
+COMMANDS = """[...document.querySelectorAll('.chosen')].filter(line => line.offsetParent)
+    .map(line => line.querySelector('code').innerText).join()"""
+
+
+@pytest.mark.slow  # a browser
+def test_a_person_looks_around(tmp_path: Path) -> None:
+    dataset = five_scenes(tmp_path)
+    report = write_report(dataset, dataset_distributions(dataset))
+    with browser() as page:
+        for width in (1280, 390):
+            page.show(width, 844)
+            page.open(report.as_uri())
+            assert page.run("document.documentElement.scrollWidth") <= width
+            assert page.run("document.querySelector('.cards').offsetTop") < 844
+            everything = page.run(SHOWN)
+            assert everything == "000000000,000000001,000000002,000000003,000000020"
+            page.run("document.getElementById('layout-1').click()")
+            assert page.run(SHOWN) == "000000000,000000002,000000003"
+            assert page.run(COMMANDS).endswith("--out ../selected --template plane")
+            page.run("document.getElementById('split-2').click()")
+            assert page.run(SHOWN) == ""
+            page.run("document.getElementById('layout-0').click()")
+            page.run("document.getElementById('split-0').click()")
+            page.run("document.getElementById('order-3').click()")  # most triangles
+            assert sorted(page.run(SHOWN).split(",")) == sorted(everything.split(","))
+            assert page.run(SHOWN) != everything and page.run(COMMANDS) == ""
+            page.run("document.querySelector('.card').click()")
+            page.until("document.querySelector('.zoom')")
+            page.run("document.querySelector('.zoom').click()")
+            assert page.run("document.querySelector('.zoom + img').width") >= min(width, 800)
