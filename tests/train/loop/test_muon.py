@@ -185,5 +185,5 @@ def test_processes_that_share_the_work_move_alike(
                 muon_file.dist, "all_gather", lambda p, d, rank=rank: gather(p, d, rank)
             )
             found = shared_out(list(several), work, torch.float32)
-        assert torch.equal(found, work(several)), "the last to be asked was told everything"
+        assert torch.equal(found, work(list(several))), "the last to be asked was told everything"
         told.clear()
