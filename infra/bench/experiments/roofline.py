@@ -18,7 +18,7 @@ WIDE_RUNS = ("pretrain", "finetune")
 
 def _points(effort: Effort) -> Sequence[Point]:
     """Return each run, kernel by kernel and compiled, and ours at every size."""
-    from infra.bench.roofline.row import Case
+    from infra.bench.roofline.case import Case
     from model.config import SIZES
     from train.runs import RUNS, named_run
 

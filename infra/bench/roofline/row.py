@@ -10,27 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from infra.bench.roofline.cards import CARDS
+from infra.bench.roofline.case import Case
+from infra.bench.roofline.fusion import fused
 from infra.bench.roofline.prediction import Prediction, predicted
+from infra.bench.roofline.trace import Traced
 from storage.errors import TrilightError, expected_one_of
 
 USABLE_SHARE = 0.9
 """Share of a card's memory that a step may take: libraries and fragments have the rest."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Case:
-    """What is asked about: one step of one pass, of as many scenes as the run puts into a pass."""
-
-    run: str
-    """A named run."""
-    size: str | None = None
-    """A name of model.config.SIZES; None: the run's own network."""
-    card: str = "H100-80"
-    """A name of CARDS."""
-    is_compiled: bool = True
-    """Whether layers, head and LPIPS are compiled (an estimate: fusion), or kernel by kernel."""
-    recomputes: bool | None = None
-    """Whether activations are recomputed; None: as the run says."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,8 +40,6 @@ def roofline(case: Case) -> RooflineRow:
     """
     if case.card not in CARDS:
         raise TrilightError(f"card {case.card!r}: {expected_one_of(case.card, sorted(CARDS))}.")
-    from infra.bench.roofline.fusion import fused
-
     traced, scenes = _traced(case.run, case.size, case.recomputes)
     if case.is_compiled:
         traced = fused(traced, lambda part: part[0] in COMPILED)
@@ -85,7 +70,8 @@ def rooflines(cases: Sequence[Case]) -> list[RooflineRow]:
 
 
 @functools.lru_cache(maxsize=1)
-def _traced(run: str, size: str | None, recomputes: bool | None):  # type: ignore[no-untyped-def]
+def _traced(run: str, size: str | None, recomputes: bool | None) -> tuple[Traced, int]:
+    """Return the kernels of a step, and its scenes."""
     from infra.bench.roofline.step import traced_step
     from train.runs import changed_run
 

@@ -3,8 +3,9 @@
 import torch
 from torch import nn
 
+from infra.bench.roofline.case import Case
 from infra.bench.roofline.prediction import peak_bytes
-from infra.bench.roofline.row import Case, RooflineRow, roofline
+from infra.bench.roofline.row import RooflineRow, roofline
 from infra.bench.roofline.step import traced_step
 from infra.bench.roofline.trace import Kernel, Traced, Tracer
 from infra.fake_card.card import CARD, fake_card

@@ -5,9 +5,10 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 
 from infra.bench.roofline.cards import CARDS
+from infra.bench.roofline.case import Case
 from infra.bench.roofline.fusion import fused
 from infra.bench.roofline.prediction import predicted
-from infra.bench.roofline.row import COMPILED, Case
+from infra.bench.roofline.row import COMPILED
 from infra.bench.roofline.step import PADDING, UNSTATED_TRIANGLES
 from model.costs import Workload, training_flops
 from storage.errors import TrilightError
