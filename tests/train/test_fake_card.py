@@ -87,7 +87,7 @@ def test_bfloat16_rounds_neither_rays_nor_materials_nor_the_last_layers(
     assert types["picture"] == "float32"
     norms = {name: kind for name, kind in types.items() if name.endswith("norm")}
     assert len(norms) > 10 and set(norms.values()) == {"kept"}
-    assert types["decoder.layers.0.ffn.up"] == "bfloat16", "and the layers are rounded"
+    assert types["decoder.layers.0.ffn.down"] == "bfloat16", "and the layers are rounded"
 
 
 @pytest.mark.parametrize(
