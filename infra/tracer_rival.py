@@ -176,9 +176,7 @@ class TracerRival:
         if self._variant is None:
             self._variant = choose_variant()
         if self._child is None:
-            self._child = IsolatedChild(
-                limits=_LIMITS, setup=set_up_child, setup_args=(self._variant,)
-            )
+            self._child = tracing_child(self._variant)
         return self._child
 
 
@@ -201,6 +199,11 @@ def chosen_level(prices: Sequence[Mapping[Level, Price]], most_s: float) -> Leve
 
 def _middle(seconds: Sequence[float]) -> float:
     return float(np.median(seconds))
+
+
+def tracing_child(variant: Variant) -> IsolatedChild:
+    """Return a child that traces on one thread; close it when nothing more is asked."""
+    return IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(variant,))
 
 
 def set_up_child(variant: Variant) -> None:

@@ -1,5 +1,6 @@
 """`TrainOrder`: everything a user asks of a training run, by command line or Prefect's form."""
 
+import os
 import sys
 from collections.abc import Mapping
 from dataclasses import field
@@ -13,6 +14,9 @@ from train.runs import changed_run
 from train.settings import TrainSettings
 from train.start import Start
 
+RESTARTS = "TORCHELASTIC_RESTART_COUNT"
+"""Variable in which torchrun counts how often it has started its processes again."""
+
 
 @checked()
 class TrainOrder:
@@ -21,13 +25,16 @@ class TrainOrder:
     run: str = "smoke"
     """Name of a run (a named set of settings), such as smoke or pretrain."""
     data: tuple[str, ...] = ("data/smoke",)
-    """Dataset (a folder or a URL), or shards by name or pattern, such as
-    s3://b/{train,validation}-{000000..000007}.tar."""
+    """Dataset (a folder or a URL); several, which are mixed as the setting data_weights says; or
+    shards by name or pattern, such as s3://b/{train,validation}-{000000..000007}.tar."""
     out: str | None = None
     """Folder for the run, on the machine that trains; by default runs/RUN."""
     resume: bool = False
     """Continue from the newest checkpoint. Settings are stated as at the start; those of how it is
     executed may differ."""
+    restartable: bool = False
+    """Resume if the folder has a checkpoint, else begin, so that a scheduler may start the same
+    command again and again. A restart by torchrun does so anyway."""
     branch: str | None = None
     """Checkpoint, or folder of a run, to continue from in a new folder (--out), which then goes its
     own way; by default there is none."""
@@ -52,8 +59,10 @@ class TrainOrder:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Changes to the run's settings, by dotted name, such as loss.perceptual=none or model=large
     (values are JSON); by default there are none."""
-    workers: Annotated[int, Within(1, 1024, unit="threads")] = 1
-    """Threads that decode samples."""
+    workers: Annotated[int | None, Within(0, 1024, unit="threads")] = None
+    """Threads of each process that decode samples, with 0 the main one; by default as many as its
+    share of the cores leaves beside the network, at most 8. Batches are the same with any number.
+    """
     processes: Annotated[int, Within(1, 1024, unit="processes")] = 1
     """Number of processes on this machine, which torchrun starts; use one for each graphics card.
     """
@@ -84,6 +93,7 @@ class TrainOrder:
         """Return how the run begins."""
         return Start(
             resume=self.resume,
+            restartable=self.restartable or int(os.environ.get(RESTARTS, "0")) > 0,
             branch=self.branch,
             decisions=self.decisions,
             begin_with=self.begin_with,

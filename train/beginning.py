@@ -14,10 +14,12 @@ from model.open import open_network
 from model.renderformer import RenderFormer
 from model.weights import decode_config, encode_weights, read_metadata
 from storage.atomic import write_atomically
+from storage.dataset.training_data import TrainingData
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.extensions import recorded
 from storage.settings.described import settings_record
+from train.data.mixture import RECORD, mixture_of
 from train.folder import RunFolder
 from train.going_on import Event, GoingOn, event_records, going_on
 from train.loop.checkpoints import (
@@ -103,15 +105,23 @@ def beginning(
 
 
 def begun(
-    plan: Beginning, folder: RunFolder, data_digest: str, crew: Crew, progress: TrainProgress
+    plan: Beginning, folder: RunFolder, data: TrainingData, crew: Crew, progress: TrainProgress
 ) -> TrainState:
     """Return the state before the run's next step.
 
     A run that has just begun, branched or changed its meaning is on disk when this returns.
+
+    Raises:
+        TrilightError: not as many weights of datasets as there are.
     """
-    precision = fitting_precision(crew)
+    precision, data_digest = fitting_precision(crew), data.digest
+    header = None if plan.checkpoint is None else plan.checkpoint.header
+    mixture = mixture_of(data, plan.settings, header)
+    if mixture is not None:
+        progress.noted(f"the stream mixes {mixture}")
     if plan.checkpoint is None or plan.going is None:
         state = new_state(plan.settings, crew.device, plan.network, precision)
+        state.mixture = mixture
         digest = None
         if plan.network is not None:
             digest = sha256_hex(encode_weights(plan.network))
@@ -122,6 +132,7 @@ def begun(
             _write_settings(folder, plan.settings, state, data_digest, crew, more)
         return state
     state = resumed_state(plan.checkpoint, plan.going, crew.device, precision)
+    state.mixture = mixture
     if plan.branch is not None:
         state.history += (_origin(state.step, "checkpoint", plan.checkpoint.header),)
     for note in plan.going.notes:
@@ -200,6 +211,7 @@ def _write_settings(
     now = {
         "settings": settings_record(settings),
         "data_digest": data_digest,
+        **({RECORD: state.mixture.record()} if state.mixture else {}),
         "history": event_records(state.history),
     }
     write_atomically(folder.settings, pretty_json(begun | _read_settings(folder) | now))

@@ -243,7 +243,7 @@ def _notes(
 
 def _shown(value: Any) -> str:
     """Return a value as a person writes it behind `=`."""
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
 
 
 def _prefixed(digest: str) -> str:

@@ -1,27 +1,33 @@
 """One training run, from a dataset to weights, figures and a sheet: joins the parts."""
 
+import dataclasses
 import time
 from collections.abc import Generator, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from model.renderformer import count_parameters
 from model.sky.known import require_known, shining
-from storage.dataset.training_data import TrainingData, open_training_data
+from storage.dataset.mixed_data import open_mixture
+from storage.dataset.training_data import TrainingData
 from storage.errors import TrilightError
 from train.beginning import beginning, begun
+from train.data.arrival import looks_up_itself, step_scenes
 from train.data.scenes import TrainingScene, training_scene
 from train.data.stream import StreamSettings, stream_batches
 from train.data.unusable import Unusable, first_samples
+from train.data.workers import fitting_workers, this_machine
 from train.evaluation.judge import Judge
 from train.evaluation.rivals import median_picture
 from train.folder import RunFolder
+from train.loop.checkpoints import saved_steps
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
-from train.loop.trainer import Trainer
+from train.loop.trainer import Trainer, scene_flops
 from train.loss.lpips import load_lpips
 from train.loss.objective import Objective
 from train.progress import TrainProgress
@@ -51,7 +57,7 @@ def train_run(
     out: Path,
     start: Start | None = None,
     crew: Crew | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     watched: WatchSettings | None = None,
     progress: TrainProgress | None = None,
 ) -> TrainResult | None:
@@ -59,13 +65,14 @@ def train_run(
 
     Args:
         settings: the run; `train.runs.named_run` returns those that have a name.
-        data: root of a dataset, or a list of shards (storage.dataset.training_data), with a train
-        split; without a
-            validation split nothing is judged.
+        data: root of a dataset, or of several that are mixed (storage.dataset.mixed_data), or a
+            list of shards (storage.dataset.training_data), with a train split; without a validation
+            split nothing is judged.
         out: folder of the run (train.folder), new unless it resumes.
         start: how it begins; anew unless said.
         crew: the processes that train together (loop.crew.join_crew); this one unless said.
-        workers: threads that read and decode samples; the weights do not depend on them.
+        workers: threads that read and decode samples; as many as fit unless said. The weights do
+            not depend on them.
         watched: how the run is watched, which the weights do not depend on either.
         progress: receives the events of the run, in the first process.
 
@@ -82,15 +89,19 @@ def train_run(
     require_wandb(watched.wandb)
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
     progress = progress if progress is not None and crew.is_first else TrainProgress()
-    opened, folder = open_training_data(data), RunFolder(out)
+    opened, folder = open_mixture(data), RunFolder(out)
+    start = _decided(start, folder, crew)
     early = _EarlyNotes(progress)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         early.noted(note)
+    if workers is None:
+        workers = _fitting_workers(settings, crew, early)
     plan = beginning(settings, folder, opened.digest, start, crew, early)
     settings = plan.settings
-    objective = Objective(settings.loss, load_lpips(start.lpips)).to(crew.device)
+    lpips = crew.once_a_machine(partial(load_lpips, start.lpips))
+    objective = Objective(settings.loss, lpips).to(crew.device)
     _check_data(opened, settings)
-    state = begun(plan, folder, opened.digest, crew, early)
+    state = begun(plan, folder, opened, crew, early)
     judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
     recorder = None
     if crew.is_first:
@@ -107,24 +118,53 @@ def train_run(
         watched=watched,
     )
     with closing(_batches(opened, settings, state, crew, workers)) as batches:
-        trainer.run(batches)
+        cost = partial(scene_flops, settings)
+        most = settings.scenes_per_pass
+        with closing(step_scenes(batches, cost, most, crew.device)) as steps:
+            trainer.run(steps)
     if recorder is None:
         return None
     recorder.close()
     return finished(state, settings, folder, opened, judge, time.monotonic() - began)
 
 
+def _fitting_workers(settings: TrainSettings, crew: Crew, progress: TrainProgress) -> int:
+    """Return how many threads decode, and say why."""
+    fitting = fitting_workers(
+        this_machine(),
+        settings,
+        on_card=crew.device.type == "cuda",
+        busy_threads=torch.get_num_threads(),
+    )
+    progress.noted(fitting.because)
+    return fitting.threads
+
+
+def _decided(start: Start, folder: RunFolder, crew: Crew) -> Start:
+    """Return how all processes begin, where one may begin or resume.
+
+    All must ask, since torchrun counts its restarts for each machine apart, and a network file
+    system shows a file to one machine before another.
+    """
+    found = crew.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    return dataclasses.replace(start, resume=start.resume or found, restartable=False)
+
+
 def _batches(
     data: TrainingData, settings: TrainSettings, state: TrainState, crew: Crew, workers: int
 ) -> Generator[list[TrainingScene], None, None]:
     """Return the scenes of this process for each step from the state's on."""
+    asked = dataclasses.replace(
+        stream_settings(settings), looked_up=not looks_up_itself(crew.device)
+    )
     return stream_batches(
         data.split("train"),
-        stream_settings(settings),
+        asked,
         state.step,
         share=crew.share,
         workers=workers,
         unusable=state.unusable,
+        mixture=state.mixture,
     )
 
 
@@ -175,17 +215,20 @@ def stream_settings(settings: TrainSettings) -> StreamSettings:
 
 def _check_data(data: TrainingData, settings: TrainSettings) -> None:
     """Refuse data that lacks views or lights before any work; damage is counted when it is read."""
-    data.split("train")
-    num_views = data.num_views
+    shards = data.split("train")
     lights_apart = settings.augmentation.light_mix > 1
-    if num_views is None or lights_apart:
-        (sample,) = first_samples(data.split("train"), 1, Unusable(settings.most_unusable))
-        num_views = sample.scene.num_views
-        training_scene(sample, settings.resolution, lights_apart=lights_apart)
-    if settings.views_per_scene > num_views:
+    num_views = [source.num_views for source in data.sources]
+    if None in num_views or lights_apart:
+        unusable = Unusable(settings.most_unusable)
+        samples = list(first_samples(shards, len(data.sources), unusable))
+        num_views = [sample.scene.num_views for sample in samples]
+        for sample in samples:
+            training_scene(sample, settings.resolution, lights_apart=lights_apart)
+    fewest = min(count for count in num_views if count is not None)
+    if settings.views_per_scene > fewest:
         raise TrilightError(
             f"views_per_scene is {settings.views_per_scene}, but scenes of {data.shown} "
-            f"have {num_views} views; expected at most that many."
+            f"have {fewest} views; expected at most that many."
         )
 
 

@@ -101,6 +101,9 @@ class TrainSettings:
     """Sizes of the network, or the name of a preset."""
     from_weights: bool = False
     """Start from given weights (`begin_with`) instead of random ones."""
+    data_weights: Annotated[tuple[float, ...], Within(0, 1e9, low_open=True)] = ()
+    """Weights of the datasets that are mixed, in their order: the shares of the scenes, and so of
+    the views, that come from each; by default in proportion to their numbers of scenes."""
     resolution: Annotated[int, Within(1, 2048, unit="pixels")]
     """Width of the training pictures in pixels: it divides the dataset's width, and is a multiple
     of the ray bundle's (with Swin windows, of a window's) width."""

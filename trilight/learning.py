@@ -1,7 +1,7 @@
 """Networks trained and judged; torch is loaded when a function is called."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +33,7 @@ __all__ = [
 def train_network(
     run: str = "smoke",
     *,
-    data: str | os.PathLike[str],
+    data: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     out: str | os.PathLike[str],
     steps: int | None = None,
     changes: Mapping[str, Any] | None = None,
@@ -42,7 +42,7 @@ def train_network(
     decisions: Mapping[str, Any] | None = None,
     begin_with: str | None = None,
     lpips: str | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     device: str | None = None,
     watched: WatchSettings | None = None,
     progress: "TrainProgress | None" = None,
@@ -53,7 +53,8 @@ def train_network(
 
     Args:
         run: named run, such as `smoke` or `pretrain`.
-        data: root of a dataset, with a train split.
+        data: root of a dataset, with a train split, or several roots, whose scenes are mixed as the
+            change `data_weights` says.
         out: folder of the run.
         steps: replaces the run's number of steps.
         changes: other settings by dotted name, such as `{"model.width": 64}`.
@@ -62,7 +63,7 @@ def train_network(
         decisions: settings by dotted name that change where the run goes on, which it records.
         begin_with: network that a finetune run begins with.
         lpips: folder of LPIPS' weights, or `hub`.
-        workers: threads that decode samples.
+        workers: threads that decode samples; as many as the machine has to spare unless said.
         device: cpu or cuda; by default cuda where there is one.
         watched: how the run is watched, such as WatchSettings(profile=5).
         progress: receives the progress of the run; unless given, the run's page is kept up to date.
@@ -72,6 +73,7 @@ def train_network(
             already holds a run.
     """
     require_torch("train_network")
+    places = [data] if isinstance(data, str | os.PathLike) else data
     settings = changed_run(run, changes or {}, steps=steps)
     start = Start(
         resume=resume,
@@ -86,7 +88,7 @@ def train_network(
 
     result = train_run(
         settings,
-        data=[os.fspath(data)],
+        data=[os.fspath(place) for place in places],
         out=Path(out),
         start=start,
         crew=Crew(device=choose_device(device)),

@@ -4,6 +4,7 @@ A point stands at its first cost and at each further one, both at its error, wit
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,20 @@ _COLOURS = ("#c0392b", "#2e7d32", "#1f5fa8", "#7d5a00", "#6a3d9a")
 _FONT = 9
 
 
+@dataclass(frozen=True, kw_only=True)
+class SeriesPoint:
+    """One point with several costs."""
+
+    name: str
+    """Written beside it."""
+    kind: str
+    """What it is one of: its colour."""
+    costs: Sequence[float]
+    """Above 0, one for each series."""
+    error: float
+    """Its height."""
+
+
 def plot_series(
     experiment: Experiment, kind: Callable[[str], str], points: Sequence[Row], path: Path
 ) -> None:
@@ -34,44 +49,60 @@ def plot_series(
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(_WIDE, _HIGH), dpi=_DPI, layout="constrained")
-    axes.set_title(experiment.title, fontsize=11)
-    axes.grid(alpha=0.25)
-    axes.set_xscale("log")
-    axes.margins(x=0.14, y=0.12)
-    axes.tick_params(labelsize=_FONT)
     assert experiment.error is not None
-    axes.set_ylabel(f"{experiment.error.name}, {experiment.better} is better", fontsize=_FONT)
-    kinds = list(dict.fromkeys(kind(one.point.name) for one in points))
-    colours = {name: _COLOURS[row % len(_COLOURS)] for row, name in enumerate(kinds)}
-    costs = (experiment.cost.name, *experiment.also_cost)
-    axes.set_xlabel(costs[0] if len(costs) == 1 else "core-seconds", fontsize=_FONT)
-    names = [
-        _draw(axes, one, experiment.error.name, costs, colours[kind(one.point.name)])
+    error, costs = experiment.error.name, (experiment.cost.name, *experiment.also_cost)
+    shown = [
+        SeriesPoint(
+            name=one.point.name,
+            kind=kind(one.point.name),
+            costs=[one.values[cost] for cost in costs],
+            error=one.values[error],
+        )
         for one in points
     ]
-    plain_log(axes.xaxis)
-    _legend(axes, costs, colours)
+    axes.set_title(experiment.title, fontsize=11)
+    axes.set_ylabel(f"{error}, {experiment.better} is better", fontsize=_FONT)
+    axes.set_xlabel(costs[0] if len(costs) == 1 else "core-seconds", fontsize=_FONT)
+    colours = colours_of(shown)
+    draw_points(axes, shown, colours)
+    draw_legend(figure, costs, colours)
     figure.canvas.draw()  # places are known from here on
-    name = experiment.error.name
-    others = [(one.values[cost], one.values[name]) for one in points for cost in costs[1:]]
-    place_labels(axes, names, font=_FONT, also_clear=others)
+    name_points(axes, shown)
     figure.savefig(path, metadata={"Software": None})
     plt.close(figure)
 
 
-def _draw(
-    axes: Any, one: Row, error: str, costs: Sequence[str], colour: str
-) -> tuple[str, tuple[float, float]]:
-    """Draw one point at each of its costs; return its name, and where it stands at the first."""
-    height, at = one.values[error], [one.values[cost] for cost in costs]
-    axes.plot(at, [height] * len(at), "-", color=colour, linewidth=1, alpha=0.5)
-    for row, cost in enumerate(at):
-        face = colour if row == 0 else "white"
-        axes.plot(cost, height, "o", color=colour, markerfacecolor=face, markersize=6)
-    return one.point.name, (at[0], height)
+def colours_of(points: Sequence[SeriesPoint]) -> dict[str, str]:
+    """Return the colour of each kind, in the order in which they come."""
+    kinds = list(dict.fromkeys(one.kind for one in points))
+    return {name: _COLOURS[row % len(_COLOURS)] for row, name in enumerate(kinds)}
 
 
-def _legend(axes: Any, costs: Sequence[str], colours: Mapping[str, str]) -> None:
+def draw_points(axes: Any, points: Sequence[SeriesPoint], colours: Mapping[str, str]) -> None:
+    """Draw each point at each of its costs, on a logarithmic axis."""
+    axes.grid(alpha=0.25)
+    axes.set_xscale("log")
+    axes.margins(x=0.14, y=0.12)
+    axes.tick_params(labelsize=_FONT)
+    for one in points:
+        colour = colours[one.kind]
+        heights = [one.error] * len(one.costs)
+        axes.plot(one.costs, heights, "-", color=colour, linewidth=1, alpha=0.5)
+        for row, cost in enumerate(one.costs):
+            face = colour if row == 0 else "white"
+            axes.plot(cost, one.error, "o", color=colour, markerfacecolor=face, markersize=6)
+    plain_log(axes.xaxis)
+
+
+def name_points(axes: Any, points: Sequence[SeriesPoint]) -> None:
+    """Write each name beside the point's first cost; the figure was drawn once."""
+    names = [(one.name, (one.costs[0], one.error)) for one in points]
+    others = [(cost, one.error) for one in points for cost in one.costs[1:]]
+    place_labels(axes, names, font=_FONT, also_clear=others)
+
+
+def draw_legend(figure: Any, costs: Sequence[str], colours: Mapping[str, str]) -> None:
+    """Say below the axes which mark is which cost, and which colour which kind."""
     from matplotlib.lines import Line2D
 
     grey = [
@@ -82,7 +113,7 @@ def _legend(axes: Any, costs: Sequence[str], colours: Mapping[str, str]) -> None
     kinds = [
         Line2D([], [], linewidth=4, color=colour, label=name) for name, colour in colours.items()
     ]
-    axes.figure.legend(
+    figure.legend(
         handles=[*kinds, *(grey if len(costs) > 1 else ())],
         loc="outside lower center", ncols=3, fontsize=_FONT, frameon=False,
     )  # fmt: skip

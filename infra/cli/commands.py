@@ -29,7 +29,8 @@ COMMANDS = {
     "plan": "Measure a few scenes and predict time, bytes and cost of all, each with an interval.",
     "render": "Render scenes: path traced to a measured noise floor, or by a trained network.",
     "convert": "Convert by extension, and report what could not be carried over.",
-    "export": "Write a dataset as files that nerfstudio, COCO tools or Hugging Face datasets open.",
+    "export": "Write a dataset as files that others' renderers, nerfstudio, COCO tools or Hugging "
+    "Face datasets open.",
     "push": "Upload a finished dataset, a network or a page to the Hugging Face hub.",
     "passes": "Write depth, normals, ids and more of stored scenes as OpenEXR.",
     "verify": "Check every hash, member and law of a dataset; exit 1 with a list of what is wrong."
@@ -44,6 +45,8 @@ COMMANDS = {
     "train": "Train a model; writes checkpoints, curves and pictures on one page, and a sheet."
     "\n\nTo train with processes on several machines, run torchrun -m trilight train ...",
     "evaluate": "Evaluate a network; writes evaluation.json, evaluation.md and sheets of pictures.",
+    "leaderboard": "Judge every engine, rung and network on one set, with what each costs; writes "
+    "table, chart and rows, and goes on where it stopped.",
     "bench": "Measure cost against error; an interrupted run resumes. Without a name, list all.",
     "shards": "Make new datasets from finished ones.",
 }

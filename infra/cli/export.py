@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from infra.cli.console import first_words, print_json, print_rows, progress_bars
+from infra.cli.console import first_words, note, print_json, print_rows, progress_bars
 from infra.cli.options import Shown, command
 from pipeline.exchange.exports.export import ExportForm
 from storage.remote.safe_url import safe_url
@@ -19,7 +19,9 @@ class ExportAsked:
     form: ExportForm
     """nerfstudio: transforms.json with pictures and depth; coco: masks and boxes of objects;
     huggingface: a folder that datasets.load_dataset reads, with pictures, depth and ids; hypersim:
-    HDF5 of reflectance, illumination, residual and geometry (with renders.split_lobes=true)."""
+    HDF5 of reflectance, illumination, residual and geometry (with renders.split_lobes=true); h5,
+    json, usd, exr: each scene as RenderFormer's HDF5, as its JSON with meshes or as USD, and the
+    pictures as OpenEXR; benchmark: these four, each in its folder, with a table of views."""
     out: Path
     """Folder to write, which must be empty or not exist."""
     split: Literal["train", "validation", "test"] | None = None
@@ -42,7 +44,7 @@ def export(asked: ExportAsked, shown: Shown) -> None:
             scenes, views = scenes + 1, views + num_views
             bars.advance(task)
 
-        export_dataset(
+        notes = export_dataset(
             asked.source,
             asked.form,
             asked.out,
@@ -51,8 +53,11 @@ def export(asked: ExportAsked, shown: Shown) -> None:
             done=lambda sample: written(sample.scene.num_views),
         )
     if shown.json:
-        print_json({"form": asked.form, "out": str(asked.out), "scenes": scenes, "views": views})
+        about = {"form": asked.form, "out": str(asked.out), "scenes": scenes, "views": views}
+        print_json({**about, "notes": list(notes)})
         return
+    for text in notes:
+        note(text)
     print_rows(
         "Exported",
         [

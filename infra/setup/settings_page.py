@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
+from infra.leaderboard.order import LeaderboardOrder
 from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
 from pipeline.builds.settings import BuildSettings
@@ -32,6 +33,7 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Plan": (CorePrice,),
     "Train": (TrainOrder, TrainSettings, WatchSettings),
     "Evaluate": (EvaluationOrder,),
+    "Leaderboard": (LeaderboardOrder,),
 }
 """The settings of each command; `reachable` finds the settings within them."""
 

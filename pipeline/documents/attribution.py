@@ -45,7 +45,7 @@ def encode_attribution(objects: Iterable[HasRights], *, changes: str = _REMESHED
     for entry in sorted(objects, key=lambda row: row.uid):
         rights = (entry.licence, entry.licence_source, entry.attribution, entry.source_url)
         done = _OF_KIND.get(getattr(entry, "kind", OBJECT), changes)
-        writer.writerow([_inert(cell) for cell in (entry.uid, entry.title, *rights, done)])
+        writer.writerow([inert(cell) for cell in (entry.uid, entry.title, *rights, done)])
     # a lone surrogate, which JSON from outside may hold, has no UTF-8
     return stream.getvalue().encode(errors="replace")
 
@@ -62,6 +62,6 @@ def _changes(settings: Mapping[str, Any]) -> set[str]:
     return {AS_IN_FILE if from_files else _REMESHED}
 
 
-def _inert(cell: str) -> str:
-    """Text from outside must not become a formula when a spreadsheet opens the file."""
+def inert(cell: str) -> str:
+    """Return text from outside so that it is no formula when a spreadsheet opens the file."""
     return f"'{cell}" if cell.startswith(_FORMULA_STARTS) else cell

@@ -5,10 +5,11 @@ samples, in any order and from several threads at once; nothing of it stays in m
 of its members, and of a whole set as many unpacked maps as storage.records.held_maps allows.
 """
 
+import contextlib
 import os
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import BinaryIO
 
 import numpy as np
@@ -22,6 +23,7 @@ from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.held_maps import HeldMaps
 from storage.records.sample import Sample, decode_sample
+from storage.records.stored_sample import StoredSample, stored_sample
 
 
 class OpenShard:
@@ -73,11 +75,24 @@ class OpenShard:
         Raises:
             TrilightError: it is not whole, not readable or breaks a law; names shard and sample.
         """
-        key, _ = self._samples[row]
-        try:
-            sample = decode_sample(key, self.members(row), self._held)
+        with self._named():
+            sample = decode_sample(self._samples[row][0], self.members(row), self._held)
             sample.check()
             return sample
+
+    def stored_sample(self, row: int) -> StoredSample:
+        """Return a sample whose pictures are unpacked when they are asked for.
+
+        Raises:
+            TrilightError: its scene is not readable or breaks a law; names shard and sample.
+        """
+        with self._named():
+            return stored_sample(self._samples[row][0], self.members(row), self._held)
+
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
         except TrilightError as error:
             raise TrilightError(f"{self.name}: {error}") from error
 
@@ -91,6 +106,11 @@ class ShardSet(ABC):
 
     names: Sequence[str]
     """Their names for people."""
+
+    @property
+    def parts(self) -> Sequence[range]:
+        """The numbers of each dataset's shards; they are those of one unless said."""
+        return (range(len(self.names)),)
 
     @abstractmethod
     def num_samples(self, number: int) -> int:

@@ -30,8 +30,20 @@ NO_MANIFEST = (
 
 
 @dataclass(frozen=True, kw_only=True)
+class DataSource:
+    """One dataset, as records name it."""
+
+    name: str
+    """Its build; what it is called else."""
+    digest: str
+    """As `TrainingData.digest`."""
+    num_views: int | None
+    """Pictures per scene, where a manifest says it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainingData:
-    """The shards of every split that holds a sample."""
+    """The shards of every split that holds a sample, of one dataset or several."""
 
     shown: str
     """Their place, for messages."""
@@ -47,6 +59,8 @@ class TrainingData:
     """Most triangles of a scene, where a manifest says it."""
     notes: tuple[str, ...] = ()
     """What the user should know, once."""
+    sources: tuple[DataSource, ...] = ()
+    """The datasets, in the order of the parts of their splits (ShardSet.parts)."""
 
     def split(self, name: str) -> ShardSet:
         """Return the shards of a split; raises TrilightError where it holds no scene."""
@@ -69,7 +83,7 @@ def open_training_data(data: Sequence[str]) -> TrainingData:
         TrilightError: nothing is named, roots and shards are mixed, a URL is refused, there is no
             readable manifest, or a key is in two shards of it.
     """
-    shards = [text for text in data if text.partition("?")[0].endswith((".tar", "}"))]
+    shards = [text for text in data if is_shards(text)]
     if shards and len(shards) == len(data):
         return _of_list(shards)
     if len(data) != 1:
@@ -78,6 +92,11 @@ def open_training_data(data: Sequence[str]) -> TrainingData:
             "shards only (each ends in .tar)."
         )
     return _of_dataset(data[0])
+
+
+def is_shards(text: str) -> bool:
+    """Return whether a place names shards, and not a dataset."""
+    return text.partition("?")[0].endswith((".tar", "}"))
 
 
 def _of_dataset(root: str) -> TrainingData:
@@ -96,12 +115,14 @@ def _of_dataset(root: str) -> TrainingData:
         entries = [shard for shard in dataset.shards_of(split) if shard.num_samples]
         if entries:
             splits[split] = ManifestShards(dataset, entries)
+    build, num_views = dataset.manifest.build, dataset.manifest.num_views
     return TrainingData(
         shown=dataset.shown,
         digest=dataset.digest,
         splits=splits,
-        num_views=dataset.manifest.num_views,
-        build=dataset.manifest.build,
+        num_views=num_views,
+        build=build,
+        sources=(DataSource(name=build, digest=dataset.digest, num_views=num_views),),
         max_triangles=_max_triangles(dataset.manifest),
     )
 
@@ -120,11 +141,14 @@ def _of_list(patterns: Sequence[str]) -> TrainingData:
         if chosen:
             splits[split] = ListedShards(chosen, seen)
     names = sorted(place.shown for place in places)
+    digest = f"list:{sha256_hex(canonical_json(names))}"
+    shown = f"the list of {len(places)} shards"
     return TrainingData(
-        shown=f"the list of {len(places)} shards",
-        digest=f"list:{sha256_hex(canonical_json(names))}",
+        shown=shown,
+        digest=digest,
         splits=splits,
         num_views=None,
+        sources=(DataSource(name=shown, digest=digest, num_views=None),),
         notes=(NO_MANIFEST,),
     )
 

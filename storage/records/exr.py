@@ -52,9 +52,14 @@ _LOSSY = frozenset(
 _MOST_LISTED = 6
 """Maximum number of channel names in a message."""
 
-_HALF = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
-_NOT_NEGATIVE = np.where(_HALF < 0, np.float32(0), _HALF)
+HALF_FLOATS = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
 """Every half float by its bits: looking them up takes half of the time of numpy's conversion."""
+FIRST_ILLEGAL = 0x7C00
+"""Bits of infinity: all below are the half floats that a picture may hold, in their order."""
+_MINUS_INFINITY = 0xFC00
+
+Stored = NDArray[np.uint16] | NDArray[np.float32]
+"""A picture as a file holds it: bits of half floats, or the float32 of other tools."""
 
 
 Attributes = Mapping[str, str | int | float]
@@ -151,14 +156,33 @@ def decode_exr(data: bytes) -> NDArray[np.float32]:
         TrilightError: not an EXR file, truncated, larger than MAX_RESOLUTION, or with other
             channels than R, G and B.
     """
+    return unpacked(decode_stored(data))
+
+
+def unpacked(stored: Stored) -> NDArray[np.float32]:
+    """Return the numbers of pictures that may be bits of half floats, of any shape."""
+    if stored.dtype == np.float32:
+        return np.asarray(stored, np.float32)
+    return np.take(HALF_FLOATS, stored.view(np.uint16))
+
+
+def decode_stored(data: bytes) -> Stored:
+    """Return the picture [H, W, 3] of `decode_exr` as the file holds it.
+
+    Whoever wants a function of half floats, such as their logarithm, may look it up by their bits.
+
+    Raises:
+        TrilightError: as `decode_exr`.
+    """
     header: dict[str, Any] = {}
     pixels = decode_channels(data, "RGB", header.update)["RGB"]
     lossy = header["compression"] in _LOSSY
     if pixels.dtype != np.float16:  # other tools write float32
         return np.asarray(np.maximum(pixels, 0) if lossy else pixels, np.float32)
-    table = _NOT_NEGATIVE if lossy else _HALF
-    picture: NDArray[np.float32] = np.take(table, pixels.view(np.uint16))
-    return picture
+    bits: NDArray[np.uint16] = pixels.view(np.uint16)
+    if lossy and bits.max(initial=0) <= _MINUS_INFINITY:  # what is not a number stays so
+        np.maximum(bits.view(np.int16), 0, out=bits.view(np.int16))
+    return bits
 
 
 def decode_channels(

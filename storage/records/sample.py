@@ -176,13 +176,13 @@ class Sample:
                 f"sample {self.key}: {count} pictures of {height} x {width} pixels and "
                 f"{len(self.views)} records; expected {views} of both, as many as cameras, square."
             )
-        _check_radiance(self.key, "", self.radiance_rgb)
+        check_radiance(self.key, "", self.radiance_rgb)
         apart = () if self.lights_rgb is None else np.moveaxis(self.lights_rgb, 1, 0)
         for light, radiance_rgb in enumerate(apart):
-            _check_radiance(self.key, f" light {light}", radiance_rgb)
+            check_radiance(self.key, f" light {light}", radiance_rgb)
         for part, pictures in (self.parts_rgb or {}).items():
             for radiance_rgb in np.moveaxis(pictures, 1, 0) if pictures.ndim == 5 else [pictures]:
-                _check_radiance(self.key, f" {part} light", radiance_rgb)
+                check_radiance(self.key, f" {part} light", radiance_rgb)
 
 
 def sample_key(scene_index: int) -> str:
@@ -365,13 +365,23 @@ def _check_numbers(record: ViewRecord | PartFloor, where: str) -> None:
             )
 
 
-def _check_radiance(key: str, which: str, radiance_rgb: NDArray[np.float32]) -> None:
+def check_radiance(
+    key: str, which: str, radiance_rgb: NDArray[np.float32], *, first_view: int = 0
+) -> None:
+    """Raise TrilightError, which names the pixel, where radiance is not finite or below 0.
+
+    Args:
+        key: of the sample.
+        which: part of its pictures, behind a space; empty for all light.
+        radiance_rgb: pictures [C, R, R, 3].
+        first_view: number of the first of them.
+    """
     if radiance_rgb.min() >= 0 and radiance_rgb.max() < math.inf:  # NaN is neither
         return
     wrong = np.argwhere(~(np.isfinite(radiance_rgb) & (radiance_rgb >= 0)))
     view, row, column, channel = (int(index) for index in wrong[0])
     value = radiance_rgb[view, row, column, channel]
     raise TrilightError(
-        f"sample {key}: view {view}{which} has radiance {value} at pixel ({row}, {column}); "
-        "expected finite values from 0. Run `trilight verify` on the dataset."
+        f"sample {key}: view {first_view + view}{which} has radiance {value} at pixel ({row}, "
+        f"{column}); expected finite values from 0. Run `trilight verify` on the dataset."
     )

@@ -195,8 +195,10 @@ def _check_arrays(scene: Scene) -> None:
         values = getattr(scene, field.name)
         if values is None:
             continue
-        part = "" if field.part is None else f"{field.part.name} "
-        require_law(~field.outside(values), field.name, values, f"{part}{field.within}")
+        outside = field.outside(values)
+        if outside.any():  # what was expected is put into words only then
+            part = "" if field.part is None else f"{field.part.name} "
+            require_law(~outside, field.name, values, f"{part}{field.within}")
     for name, other in (("vertex_normals", "vertex_positions"), ("fov_deg", "c2w")):
         _same_length(scene, name, other)
     for name in ("material_index", "object_index"):

@@ -227,10 +227,13 @@ def scene_provenance(value: Any) -> Mapping[str, Any]:
     return value
 
 
+_OBJECT_FIELDS = frozenset(field.name for field in dataclasses.fields(SceneObject))
+
+
 def _object(value: Any, row: int) -> SceneObject:
-    names = {field.name for field in dataclasses.fields(SceneObject)}
-    if not isinstance(value, dict) or set(value) != names:
-        _broken(f"objects[{row}]", value, f"exactly the fields {', '.join(sorted(names))}")
+    if not isinstance(value, dict) or value.keys() != _OBJECT_FIELDS:
+        fields = ", ".join(sorted(_OBJECT_FIELDS))
+        _broken(f"objects[{row}]", value, f"exactly the fields {fields}")
     for name, text in value.items():
         if not isinstance(text, str):
             _broken(f"objects[{row}].{name}", text, "text")

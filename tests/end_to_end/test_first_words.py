@@ -23,6 +23,7 @@ LONG = {
     "inspect": ("inspect", "scene.json"),
     "verify": ("verify", "SILENT"),
     "evaluate": ("evaluate", "builtin:", "--data", "nowhere"),
+    "leaderboard": ("leaderboard", "nowhere"),
     "doctor": ("doctor",),
 }
 

@@ -7,6 +7,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
+from infra.leaderboard.order import LeaderboardOrder
 from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
 from infra.setup.settings_page import ROOTS, reachable
@@ -85,6 +86,7 @@ EXAMPLES: dict[type, Any] = {
     LossSettings: RUN.loss,
     AugmentationSettings: RUN.augmentation,
     EvaluationOrder: EvaluationOrder(checkpoint="a", data=("b",)),
+    LeaderboardOrder: LeaderboardOrder(source="a", width=(64,)),
     WatchSettings: WatchSettings(),
 }  # fmt: skip
 """A valid value of every class that declares a range, but for `Scene`."""

@@ -73,7 +73,7 @@ def test_execution_is_free_and_noted() -> None:
             "or decide on --change seed=1, which the run records",
         ),
         ({"num_steps": 20}, "num_steps is 20, but .* 12.* --set num_steps=12.*change num_steps=20"),
-        ({"betas": (0.9, 0.95)}, r"--set betas=\[0.9, 0.99\].* --change betas=\[0.9, 0.95\]"),
+        ({"betas": (0.9, 0.95)}, r"--set betas=\[0.9,0.99\].* --change betas=\[0.9,0.95\]"),
         ({"schedule": "wsd"}, "--set schedule=cosine, or decide on --change schedule=wsd"),
         (
             {"augmentation": AugmentationSettings(mirror=True)},

@@ -137,7 +137,7 @@ def test_a_run_goes_on_past_a_damaged_checkpoint_to_the_same_weights(
     with pytest.raises(TrilightError, match=f"{path} is not readable"):
         open_network(path, network_of_run)
     notes = Notes()
-    again = trained(settings, data, tmp_path, resume=True, progress=notes)
+    again = trained(settings, data, tmp_path, resume=True, workers=1, progress=notes)
     assert [str(path) in text for text in notes.texts] == [True]
     assert again.folder.weights.read_bytes() == weights
     assert open_network(path, network_of_run).config == settings.model, "it was written again"
@@ -173,7 +173,7 @@ def test_muon_goes_on_in_another_precision_on_another_processor(
     begun_at = read_checkpoint(path_of_step(checkpoints, 8)).network().state_dict()
     have_bfloat16(monkeypatch, False)
     notes = Notes()
-    trained(settings, data, tmp_path, resume=True, progress=notes)
+    trained(settings, data, tmp_path, resume=True, workers=1, progress=notes)
     assert ["Muon's products in float32 instead of bfloat16" in text for text in notes.texts] == [1]
     assert read_checkpoint(path_of_step(checkpoints, 12)).header["muon_precision"] == "float32"
     resumed = open_network(tmp_path, network_of_run).state_dict()

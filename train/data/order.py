@@ -28,6 +28,8 @@ class Place:
     """Row of the sample in the shard."""
     arrival: int
     """Number of the shard in the order of its epoch."""
+    source: int = 0
+    """Number of the dataset, where several are mixed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +79,7 @@ class RankShare:
     def of_batch(self, places: Sequence[Place]) -> list[Place]:
         """Return this process's part of a global batch, in the order of positions."""
         size = len(places) // self.world_size
-        by_shard = sorted(places, key=lambda place: (place.arrival, place.position))
+        by_shard = sorted(places, key=lambda place: (place.source, place.arrival, place.position))
         mine = by_shard[self.rank * size : (self.rank + 1) * size]
         return sorted(mine, key=lambda place: place.position)
 
@@ -128,6 +130,15 @@ def batches_from(
     windows: Iterator[ShardWindow], first: int, batch_size: int
 ) -> Iterator[tuple[Place, ...]]:
     """Yield global batches without end; the first begins at position `first`."""
-    places = (place for window in windows for place in window.places if place.position >= first)
+    return batched(places_from(windows, first), batch_size)
+
+
+def places_from(windows: Iterator[ShardWindow], first: int) -> Iterator[Place]:
+    """Yield places without end, from position `first` on."""
+    return (place for window in windows for place in window.places if place.position >= first)
+
+
+def batched(places: Iterator[Place], batch_size: int) -> Iterator[tuple[Place, ...]]:
+    """Yield so many places at a time, without end."""
     while True:
         yield tuple(itertools.islice(places, batch_size))

@@ -17,11 +17,7 @@ def block_mean(radiance_rgb: NDArray[np.float32], resolution: int) -> NDArray[np
         TrilightError: `resolution` does not divide the pictures' own.
     """
     views, stored = radiance_rgb.shape[:2]
-    if resolution < 1 or stored % resolution:
-        raise TrilightError(
-            f"resolution {resolution}: expected a divisor of {stored}, the resolution of the "
-            "dataset. Choose one, or generate the dataset at another resolution."
-        )
+    require_divisor(resolution, stored)
     factor = stored // resolution
     if factor == 1:
         return radiance_rgb
@@ -29,3 +25,12 @@ def block_mean(radiance_rgb: NDArray[np.float32], resolution: int) -> NDArray[np
     rows = radiance_rgb.reshape(views, resolution, factor, stored, 3).sum(axis=2, dtype=np.float32)
     blocks = rows.reshape(views, resolution, resolution, factor, 3).sum(axis=3, dtype=np.float32)
     return blocks / np.float32(factor**2)
+
+
+def require_divisor(resolution: int, stored: int) -> None:
+    """Raise TrilightError where `resolution` does not divide that of the stored pictures."""
+    if resolution < 1 or stored % resolution:
+        raise TrilightError(
+            f"resolution {resolution}: expected a divisor of {stored}, the resolution of the "
+            "dataset. Choose one, or generate the dataset at another resolution."
+        )

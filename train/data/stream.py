@@ -5,34 +5,42 @@ number of ranks and threads: a run resumes by the number of its step.
 """
 
 import dataclasses
+import itertools
 import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from model.scene_tensors import with_cells
-from model.sky.known import require_known
+from model.sky.known import require_known, shining
 from storage.dataset.shard_set import OpenShard, ShardSet
 from storage.errors import TrilightError
-from storage.records.sample import Sample
+from storage.records.stored_sample import StoredSample
 from storage.seeds import rng_for
-from train.data.augment import augmented, with_inputs_withheld, with_views
+from train.data.augment import augmented, with_inputs_withheld
+from train.data.mixture import Mixture, mixed_places
 from train.data.open_shards import OpenShards
 from train.data.order import (
     OrderSettings,
     Place,
     RankShare,
-    batches_from,
+    batched,
+    places_from,
     shard_order,
     windows_from,
 )
-from train.data.scenes import TrainingScene, training_scene
+from train.data.scenes import (
+    TrainingScene,
+    drawn_scene,
+    require_few_triangles,
+    with_target,
+)
 from train.data.unusable import Unusable, lost_with
 
 if TYPE_CHECKING:
@@ -63,6 +71,8 @@ class StreamSettings:
     """Samples with more are unusable; 0: none is."""
     augmentation: "AugmentationSettings | None" = None
     """Symmetries that are drawn at each visit; none by default."""
+    looked_up: bool = True
+    """Whether targets are looked up in the decoding threads, and not where batches arrive."""
     network: "ModelConfig | None" = None
     """The network that is trained: what it wants traced of its views, is traced here."""
 
@@ -79,6 +89,7 @@ def stream_batches(
     share: RankShare,
     workers: int,
     unusable: Unusable,
+    mixture: Mixture | None = None,
 ) -> Generator[list[TrainingScene], None, None]:
     """Yield this process's part of the global batches first, first + 1, ... without end.
 
@@ -89,7 +100,9 @@ def stream_batches(
         settings: what decides the order and the scenes.
         first: number of a global batch.
         share: which part of each batch; the ranks' parts are equally large and make up the batch.
-        workers: threads that read and decode; what comes out does not depend on them.
+        workers: threads that read and decode, 0: the caller's own; what comes out does not depend
+            on them.
+        mixture: how the parts of the shards are mixed, where these are several datasets.
         unusable: counts damaged data, or stops at it. An unusable sample is replaced by the next
             usable one of its shard, a shard that cannot be opened by the one of the next number.
 
@@ -98,13 +111,15 @@ def stream_batches(
             when it is reached.
     """
     share.require_equal(settings.batch_size)
-    with OpenShards(shards) as opened, ThreadPoolExecutor(workers, "decode") as decoders:
+    pool = ThreadPoolExecutor(workers, "decode") if workers else _CallersThread()
+    with OpenShards(shards) as opened, pool as decoders:
         maker = _SceneMaker(shards, opened, settings, unusable)
-        plan = _planned(shards, settings, first, share, opened, unusable)
+        counted = _Counted(shards, unusable)
+        plan = _planned(counted, settings, mixture, first, share, opened)
         waiting: deque[tuple[list[Place], list[Future[TrainingScene]]]] = deque()
-        depth = -(-PREFETCHED_SCENES * share.world_size // settings.batch_size)
+        depth = -(-PREFETCHED_SCENES * share.world_size // settings.batch_size) if workers else 0
         try:
-            with closing(prefetched(plan, _plan_ahead(shards, settings, unusable))) as batches:
+            with closing(prefetched(plan, _plan_ahead(counted, settings, mixture))) as batches:
                 for mine in batches:
                     waiting.append((mine, [decoders.submit(maker.scene, p) for p in mine]))
                     if len(waiting) > depth:
@@ -116,41 +131,77 @@ def stream_batches(
             decoders.shutdown(wait=True, cancel_futures=True)
 
 
+class _CallersThread(Executor):
+    """Does at once what it is asked."""
+
+    def submit(
+        self, function: Callable[..., Item], /, *arguments: Any, **named: Any
+    ) -> Future[Item]:
+        done: Future[Item] = Future()
+        try:
+            done.set_result(function(*arguments, **named))
+        except Exception as error:
+            done.set_exception(error)
+        return done
+
+
+class _Counted:
+    """The parts of a set, with the sizes of their shards; an unusable one has no sample."""
+
+    def __init__(self, shards: ShardSet, unusable: Unusable) -> None:
+        self._shards = shards
+        self._unusable = unusable
+        self.parts = shards.parts
+
+    def in_part(self, part: range) -> Callable[[int], int]:
+        """Return a function that counts the samples of a shard by its number in a part."""
+        return lambda number: self._count(part.start + number)
+
+    def _count(self, number: int) -> int:
+        try:
+            return self._shards.num_samples(number)
+        except TrilightError as error:
+            self._unusable.add(self._shards.names[number], 1, error)
+            return 0
+
+
 def _planned(
-    shards: ShardSet,
+    counted: _Counted,
     settings: StreamSettings,
+    mixture: Mixture | None,
     first: int,
     share: RankShare,
     opened: OpenShards,
-    unusable: Unusable,
 ) -> Iterator[list[Place]]:
     """Yield this process's places batch by batch, and have their shards opened."""
     position = first * settings.batch_size
-    count = _counter(shards, unusable)
-    windows = windows_from(len(shards.names), count, settings.order, position)
-    for batch in batches_from(windows, position, settings.batch_size):
+    begin = (position,) if mixture is None else mixture.taken(position)
+    streams = [
+        places_from(windows_from(len(part), counted.in_part(part), settings.order, start), start)
+        for part, start in zip(counted.parts, begin, strict=True)
+    ]
+    if mixture is None:
+        places = streams[0]
+    else:
+        places = mixed_places(mixture, streams, counted.parts, position)
+    for batch in batched(places, settings.batch_size):
         mine = share.of_batch(batch)
         opened.plan(place.shard for place in mine)
         yield mine
 
 
-def _counter(shards: ShardSet, unusable: Unusable) -> Callable[[int], int]:
-    """Return a function that counts the samples of a shard; an unusable shard has none."""
+def _plan_ahead(counted: _Counted, settings: StreamSettings, mixture: Mixture | None) -> int:
+    """Return how many batches to plan ahead: about a window, so that the next shards are opened.
 
-    def count(number: int) -> int:
-        try:
-            return shards.num_samples(number)
-        except TrilightError as error:
-            unusable.add(shards.names[number], 1, error)
-            return 0
-
-    return count
-
-
-def _plan_ahead(shards: ShardSet, settings: StreamSettings, unusable: Unusable) -> int:
-    """Return how many batches to plan ahead: about a window, so that the next shards are opened."""
-    some = shard_order(len(shards.names), settings.order, 0)[0]
-    return max(_counter(shards, unusable)(some) * settings.window // settings.batch_size, 1)
+    Of several datasets, the window that is through first.
+    """
+    weights = (1.0,) if mixture is None else mixture.weights
+    ahead = []
+    for part, weight in zip(counted.parts, weights, strict=True):
+        some = shard_order(len(part), settings.order, 0)[0]
+        window = counted.in_part(part)(some) * settings.window
+        ahead.append(int(window * sum(weights) / weight) // settings.batch_size)
+    return max(min(ahead), 1)
 
 
 class _SceneMaker:
@@ -168,13 +219,10 @@ class _SceneMaker:
     def scene(self, place: Place) -> TrainingScene:
         """Return the scene that is seen at a place of the order."""
         settings = self._settings
-        scene = self._usable(place)
-        rng = rng_for(settings.seed, "visit", place.position)
-        views = rng.permutation(len(scene.target_VRR3))[: settings.views_per_scene]
-        seen = with_views(scene, np.sort(views))
+        seen, rng = self._usable(place)
         if settings.augmentation:
             seen = augmented(seen, settings.augmentation, rng)
-        return self._prepared(seen, rng)
+        return self._prepared(with_target(seen) if settings.looked_up else seen, rng)
 
     def _prepared(self, seen: TrainingScene, rng: np.random.Generator) -> TrainingScene:
         """Return a scene with all that its network wants to be told."""
@@ -198,9 +246,11 @@ class _SceneMaker:
         withheld = settings.augmentation.withheld_inputs if settings.augmentation else 0.0
         return dataclasses.replace(seen, tensors=with_inputs_withheld(tensors, withheld, rng))
 
-    def _usable(self, place: Place) -> TrainingScene:
-        count = len(self._shards.names)
-        for number in ((place.shard + step) % count for step in range(count)):
+    def _usable(self, place: Place) -> tuple[TrainingScene, np.random.Generator]:
+        """Return the drawn views of a usable sample, and what else of its visit is drawn from."""
+        part = self._shards.parts[place.source]
+        after = range(place.shard, part.stop), range(part.start, place.shard)
+        for number in itertools.chain(*after):
             if number in self._given_up:
                 continue
             planned = number == place.shard
@@ -211,42 +261,42 @@ class _SceneMaker:
                 self._unusable.add(self._shards.names[number], lost, error)
                 continue
             with nullcontext() if planned else closing(shard):
-                found = self._first_usable(shard, place.row)
+                found = self._first_usable(shard, place)
             if found is not None:
                 return found
             self._given_up.add(number)
         raise TrilightError(
-            f"data: no sample of {count} shards is usable. The last that was tried: "
+            f"data: no sample of {len(part)} shards is usable. The last that was tried: "
             f"{self._unusable.messages[-1]}"
         )
 
-    def _first_usable(self, shard: OpenShard, row: int) -> TrainingScene | None:
+    def _first_usable(
+        self, shard: OpenShard, place: Place
+    ) -> tuple[TrainingScene, np.random.Generator] | None:
         """Return the first scene of a shard that is usable, from a row on and around; or None."""
         keys = shard.keys
-        for at in ((row + step) % len(keys) for step in range(len(keys))):
+        for at in ((place.row + step) % len(keys) for step in range(len(keys))):
+            rng = rng_for(self._settings.seed, "visit", place.position)
             try:
-                return self._made(shard.sample(at))
+                return self._drawn(shard.stored_sample(at), rng), rng
             except TrilightError as error:
                 named = _named(shard.name, error)
                 self._unusable.add(f"{shard.name}: sample {keys[at]}", 1, named)
         return None
 
-    def _made(self, sample: Sample) -> TrainingScene:
-        settings = self._settings
-        if sample.scene.num_views < settings.views_per_scene:
+    def _drawn(self, sample: StoredSample, rng: np.random.Generator) -> TrainingScene:
+        settings, num_views = self._settings, sample.scene.num_views
+        if num_views < settings.views_per_scene:
             raise TrilightError(
-                f"sample {sample.key}: {sample.scene.num_views} views; the run draws "
+                f"sample {sample.key}: {num_views} views; the run draws "
                 f"{settings.views_per_scene} of each scene."
             )
-        scene = training_scene(
-            sample,
-            settings.resolution,
-            most_triangles=settings.most_triangles,
-            lights_apart=settings.augmentation is not None and settings.augmentation.light_mix > 1,
-        )
+        require_few_triangles(sample.key, sample.scene, settings.most_triangles)
         if settings.network is not None:
-            require_known(scene.tensors.sky, settings.network)
-        return scene
+            require_known(shining(sample.scene.environment), settings.network)
+        views = np.sort(rng.permutation(num_views)[: settings.views_per_scene])
+        lights_apart = settings.augmentation is not None and settings.augmentation.light_mix > 1
+        return drawn_scene(sample, views.tolist(), settings.resolution, lights_apart=lights_apart)
 
 
 def _named(shard: str, error: TrilightError) -> TrilightError:

@@ -72,17 +72,25 @@ class Unusable:
 def first_samples(shards: ShardSet, limit: int, unusable: Unusable) -> Iterator[Sample]:
     """Yield the first usable samples of a split, at most `limit`, in the order of the shards.
 
+    Of several datasets each gives the same number, or all that it has.
+
     Raises:
         TrilightError: more samples are damaged than `unusable` allows.
     """
+    count = len(shards.parts)
+    for row, part in enumerate(shards.parts):
+        yield from _first_of(shards, part, limit // count + (row < limit % count), unusable)
+
+
+def _first_of(shards: ShardSet, part: range, limit: int, unusable: Unusable) -> Iterator[Sample]:
     left = limit
-    for number, name in enumerate(shards.names):
+    for number in part:
         if not left:
             return
         try:
             shard = shards.open(number)
         except TrilightError as error:
-            unusable.add(name, lost_with(shards, number), error)
+            unusable.add(shards.names[number], lost_with(shards, number), error)
             continue
         with closing(shard):
             for row, key in enumerate(shard.keys[:left]):

@@ -4,12 +4,14 @@ The nearest training view is the training picture closest to the target itself. 
 up a training picture by the scene can do better.
 """
 
+import functools
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from storage.conventions import log10_radiance, radiance_from_log10
+from storage.errors import TrilightError
 from train.data.scenes import TrainingScene
 
 MEDIAN, NEAREST = "median picture", "nearest training view"
@@ -23,19 +25,38 @@ class Rivals:
 
     def __init__(self, scenes: Iterable[TrainingScene]) -> None:
         # half floats: a rival that is off by a thousandth is as good, and takes half the memory
-        found = [scene.target_VRR3.numpy().astype(np.float16) for scene in scenes]
-        self._log10_MRR3 = np.concatenate(found)
+        named = [(scene.key, scene.target_VRR3.numpy().astype(np.float16)) for scene in scenes]
+        self._keys_M = np.array([key for key, pictures in named for _ in pictures])
+        self._log10_MRR3 = np.concatenate([pictures for _, pictures in named])
         self._small_MRR3 = _small(self._log10_MRR3)
-        self._median_RR3 = median_picture(found)
+
+    @functools.cached_property
+    def _median_RR3(self) -> NDArray[np.float64]:
+        return median_picture([self._log10_MRR3])
 
     def pictures(self, target_rgb: NDArray) -> dict[str, NDArray[np.float64]]:
         """Return what each rival shows in place of a target [R, R, 3], linear radiance."""
+        return {MEDIAN: self._median_RR3, NEAREST: self.nearest(target_rgb)}
+
+    def nearest(self, target_rgb: NDArray, *, not_of: str = "") -> NDArray[np.float64]:
+        """Return the picture [R, R, 3] that is closest to a target, linear radiance.
+
+        Args:
+            target_rgb: [R, R, 3] linear radiance.
+            not_of: key of a scene whose own pictures do not count.
+
+        Raises:
+            TrilightError: there is no picture of another scene.
+        """
         small = _small(log10_radiance(target_rgb)[None])
-        nearest = int(np.abs(self._small_MRR3 - small).mean(axis=(1, 2, 3)).argmin())
-        return {
-            MEDIAN: self._median_RR3,
-            NEAREST: radiance_from_log10(self._log10_MRR3[nearest].astype(np.float64)),
-        }
+        distance_M = np.abs(self._small_MRR3 - small).mean(axis=(1, 2, 3))
+        others_M = self._keys_M != not_of
+        if not others_M.any():
+            raise TrilightError(
+                f"nearest view: scene {not_of} is alone; expected a second scene to look up."
+            )
+        nearest = int(np.where(others_M, distance_M, np.inf).argmin())
+        return radiance_from_log10(self._log10_MRR3[nearest].astype(np.float64))
 
 
 def median_picture(log10_pictures: Sequence[NDArray]) -> NDArray[np.float64]:

@@ -8,12 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
-from storage.intervals import mean_interval
 from storage.records.sample import Sample
 from train.evaluation.judged_view import NETWORK, JudgedView, summary
+from train.evaluation.pairs import pair
 
 TRACER = "path tracer, same time"
 """Name of the contestant."""
@@ -81,16 +80,12 @@ def same_time(views: Sequence[JudgedView], times: Times, which: str) -> dict[str
         return found
     if not both:
         return found | {"missing": "none of the judged views could be traced"}
-    leads_db = [
-        (view.scores[NETWORK]["psnr_log_db"] or 0.0) - (view.scores[TRACER]["psnr_log_db"] or 0.0)
-        for view in both
-    ]
-    low, high = mean_interval(leads_db, [view.key for view in both])
+    lead = pair(both, NETWORK, TRACER)
     return found | {
         "network": summary(both, NETWORK),
         "tracer": summary(both, TRACER),
-        "lead_db": {"mean": float(np.mean(leads_db)), "low": low, "high": high},
-        "share_better": float(np.mean(np.array(leads_db) > 0)),
+        "lead_db": {"mean": lead.mean, "low": lead.low, "high": lead.high},
+        "share_better": lead.share_better,
     }
 
 

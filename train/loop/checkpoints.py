@@ -6,6 +6,7 @@ because going on with others in silence would be neither the old run nor a new o
 sha256 of itself, because safetensors would not notice a weight that a disk changed.
 """
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Mapping
@@ -26,19 +27,22 @@ from storage.errors import TrilightError
 from storage.extensions import recorded, require_same_extensions
 from storage.records.safe_read import read_safetensors
 from storage.settings.described import settings_record
+from train.data.mixture import RECORD
 from train.folder import RunFolder
 from train.going_on import GoingOn, event_records
 from train.loop.crew import Crew
 from train.loop.schedule import decay_begins
 from train.loop.state import TrainState, new_state
+from train.loop.step import StepReport
 from train.settings import Precision, TrainSettings
 
 PREFIX, SUFFIX = "step-", ".safetensors"
 """Names of the files, around the number of the step."""
 
 HEADER_KEY = "trilight_checkpoint"
-"""Metadata entry with counters, damage met, settings, digest of the data, the run's history, and
-how it was executed: number of processes and threads, precision of Muon's products."""
+"""Metadata entry with counters, damage met, settings, digest of the data, how datasets are mixed,
+the run's history, and how it was executed: number of processes and threads, precision of Muon's
+products."""
 
 UNSEALED = "0" * 64
 """Placeholder for the sha256 while it is computed. Old checkpoints have no sha256."""
@@ -59,9 +63,11 @@ def save_checkpoint(
         "skipped_steps": state.skipped_steps,
         "skipped_in_a_row": state.skipped_in_a_row,
         "unusable": dict(state.unusable.met),
+        "reports": [dataclasses.asdict(report) for report in state.reports],
         "settings": settings_record(settings),
         "model": encode_config(settings.model),
         "data_digest": data_digest,
+        **({RECORD: state.mixture.record()} if state.mixture else {}),
         "history": event_records(state.history),
         "world_size": world_size,
         "threads": torch.get_num_threads(),
@@ -153,6 +159,7 @@ def resumed_state(
     if not going.has_decided:
         state.skipped_in_a_row = header.get("skipped_in_a_row", 0)
     state.history = going.history
+    state.reports = [StepReport(**fields) for fields in header.get("reports", ())]
     weights = _part(checkpoint.arrays, "model")
     load_tensors(state.model, weights)
     if state.mean_model is not None:

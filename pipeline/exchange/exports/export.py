@@ -1,6 +1,7 @@
 """Which exports there are, and how the samples of a dataset go through one."""
 
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -9,23 +10,29 @@ from pipeline.exchange.exports.coco import write_coco
 from pipeline.exchange.exports.huggingface import write_huggingface
 from pipeline.exchange.exports.hypersim import write_hypersim
 from pipeline.exchange.exports.nerfstudio import write_nerfstudio
+from pipeline.exchange.exports.scenes import PARTS, write_benchmark, write_scenes
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
 from storage.errors import TrilightError
 from storage.records.sample import Sample
 
-ExportForm = Literal["nerfstudio", "coco", "huggingface", "hypersim"]
+ExportForm = Literal[
+    "nerfstudio", "coco", "huggingface", "hypersim", "h5", "json", "usd", "exr", "benchmark"
+]
 
 Samples = Iterator[tuple[str, Sample]]
 """Samples with the split of each."""
 
-FORMS: dict[ExportForm, Callable[[Samples, Path], None]] = {
+FORMS: dict[str, Callable[[Samples, Path], Sequence[str] | None]] = {
     "nerfstudio": write_nerfstudio,
     "coco": write_coco,
     "huggingface": write_huggingface,
     "hypersim": write_hypersim,
+    **{form: functools.partial(write_scenes, form=form) for form in PARTS},
+    "benchmark": write_benchmark,
 }
-"""Writers by form; each writes into a folder, the file that names all others last."""
+"""Writers by form; each writes into a folder, the file that names all others last, and returns what
+it could not carry over, where that can happen."""
 
 _RIGHTS = ("LICENSE.md", "attribution.csv")
 """Files of a dataset that go with every copy of its objects' pictures."""
@@ -39,7 +46,7 @@ def export_dataset(
     split: str | None,
     scene: str | None,
     done: Callable[[Sample], None],
-) -> None:
+) -> Sequence[str]:
     """Write samples of a dataset in another library's form, with the rights of its objects.
 
     Args:
@@ -48,6 +55,9 @@ def export_dataset(
         out: a folder that is empty, or does not exist.
         split, scene: as `chosen_samples`.
         done: called with each sample that is read.
+
+    Returns:
+        What the form cannot hold, for people.
 
     Raises:
         TrilightError: the dataset is unusable, there is no such split or scene, or the folder is
@@ -62,7 +72,8 @@ def export_dataset(
             yield found
             done(found[1])
 
-    FORMS[form](samples(), out)
+    lost = FORMS[form](samples(), out)
     for name in _RIGHTS:
         if (data := dataset.files.read(name)) is not None:
             write_atomically(out / name, data)
+    return lost or ()

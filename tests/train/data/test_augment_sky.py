@@ -12,7 +12,8 @@ from model.hits.tracing import lit_scene_of
 from model.hits.view_inputs import Channel, view_inputs
 from model.scene_tensors import SceneTensors, scene_tensors
 from storage.errors import TrilightError
-from storage.records.sample import Sample
+from storage.records.sample import encode_sample
+from storage.records.stored_sample import StoredSample, stored_sample
 from tests.model.hits.kit import corner
 from tests.model.hits.test_decoder import hits_config
 from tests.model.kit import tiny_config
@@ -68,11 +69,10 @@ def test_a_sky_goes_through_the_symmetries_of_training(symmetry: str) -> None:
     assert after.mean() == pytest.approx(before.mean(), rel=most / 4)
 
 
-def _below_a_sky() -> Sample:
+def _below_a_sky() -> StoredSample:
     sample = toy_sample(0)
-    return dataclasses.replace(
-        sample, scene=dataclasses.replace(sample.scene, environment=smooth())
-    )
+    below = dataclasses.replace(sample.scene, environment=smooth())
+    return stored_sample("0", encode_sample(dataclasses.replace(sample, scene=below)))
 
 
 @pytest.mark.parametrize(
@@ -89,9 +89,10 @@ def test_training_takes_skies_that_its_network_knows(config: object, is_known: b
     settings = StreamSettings(
         seed=0, window=1, batch_size=1, resolution=16, views_per_scene=1, network=config  # type: ignore[arg-type]
     )  # fmt: skip
+    rng = np.random.default_rng(0)
     maker = _SceneMaker(None, None, settings, Unusable(0))  # type: ignore[arg-type]
     if is_known:
-        assert maker._made(_below_a_sky()).tensors.sky is not None
+        assert maker._drawn(_below_a_sky(), rng).tensors.sky is not None
         return
     with pytest.raises(TrilightError, match="this network does not know its light"):
-        maker._made(_below_a_sky())
+        maker._drawn(_below_a_sky(), rng)

@@ -6,13 +6,19 @@ import numpy as np
 import pytest
 import torch
 
+from model.scene_tensors import tensors_of
 from storage.errors import TrilightError
+from storage.records.exr import encode_channels
+from storage.records.profiles import PROFILES, Profile
+from storage.records.sample import decode_sample, encode_sample
+from storage.records.stored_sample import stored_sample
 from storage.seeds import rng_for
 from tests.train.toy import toy_sample
-from train.data.augment import with_views
+from train.data.augment import augmented, with_views
 from train.data.buckets import MOST_WASTE, bucket_scenes
 from train.data.resolution import block_mean
-from train.data.scenes import training_scene
+from train.data.scenes import drawn_scene, training_scene, with_target
+from train.settings import AugmentationSettings
 
 
 def test_a_smaller_picture_is_the_mean_of_its_blocks() -> None:
@@ -97,3 +103,56 @@ def test_what_a_run_does_not_take_is_refused() -> None:
         training_scene(sample, 16, most_triangles=most - 1)
     with pytest.raises(TrilightError, match=r"not kept apart, which light_mix needs.*per_light"):
         training_scene(sample, 16, lights_apart=True)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("lights_apart", [False, True], ids=["together", "apart"])
+def test_drawn_views_are_those_of_the_whole_sample_to_the_bit(
+    profile: Profile, lights_apart: bool
+) -> None:
+    """Looked up by bits, or computed for each pixel; after all symmetries, at both resolutions."""
+    sample = toy_sample(1, resolution=16, views=3)
+    noisy = tuple(dataclasses.replace(view, noise_floor_db=20.0) for view in sample.views)
+    sample = dataclasses.replace(sample, views=noisy)
+    if lights_apart:
+        exact = sample.radiance_rgb.astype(np.float16).astype(np.float32)
+        sample = dataclasses.replace(sample, radiance_rgb=exact, lights_rgb=exact[:, None])
+    members = encode_sample(sample, profile)
+    whole, stored = decode_sample("1", members), stored_sample("1", members)
+    settings = AugmentationSettings(
+        mirror=True,
+        channels=True,
+        vertex_order=True,
+        light_scale=3.0,
+        light_mix=2.0 if lights_apart else 1.0,
+        rotation="uniform",
+    )
+    rows_seen = 0
+    for seed, resolution in enumerate((16, 16, 8, 16)):
+        full = training_scene(whole, resolution, lights_apart=lights_apart)
+        drawn = drawn_scene(stored, [0, 2], resolution, lights_apart=lights_apart)
+        rows_seen += drawn.levels_L is not None
+        wanted = augmented(
+            with_views(full, np.array([0, 2])), settings, np.random.default_rng(seed)
+        )
+        got = with_target(augmented(drawn, settings, np.random.default_rng(seed)))
+        assert torch.equal(got.target_VRR3, wanted.target_VRR3) and got.levels_L is None
+        assert torch.equal(got.noise_V, wanted.noise_V)
+        for name, tensor in tensors_of(wanted.tensors).items():
+            assert torch.equal(getattr(got.tensors, name), tensor)
+    assert rows_seen == 3
+
+
+def test_what_is_no_half_float_is_no_row() -> None:
+    """Zeros with a sign are zeros; a picture of another tool's float32 is computed as it is."""
+    sample = toy_sample(1, resolution=8)
+    radiance = sample.radiance_rgb.copy()
+    radiance[0, 0, 0] = -0.0
+    members = encode_sample(dataclasses.replace(sample, radiance_rgb=radiance))
+    drawn = with_target(drawn_scene(stored_sample("1", members), [0], 8))
+    assert drawn.target_VRR3[0, 0, 0].tolist() == [0.0, 0.0, 0.0]
+    members["1.exr"] = encode_channels({"RGB": sample.radiance_rgb[1]})
+    mixed = drawn_scene(stored_sample("1", members), [0, 1], 8)
+    assert mixed.levels_L is None
+    wanted = torch.from_numpy(np.log10(1 + sample.radiance_rgb[1]).astype(np.float32))
+    assert torch.equal(mixed.target_VRR3[1], wanted)

@@ -131,7 +131,7 @@ def test_any_number_of_ranks_may_go_on(
     )
 
 
-@pytest.mark.parametrize("workers", [2, 5])
+@pytest.mark.parametrize("workers", [0, 2, 5])
 def test_the_number_of_threads_changes_nothing(
     data: TrainingData, whole: list[list[TrainingScene]], workers: int
 ) -> None:

@@ -27,14 +27,14 @@ def dataset(tmp_path: Path) -> Dataset:
     return write_toy_dataset(tmp_path, train=8, validation=1, per_shard=2, resolution=8)
 
 
-def spoil_sample(dataset: Dataset) -> None:
-    """Make a sample unreadable whose shard has the hash of the manifest."""
+def spoil_sample(dataset: Dataset, suffixes: tuple[str, ...] = ("0.exr", "1.exr")) -> None:
+    """Make pictures of a sample unreadable whose shard has the hash of the manifest."""
     name = "train-000001.tar"
     samples = [
         (sample.key, encode_sample(sample))
         for sample in (toy_sample(i, resolution=8) for i in (2, 3))
     ]
-    samples[0][1]["0.exr"] = b"no picture"
+    samples[0][1].update(dict.fromkeys(suffixes, b"no picture"))
     dataset.folder.shard(name).unlink()  # a shard is never written over
     write_shard(dataset.folder.shard(name), samples)
     shards = [
@@ -85,6 +85,18 @@ def test_a_sample_is_replaced_by_the_next_of_its_shard(dataset: Dataset) -> None
     found = keys(opened(dataset), unusable)
     assert found == [[key.replace(BAD_KEY, "000000003") for key in batch] for batch in whole]
     assert len(unusable.messages) == 1 and BAD_KEY in unusable.messages[0]
+
+
+def test_damage_costs_only_the_visits_that_draw_its_view(dataset: Dataset) -> None:
+    whole = keys(opened(dataset), Unusable(0))
+    visits = [(batch, row) for batch in range(4) for row in range(4)]
+    replaced = list[set[tuple[int, int]]]()
+    for suffix in ("0.exr", "1.exr"):
+        spoil_sample(dataset, (suffix,))
+        found = keys(opened(dataset), Unusable(1))
+        replaced.append({at for at in visits if found[at[0]][at[1]] != whole[at[0]][at[1]]})
+    drawn = {at for at in visits if whole[at[0]][at[1]] == BAD_KEY}
+    assert replaced[0] | replaced[1] == drawn and not replaced[0] & replaced[1]
 
 
 def test_a_shard_is_replaced_and_counts_with_its_samples(dataset: Dataset) -> None:

@@ -2,7 +2,8 @@
 
 from pipeline.builds.judging import JUDGING_BUILDS
 from tests.train.evaluation.test_evaluate import row
-from train.evaluation.report import BENCHMARK, markdown, record
+from train.evaluation.published import BENCHMARK
+from train.evaluation.report import markdown, record
 
 
 def test_the_benchmark_stands_beside_the_paper() -> None:

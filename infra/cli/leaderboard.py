@@ -1,0 +1,70 @@
+"""`trilight leaderboard`: every engine, rung and network on one set, with what each costs."""
+
+from typing import Any
+
+from infra.cli.console import (
+    first_words,
+    look_at,
+    note,
+    print_json,
+    print_table,
+    progress_bars,
+)
+from infra.cli.options import Shown, command
+from infra.leaderboard.order import LeaderboardOrder
+from infra.torch_library import require_torch
+from storage.remote.safe_url import safe_url
+
+
+@command("source")
+def leaderboard(order: LeaderboardOrder, shown: Shown) -> None:
+    first_words(f"Judging on {safe_url(order.source)}, into {order.out}", silent=shown.json)
+    require_torch("leaderboard")
+    from infra.leaderboard.run import make_leaderboard
+
+    with progress_bars() as bars:
+        task = bars.add_task("scenes", total=None, note="", visible=not shown.json)
+        board = make_leaderboard(
+            order,
+            lambda now, total, what: bars.update(task, completed=now, total=total, note=what),
+        )
+    if shown.json:
+        print_json({"out": str(board.out), "rival": board.rival, "widths": _plain(board)})
+        return
+    for one in board.widths:
+        title = f"{one.width} x {one.width} pixels: median psnr_log_db of {one.num_views} views"
+        print_table(f"{title}, lead over {board.rival}", [_row(each) for each in one.standings])
+    for text in board.notes:
+        note(text)
+    look_at(f"Read {board.out / 'leaderboard.md'}, look at {board.out / 'leaderboard.png'}")
+
+
+def _row(standing: Any) -> dict[str, str]:
+    from infra.bench.table import shown
+    from train.evaluation.pairs import METRIC
+
+    lead, scores = standing.lead, standing.scores[METRIC]
+    return {
+        "": standing.name,
+        "first, s": "" if standing.first_s is None else shown(standing.first_s),
+        "further": "" if standing.further_s is None else shown(standing.further_s),
+        "dB": f"{scores['median']:.1f}",
+        "5th": f"{scores['worse_5_percent']:.1f}",
+        "lead, dB": (
+            "" if lead is None else f"{lead.mean:+.1f} ({lead.low:+.1f} to {lead.high:+.1f})"
+        ),
+    }
+
+
+def _plain(board: Any) -> list[dict[str, Any]]:
+    import dataclasses
+
+    return [
+        {
+            "width": one.width,
+            "views": one.num_views,
+            "scenes": one.num_scenes,
+            "standings": [dataclasses.asdict(each) for each in one.standings],
+        }
+        for one in board.widths
+    ]

@@ -1,0 +1,222 @@
+"""Every contestant judged on every view: what is missing among the rows is made, one row each.
+
+The judging is that of `trilight evaluate`: targets, masks, metrics and floors are its own.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from typing import Any
+
+from infra.leaderboard.contestants import Contestant
+from infra.leaderboard.rows import BoardRow, BoardRows, RowKey
+from pipeline.isolation import ChildFailed
+from storage.dataset.shard_set import ShardSet
+from storage.digests import canonical_json, sha256_hex
+from storage.errors import Rejected
+from storage.records.sample import Sample
+from storage.seeds import rng_for
+from train.data.unusable import Unusable, first_samples
+from train.evaluation.judge import JudgedScene, judged_scene
+from train.evaluation.judged_view import JudgedView, facts_of
+from train.evaluation.metrics import METRICS, noise_floors, picture_scores
+from train.loss.lpips import Lpips
+
+NOISE = "noise of the references"
+"""Name of the row that says what the targets leave open: nobody can be asked for more."""
+
+Told = Callable[[int, int, str], None]
+"""Called with (finished, all) pairs of scene and width, and what is being done."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BoardContest:
+    """Who is judged on what."""
+
+    shards: ShardSet
+    """The split."""
+    keys: Sequence[str]
+    """The scenes that are judged: the first ones of the split."""
+    num_views: int
+    """Cameras of each scene."""
+    timed_scenes: int
+    """And on the first so many of these everything is timed."""
+    widths: Sequence[int]
+    """Pixels across, rising."""
+    contestants: Sequence[Contestant]
+    """In the order of their turns."""
+    lpips: Lpips | None
+    """None where its weights are not at hand."""
+    rows: BoardRows
+    """What was judged already, and is from now on."""
+    left_out: dict[tuple[int, str], str] = field(default_factory=dict)
+    """Scenes that somebody could not show, by width and key: why."""
+
+    @functools.cached_property
+    def judged_by(self) -> str:
+        """The digest of how pictures are judged."""
+        meanings = {metric: METRICS[metric].meaning for metric in METRICS}
+        return sha256_hex(canonical_json([meanings, self.lpips is not None]))
+
+    def row_key(self, width: int, name: str, made_by: str, key: str, view: int) -> RowKey:
+        """Return what a row is known by; `made_by` is the digest of what made the picture."""
+        digest = sha256_hex(f"{made_by} {self.judged_by}".encode())
+        return RowKey(width=width, scene=key, view=view, name=name, digest=digest)
+
+    def key_of(self, contestant: Contestant, width: int, key: str, view: int) -> RowKey:
+        """Return what the row of a contestant is known by."""
+        return self.row_key(width, contestant.name, contestant.digest(key, view), key, view)
+
+    def present(self, width: int) -> list[Contestant]:
+        """Return the contestants that have pictures of a width."""
+        return [one for one in self.contestants if not one.why_not(width)]
+
+
+def first_keys(shards: ShardSet, limit: int) -> list[str]:
+    """Return the keys of the first scenes of a split; no picture is read."""
+    found: list[str] = []
+    for number in range(len(shards.names)):
+        if len(found) < limit:
+            with closing(shards.open(number)) as shard:
+                found += shard.keys
+    return found[:limit]
+
+
+def judge_all(contest: BoardContest, told: Told) -> None:
+    """Add every row that is missing.
+
+    Raises:
+        TrilightError: damaged data, or a network that cannot show a scene.
+    """
+    total = len(contest.keys) * len(contest.widths)
+    done = 0
+    told(done, total, "")
+    samples = first_samples(contest.shards, len(contest.keys), Unusable(0))
+    for number, sample in enumerate(samples):
+        for width in contest.widths:
+            turn = _Turn(contest, sample, width, timed=number < contest.timed_scenes)
+            for contestant in turn.missing():
+                told(done, total, f"{width} px, {contestant.name}")
+                turn.judge(contestant)
+            turn.judge_noise()
+            done += 1
+            told(done, total, "")
+
+
+class _Turn:
+    """One scene at one width."""
+
+    def __init__(self, contest: BoardContest, sample: Sample, width: int, *, timed: bool) -> None:
+        self._contest, self._sample, self._width, self._timed = contest, sample, width, timed
+        self._scene: JudgedScene | None = None
+
+    def missing(self) -> list[Contestant]:
+        """Return who has not all of the scene's rows, or not its times."""
+        return [one for one in self._contest.present(self._width) if not self._has_all(one)]
+
+    def _has_all(self, contestant: Contestant) -> bool:
+        rows = [self._contest.rows.get(self._key(contestant, view)) for view in self._views()]
+        if not self._timed or not contestant.is_timed:
+            return None not in rows
+        return None not in rows and rows[0] is not None and rows[0].first_s is not None
+
+    def _key(self, contestant: Contestant, view: int) -> RowKey:
+        return self._contest.key_of(contestant, self._width, self._sample.key, view)
+
+    def _views(self) -> Sequence[int]:
+        return range(self._sample.scene.num_views)
+
+    def judge(self, contestant: Contestant) -> None:
+        """Add a contestant's rows, or remember why the scene is left out."""
+        timed = self._timed and contestant.is_timed
+        try:
+            shown = contestant.shown(self._sample, self._width, timed=timed)
+        except (Rejected, ChildFailed) as error:
+            self._contest.left_out[self._width, self._sample.key] = f"{contestant.name}: {error}"
+            return
+        scene = self._judged_scene()
+        for view, picture in enumerate(shown.radiance_VRR3):
+            scores = picture_scores(
+                picture, scene.target_VRR3[view], scene.hits_VRR[view], self._contest.lpips
+            )
+            row = BoardRow(
+                scores=scores,
+                first_s=shown.first_s if view == 0 else None,
+                further_s=shown.further_s if view == 0 else None,
+            )
+            self._contest.rows.add(self._key(contestant, view), row)
+
+    def judge_noise(self) -> None:
+        """Add what the noise of the targets alone scores, with what is known of the scene."""
+        sample, facts = self._sample, facts_of(self._sample)
+        for view in self._views():
+            key = self._contest.row_key(self._width, NOISE, "", sample.key, view)
+            if self._contest.rows.get(key) is None:
+                scene = self._judged_scene()
+                floors = noise_floors(
+                    sample.views[view],
+                    scene.target_VRR3[view],
+                    scene.hits_VRR[view],
+                    self._contest.lpips,
+                    rng_for(0, f"noise of {sample.key}", view),
+                )
+                self._contest.rows.add(key, BoardRow(scores=floors, facts=facts))
+
+    def _judged_scene(self) -> JudgedScene:
+        if self._scene is None:
+            self._scene = judged_scene(self._sample, self._width)
+        return self._scene
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedWidth:
+    """All that is known at one width."""
+
+    width: int
+    """Pixels across."""
+    views: tuple[JudgedView, ...]
+    """Views that every contestant of the width has, each with NOISE as a contestant too."""
+    first_s: dict[str, list[float]]
+    """Core-seconds of first views by contestant, one for each timed scene."""
+    further_s: dict[str, list[float]]
+    """And of further views."""
+
+
+def judged_width(contest: BoardContest, width: int) -> JudgedWidth:
+    """Return the rows of a width, put together by view."""
+    found = JudgedWidth(width=width, views=tuple(_views(contest, width)), first_s={}, further_s={})
+    shown = {view.key for view in found.views}
+    timed = [key for key in contest.keys[: contest.timed_scenes] if key in shown]
+    for one in contest.present(width):
+        rows = [contest.rows.get(contest.key_of(one, width, key, 0)) for key in timed]
+        for row in rows:
+            if row is not None and row.first_s is not None and row.further_s is not None:
+                found.first_s.setdefault(one.name, []).append(row.first_s)
+                found.further_s.setdefault(one.name, []).append(row.further_s)
+    return found
+
+
+def _views(contest: BoardContest, width: int) -> Iterator[JudgedView]:
+    present = contest.present(width)
+    for key in contest.keys:
+        for view in range(contest.num_views):
+            noise = contest.rows.get(contest.row_key(width, NOISE, "", key, view))
+            rows = {
+                one.name: contest.rows.get(contest.key_of(one, width, key, view)) for one in present
+            }
+            if noise is None or noise.facts is None or None in rows.values():
+                continue
+            floors = {name: value for name, value in noise.scores.items() if value is not None}
+            scores = {name: dict(row.scores) for name, row in rows.items() if row is not None}
+            scores[NOISE] = {metric: noise.scores.get(metric) for metric in METRICS}
+            yield JudgedView(view=view, floors=floors, scores=scores, **_facts(noise.facts))
+
+
+def _facts(facts: Any) -> dict[str, Any]:
+    """Return facts as they were before JSON made a list of a pair."""
+    excursion = facts["excursion"]
+    known = {one.name for one in dataclasses.fields(JudgedView)}
+    whole = {**facts, "excursion": None if excursion is None else tuple(excursion)}
+    return {name: value for name, value in whole.items() if name in known}

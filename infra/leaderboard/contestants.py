@@ -1,0 +1,228 @@
+"""Who stands on a leaderboard: traced light, networks, the path tracer, and the nearest picture.
+
+Each shows all views of a sample at a width, and says by a digest what decides its pictures.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.bench.experiments.rungs import KINDS, kind_of, samples_name
+from infra.bench.sides.rung_pictures import Rung, sampled_rung
+from infra.bench.sides.shots import warm_up_denoiser
+from infra.timed_views import Show, timed_views
+from pipeline.isolation import IsolatedChild, with_retries
+from pipeline.renders.settings import Filtered
+from pipeline.renders.variant import Variant
+from storage.digests import canonical_json, sha256_hex
+from storage.records.sample import Sample
+from storage.records.scene import Scene
+
+if TYPE_CHECKING:
+    from model.neural_renderer import NeuralRenderer
+    from train.evaluation.rivals import Rivals
+
+TRACED_LIGHT, TRACER = KINDS[1], KINDS[2]
+BASELINE, ELSEWHERE = "picture of another scene", "pictures made elsewhere"
+"""Kinds of contestants, beside those of the experiment `rungs`."""
+
+_REPEATS = 1
+"""Counted times after one to warm up: the median over scenes counts, not that over repeats."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShownViews:
+    """All views of a scene by one contestant."""
+
+    radiance_VRR3: NDArray[np.floating]
+    """Linear radiance of at least 0."""
+    first_s: float | None = None
+    """Core-seconds of the first view, loading included; None where it was not timed."""
+    further_s: float | None = None
+    """And of a further one."""
+
+
+class Contestant(Protocol):
+    """One row of the table."""
+
+    name: str
+    """Its name in the table."""
+    kind: str
+    """What it is one of, for the chart's colours."""
+    is_timed: bool
+    """Whether core-seconds are measured of it."""
+    notes: Sequence[str]
+    """What a reader should know of it."""
+
+    def why_not(self, width: int) -> str:
+        """Return why it has no pictures of this width; empty where it has."""
+
+    def digest(self, key: str, view: int) -> str:
+        """Return the digest of all that decides its picture of a view."""
+
+    def shown(self, sample: Sample, width: int, *, timed: bool) -> ShownViews:
+        """Return its pictures of a sample.
+
+        Raises:
+            Rejected, ChildFailed: this scene cannot be shown.
+        """
+
+
+def shown_by(rung: Rung, scene: Scene, *, timed: bool) -> ShownViews:
+    """Return all views of a scene by a rung; core-seconds are of this process, kernels warm."""
+    if not timed:
+        return ShownViews(radiance_VRR3=_all_views(rung, scene))
+
+    def load() -> Show:
+        view = rung(scene)
+        return lambda: view(scene.c2w[0], float(scene.fov_deg[0]))
+
+    first = timed_views(load, repeats=_REPEATS)
+    whole = first.radiance_rgb[None] if scene.num_views == 1 else _all_views(rung, scene)
+    return ShownViews(radiance_VRR3=whole, first_s=first.first_s, further_s=first.further_s)
+
+
+def _all_views(rung: Rung, scene: Scene) -> NDArray[np.float32]:
+    view = rung(scene)
+    return np.stack([view(c2w, float(f)) for c2w, f in zip(scene.c2w, scene.fov_deg, strict=True)])
+
+
+def _digest_of(**facts: Any) -> str:
+    return sha256_hex(canonical_json({**facts, "trilight": metadata.version("trilight")}))
+
+
+class RungContestant:
+    """A rung that is shown in this process: traced light alone, or a network."""
+
+    is_timed = True
+
+    def __init__(
+        self, name: str, rung_of: Callable[[int], Rung], *, weights: str = "", notes: Sequence[str]
+    ) -> None:
+        """Take a rung by its width; `weights` is the digest of what it has learned."""
+        self.name, self.kind, self.notes = name, kind_of(name), notes
+        self._rung_of = functools.lru_cache(rung_of)
+        self._own = _digest_of(name="" if weights else name, weights=weights)
+
+    def why_not(self, width: int) -> str:
+        return ""
+
+    def digest(self, key: str, view: int) -> str:
+        return self._own
+
+    def shown(self, sample: Sample, width: int, *, timed: bool) -> ShownViews:
+        import torch
+
+        torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
+        return shown_by(self._rung_of(width), sample.scene, timed=timed)
+
+
+class NetworkContestant(RungContestant):
+    """A network, at the widths that it can show."""
+
+    def __init__(self, name: str, renderer: "NeuralRenderer", notes: Sequence[str]) -> None:
+        from infra.bench.sides.rung_pictures import network_rung
+
+        super().__init__(
+            name,
+            lambda width: network_rung(renderer, width),
+            weights=renderer.digest,
+            notes=notes,
+        )
+        self._renderer = renderer
+        self.most_triangles = renderer.trained.max_triangles
+
+    def why_not(self, width: int) -> str:
+        from storage.errors import TrilightError
+
+        try:
+            self._renderer.require_resolution(width)
+        except TrilightError as error:
+            return str(error).rstrip(".")
+        return ""
+
+
+class SampledContestant:
+    """Few samples a pixel with one denoise, in a child that traces on one thread."""
+
+    kind, is_timed = TRACER, True
+    notes: Sequence[str] = ()
+
+    def __init__(
+        self, level: tuple[int, Filtered], variant: Variant, child: Callable[[], IsolatedChild]
+    ) -> None:
+        """Take samples a pixel with the filter; the child is asked for when it is needed."""
+        self.name = samples_name(level)
+        self._level, self._child = level, child
+        libraries = {name: metadata.version(name) for name in ("mitsuba", "pyoidn")}
+        self._own = _digest_of(level=list(level), variant=variant.name, libraries=libraries)
+
+    def why_not(self, width: int) -> str:
+        return ""
+
+    def digest(self, key: str, view: int) -> str:
+        return self._own
+
+    def shown(self, sample: Sample, width: int, *, timed: bool) -> ShownViews:
+        ask = (shown_by_samples, sample.scene, width, self._level, timed)
+        return with_retries(lambda: self._child().call(*ask))
+
+
+def shown_by_samples(
+    scene: Scene, width: int, level: tuple[int, Filtered], timed: bool
+) -> ShownViews:
+    """Return all views of a scene by samples a pixel; runs in the child."""
+    if timed:
+        warm_up_denoiser(width)
+    return shown_by(sampled_rung(width, *level), scene, timed=timed)
+
+
+class NearestContestant:
+    """The picture closest to the target among those of other scenes: what looking up can do.
+
+    It is found by the target itself, so that no method that looks up a picture by the scene can do
+    better.
+    """
+
+    kind, is_timed = BASELINE, False
+
+    def __init__(
+        self,
+        name: str,
+        rivals_of: Callable[[int], "Rivals"],
+        *,
+        pool: str,
+        not_itself: bool,
+        notes: Sequence[str],
+    ) -> None:
+        """Take what is looked up.
+
+        Args:
+            name: in the table.
+            rivals_of: the pictures of a width.
+            pool: digest of what they are of.
+            not_itself: whether the judged scenes are among them.
+            notes: what a reader should know.
+        """
+        self.name, self.notes, self._not_itself = name, notes, not_itself
+        self._rivals_of, self._own = functools.lru_cache(rivals_of), _digest_of(pool=pool)
+
+    def why_not(self, width: int) -> str:
+        return ""
+
+    def digest(self, key: str, view: int) -> str:
+        return self._own
+
+    def shown(self, sample: Sample, width: int, *, timed: bool) -> ShownViews:
+        from train.data.resolution import block_mean
+
+        rivals = self._rivals_of(width)
+        targets = block_mean(sample.radiance_rgb, width)
+        itself = sample.key if self._not_itself else ""
+        nearest = [rivals.nearest(target, not_of=itself) for target in targets]
+        return ShownViews(radiance_VRR3=np.stack(nearest))

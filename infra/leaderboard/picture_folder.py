@@ -1,0 +1,138 @@
+"""A folder of anybody's OpenEXR pictures as a contestant: one a view, all looked at first."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from infra.leaderboard.contestants import ELSEWHERE, ShownViews
+from pipeline.exchange.exports.scenes import picture_name
+from pipeline.exchange.pictures import MAX_BYTES, decoded_pixels
+from storage.digests import sha256_hex
+from storage.errors import TrilightError
+from storage.records.sample import Sample
+
+_LEAST = -1e-2
+"""Radiance below this is no rounding of a network's black."""
+
+Views = Sequence[tuple[str, int]]
+"""Scene and camera of every view that is judged."""
+
+
+class FolderContestant:
+    """Pictures that were made elsewhere, at the one width that they have.
+
+    Values a little below 0, as networks of logarithms give them, count as 0; alpha is left out.
+    """
+
+    kind, is_timed = ELSEWHERE, False
+
+    def __init__(self, folder: Path, views: Views, widths: Sequence[int]) -> None:
+        """Look at the picture of every view.
+
+        Raises:
+            TrilightError: one is missing, no picture, of another width than the first one or than
+                is judged, or has values that are not finite or below 0.
+        """
+        self.name = f"pictures of {folder.name or folder.resolve().name}"
+        self._folder = folder
+        self._require_all(views)
+        self._sha256: dict[tuple[str, int], str] = {}
+        found: dict[int, Path] = {}
+        for key, view in views:
+            path = self._path(key, view)
+            data = _bytes_of(path)
+            found.setdefault(_picture(data, path, widths).shape[0], path)
+            self._sha256[key, view] = sha256_hex(data)
+        if len(found) > 1:
+            shown = ", ".join(f"{path.name} has {width}" for width, path in found.items())
+            raise TrilightError(
+                f"--pictures {folder}: its pictures have several widths ({shown}); expected one. "
+                "Put those of each width into a folder of their own."
+            )
+        (self._width,) = found
+        self.notes: Sequence[str] = (
+            f"{self.name} were made elsewhere: what they cost is not known, and they are judged at "
+            f"{self._width} pixels alone",
+        )
+
+    def why_not(self, width: int) -> str:
+        return "" if width == self._width else f"its pictures have {self._width} pixels"
+
+    def digest(self, key: str, view: int) -> str:
+        return self._sha256[key, view]
+
+    def shown(self, sample: Sample, width: int, *, timed: bool) -> ShownViews:
+        paths = [self._path(sample.key, view) for view in range(sample.scene.num_views)]
+        pictures = [_picture(_bytes_of(path), path, [width]) for path in paths]
+        return ShownViews(radiance_VRR3=np.maximum(np.stack(pictures), 0))
+
+    def _path(self, key: str, view: int) -> Path:
+        return self._folder / picture_name(key, view)
+
+    def _require_all(self, views: Views) -> None:
+        if not self._folder.is_dir():
+            raise TrilightError(f"--pictures {self._folder}: no such folder; expected one.")
+        missing = [name for name in views if not self._path(*name).is_file()]
+        if missing:
+            raise TrilightError(
+                f"--pictures {self._folder}: {len(missing)} of {len(views)} pictures are missing, "
+                f"the first is {picture_name(*missing[0])}; expected one for each view, called as "
+                "`trilight export SET --form exr` calls them. --scenes judges fewer."
+            )
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise TrilightError(f"{path.name}: expected a picture of at most {MAX_BYTES} bytes.")
+        return path.read_bytes()
+    except OSError as error:
+        raise TrilightError(f"{path.name}: cannot be read ({error.strerror}).") from error
+
+
+def _picture(data: bytes, path: Path, widths: Sequence[int]) -> NDArray[np.float32]:
+    """Return the radiance [R, R, 3] of a file whose width is one of `widths`."""
+    pixels = decoded_pixels(data, path.name)
+    if pixels is None or pixels.dtype != np.float32 or pixels.shape[2] < 3:
+        raise TrilightError(
+            f"{path.name}: no readable OpenEXR picture of channels R, G and B; expected linear "
+            "radiance as `trilight export SET --form exr` writes it."
+        )
+    height, width = pixels.shape[:2]
+    if height != width or width not in widths:
+        expected = " or ".join(f"{each} x {each}" for each in widths)
+        raise TrilightError(
+            f"{path.name}: {width} x {height} pixels; expected {expected}. Render it at that size, "
+            "or name another --width."
+        )
+    radiance_rgb = np.asarray(pixels[..., :3], np.float32)
+    legal = np.isfinite(radiance_rgb) & (radiance_rgb >= _LEAST)
+    if not legal.all():
+        _refuse(radiance_rgb, legal, path.name)
+    return radiance_rgb
+
+
+def _refuse(radiance_rgb: NDArray[np.float32], legal: NDArray[np.bool_], name: str) -> None:
+    row, column, channel = (int(place) for place in np.argwhere(~legal)[0])
+    raise TrilightError(
+        f"{name}: row {row}, column {column} is {radiance_rgb[row, column].tolist()}, and "
+        f"{int((~legal).any(axis=-1).sum())} pixels are like it; expected finite radiance of at "
+        f"least 0 (channel {'RGB'[channel]}). Make the picture again."
+    )
+
+
+def folder_contestants(
+    folders: Sequence[Path], views: Views, widths: Sequence[int]
+) -> Mapping[str, FolderContestant]:
+    """Return the folders as contestants by name; raises TrilightError where two have one name."""
+    found: dict[str, FolderContestant] = {}
+    for folder in folders:
+        one = FolderContestant(folder, views, widths)
+        if one.name in found:
+            raise TrilightError(
+                f"--pictures {folder}: another folder has the same name; expected different ones."
+            )
+        found[one.name] = one
+    return found

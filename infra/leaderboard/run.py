@@ -1,0 +1,250 @@
+"""A leaderboard from its order to its files: who never lacks, who is asked for, what is written."""
+
+import contextlib
+import functools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from infra.bench.effort import Asked
+from infra.bench.experiments.rungs import LAMPS, PHYSICS, SAMPLES, SHIPPED, network_name
+from infra.bench.machine import processor
+from infra.bench.sides.rung_pictures import lamps_rung, network_rung, physics_alone
+from infra.leaderboard.chart import plot_leaderboard
+from infra.leaderboard.contest import (
+    BoardContest,
+    JudgedWidth,
+    Told,
+    first_keys,
+    judge_all,
+    judged_width,
+)
+from infra.leaderboard.contestants import (
+    Contestant,
+    NearestContestant,
+    NetworkContestant,
+    RungContestant,
+    SampledContestant,
+)
+from infra.leaderboard.order import LeaderboardOrder
+from infra.leaderboard.page import page, pairs_csv, standings_csv
+from infra.leaderboard.picture_folder import folder_contestants
+from infra.leaderboard.rows import BoardRows
+from infra.leaderboard.standings import WidthStandings, standings_of
+from infra.tracer_rival import tracing_child
+from pipeline.isolation import IsolatedChild
+from pipeline.renders.variant import choose_variant
+from storage.atomic import write_atomically
+from storage.dataset.training_data import TrainingData, open_training_data
+from storage.errors import TrilightError
+from train.evaluation.evaluate import RIVAL_SCENES, make_rivals, stored_resolution
+from train.loop.checkpoints import network_of_run
+from train.loss.lpips import load_lpips
+
+if TYPE_CHECKING:
+    from model.neural_renderer import NeuralRenderer
+
+USUAL_WIDTHS = (64, 256, 512)
+"""Widths that are judged where nobody names any and the set has them."""
+
+FILTER = "fast"
+"""The filter of the path tracer's rows."""
+
+NEAREST_TRAINED, NEAREST_OTHER = "nearest training view", "nearest other scene"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leaderboard:
+    """A finished leaderboard."""
+
+    widths: tuple[WidthStandings, ...]
+    """The table of each width."""
+    notes: tuple[str, ...]
+    """What a reader should know."""
+    rival: str
+    """Name of the row that all others are compared with."""
+    out: Path
+    """Its folder."""
+
+
+def make_leaderboard(order: LeaderboardOrder, told: Told) -> Leaderboard:
+    """Judge what is missing, and write leaderboard.md, .csv and .png and pairs.csv.
+
+    Raises:
+        TrilightError: the set, a network or a folder of pictures is unusable, the rows in the
+            folder are of another set, or nothing could be judged.
+    """
+    opened = open_training_data([order.source])
+    shards = opened.split(order.split)
+    if opened.num_views is None:
+        raise TrilightError(
+            f"SOURCE is {opened.shown}, a list of shards; expected a dataset with its manifest."
+        )
+    widths = widths_of(order.width, stored_resolution(shards))
+    keys = first_keys(shards, order.scenes)
+    views = [(key, view) for key in keys for view in range(opened.num_views)]
+    rival = _names(order.checkpoint or SHIPPED[:1])[0]
+    with contextlib.ExitStack() as stack:
+        contest = BoardContest(
+            shards=shards,
+            keys=keys,
+            num_views=opened.num_views,
+            timed_scenes=order.timed_scenes,
+            widths=widths,
+            contestants=[
+                *folder_contestants(order.pictures, views, widths).values(),
+                *_never_lacking(order, opened, stack),
+                *_networks(order),
+            ],
+            lpips=load_lpips(order.lpips),
+            rows=BoardRows(order.out / "rows.jsonl", opened.digest),
+        )
+        judge_all(contest, told)
+    return _written(order, opened, contest, rival)
+
+
+def widths_of(asked: Sequence[int], stored: int) -> list[int]:
+    """Return the widths to judge at, rising; raises TrilightError where the set lacks one."""
+    if wrong := [width for width in asked if stored % width]:
+        raise TrilightError(
+            f"--width is {wrong[0]}; expected a divisor of {stored}, the width of the set. "
+            "Generate it at another --resolution for wider pictures."
+        )
+    usual = [width for width in USUAL_WIDTHS if stored % width == 0]
+    return sorted(set(asked or usual or [stored]))
+
+
+def _names(places: Sequence[str]) -> list[str]:
+    """Return what networks are called: by the folder of a run, by no path of this machine."""
+    return [network_name(label) for label in Asked(checkpoint=tuple(places)).network_names]
+
+
+def _never_lacking(
+    order: LeaderboardOrder, opened: TrainingData, stack: contextlib.ExitStack
+) -> Iterator[Contestant]:
+    """Yield who stands on every leaderboard, the networks that come along aside."""
+    yield _nearest(order, opened)
+    yield RungContestant(LAMPS, lamps_rung, notes=())
+    physics = functools.cache(physics_alone)
+    yield RungContestant(PHYSICS, lambda width: network_rung(physics(), width), notes=())
+    variant = choose_variant()
+
+    @functools.cache
+    def child() -> IsolatedChild:
+        return stack.enter_context(contextlib.closing(tracing_child(variant)))
+
+    for level in SAMPLES:
+        if level[1] == FILTER:
+            yield SampledContestant(level, variant, child)
+
+
+def _nearest(order: LeaderboardOrder, opened: TrainingData) -> NearestContestant:
+    """Return the pictures that are looked up: of the training split, or of the other scenes."""
+    pool = open_training_data(order.train_data) if order.train_data else opened
+    trained = "train" in pool.splits
+    split = "train" if trained else order.split
+    if order.train_data and not trained:
+        raise TrilightError(
+            f"--train-data {pool.shown}: it has no training split; expected one. Leave it out to "
+            "look up the other scenes of the set."
+        )
+    name = NEAREST_TRAINED if trained else NEAREST_OTHER
+    note = (
+        f"{name} is found by the target itself, among the first {RIVAL_SCENES} scenes of the "
+        f"{split} split: no way to look one of them up can do better"
+    )
+    if not trained:
+        note += ". The set has no training split, so that its other scenes are looked up"
+    return NearestContestant(
+        name,
+        lambda width: make_rivals(pool.split(split), width),
+        pool=f"{pool.digest} {split}",
+        not_itself=pool is opened,
+        notes=(note,),
+    )
+
+
+def _networks(order: LeaderboardOrder) -> Iterator[Contestant]:
+    """Yield the networks that come along and those asked for, each once."""
+    from model.neural_renderer import NeuralRenderer
+
+    places = [*SHIPPED, *(place for place in order.checkpoint if place not in SHIPPED)]
+    names = _names(places)
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise TrilightError(
+            f"--checkpoint: {twice[0]} is there twice; expected each network once, in folders of "
+            "different names."
+        )
+    for name, place in zip(names, places, strict=True):
+        renderer = NeuralRenderer.load(place, device="cpu", finders=[network_of_run])
+        yield NetworkContestant(name, renderer, [_about_network(name, renderer)])
+
+
+def _about_network(name: str, renderer: "NeuralRenderer") -> str:
+    """Return a sentence on a network's weights and what it was trained on."""
+    trained = renderer.trained
+    width = "an unknown width" if trained.resolution is None else f"{trained.resolution} pixels"
+    most = "" if trained.max_triangles is None else f", at most {trained.max_triangles} triangles"
+    return f"{name} is {renderer.digest[:8]}, trained at {width}{most}"
+
+
+def _written(
+    order: LeaderboardOrder, opened: TrainingData, contest: BoardContest, rival: str
+) -> Leaderboard:
+    kinds = {one.name: one.kind for one in contest.contestants}
+    judged = [judged_width(contest, width) for width in contest.widths]
+    tables = tuple(standings_of(one, kinds, rival) for one in judged if one.views)
+    if not tables:
+        why = next(iter(contest.left_out.values()), "the split is empty")
+        raise TrilightError(f"leaderboard: no scene could be shown by everybody ({why}).")
+    about = {
+        "set": f"{opened.build or 'a set of unknown build'}, digest {opened.digest[:12]}",
+        "split": order.split,
+        "scenes": str(len(contest.keys)),
+        "processor": processor(),
+    }
+    notes = tuple(dict.fromkeys([*_notes(contest, tables), *_beyond(contest, judged)]))
+    write_atomically(order.out / "leaderboard.md", page(about, tables, notes, rival).encode())
+    write_atomically(order.out / "leaderboard.csv", standings_csv(tables))
+    write_atomically(order.out / "pairs.csv", pairs_csv(tables))
+    title = f"{opened.build or 'leaderboard'}: what core-seconds buy"
+    plot_leaderboard(tables, title, order.out / "leaderboard.png")
+    return Leaderboard(widths=tables, notes=notes, rival=rival, out=order.out)
+
+
+FEW_SCENES = 10
+"""Below this an interval over scenes is a hint at most."""
+
+
+def _notes(contest: BoardContest, tables: Sequence[WidthStandings]) -> Iterator[str]:
+    for one in contest.contestants:
+        yield from one.notes
+        for width in contest.widths:
+            if why := one.why_not(width):
+                yield f"{one.name} is not judged at {width} pixels: {why}"
+    for (width, key), why in contest.left_out.items():
+        yield f"scene {key} is left out at {width} pixels: {why}"
+    if min(one.num_scenes for one in tables) < FEW_SCENES:
+        yield f"fewer than {FEW_SCENES} scenes: intervals are narrower than they should be"
+    if contest.lpips is None:
+        yield "LPIPS is n/a without its weights (--lpips)"
+    yield "targets went through the path tracer's denoiser, which favours its rows a little"
+    yield (
+        "the references' noise was measured at the width of the set; less is left at smaller ones. "
+        "In log_l1 it is an upper bound, and in SSIM, LPIPS and HDR-FLIP that of independent noise "
+        "of its size, where a denoiser's is smoother: a row may score better than it"
+    )
+
+
+def _beyond(contest: BoardContest, judged: Sequence[JudgedWidth]) -> Iterator[str]:
+    """Yield which networks were shown larger scenes than they were trained on."""
+    sizes = {view.key: view.num_triangles for one in judged for view in one.views}
+    for one in contest.contestants:
+        most = one.most_triangles if isinstance(one, NetworkContestant) else None
+        larger = 0 if most is None else sum(size > most for size in sizes.values())
+        if larger:
+            yield (
+                f"{larger} of {len(sizes)} scenes have more triangles than any that {one.name} was "
+                "trained on"
+            )

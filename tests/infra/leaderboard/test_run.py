@@ -1,0 +1,207 @@
+"""The command as a whole: who never lacks, what is compared, and that nothing is judged twice."""
+
+import csv
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from infra.bench.experiments.rungs import LAMPS, PHYSICS
+from infra.leaderboard import contest as contest_module
+from infra.leaderboard import run as run_module
+from infra.leaderboard.contest import NOISE
+from infra.leaderboard.contestants import TRACER
+from infra.leaderboard.order import LeaderboardOrder
+from infra.leaderboard.run import (
+    NEAREST_OTHER,
+    NEAREST_TRAINED,
+    Leaderboard,
+    _nearest,
+    make_leaderboard,
+    widths_of,
+)
+from model.open import save_published
+from pipeline.exchange.exports.export import export_dataset
+from storage.errors import Rejected, TrilightError
+from tests.command_line import trilight
+from tests.model.kit import awake
+from tests.model.published.test_convert import publishable
+from tests.train.toy import VIEWS, write_toy_dataset
+
+PX = 16
+SHIPPED = {"network builtin:", "network builtin:tokens"}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a set, its targets as a folder of pictures, and published weights."""
+    import torch
+
+    root = tmp_path_factory.mktemp("board")
+    write_toy_dataset(root / "toy", train=3, validation=3, per_shard=3, resolution=PX)
+    export_dataset(
+        str(root / "toy"), "exr", root / "perfect", split=None, scene=None, done=lambda _: None
+    )
+    save_published(awake(publishable("dpt"), torch.float32), root / "renderformer-v1-base")
+    return root
+
+
+@pytest.fixture
+def order(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOrder:
+    """Return an order of seconds: no path tracer, which the slow test has."""
+    monkeypatch.setattr(run_module, "SAMPLES", ())
+    monkeypatch.delenv("TRILIGHT_LPIPS", raising=False)
+    return LeaderboardOrder(
+        source=str(root / "toy"), split="validation", scenes=2, timed_scenes=1, out=tmp_path / "out"
+    )
+
+
+@pytest.fixture
+def short(order: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOrder:
+    """Return an order of one network beside the nearest picture, without a chart."""
+    monkeypatch.setattr(run_module, "SHIPPED", ("builtin:tokens",))
+    monkeypatch.setattr(
+        run_module, "_never_lacking", lambda order, opened, stack: [_nearest(order, opened)]
+    )
+    monkeypatch.setattr(run_module, "plot_leaderboard", lambda *words: None)
+    return order
+
+
+def board_of(order: LeaderboardOrder) -> Leaderboard:
+    return make_leaderboard(order, lambda now, total, what: None)
+
+
+def tables(folder: Path, name: str) -> list[dict[str, str]]:
+    return list(csv.DictReader((folder / name).open()))
+
+
+def test_who_is_asked_for_stands_beside_those_who_never_lack(
+    order: LeaderboardOrder, root: Path
+) -> None:
+    asked = dataclasses.replace(
+        order, pictures=(root / "perfect",), checkpoint=(str(root / "renderformer-v1-base"),)
+    )
+    board = board_of(asked)
+    (one,) = board.widths
+    assert (one.width, one.num_scenes, one.num_views) == (PX, 2, 2 * VIEWS)
+    names = [each.name for each in one.standings]
+    assert names[:2] == [NOISE, "pictures of perfect"], "the best comes first"
+    assert set(names[2:]) == SHIPPED | {
+        LAMPS, PHYSICS, NEAREST_TRAINED, "network renderformer-v1-base",
+    }  # fmt: skip
+    assert board.rival == "network renderformer-v1-base"
+    rows = {row["name"]: row for row in tables(asked.out, "leaderboard.csv")}
+    assert float(rows["pictures of perfect"]["psnr_log_db_median"]) > 60, "half floats aside"
+    assert rows[NOISE]["psnr_log_db_median"] == "100.0" and rows[NOISE]["lead_mean_db"] == ""
+    for name in SHIPPED | {LAMPS, PHYSICS}:
+        assert float(rows[name]["first_core_s"]) > 0 < float(rows[name]["further_core_s"]), name
+    assert rows["pictures of perfect"]["first_core_s"] == ""
+    pairs = {(row["name"], row["than"]): row for row in tables(asked.out, "pairs.csv")}
+    lead = pairs[LAMPS, board.rival]
+    assert float(lead["mean_db"]) == float(rows[LAMPS]["lead_mean_db"])
+    assert float(lead["mean_db"]) == -float(pairs[board.rival, LAMPS]["mean_db"])
+    assert float(lead["low_db"]) <= float(lead["mean_db"]) <= float(lead["high_db"])
+    page = (asked.out / "leaderboard.md").read_text()
+    assert "29.77" in page and "never released" in page and "16 x 16 pixels" in page
+    assert "fewer than 10 scenes" in page and "LPIPS is n/a" in page
+    assert (asked.out / "leaderboard.png").stat().st_size > 10_000
+
+
+def test_nothing_is_judged_twice_and_what_changed_is_judged_again(
+    short: LeaderboardOrder, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for path in (root / "perfect").glob("*.exr"):
+        (mine / path.name).write_bytes(path.read_bytes())
+    asked = dataclasses.replace(short, pictures=(mine,))
+    before = board_of(asked)
+    lines = (asked.out / "rows.jsonl").read_text().splitlines()
+    judged: list[Any] = []
+    real = contest_module.picture_scores
+    monkeypatch.setattr(contest_module, "picture_scores", counted(real, judged))
+    assert board_of(asked).widths == before.widths and judged == []
+    assert (asked.out / "rows.jsonl").read_text().splitlines() == lines
+    name = sorted(path.name for path in mine.glob("*.exr"))[-1]  # the scene before is not judged
+    (mine / "000000003_view_0.exr").write_bytes((mine / name).read_bytes())
+    board_of(asked)
+    assert len(judged) == VIEWS, "one picture is another: its scene is judged again"
+    board_of(dataclasses.replace(asked, scenes=3))
+    scenes = {json.loads(line).get("scene") for line in (asked.out / "rows.jsonl").open()}
+    assert len(scenes - {None}) == 3
+
+
+def counted(real: Callable[..., Any], calls: list[Any]) -> Callable[..., Any]:
+    def score(*words: Any) -> Any:
+        calls.append(words)
+        return real(*words)
+
+    return score
+
+
+def test_a_set_without_training_split_looks_up_its_other_scenes(
+    short: LeaderboardOrder, root: Path, tmp_path: Path
+) -> None:
+    write_toy_dataset(tmp_path / "bare", train=0, validation=3, per_shard=3, resolution=PX)
+    bare = dataclasses.replace(short, source=str(tmp_path / "bare"))
+    board = board_of(bare)
+    found = {each.name: each for each in board.widths[0].standings}
+    assert NEAREST_OTHER in found and NEAREST_TRAINED not in found
+    assert found[NEAREST_OTHER].median_db < 60, "never its own target"
+    assert any("no training split" in text for text in board.notes)
+    known = dataclasses.replace(bare, train_data=(str(root / "toy"),), out=tmp_path / "other")
+    assert NEAREST_TRAINED in {each.name for each in board_of(known).widths[0].standings}
+    with pytest.raises(TrilightError, match=r"--train-data .*no training split"):
+        board_of(dataclasses.replace(bare, train_data=(str(tmp_path / "bare"),)))
+
+
+def test_a_scene_that_somebody_cannot_show_is_left_out_for_all(
+    short: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(self: Any, sample: Any, width: int, *, timed: bool) -> Any:
+        if sample.key.endswith("4"):
+            raise Rejected("no_light", "nothing shines")
+        return real(self, sample, width, timed=timed)
+
+    real = run_module.NearestContestant.shown
+    monkeypatch.setattr(run_module.NearestContestant, "shown", refused)
+    board = board_of(short)
+    assert board.widths[0].num_scenes == 1
+    assert any("scene 000000004 is left out at 16 pixels" in text for text in board.notes)
+    monkeypatch.setattr(run_module.NearestContestant, "shown", real)
+    assert board_of(short).widths[0].num_scenes == 2, "and asked again"
+
+
+def test_widths_are_those_that_the_set_has() -> None:
+    assert widths_of((), 256) == [64, 256] and widths_of((), 512) == [64, 256, 512]
+    assert widths_of((), 96) == [96] and widths_of((128, 64), 256) == [64, 128]
+    with pytest.raises(TrilightError, match=r"--width is 512; expected a divisor of 256"):
+        widths_of((512,), 256)
+
+
+def test_mistakes_are_one_line(order: LeaderboardOrder, root: Path) -> None:
+    twice = dataclasses.replace(order, checkpoint=(str(root / "renderformer-v1-base"),) * 2)
+    with pytest.raises(TrilightError, match=r"--checkpoint: .*is there twice"):
+        board_of(twice)
+    lacks = dataclasses.replace(order, pictures=(root / "toy",))
+    with pytest.raises(TrilightError, match=r"4 of 4 pictures are missing"):
+        board_of(lacks)
+    with pytest.raises(TrilightError, match="the test split holds no scene"):
+        board_of(dataclasses.replace(order, split="test"))
+
+
+@pytest.mark.slow
+def test_the_path_tracer_stands_on_it_too(root: Path, tmp_path: Path) -> None:
+    words = ["leaderboard", str(root / "toy"), "--split", "validation", "--scenes", "1", "--json"]
+    result = trilight([*words, "--out", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.exception
+    (one,) = json.loads(result.stdout)["widths"]
+    found = {each["name"]: each for each in one["standings"]}
+    traced = [found[name] for name in ("1 sample, fast", "4 samples, fast", "16 samples, fast")]
+    assert all(each["first_s"] > 0 < each["further_s"] for each in traced)
+    assert all(each["kind"] == TRACER and each["timed_scenes"] == 1 for each in traced)
+    # the toy's pictures are no path tracer's: what is traced has their shapes, not their light
+    assert len({each["scores"]["psnr_log_db"]["median"] for each in traced}) == 3
