@@ -5,6 +5,7 @@ from typing import Any
 
 from infra.bench.card.drawn_batch import workloads
 from infra.bench.card.effort import CardEffort, sized
+from infra.bench.run import RESULTS, newest_run
 from model.costs import training_flops
 from train.runs import named_run
 
@@ -36,4 +37,23 @@ def with_prediction(
     """Return the record of a run's steps with what was predicted of them."""
     if "failed" in row:
         return dict(row)
-    return {**row, "least_ms": least_ms(row["run"], row["scenes"], effort, flops_per_s)}
+    run, scenes = row["run"], row["scenes"]
+    return {
+        **row,
+        "least_ms": least_ms(run, scenes, effort, flops_per_s),
+        "h100": h100_row(run, scenes) if not effort.shrunk else None,
+    }
+
+
+def h100_row(run: str, scenes: int) -> dict[str, float] | None:
+    """Return what `trilight bench roofline` predicts of a step on an H100, from its stored rows.
+
+    None where it has no row of this run with as many scenes in a pass, or where the documents did
+    not come along.
+    """
+    found = newest_run(RESULTS, "roofline")
+    for figures in found[0].turns.values() if found else ():
+        row = figures.get(f"{run}, compiled")
+        if row is not None and row["scenes"] == scenes:
+            return {name: float(row[name]) for name in ("ms", "kernels", "peak_gib")}
+    return None

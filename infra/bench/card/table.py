@@ -13,9 +13,10 @@ _PLAIN = re.compile(r"[^\w .,()+:-]")
 MOST_ROWS, MOST_CHARACTERS = 100, 60
 NONE = "n/a"
 
-RUN_NAMES = ("run", "scenes a pass", "ms a step", "at least", "TFLOP/s", "views/s", "GiB",
-             "kernels", "dearest parts")  # fmt: skip
-"""Headings of `run_rows`. `at least` is what the products alone take at the measured peak."""
+RUN_NAMES = ("run", "scenes a pass", "ms a step", "at least", "H100 by count, ms", "TFLOP/s",
+             "views/s", "GiB", "kernels", "the same by count", "dearest parts")  # fmt: skip
+"""Headings of `run_rows`. `at least` is what the products alone take at the measured peak; `by
+count` is what `trilight bench roofline` predicts of a compiled step on an H100."""
 
 
 def facts(record: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -73,10 +74,12 @@ def run_rows(record: Mapping[str, Any]) -> Iterator[list[str]]:
             scenes if scenes == asked else f"{scenes} of {asked}: memory",
             _number(statistics.median(steps)) if steps else NONE,
             _number(row.get("least_ms")),
+            _number(_map(row, "h100").get("ms")),
             _number(row.get("teraflop_per_s"), 3),
             _number(row.get("views_per_s"), 3),
             _number(row.get("peak_gib"), 3),
             _number(profile.get("kernels")),
+            _number(_map(row, "h100").get("kernels")),
             _dearest(_map(profile, "by_part_ms")),
         ]
 

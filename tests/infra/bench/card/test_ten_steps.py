@@ -9,7 +9,7 @@ import torch
 
 from infra.bench.card.drawn_batch import workloads
 from infra.bench.card.effort import CARD, PROCESSOR, sized
-from infra.bench.card.predicted import least_ms
+from infra.bench.card.predicted import h100_row, least_ms
 from infra.bench.card.step_profile import REST, kind_of, summed
 from infra.bench.card.ten_steps import steps_of_run
 from model.costs import training_flops
@@ -88,3 +88,11 @@ def test_lpips_is_no_part_of_the_loss_in_the_sum() -> None:
     assert found["by_kind_ms"] == {"product": 0.06, "elementwise": 0.06}
     assert (found["kernels"], found["total_ms"]) == (3, 0.12)
     assert found["dearest"][1] == {"name": "add", "calls": 2, "ms": 0.06}
+
+
+def test_the_roofline_of_a_run_stands_beside_it() -> None:
+    """As many scenes in a pass, or none: a step of other size is no prediction of this one."""
+    found = h100_row("pretrain", 16)
+    assert found is not None and found["ms"] > 50 and found["kernels"] > 500
+    assert h100_row("pretrain", 15) is None
+    assert h100_row("no such run", 16) is None
