@@ -1,5 +1,6 @@
 """Uploads a folder to a repository of the Hugging Face hub, by its own package."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,6 +13,10 @@ from storage.errors import TrilightError
 RepositoryKind = Literal["dataset", "model", "space"]
 
 NETWORK_FILE = "model.safetensors"
+
+_PART = r"(?!\S*(?:--|\.\.))\w(?:[\w.-]{0,94}\w)?"
+_REPOSITORY = re.compile(f"{_PART}/{_PART}", re.ASCII)
+"""As huggingface_hub refuses others, only later."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +56,11 @@ def planned_upload(folder: Path, repository: str) -> Upload:
         TrilightError: the name is none, the folder is no release, an unfinished or damaged dataset,
             a network without its card, or more than the hub takes.
     """
-    owner, _, name = repository.partition("/")
-    if not owner or not name or "/" in name:
-        raise TrilightError(f"repository is {repository}; expected USER/NAME.")
+    if not _REPOSITORY.fullmatch(repository) or repository.endswith(".git"):
+        raise TrilightError(
+            f"repository is {repository}; expected USER/NAME of letters, digits and single -, _ "
+            "and . between them, as the hub takes them."
+        )
     kind = kind_of(folder)
     if kind == "dataset":
         _require_sound(folder)

@@ -85,7 +85,7 @@ def test_what_kind_a_folder_is(dataset: Dataset, tmp_path: Path) -> None:
 
 def test_nothing_is_sent_that_nobody_could_use(dataset: Dataset, tmp_path: Path) -> None:
     root = dataset.folder.root
-    for name in ("set", "a/b/c", "/set", "ada/"):
+    for name in ("set", "a/b/c", "/set", "ada/", "ada/my set", "ada/-set", "a--b/set", "ada/set.git"):
         with pytest.raises(TrilightError, match="expected USER/NAME"):
             planned_upload(root, name)
     (root / "README.md").unlink()
@@ -116,7 +116,8 @@ def test_the_limits_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_dry_run_sends_nothing(dataset: Dataset) -> None:
-    result = trilight(["push", str(dataset.folder.root), "ada/set", "--dry-run"])
+    words = ["push", str(dataset.folder.root), "ada/my_set-1.0"]
+    result = trilight([*words, "--private", "--dry-run"])
     assert result.exit_code == 0, result.exception
     assert "Would be uploaded" in result.output
-    assert f"Next: trilight push {dataset.folder.root} ada/set" in result.output
+    assert f"Next: trilight {' '.join(words)} --private" in result.output
