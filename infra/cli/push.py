@@ -16,7 +16,7 @@ class PushAsked:
     repository: str
     """Repository USER/NAME; made where it is missing."""
     private: bool = False
-    """Make a new repository private."""
+    """Make a new repository private; refuse one that is public."""
     dry_run: bool = False
     """Only check and say what would be uploaded."""
 

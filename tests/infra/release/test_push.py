@@ -57,8 +57,11 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
         home = {"HF_ENDPOINT": url, "HF_HOME": str(tmp_path / "home")}
         words = [str(dataset.folder.root), "ada/set", "--json"]
         refused = pushed(words, HF_TOKEN="hf_other", **home)
+        public = pushed([*words, "--private"], HF_TOKEN=TOKEN, **home)
+        assert list(there.iterdir()) == []
         result = pushed(words, HF_TOKEN=TOKEN, **home)
     assert refused.returncode == 1 and "set HF_TOKEN" in refused.stderr + refused.stdout
+    assert public.returncode == 1 and "already and public" in public.stderr + public.stdout
     assert result.returncode == 0, result.stderr
     said = json.loads(result.stdout)
     assert said["address"] == f"{url}/datasets/ada/set"
@@ -114,8 +117,8 @@ def test_the_limits_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     (tmp_path / "below" / "3.bin").write_bytes(bytes(1))
     assert require_within_limits(tmp_path) == (4, 61)
     for limit, value, message in (
-        ("MOST_FILES", 3, "4 files; the hub takes at most 3"),
-        ("MOST_ENTRIES", 2, "3 entries in one folder; the hub takes at most 2"),
+        ("MOST_FILES", 3, "4 files; the hub advises at most 3"),
+        ("MOST_ENTRIES", 2, "3 entries in one folder; the hub advises at most 2"),
         ("MOST_FILE_BYTES", 29, "30 bytes in one file"),
     ):
         with monkeypatch.context() as patched:
