@@ -1,5 +1,6 @@
 """`TrainOrder`: everything a user asks of a training run, by command line or Prefect's form."""
 
+import os
 import sys
 from collections.abc import Mapping
 from dataclasses import field
@@ -12,6 +13,9 @@ from storage.settings.ranges import Within
 from train.runs import changed_run
 from train.settings import TrainSettings
 from train.start import Start
+
+RESTARTS = "TORCHELASTIC_RESTART_COUNT"
+"""Variable in which torchrun counts how often it has started its processes again."""
 
 
 @checked()
@@ -28,6 +32,9 @@ class TrainOrder:
     resume: bool = False
     """Continue from the newest checkpoint. Settings are stated as at the start; those of how it is
     executed may differ."""
+    restartable: bool = False
+    """Resume if the folder has a checkpoint, else begin, so that a scheduler may start the same
+    command again and again. A restart by torchrun does so anyway."""
     branch: str | None = None
     """Checkpoint, or folder of a run, to continue from in a new folder (--out), which then goes its
     own way; by default there is none."""
@@ -86,6 +93,7 @@ class TrainOrder:
         """Return how the run begins."""
         return Start(
             resume=self.resume,
+            restartable=self.restartable or int(os.environ.get(RESTARTS, "0")) > 0,
             branch=self.branch,
             decisions=self.decisions,
             begin_with=self.begin_with,

@@ -2,14 +2,18 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import ClassVar
 
 
 class TrilightError(ValueError):
     """A user's mistake.
 
     The message is one line that names the thing, the value got, the value expected and the next
-    step. The command line prints it without a traceback and exits with a non-zero status.
+    step. The command line prints it without a traceback and exits with its status.
     """
+
+    exit_status: ClassVar[int] = 1
+    """What a process ends with that cannot go on."""
 
 
 class EnvironmentFailure(TrilightError):

@@ -21,7 +21,7 @@ DATA = "data"
 """Name by which a decision names other data; its value is the start of their digest, behind
 `sha256:` for a dataset and `list:` for listed shards, so that no digits pass for a number."""
 
-_FIXED = ("run", "from_weights", "model")
+_FIXED = ("run", "from_weights", "model", "base_widths")
 """Settings that no decision changes: with others it would be another run."""
 
 _LEAST_DIGITS = 8

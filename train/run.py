@@ -1,10 +1,10 @@
 """One training run, from a dataset to weights, figures and a sheet: joins the parts."""
 
 import dataclasses
-import functools
 import time
 from collections.abc import Generator, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -23,6 +23,7 @@ from train.data.workers import fitting_workers, this_machine
 from train.evaluation.judge import Judge
 from train.evaluation.rivals import median_picture
 from train.folder import RunFolder
+from train.loop.checkpoints import saved_steps
 from train.loop.crew import Crew
 from train.loop.recorder import Recorder
 from train.loop.state import TrainState
@@ -89,6 +90,7 @@ def train_run(
     start, crew = start or Start(), crew or Crew(device=torch.device("cpu"))
     progress = progress if progress is not None and crew.is_first else TrainProgress()
     opened, folder = open_mixture(data), RunFolder(out)
+    start = _decided(start, folder, crew)
     early = _EarlyNotes(progress)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         early.noted(note)
@@ -96,7 +98,8 @@ def train_run(
         workers = _fitting_workers(settings, crew, early)
     plan = beginning(settings, folder, opened.digest, start, crew, early)
     settings = plan.settings
-    objective = Objective(settings.loss, load_lpips(start.lpips)).to(crew.device)
+    lpips = crew.once_a_machine(partial(load_lpips, start.lpips))
+    objective = Objective(settings.loss, lpips).to(crew.device)
     _check_data(opened, settings)
     state = begun(plan, folder, opened, crew, early)
     judge = _make_judge(opened, settings, state.unusable) if crew.is_first else None
@@ -115,7 +118,7 @@ def train_run(
         watched=watched,
     )
     with closing(_batches(opened, settings, state, crew, workers)) as batches:
-        cost = functools.partial(scene_flops, settings)
+        cost = partial(scene_flops, settings)
         most = settings.scenes_per_pass
         with closing(step_scenes(batches, cost, most, crew.device)) as steps:
             trainer.run(steps)
@@ -135,6 +138,16 @@ def _fitting_workers(settings: TrainSettings, crew: Crew, progress: TrainProgres
     )
     progress.noted(fitting.because)
     return fitting.threads
+
+
+def _decided(start: Start, folder: RunFolder, crew: Crew) -> Start:
+    """Return how all processes begin, where one may begin or resume.
+
+    All must ask, since torchrun counts its restarts for each machine apart, and a network file
+    system shows a file to one machine before another.
+    """
+    found = crew.any(start.restartable and bool(saved_steps(folder.checkpoints)))
+    return dataclasses.replace(start, resume=start.resume or found, restartable=False)
 
 
 def _batches(

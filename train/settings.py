@@ -9,6 +9,7 @@ others are what the run means, and change by a decision that the run records (tr
 from dataclasses import field
 from typing import Annotated, Literal
 
+from model.base_widths import BaseWidths
 from model.config import ModelConfig
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -123,6 +124,9 @@ class TrainSettings:
     muon_rate: Annotated[float, Within(0, 100, unit="x learning_rate")] = 0.0
     """Learning rate of Muon, which updates the matrices, as a multiple of `learning_rate`; with 0,
     AdamW updates every weight."""
+    base_widths: BaseWidths = field(default_factory=BaseWidths)
+    """Widths for which the rates above and the initial weights are stated; no other width of the
+    network changes them unless `width` is one."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear warm-up to the peak learning rate."""
     schedule: Schedule = "cosine"
@@ -171,6 +175,8 @@ class TrainSettings:
         for name in ("validate_every", "checkpoint_every"):
             if getattr(self, name) % self.log_every:
                 _wrong(name, getattr(self, name), f"a multiple of log_every, {self.log_every}")
+        if self.base_widths.width:
+            self.base_widths.of(self.model)  # raises where no such network can be
         if self.warmup_steps >= self.num_steps:
             _wrong("warmup_steps", self.warmup_steps, f"0 to {self.num_steps - 1}")
 

@@ -17,6 +17,9 @@ class Start:
     resume: bool = False
     """Go on from the folder's newest checkpoint; the weights come out the same to the bit on the
     CPU, for the same number of threads and processes. A finished run is judged again."""
+    restartable: bool = False
+    """Resume where the folder has a checkpoint, else begin: for whoever starts the same command
+    again without looking."""
     branch: str | None = None
     """Checkpoint, or folder of a run, from which a new folder goes on: with its steps, its
     optimiser's memories and its place in the data. A run that resumes has branched and is not
@@ -48,7 +51,7 @@ class Start:
             )
         if self.goes_on:
             return
-        if self.decisions:
+        if self.decisions and not self.restartable:
             name = next(iter(self.decisions))
             raise TrilightError(
                 f"run {settings.run}: it has not begun, so --change {name} changes nothing; "

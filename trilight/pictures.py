@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from infra.rendering.cameras import own_camera
 from infra.torch_library import require_torch
-from pipeline.renders.renderer import RenderedView
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import one_picture
 from storage.atomic import write_atomically
 from storage.conventions import HALF_FLOAT_MAX, preview_srgb8

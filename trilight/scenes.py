@@ -57,7 +57,7 @@ def write_scene(
 
     Args:
         scene: passes `Scene.check`.
-        path: ends in `.usda .usdc .usdz .json .h5` or `.safetensors`. Meshes of a `.json` are
+        path: ends in `.usda .usdc .usdz .glb .json .h5` or `.safetensors`. Meshes of a `.json` are
             written beside it.
         radiance_rgb: [V, R, R, 3] linear radiance of its views, which `.h5` alone holds.
 

@@ -91,8 +91,8 @@ class Asked:
     """Networks to measure; by default the one that comes with Trilight. Experiments on one network
     take the first, and those that compare pair every other row with it."""
     data: str | None = None
-    """Finished dataset (a folder or a URL) for the experiments economy and loader; by default
-    none."""
+    """Finished dataset (a folder or a URL) for the experiments economy and loader, and for those
+    that train (repairs, learning-rates, optimisers); by default none."""
 
     @property
     def network(self) -> str:

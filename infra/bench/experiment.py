@@ -94,6 +94,9 @@ class Experiment:
     kind: Callable[[str], str] | None = None
     """Names what a point is one of. The figure then shows every cost as a series of its own, in
     its unit, and a colour for each kind; without it, cost ratios."""
+    line_of: Callable[[Point], tuple[str, float]] | None = None
+    """Names the line that a point stands on, and where on it. The figure then shows each further
+    column along the lines, and no costs."""
     because: str = ""
     """The default and its reason, or what the figures mean."""
     covers: tuple[str, ...] = ()
@@ -101,6 +104,9 @@ class Experiment:
     what a dataset order says, `train.` as in `--set` of train, `render.` an option."""
     cluster: Callable[[str], str] = str
     """Names what turns have in common whose figures are alike; by default nothing."""
+    by_point: bool = False
+    """Whether a point is measured without the others of its turn: a run that was interrupted then
+    measures again only what is missing of a turn."""
     warm_up: bool = False
     """Whether one turn that is not counted comes first, where all turns are repeats."""
     takes_scenes: bool = False

@@ -1,7 +1,8 @@
 """The one figure of an experiment: error against cost, or costs alone as bars.
 
 Points are named where there is room: the table beside the figure has all names. An experiment of
-several kinds of points has the figure of infra.bench.series_plot.
+several kinds of points has the figure of infra.bench.series_plot, one of lines that of
+infra.bench.line_plot.
 """
 
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ from typing import Any
 from infra.bench.curve import Row, rows
 from infra.bench.experiment import Experiment
 from infra.bench.labels import place_labels, plain_log
+from infra.bench.line_plot import plot_lines
 from infra.bench.series_plot import plot_series
 from infra.bench.store import Run
 
@@ -26,6 +28,9 @@ def plot(experiment: Experiment, run: Run, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     points = rows(experiment, run)
+    if experiment.line_of is not None:
+        plot_lines(experiment, experiment.line_of, points, path)
+        return
     if experiment.kind is not None:
         plot_series(experiment, experiment.kind, points, path)
         return

@@ -54,7 +54,7 @@ def run(
     """Measure what is missing of an experiment, draw its figure, and return its results.
 
     A run of the same plan that was interrupted goes on. Turns that were measured are not measured
-    again; an interrupted turn is.
+    again; an interrupted turn is, or only what it lacks where points are measured one by one.
 
     Raises:
         TrilightError: something that the experiment needs is missing, or no turn could be measured.
@@ -124,8 +124,10 @@ def _measure(
         for _ in experiment.measure(workshop, points, missing[0]):
             pass
     for number, turn in enumerate(missing, total - len(missing) + 1):
+        done = current.turns.get(turn, {}) if experiment.by_point else {}
+        wanted = [point for point in points if point.name not in done]
         try:
-            for point, figures in experiment.measure(workshop, points, turn):
+            for point, figures in experiment.measure(workshop, wanted, turn):
                 store.add(current, turn, point, figures)
         except (Rejected, ChildFailed) as error:
             store.leave_out(current, turn, str(error))

@@ -25,7 +25,7 @@ def main() -> None:
     except CycloptsError as mistake:
         leave(f"trilight: {complaint(mistake)}", 2)
     except TrilightError as mistake:
-        leave(f"trilight: {mistake}", 1)
+        leave(f"trilight: {mistake}", mistake.exit_status)
 
 
 def _interrupted(signal_number: int, frame: FrameType | None) -> None:

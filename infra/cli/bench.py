@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from infra.bench.effort import Asked
+from infra.cli.bench_card import ABOUT, bench_card
+from infra.cli.bench_card import NAME as CARD
 from infra.cli.console import console, first_words, progress_bars
 from infra.cli.options import command
 from storage.settings.described import checked
@@ -20,17 +22,23 @@ class Measured:
     """The experiments, and where results go."""
 
     names: tuple[str, ...] = ()
-    """Names of experiments or of families of them; by default all are listed and none is run."""
+    """Names of experiments or of families of them; by default all are listed and none is run. The
+    name card measures the graphics card here into one file to send back, and card FILE ... shows
+    such files."""
     quick: bool = False
     """Measure for minutes instead of carefully."""
     out: Path | None = None
-    """Folder for the results; by default docs/bench of the checkout."""
+    """Folder for the results; by default docs/bench of the checkout. Of card: the file, by default
+    trilight-card.json."""
     write_docs: bool = False
     """Afterwards write the blocks of README.md and docs that are made from the results."""
 
 
 @command("names")
 def bench(measured: Measured, asked: Asked) -> None:
+    if measured.names[:1] == (CARD,):
+        bench_card(measured.names[1:], measured.out, asked, write_docs=measured.write_docs)
+        return
     if measured.names:
         first_words(f"Measuring {', '.join(measured.names)}")
     from infra.bench.catalogue import chosen
@@ -90,4 +98,5 @@ def _list() -> None:
     for family, experiments in families().items():
         for experiment in experiments:
             table.add_row(family, experiment.name, experiment.title)
+    table.add_row("", CARD, ABOUT)
     console.print(table)

@@ -40,6 +40,8 @@ COMMANDS = {
     "layers, spikes, notes and settings."
     "\n\nFor a dataset that is read-only or on a server, only a summary is printed, unless --out "
     "names a folder. For a scene file, its summary and what could not be carried over are printed.",
+    "view": "Open a page on this machine: turn a scene in 3D beside its path traced picture and "
+    "those of networks, browse a dataset, or see the pictures of a training run over steps.",
     "model": "Print parameters, FLOPs and memory by precision of a named size or of a checkpoint.",
     "status": "Report a dataset's progress, estimated finish and failures; needs no server.",
     "train": "Train a model; writes checkpoints, curves and pictures on one page, and a sheet."

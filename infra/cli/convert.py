@@ -15,10 +15,10 @@ class Conversion:
     """The scene to convert, and the file to write."""
 
     source: str
-    """Scene .usda .usdc .usdz .usd, RenderFormer .json or .h5, .safetensors, a shard .tar, or one
-    sample SHARD.tar::KEY."""
+    """Scene .usda .usdc .usdz .usd .glb .gltf, RenderFormer .json or .h5, .safetensors, a shard
+    .tar, or one sample SHARD.tar::KEY."""
     target: Path
-    """File .usda .usdc .usdz .json .h5 or .safetensors."""
+    """File .usda .usdc .usdz .glb .json .h5 or .safetensors."""
     budget: Annotated[int | None, Within(1, 2**31 - 1, unit="triangles")] = None
     """Maximum number of triangles of each scene, reached by simplifying what is not an emitter; by
     default nothing is simplified."""

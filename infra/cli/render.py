@@ -12,7 +12,7 @@ from infra.rendering.request import Asked
 
 if TYPE_CHECKING:
     from infra.rendering.ways import Choice
-    from pipeline.renders.renderer import Sampling
+    from pipeline.renders.results import Sampling
 
 
 @command("source")

@@ -156,10 +156,9 @@ def _trained(
             if crew.world_size > 1:  # torchrun's own arguments are not known here
                 raise
             typed = [part for part in sys.argv[1:] if part != "--resume"]
-            raise TrilightError(
-                f"training: stopped at step {stopped.step}, nothing is lost. To go on: "
-                + shlex.join(["trilight", *typed, "--resume"])
-            ) from stopped
+            again = [] if order.restartable else ["--resume"]
+            command = shlex.join(["trilight", *typed, *again])
+            raise Stopped(stopped.step, command) from stopped
         finally:
             if crew.is_first and is_run(Path(order.place)):
                 with suppress(TrilightError):  # no reason to lose what else is said

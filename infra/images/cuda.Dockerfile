@@ -1,5 +1,10 @@
 # Trilight with torch for graphics cards: trains, and renders where TRILIGHT_VARIANT=cuda_ad_rgb.
 #   docker build --file infra/images/cuda.Dockerfile --tag trilight:cuda .
+# What the card here does, as one file to send back, in 15 to 30 minutes
+# (docs/how-to/measure-a-card.md):
+#   docker run --name card --gpus all --ipc=host trilight:cuda \
+#       trilight bench card --out /data/card.json
+#   docker cp card:/data/card.json .
 # The driver comes from the host (nvidia-container-toolkit); torch brings CUDA's libraries itself.
 FROM python:3.11.13-slim-bookworm AS build
 WORKDIR /opt/trilight

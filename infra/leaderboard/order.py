@@ -23,7 +23,7 @@ class LeaderboardOrder:
     first; by default with the network that comes with Trilight."""
     pictures: tuple[Path, ...] = ()
     """Folders of OpenEXR pictures made elsewhere, one for each view, called as export calls them:
-    000000003_view_0.exr."""
+    000000003_view_0.exr; by default there are none."""
     width: tuple[Width, ...] = ()
     """Widths of pictures in pixels, which divide the dataset's; by default those of 64, 256 and 512
     that do, else the dataset's own."""

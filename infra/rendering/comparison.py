@@ -14,7 +14,7 @@ from infra.rendering.look import Look, enlarged, shown
 from pipeline.exchange.formats import FORMATS, SceneSource
 from storage.conventions import log10_radiance
 from storage.metrics import flicker_log_db, psnr_log_db
-from train.evaluation.sheet import ERROR_WHITE, error_picture
+from train.evaluation.error_colours import ERROR_WHITE, error_picture
 
 _CAPTION_PX, _GAP_PX, _FONT_PX = 24, 8, 14
 _INK, _PAPER = (30, 30, 30), (250, 250, 248)

@@ -24,7 +24,7 @@ from storage.records.scene import Scene
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer
     from pipeline.making.path_tracer import PathTracer
-    from pipeline.renders.renderer import Sampling
+    from pipeline.renders.results import Sampling
 
 Fact = str | int | float
 Facts = Mapping[str, Fact]

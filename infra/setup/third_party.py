@@ -17,9 +17,29 @@ duty on Trilight's own code or on the datasets that it makes. The wheel of av (B
 and x265, GPL-2, which make the .mp4 of `trilight render`. `make setup WITHOUT_GPL=1` leaves both
 out, together with the parts of libigl's wheel that are not under its MPL: bindings of CGAL, TetGen
 and Triangle, which nothing here calls.
+"""
 
+_TABLE = """
 | package | version | licence |
 |---|---|---|
+"""
+
+
+THREE_SHA256 = {
+    "three.core.min.js": "61ba0df005b05991361d040d8ff670e1aadfd0ce7aeebd1fdb0725957a8957de",
+    "three.module.min.js": "e2b5ee6bccd38fd6d8a2428546b83c5f2426d84b152ef82be8055556e3b40eb6",
+}
+"""Files of three.js in infra/viewer/static/three."""
+
+_VENDORED = """
+The page of `trilight view` draws with three.js, which lies in `infra/viewer/static/three` as its
+authors built it, with its licence. It is a library for browsers, so that no package of Python
+brings it as such: trimesh and viser hold copies inside programs of their own. 0.180.0 is of the
+last releases with a built module of this size; the files are `build/three.*.min.js` of the package
+`three` of npm.
+
+| file | version | licence | sha256 |
+|---|---|---|---|
 """
 
 
@@ -37,7 +57,15 @@ def main() -> None:
         for row in sorted(rows, key=lambda row: row["Name"].lower())
         if re.sub(r"[-_.]+", "-", row["Name"]).lower() in locked
     ]
-    (ROOT / "docs/third_party.md").write_text(_HEAD + "\n".join(lines) + "\n")
+    (ROOT / "docs/third_party.md").write_text(
+        _HEAD + _vendored() + _TABLE + "\n".join(lines) + "\n"
+    )
+
+
+def _vendored() -> str:
+    """Return what lies in the tree itself: files by their digest."""
+    rows = [f"| {name} | 0.180.0 | MIT | {digest} |" for name, digest in THREE_SHA256.items()]
+    return _VENDORED + "\n".join(rows) + "\n"
 
 
 def _one_line(licence: str) -> str:

@@ -34,6 +34,8 @@ pre { columns: 22rem; font-size: .8rem; line-height: 1.45; padding: .7rem;
   white-space: pre-wrap; overflow-wrap: anywhere }
 """
 
+_VIEWED = " in the dataset's folder opens all scenes in 3D, beside their pictures by every engine."
+
 _SECTIONS = {
     "scenes": report_sections.scenes_section,
     "objects": report_sections.objects_section,
@@ -75,6 +77,7 @@ def write_report(
         element("h1", f"Dataset {dataset.manifest.build}"),
         element("p", _in_one_line(dataset, found), class_="faint"),
         element("p", *(element("a", name, href=f"#{name}") for name in anchors), class_="toc"),
+        element("p", element("code", "trilight view .", class_="command"), _VIEWED),
         element("h2", "Gallery", id="gallery"),
         gallery.markup,
         element("h2", "In numbers"),

@@ -36,7 +36,7 @@ _PREVIEW_PX = 96
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Shown:
+class ShownPass:
     """How one pass is shown."""
 
     word: str
@@ -57,27 +57,27 @@ def _ids_seen(ids: NDArray) -> str:
     return f"{seen} seen, in the colours of the table Objects"
 
 
-_SHOWN = (
-    _Shown(
+SHOWN_PASSES = (
+    ShownPass(
         word="depth",
         title="depth",
         pixels=depth_greys,
         caption=_ranged("{:.2f} to {:.2f} m, near is bright"),
     ),
-    _Shown(
+    ShownPass(
         word="normal",
         title="shading normal",
         pixels=normal_colours,
         caption=lambda _: "x, y, z of the world from -1 to 1 as red, green, blue",
     ),
-    _Shown(word="object", title="object ids", pixels=id_colours, caption=_ids_seen),
-    _Shown(
+    ShownPass(word="object", title="object ids", pixels=id_colours, caption=_ids_seen),
+    ShownPass(
         word="diffuse",
         title="diffuse albedo",
         pixels=albedo_colours,
         caption=_ranged("{:.2f} to {:.2f} (no unit)"),
     ),
-    _Shown(
+    ShownPass(
         word="roughness",
         title="roughness",
         pixels=share_greys,
@@ -88,7 +88,7 @@ _SHOWN = (
 
 def passes_section(sample: Sample) -> Markup:
     """Return small pictures of what each view of a sample sees, and the command for the numbers."""
-    words = [shown.word for shown in _SHOWN]
+    words = [shown.word for shown in SHOWN_PASSES]
     intro = element(
         "p",
         f"What each view sees through the centres of {_PREVIEW_PX} x {_PREVIEW_PX} pixels, "
@@ -116,7 +116,7 @@ def _view(sample: Sample, view: int, words: Sequence[str]) -> Markup:
     names = [pass_names([word])[0] for word in words]
     found = view_passes(sample.scene, names, view=view, resolution=_PREVIEW_PX)
     figures = []
-    for shown, name in zip(_SHOWN, names, strict=True):
+    for shown, name in zip(SHOWN_PASSES, names, strict=True):
         values = found[name]
         met = np.any(values != MISS if values.dtype == np.int32 else np.isfinite(values))
         means = shown.caption(values) if met else "nothing is met"

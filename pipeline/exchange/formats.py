@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pipeline.assets.settings import AssetSettings
 from pipeline.exchange import renderformer_h5, renderformer_json
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
-from pipeline.exchange.gltf.read import SUFFIXES as GLTF_SUFFIXES
+from pipeline.exchange.gltf import write as gltf
 from pipeline.exchange.gltf.read import read_gltf
 from pipeline.exchange.renderformer_cells import textured_triangles
 from pipeline.exchange.renderformer_h5 import (
@@ -154,6 +154,10 @@ def _read_gltf(source: SceneSource, pictures: bool) -> LoadedScene:
     )
 
 
+def _write_glb(target: Path, scene: Scene, pictures: Pictures) -> tuple[str, ...]:
+    return gltf.write_gltf(target, scene)
+
+
 def _read_json(source: SceneSource, pictures: bool) -> LoadedScene:
     root, name = source.path.parent.resolve(), source.path.name
     unknown = described_by(root, name).unknown_fields
@@ -246,7 +250,8 @@ FORMATS: Registry[SceneFormat] = Registry(
             write=_write_json,
             carried=renderformer_json.CARRIED,
         ),
-        **dict.fromkeys(GLTF_SUFFIXES, SceneFormat(read=_read_gltf)),
+        ".glb": SceneFormat(read=_read_gltf, write=_write_glb, carried=gltf.CARRIED),
+        ".gltf": SceneFormat(read=_read_gltf),
         ".h5": SceneFormat(
             read=_read_h5,
             write=_write_h5,

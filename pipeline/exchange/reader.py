@@ -39,10 +39,10 @@ class SceneReader:
             raise TrilightError(f"{source.name}: holds no scene.")
         return [dataclasses.replace(source, key=key) for key in keys]
 
-    def load(self, source: SceneSource) -> LoadedScene:
-        """Read one scene; raises TrilightError as `scene_source.load_source`."""
+    def load(self, source: SceneSource, *, pictures: bool = False) -> LoadedScene:
+        """Read one scene; arguments and TrilightError as of `scene_source.load_source`."""
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
-        return self._call(source.name, load_source, source)
+        return self._call(source.name, _load_with_pictures if pictures else load_source, source)
 
     def cameras(self, source: SceneSource) -> Cameras:
         """Return poses and angles; raises TrilightError as `scene_source.load_cameras`."""
@@ -73,6 +73,10 @@ class SceneReader:
             return call_with_retries(self._child, function, *args)
         except ChildFailed as failure:
             raise TrilightError(f"{name}: could not be read ({failure}).") from failure
+
+
+def _load_with_pictures(source: SceneSource) -> LoadedScene:
+    return load_source(source, pictures=True)
 
 
 def _within_budget(scene: Scene, max_triangles: int) -> LoadedScene:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, with_retries
 from pipeline.making.environment import environment
 from pipeline.renders.preview import Preview, PreviewRenderer, PreviewSettings
-from pipeline.renders.renderer import RenderedView, Sampling, SceneRenderer, set_threads
+from pipeline.renders.renderer import SceneRenderer, set_threads
+from pipeline.renders.results import RenderedView, Sampling
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate
 from storage.errors import Rejected, TrilightError
@@ -59,7 +60,7 @@ class PathTracer:
         """All that decides a picture beside scene and camera, as JSON values."""
         self._is_open = False
         self._child = IsolatedChild(
-            limits=_LIMITS, setup=_set_up_child, setup_args=(variant, threads)
+            limits=_LIMITS, setup=set_up_renderer, setup_args=(variant, threads)
         )
 
     def wake(self, name: str) -> None:
@@ -147,7 +148,7 @@ class _ChildState:
 _state = _ChildState()
 
 
-def _set_up_child(variant: Variant, threads: int) -> None:
+def set_up_renderer(variant: Variant, threads: int) -> None:
     activate(variant)
     set_threads(threads)
 

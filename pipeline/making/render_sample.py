@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.view_progress import ViewProgress
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.scenes.sight import Sight
 from pipeline.scenes.views import ViewCamera, cameras_of, cameras_of_view, with_cameras
 from storage.errors import Rejected

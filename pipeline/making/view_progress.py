@@ -3,7 +3,7 @@
 import time
 from collections.abc import Generator
 
-from pipeline.renders.renderer import RenderedView, Sampling
+from pipeline.renders.results import RenderedView, Sampling
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import forget_views, tell_views
 

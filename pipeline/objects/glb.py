@@ -18,10 +18,11 @@ from PIL import Image
 from storage.conventions import srgb8
 from storage.records.texture import Texture
 
-_MOST_SPECULAR = 25.0
+MOST_SPECULAR = 25.0
 """Times F0 = 0.04 of an ordinary dielectric is a mirror."""
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
-_FLOAT, _UNSIGNED = 5126, 5125
+FLOAT, UNSIGNED = 5126, 5125
+"""Kinds of numbers."""
 
 
 def encode_glb(
@@ -38,16 +39,16 @@ def encode_glb(
         uv: [F, 3, 2] of each corner, v up.
         textures: diffuse, specular and roughness.
     """
-    file = _Glb()
+    file = GlbFile()
     corners = positions[faces].reshape(-1, 3)
     upright = np.stack([corners[:, 0], corners[:, 2], -corners[:, 1]], axis=1)
     flipped = np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1).reshape(-1, 2)
     bounds = {"min": upright.min(axis=0).tolist(), "max": upright.max(axis=0).tolist()}
     attributes = {
-        "POSITION": file.accessor(upright.astype("<f4"), "VEC3", _FLOAT, bounds),
-        "TEXCOORD_0": file.accessor(flipped.astype("<f4"), "VEC2", _FLOAT),
+        "POSITION": file.accessor(upright.astype("<f4"), "VEC3", FLOAT, bounds),
+        "TEXCOORD_0": file.accessor(flipped.astype("<f4"), "VEC2", FLOAT),
     }
-    indices = file.accessor(np.arange(len(corners), dtype="<u4"), "SCALAR", _UNSIGNED)
+    indices = file.accessor(np.arange(len(corners), dtype="<u4"), "SCALAR", UNSIGNED)
     primitive = {"attributes": attributes, "indices": indices, "material": 0}
     file.tree |= {
         "meshes": [{"primitives": [primitive]}],
@@ -58,7 +59,7 @@ def encode_glb(
 
 
 def _material(
-    file: "_Glb", diffuse: Texture, specular: Texture, roughness: Texture
+    file: "GlbFile", diffuse: Texture, specular: Texture, roughness: Texture
 ) -> dict[str, Any]:
     shown = [texture.linear(texture.texels).astype(np.float64) for texture in (diffuse, specular)]
     base = np.clip(shown[0] / np.maximum(1 - shown[1], 1e-6), 0, 1)
@@ -74,16 +75,16 @@ def _material(
         rough = np.round(roughness.linear(roughness.texels) * 255).astype(np.uint8)
         packed = np.concatenate([np.zeros_like(rough), rough, np.zeros_like(rough)], axis=2)
         metal["metallicRoughnessTexture"] = {"index": file.picture(packed)}
-    lobe: dict[str, Any] = {"specularColorFactor": [_MOST_SPECULAR] * 3}
+    lobe: dict[str, Any] = {"specularColorFactor": [MOST_SPECULAR] * 3}
     if f0.shape[:2] == (1, 1):
-        lobe["specularColorFactor"] = (_MOST_SPECULAR * f0[0, 0]).tolist()
+        lobe["specularColorFactor"] = (MOST_SPECULAR * f0[0, 0]).tolist()
     else:
         lobe["specularColorTexture"] = {"index": file.picture(srgb8(f0))}
     return {"pbrMetallicRoughness": metal, "extensions": {"KHR_materials_specular": lobe}}
 
 
-class _Glb:
-    """A file in the making."""
+class GlbFile:
+    """A file in the making: one buffer, and a tree that whoever writes it completes."""
 
     def __init__(self) -> None:
         self.tree: dict[str, Any] = {
@@ -94,7 +95,7 @@ class _Glb:
             "accessors": [],
             "bufferViews": [],
         }
-        self._data = b""
+        self._data = bytearray()
 
     def accessor(
         self, values: NDArray, kind: str, component: int, more: Mapping[str, Any] | None = None
@@ -118,7 +119,7 @@ class _Glb:
         self.tree["buffers"] = [{"byteLength": len(self._data)}]
         text = json.dumps(self.tree, sort_keys=True).encode()
         text += b" " * (-len(text) % 4)
-        data = self._data + bytes(-len(self._data) % 4)
+        data = bytes(self._data) + bytes(-len(self._data) % 4)
         chunks = struct.pack("<II", len(text), _JSON) + text
         chunks += struct.pack("<II", len(data), _BIN) + data
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

@@ -14,12 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.renderer import (
-    Sampling,
-    representable,
-    require_bounded,
-    require_surfaces,
-)
+from pipeline.renders.renderer import representable, require_bounded, require_surfaces
+from pipeline.renders.results import Sampling
 from pipeline.renders.settings import PASS_SPP, Depth, Filtered, RenderSettings, Resolution
 from pipeline.renders.tracer import Tracer
 from storage.errors import Rejected, TrilightError

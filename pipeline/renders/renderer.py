@@ -13,8 +13,7 @@ picture is their sum; with `split` direct and indirect light are kept apart, and
 Mitsuba is imported inside functions only: `activate` must come first.
 """
 
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Generator, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,6 +29,7 @@ from pipeline.renders.kept_light import (
 )
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import Half, MeasuredFloor, measure_floor
+from pipeline.renders.results import GrowingPicture, RenderedView, Sampling, UsedTime
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import Filtered, RenderSettings
 from pipeline.renders.stopping import Floors, Goal, expected_spp, gaps_db, next_spp
@@ -38,52 +38,10 @@ from pipeline.renders.tracer import Features, Tracer
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import Rejected, TrilightError
 from storage.records.lights import light_rows, rounded_to_half, sum_of_lights
-from storage.records.parts import MAX_PICTURES, Parts
+from storage.records.parts import MAX_PICTURES
 from storage.records.scene import Scene
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RenderedView:
-    """One finished picture and how far to trust it."""
-
-    radiance_rgb: NDArray[np.float32]
-    """[R, R, 3] linear radiance, finite, at least 0, below HALF_FLOAT_MAX; the background is 0."""
-    spp: int
-    """Samples per pixel that were spent, on each light where they are apart: the mean over the
-    pixels that show anything, rounded down."""
-    noise_floor_db: float
-    """Measured error as psnr_log_db."""
-    noise_floor_linear_db: float
-    """Measured error as psnr_linear_db."""
-    object_noise_floor_db: float
-    """Measured error as object_psnr_log_db, over `hits`."""
-    at_cap: bool
-    """Whether sampling ended at max_spp with a floor below its target."""
-    hits: NDArray[np.bool_]
-    """[R, R] whether the ray through the pixel's centre meets geometry (emitters do not count)."""
-    lights_rgb: NDArray[np.float32] | None = None
-    """With `per_light`: [L, R, R, 3] radiance of each emitter object alone, rounded to half floats;
-    `radiance_rgb` is their storage.records.lights.sum_of_lights in every bit."""
-    parts_rgb: Parts | None = None
-    """With `split` or `split_lobes`: [R, R, 3] radiance of each part, rounded to half floats, or
-    [L, R, R, 3] of lights apart. Their storage.records.parts.sum_of_parts is `radiance_rgb`, or
-    `lights_rgb`, in every bit."""
-    part_floors: Mapping[str, MeasuredFloor] | None = None
-    """Measured error of each part, of all lights together."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sampling:
-    """How far the sampling of a view has come."""
-
-    spp: int
-    """Samples per pixel so far."""
-    expected_spp: int
-    """Samples at which all targets should be reached, or the cap; a guess that improves."""
-    missing_db: float | None
-    """The widest gap to a target when the floors were measured last; None before that."""
 
 
 _MAX_RAW = 1e13
@@ -106,8 +64,16 @@ slower passes cost easier ones 7 to 11 %."""
 class SceneRenderer:
     """A scene loaded once, for any number of views of it."""
 
-    def __init__(self, scene: Scene, settings: RenderSettings) -> None:
+    def __init__(
+        self, scene: Scene, settings: RenderSettings, *, shows_looks: bool = False
+    ) -> None:
         """Load a scene that passes `Scene.check`; `activate` must have been called.
+
+        Args:
+            scene: what is rendered.
+            settings: how well.
+            shows_looks: whether `view_steps` yields a `GrowingPicture` after each measurement by
+                which a target is missed; pictures stay the same, each look costs one denoise.
 
         Raises:
             Rejected: "unlit_scene" where no emitter has an area (with `per_light`: where one has
@@ -118,7 +84,7 @@ class SceneRenderer:
             NotImplementedError: RenderSettings.require_variant refuses the variant.
         """
         require_surfaces(scene)
-        self._settings = settings
+        self._settings, self._shows_looks, self._used = settings, shows_looks, UsedTime()
         self._tracer = load_tracer(scene, max_depth=settings.max_depth, rr_depth=settings.rr_depth)
         if settings.part_names:
             self._tracer = self._tracer.apart(bounces=settings.split, lobes=settings.split_lobes)
@@ -128,6 +94,16 @@ class SceneRenderer:
             _refuse_sky(scene)
             most = MAX_PICTURES // max(1, len(settings.part_names))
             self._tracers = _tracer_of_each_light(self._tracer, scene, most)
+
+    @property
+    def tracer(self) -> Tracer:
+        """What traces all light of the scene."""
+        return self._tracer
+
+    @property
+    def used_core_s(self) -> float:
+        """Core-seconds of this process since the view at hand began, without its looks."""
+        return self._used.core_s()
 
     def render_view(self, c2w: ArrayLike, fov_deg: float, seed: int) -> RenderedView:
         """Return the picture of one camera; equal arguments give equal bits.
@@ -149,7 +125,7 @@ class SceneRenderer:
         self, c2w: ArrayLike, fov_deg: float, seed: int
     ) -> Generator[Sampling, None, RenderedView]:
         """Do what `render_view` does, yielding after each pass of one half."""
-        settings = self._settings
+        settings, self._used = self._settings, UsedTime()
         pose = np.asarray(c2w, np.float64)
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=settings.resolution)
         settled = settings.first_spp
@@ -226,6 +202,8 @@ class SceneRenderer:
                 return floor, self._part_floors(kept, hits)
             goal = Goal(targets_db=targets_db, step=2 * samples.pass_spp, max_spp=max_spp)
             expected, missing_db = expected_spp(measured, goal), max(gaps.values())
+            if self._shows_looks:
+                yield self._look(samples, features, floor, expected, missing_db)
             if expected >= _GUIDED_SPP:
                 samples.guide()
             spp = next_spp(measured, goal)
@@ -233,6 +211,27 @@ class SceneRenderer:
             passes = samples.passes_to(spp) if chosen is None else samples.passes_over(chosen)
             for _ in passes:
                 yield Sampling(spp=samples.spp, expected_spp=expected, missing_db=missing_db)
+
+    def _look(
+        self,
+        samples: HalfSamples,
+        features: Features,
+        floor: MeasuredFloor,
+        expected_spp: int,
+        missing_db: float,
+    ) -> GrowingPicture:
+        before_s = self._used.core_s()
+        picture = self._stored(self._picture(samples, features))["radiance_rgb"]
+        core_s = self._used.core_s()
+        self._used.leave_out(core_s - before_s)
+        return GrowingPicture(
+            spp=samples.spp,
+            expected_spp=expected_spp,
+            missing_db=missing_db,
+            radiance_rgb=picture,
+            floor=floor,
+            core_s=core_s,
+        )
 
     def _filter_of_halves(self, spp: int) -> Filtered:
         quality = self._settings.denoiser

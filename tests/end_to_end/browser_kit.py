@@ -97,6 +97,45 @@ class Browser:
         """Type into what has the focus."""
         self.call("Input.insertText", text=text)
 
+    def press(self, key: str, *, shift: bool = False) -> None:
+        """Press a key and let it go; `key` as DOM events name it."""
+        code = {"Tab": 9, "Enter": 13, " ": 32, "Escape": 27, "ArrowLeft": 37, "ArrowUp": 38,
+                "ArrowRight": 39, "ArrowDown": 40}.get(key, ord(key[0].upper()))  # fmt: skip
+        text = {"Enter": "\r"}.get(key, key if len(key) == 1 else "")
+        parts = {"key": key, "windowsVirtualKeyCode": code, "modifiers": 8 if shift else 0}
+        down = {**parts, "text": text} if text else parts
+        self.call("Input.dispatchKeyEvent", type="keyDown", **down)
+        self.call("Input.dispatchKeyEvent", type="keyUp", **parts)
+
+    def tab_to(self, selector: str) -> None:
+        """Press Tab until an element has the focus."""
+        for _ in range(200):
+            self.press("Tab")
+            if self.run(f"document.activeElement.matches({json.dumps(selector)})"):
+                return
+        raise AssertionError(f"{selector} is out of reach of the keyboard")
+
+    def drag(self, selector: str, right_px: int, down_px: int) -> None:
+        """Press the mouse in the middle of an element, move it, and let it go."""
+        at = f"document.querySelector({json.dumps(selector)})"
+        self.run(f"{at}.scrollIntoView({{block: 'center'}})")
+        x, y = self.run(
+            f"(() => {{const b = {at}.getBoundingClientRect();"
+            "return [b.x + b.width / 2, b.y + b.height / 2]})()"
+        )
+        steps = [("mousePressed", 0.0), ("mouseMoved", 0.5), ("mouseMoved", 1.0)]
+        for kind, share in [*steps, ("mouseReleased", 1.0)]:
+            self.call(
+                "Input.dispatchMouseEvent", type=kind, x=x + share * right_px,
+                y=y + share * down_px, button="left", buttons=int(kind != "mouseReleased"),
+                clickCount=1,
+            )  # fmt: skip
+
+    def in_colours(self, scheme: str) -> None:
+        """Let pages be told that the user wants `light` or `dark`."""
+        wish = {"name": "prefers-color-scheme", "value": scheme}
+        self.call("Emulation.setEmulatedMedia", features=[wish])
+
     def show(self, width: int, height: int) -> None:
         """Make the page as wide and high as a screen."""
         self.call(

@@ -25,6 +25,7 @@ LONG = {
     "evaluate": ("evaluate", "builtin:", "--data", "nowhere"),
     "leaderboard": ("leaderboard", "nowhere"),
     "doctor": ("doctor",),
+    "view": ("view", "SILENT", "--no-browser"),
 }
 
 

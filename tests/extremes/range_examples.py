@@ -11,6 +11,7 @@ from infra.leaderboard.order import LeaderboardOrder
 from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
 from infra.setup.settings_page import ROOTS, reachable
+from model.base_widths import BaseWidths
 from model.config import ModelConfig, smoke, tiny
 from pipeline.assets.settings import AssetSettings, GateSettings, OwnMaterialSettings
 from pipeline.builds.named import named_build
@@ -85,6 +86,7 @@ EXAMPLES: dict[type, Any] = {
     ModelConfig: tiny(),
     LossSettings: RUN.loss,
     AugmentationSettings: RUN.augmentation,
+    BaseWidths: RUN.base_widths,
     EvaluationOrder: EvaluationOrder(checkpoint="a", data=("b",)),
     LeaderboardOrder: LeaderboardOrder(source="a", width=(64,)),
     WatchSettings: WatchSettings(),

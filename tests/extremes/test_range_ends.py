@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from model.config import ModelConfig
 from model.renderformer import RenderFormer
 from model.scene_tensors import batch_scenes, tensors_of
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import MAX_SPP, RenderSettings
 from pipeline.scenes.compose import compose_scene
 from pipeline.scenes.pool import PooledAsset

@@ -128,6 +128,7 @@ def test_a_decision_holds_from_its_step_and_is_not_typed_again() -> None:
         ),
         ({"model.hidden_width": 64}, "model.hidden_width: it is the run's for good.*--from"),
         ({"from_weights": True}, "from_weights: it is the run's for good"),
+        ({"base_widths.width": 64}, "base_widths.width: it is the run's for good"),
         ({"muon_rate": 3.0}, "muon_rate=3: the checkpoint lacks the memories"),
         ({"num_steps": 7}, "num_steps=7: 8 steps are done.*--branch"),
         ({"lossy": 1}, "setting 'lossy' does not exist"),

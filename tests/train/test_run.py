@@ -6,6 +6,7 @@ import re
 import signal
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -19,9 +20,14 @@ from storage.records.safe_read import safetensors_header
 from tests.command_line import trilight
 from tests.train.kit import tiny_run, trained
 from tests.train.toy import write_toy_dataset
+from train.evaluation import judge
+from train.loop import trainer
+from train.loop.interrupts import Stopped
 from train.progress import TrainProgress
 from train.result import TrainResult
+from train.run import train_run
 from train.settings import TrainSettings
+from train.start import Start
 from train.watching.rows import read_rows
 
 TIMINGS = {"views_per_s", "data_wait_share", "flops_per_s", "peak_share", "time_s", "memory_mb"}
@@ -79,8 +85,14 @@ def same_as_uninterrupted(out: Path, whole: TrainResult) -> None:
         assert (out / name).read_bytes() == (whole.folder.root / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("step", [1, 7, 11])
+def curve(out: Path) -> list[dict]:
+    rows = read_rows(out / "metrics.jsonl")
+    return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("step", "number"), [(1, signal.SIGINT), (7, signal.SIGTERM), (11, signal.SIGUSR1)]
+)
 def test_stopped_and_resumed_is_uninterrupted_to_the_bit(
     dataset: Dataset, whole: TrainResult, tmp_path: Path, step: int, number: int
 ) -> None:
@@ -90,6 +102,7 @@ def test_stopped_and_resumed_is_uninterrupted_to_the_bit(
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == handlers
     run(tiny_run(), dataset, tmp_path, resume=True)
     same_as_uninterrupted(tmp_path, whole)
+    assert curve(tmp_path) == curve(whole.folder.root), "a row half full is filled"
 
 
 def test_killed_and_resumed_repeats_at_most_one_checkpoint(
@@ -99,11 +112,72 @@ def test_killed_and_resumed_repeats_at_most_one_checkpoint(
         run(tiny_run(), dataset, tmp_path, progress=KillAt(7))
     run(tiny_run(), dataset, tmp_path, resume=True)
     same_as_uninterrupted(tmp_path, whole)
-    ours, theirs = (
-        [{k: v for k, v in row.items() if k not in TIMINGS} for row in read_rows(path)]
-        for path in (tmp_path / "metrics.jsonl", whole.folder.metrics)
-    )
-    assert ours == theirs
+    assert curve(tmp_path) == curve(whole.folder.root)
+
+
+class SignalIn:
+    """A signal within a call of a function of another module, after which that goes on."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, module: ModuleType, name: str, call: int) -> None:
+        function, self.calls = getattr(module, name), 0
+
+        def asked(*given: object, **named: object) -> object:
+            self.calls += 1
+            if self.calls == call:
+                os.kill(os.getpid(), signal.SIGUSR1)
+            return function(*given, **named)
+
+        patch.setattr(module, name, asked)
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "call", "step", "calls"),
+    [
+        # a call for each of two scenes, at steps 4, 8 and 12
+        pytest.param(judge, "predict", 4, 8, 4, id="in its last picture"),
+        pytest.param(judge, "predict", 5, 12, 5, id="in the last validation"),
+        # and one before, for the median picture
+        pytest.param(judge, "score_pictures", 2, 4, 2, id="while pictures are judged"),
+        pytest.param(trainer, "keep_checkpoint", 2, 8, 2, id="while saving"),
+    ],
+)
+def test_a_signal_in_a_validation_or_while_saving_loses_nothing(
+    dataset: Dataset,
+    whole: TrainResult,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    module: ModuleType,
+    name: str,
+    call: int,
+    step: int,
+    calls: int,
+) -> None:
+    """A validation that was left is not finished first, and made up for by who goes on."""
+    with monkeypatch.context() as patch:
+        asked = SignalIn(patch, module, name, call)
+        with pytest.raises(Stopped, match=f"stopped at step {step} by") as stopped:
+            run(tiny_run(), dataset, tmp_path)
+    assert (asked.calls, stopped.value.exit_status) == (calls, 75)
+    left = [row["step"] for row in read_rows(tmp_path / "metrics.jsonl") if "validation" in row]
+    assert (step in left) == (name == "keep_checkpoint")
+    run(tiny_run(), dataset, tmp_path, resume=True)
+    same_as_uninterrupted(tmp_path, whole)
+    assert curve(tmp_path) == curve(whole.folder.root)
+
+
+def test_the_same_command_begins_begins_again_and_goes_on(
+    dataset: Dataset, whole: TrainResult, tmp_path: Path
+) -> None:
+    """As a scheduler starts it: killed before the first checkpoint, and after one."""
+    start, data = Start(restartable=True), [str(dataset.folder.root)]
+    for step in (3, 7):
+        with pytest.raises(Killed):
+            train_run(tiny_run(), data=data, out=tmp_path, start=start, progress=KillAt(step))
+    train_run(tiny_run(), data=data, out=tmp_path, start=start)
+    same_as_uninterrupted(tmp_path, whole)
+    assert curve(tmp_path) == curve(whole.folder.root)
+    begun = [row["text"].split(" on ")[0] for row in read_rows(tmp_path / "notes.jsonl")]
+    assert [text for text in begun if text in ("began", "went")] == ["began", "began", "went"]
 
 
 def test_a_finished_run_is_judged_again(

@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from model.base_widths import BaseWidths
 from model.config import SIZES, large
 from storage.errors import TrilightError
 from storage.settings.changes import changed
@@ -106,6 +107,7 @@ def test_the_paper_runs_are_the_papers() -> None:
         assert (run.betas, run.weight_decay, run.grad_clip) == ((0.9, 0.999), 0.01, 1.0)
         assert (run.augmentation.rotation, run.augmentation.translation) == ("recipe", 0.25)
         assert run.ema_decay == run.muon_rate == 0 and not run.augmentation.mirror
+        assert run.base_widths == BaseWidths() and run.base_widths.width == 0
     assert second.from_weights and not first.from_weights
 
 

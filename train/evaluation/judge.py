@@ -1,6 +1,6 @@
 """The validation split, its simplest rival, and how a network stands between the two."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,15 +52,30 @@ class Judge:
         self.median_views = score_pictures(stills, self.scenes)
         self.median_scores = summarise(self.median_views)
 
-    def judge(self, model: RenderFormer) -> ValidationJudgement:
-        """Judge a network on all scenes."""
-        pictures = tuple(predict(model, judged.scene) for judged in self.scenes)
-        views = score_pictures(pictures, self.scenes)
+    def judge(
+        self, model: RenderFormer, between: Callable[[], None] = lambda: None
+    ) -> ValidationJudgement:
+        """Judge a network on all scenes.
+
+        Args:
+            model: the network.
+            between: called before each scene is rendered and before it is judged; what it raises
+                ends the judging.
+        """
+        pictures, views = [], []
+        for judged in self.scenes:
+            between()
+            pictures.append(predict(model, judged.scene))
+        for picture, judged in zip(pictures, self.scenes, strict=True):
+            between()
+            views += score_pictures([picture], [judged])
         scores = summarise(views)
         scores["better_than_median"] = share_better(views, self.median_views)
         sizes = [len(scene.target_VRR3) for scene in self.scenes]
         ahead = lead(views, self.median_views, sizes)
-        return ValidationJudgement(pictures=pictures, views=tuple(views), scores=scores, lead=ahead)
+        return ValidationJudgement(
+            pictures=tuple(pictures), views=tuple(views), scores=scores, lead=ahead
+        )
 
 
 def judged_scene(sample: Sample, resolution: int) -> JudgedScene:

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from storage.atomic import write_atomically
-from storage.conventions import log10_radiance, preview_srgb8
+from storage.conventions import preview_srgb8
+from train.evaluation.error_colours import (
+    ERROR_WHITE,
+    error_picture,
+    heat_colours,
+    mean_error,
+)
 from train.evaluation.judge import Judge, ValidationJudgement
 from train.settings import TrainSettings
 
@@ -23,9 +29,6 @@ CAPTION_PX = 20
 
 GAP_PX = 8
 BLOCKS_PER_LINE = 2
-
-ERROR_WHITE = 0.5
-"""|log10(1 + a) - log10(1 + b)| that the error picture shows as white."""
 
 NOISE_WHITE = 16.0
 """Multiple of the target's own noise that the last picture shows as white; at the noise it is
@@ -74,29 +77,14 @@ def write_picture(path: Path, picture: Image.Image) -> None:
     write_atomically(path, data.getvalue())
 
 
-def error_picture(predicted_rgb: NDArray, target_rgb: NDArray) -> NDArray[np.uint8]:
-    """Return [R, R, 3]: the channels' mean error of log10(1 + radiance), black to red to white."""
-    return _ramp(_mean_error(predicted_rgb, target_rgb) / ERROR_WHITE)
-
-
 def noise_picture(view: SheetView) -> NDArray[np.uint8]:
     """Return [R, R, 3]: how often the error holds the view's noise, black at once, by doublings.
 
     The noise is one number for the whole view, its noise floor.
     """
-    error = _mean_error(view.predicted_rgb, view.target_rgb)
+    error = mean_error(view.predicted_rgb, view.target_rgb)
     times = np.maximum(error / max(view.noise, 1e-6), 1.0)
-    return _ramp(np.log(times) / np.log(NOISE_WHITE))
-
-
-def _mean_error(predicted_rgb: NDArray, target_rgb: NDArray) -> NDArray:
-    return np.abs(log10_radiance(predicted_rgb) - log10_radiance(target_rgb)).mean(axis=-1)
-
-
-def _ramp(level_RR: NDArray) -> NDArray[np.uint8]:
-    """Return 0 to 1 as black to red to yellow to white."""
-    ramp = np.clip(3 * level_RR[..., None] - np.array([0, 1, 2]), 0, 1)
-    return np.round(255 * ramp).astype(np.uint8)
+    return heat_colours(np.log(times) / np.log(NOISE_WHITE))
 
 
 def _block(view: SheetView) -> Image.Image:

@@ -6,6 +6,7 @@ because going on with others in silence would be neither the old run nor a new o
 sha256 of itself, because safetensors would not notice a weight that a disk changed.
 """
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Mapping
@@ -32,6 +33,7 @@ from train.going_on import GoingOn, event_records
 from train.loop.crew import Crew
 from train.loop.schedule import decay_begins
 from train.loop.state import TrainState, new_state
+from train.loop.step import StepReport
 from train.settings import Precision, TrainSettings
 
 PREFIX, SUFFIX = "step-", ".safetensors"
@@ -61,6 +63,7 @@ def save_checkpoint(
         "skipped_steps": state.skipped_steps,
         "skipped_in_a_row": state.skipped_in_a_row,
         "unusable": dict(state.unusable.met),
+        "reports": [dataclasses.asdict(report) for report in state.reports],
         "settings": settings_record(settings),
         "model": encode_config(settings.model),
         "data_digest": data_digest,
@@ -156,6 +159,7 @@ def resumed_state(
     if not going.has_decided:
         state.skipped_in_a_row = header.get("skipped_in_a_row", 0)
     state.history = going.history
+    state.reports = [StepReport(**fields) for fields in header.get("reports", ())]
     weights = _part(checkpoint.arrays, "model")
     load_tensors(state.model, weights)
     if state.mean_model is not None:

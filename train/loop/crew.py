@@ -5,15 +5,18 @@ DistributedDataParallel over nccl or gloo. The first process alone logs, judges 
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 import torch.distributed as dist
 
 from storage.errors import TrilightError
 from train.data.order import RankShare
+
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +29,8 @@ class Crew:
     """Number of this process, from 0."""
     world_size: int = 1
     """How many train together."""
+    local_rank: int = 0
+    """Number of this process on its machine, from 0."""
 
     @property
     def is_first(self) -> bool:
@@ -63,6 +68,16 @@ class Crew:
             for said, count in zip(texts, lengths, strict=True)
         ]
 
+    def once_a_machine(self, make: Callable[[], Made]) -> Made:
+        """Return what each process makes, the first of each machine before the others.
+
+        For what leaves a copy on the machine that the others find, such as a download. All must
+        call it.
+        """
+        made = [make()] if self.local_rank == 0 else []
+        self.any(False)  # a barrier
+        return made[0] if made else make()
+
     def any(self, flag: bool) -> bool:
         """Return whether the flag is set in any process, alike on each; all must call it."""
         return self.mean([float(flag)])[0] > 0
@@ -80,13 +95,16 @@ def join_crew(device: str | None = None) -> Iterator[Crew]:
         TrilightError: CUDA was asked for and there is none, or too few cards.
     """
     world_size = int(os.environ.get("WORLD_SIZE", "1"))
-    chosen = choose_device(device, int(os.environ.get("LOCAL_RANK", "0")))
+    local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+    chosen = choose_device(device, local_rank)
     if world_size == 1:
         yield Crew(device=chosen)
         return
     dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
     try:
-        yield Crew(device=chosen, rank=dist.get_rank(), world_size=world_size)
+        yield Crew(
+            device=chosen, rank=dist.get_rank(), world_size=world_size, local_rank=local_rank
+        )
     finally:
         dist.destroy_process_group()
 

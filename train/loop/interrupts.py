@@ -1,4 +1,7 @@
-"""Ctrl-C and SIGTERM take effect between two steps, when the state is whole and can be saved."""
+"""Ctrl-C, SIGTERM and SIGUSR1 take effect between two steps, when the state can be saved whole.
+
+A validation that is under way is left, and done again by the run that goes on.
+"""
 
 import os
 import signal
@@ -7,10 +10,16 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import ClassVar
 
 from storage.errors import TrilightError
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+"""Those that ask to stop; SIGUSR1 is what job files ask Slurm for, ahead of the time limit."""
+
+SAVED_STATUS = 75
+"""What a process ends with whose state is saved: the same command with --resume goes on. (In BSD's
+sysexits.h it is EX_TEMPFAIL: try again.) torchrun does not pass it on."""
 
 ONE_ASKING_S = 1.0
 """Signals within this time are one: torchrun forwards a signal that the terminal sent to all."""
@@ -19,12 +28,21 @@ ONE_ASKING_S = 1.0
 class Stopped(TrilightError):
     """A run obeyed a signal: its state is saved, and --resume goes on from there."""
 
-    def __init__(self, step: int) -> None:
+    exit_status: ClassVar[int] = SAVED_STATUS
+
+    def __init__(self, step: int, command: str | None = None) -> None:
+        """Take the steps that are done, and the command that goes on, where it is known."""
+        stopped = f"training: stopped at step {step}"
         super().__init__(
-            f"training: stopped at step {step} by a signal, nothing is lost. Run the same command "
-            "with --resume to go on."
+            f"{stopped} by a signal, nothing is lost. Run the same command with --resume to go on."
+            if command is None
+            else f"{stopped}, nothing is lost. To go on: {command}"
         )
         self.step = step
+
+
+class ValidationLeft(Exception):
+    """A validation was left, because the run was asked to stop."""
 
 
 class Asking:

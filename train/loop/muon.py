@@ -25,8 +25,13 @@ def fitting_precision(crew: Crew) -> Precision:
     return "float32" if crew.any(not quick) else "bfloat16"
 
 
-def muon(matrices: Iterable[Tensor], weight_decay: float, precision: Precision) -> torch.optim.Muon:
-    """Return the optimizer of matrices [M, N]: torch's own, or the same with float32 products."""
+def muon(
+    matrices: Iterable[Tensor] | Iterable[dict[str, Any]], weight_decay: float, precision: Precision
+) -> torch.optim.Muon:
+    """Return the optimizer of matrices [M, N]: torch's own, or the same with float32 products.
+
+    `matrices` may be groups of them, as torch's optimizers take those, each with its own decay.
+    """
     kind = torch.optim.Muon if precision == "bfloat16" else Float32Muon
     return kind(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
 

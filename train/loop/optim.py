@@ -1,11 +1,15 @@
 """What moves the weights: AdamW, and Muon for the matrices."""
 
 import itertools
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from model.renderformer import RenderFormer
+from model.width_scales import width_scales
 from train.loop.muon import muon
 from train.settings import Precision, TrainSettings
 
@@ -14,6 +18,12 @@ ADAMW_KEEPS = ("exp_avg", "exp_avg_sq")
 
 MUON_KEEPS = ("momentum_buffer",)
 """Muon's state for each weight; it counts no updates."""
+
+_SCALE = "width_scale"
+"""Name in a group of weights of the factor of their rate."""
+
+_Scaled = tuple[Tensor, float]
+"""A weight, and the factor of its rate."""
 
 
 class Updater:
@@ -31,17 +41,22 @@ class Updater:
     muon_precision: Precision | None
     """Precision of Muon's products; None where AdamW moves every weight."""
 
-    def __init__(self, model: nn.Module, settings: TrainSettings, precision: Precision) -> None:
+    def __init__(self, model: RenderFormer, settings: TrainSettings, precision: Precision) -> None:
         """Take the network, the run, and the precision of Muon's products (loop.muon)."""
         self._names: dict[Tensor, str] = {weight: name for name, weight in model.named_parameters()}
-        muon_rate = settings.muon_rate
-        matrices = [weight for weight in self._names if muon_rate and weight.ndim == 2]
-        others = [weight for weight in self._names if not (muon_rate and weight.ndim == 2)]
-        adamw = torch.optim.AdamW(others, betas=settings.betas, weight_decay=settings.weight_decay)
+        scales = width_scales(model, settings.base_widths)
+        muon_rate, decay = settings.muon_rate, settings.weight_decay
+        matrices, others = list[_Scaled](), list[_Scaled]()
+        for weight, name in self._names.items():
+            if muon_rate and weight.ndim == 2:
+                matrices.append((weight, scales[name].muon))
+            else:
+                others.append((weight, scales[name].adamw))
+        adamw = torch.optim.AdamW(_groups(others, decay), betas=settings.betas)
         self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
         self.muon_precision = precision if matrices else None
         if matrices:
-            self._optimizers.append((muon(matrices, settings.weight_decay, precision), muon_rate))
+            self._optimizers.append((muon(_groups(matrices, decay), decay, precision), muon_rate))
 
     def zero_grad(self) -> None:
         """Forget the gradient."""
@@ -52,7 +67,7 @@ class Updater:
         """Move every weight along the gradient it holds."""
         for optimizer, share in self._optimizers:
             for group in optimizer.param_groups:
-                group["lr"] = learning_rate * share
+                group["lr"] = learning_rate * share * group[_SCALE]
             optimizer.step()
 
     def memories(self) -> dict[str, Tensor]:
@@ -76,6 +91,21 @@ class Updater:
                 if isinstance(optimizer, torch.optim.AdamW):
                     memory["step"] = torch.tensor(float(updates))
                 optimizer.state[weight] = memory
+
+
+def _groups(weights: Sequence[_Scaled], weight_decay: float) -> list[dict[str, Any]]:
+    """Return the groups of weights whose rates have one factor.
+
+    A step takes the same share of every weight for decay, whatever that factor: a share that fell
+    with the rate would keep wide networks from forgetting (Wortsman et al. 2023).
+    """
+    by_scale = defaultdict[float, list[Tensor]](list)
+    for weight, scale in weights:
+        by_scale[scale].append(weight)
+    return [
+        {"params": params, "weight_decay": weight_decay / scale, _SCALE: scale}
+        for scale, params in by_scale.items()
+    ]
 
 
 def _kept(optimizer: torch.optim.Optimizer) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """What the first process writes during a run beside checkpoints: its log, notes and pictures."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,11 +83,23 @@ class Recorder:
         self.progress.noted(text)
         add_note(self._folder.notes, step, text)
 
-    def validate(self, state: TrainState) -> None:
-        """Judge the network on the validation split, if there is one, and write down how it did."""
+    def has_validated(self, step: int) -> bool:
+        """Return whether the log has a validation of a step, or there is nothing to judge on."""
+        rows = read_rows(self._folder.metrics)
+        return self._judge is None or any(
+            "validation" in row and row["step"] == step for row in rows
+        )
+
+    def validate(self, state: TrainState, between: Callable[[], None] = lambda: None) -> None:
+        """Judge the network on the validation split, if there is one, and write down how it did.
+
+        Args:
+            state: of the run.
+            between: as `Judge.judge` takes it; where it raises, nothing is written.
+        """
         if self._judge is None:
             return
-        judgement = self._judge.judge(state.shown)
+        judgement = self._judge.judge(state.shown, between)
         self.row({"step": state.step, "validation": judgement.scores})
         sheet = drawn_validation_sheet(self._settings, self._judge, judgement, state.step)
         for board in self._boards:

@@ -6,17 +6,22 @@ no random generator's state has to be saved.
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import torch
 
 from model.renderformer import RenderFormer
+from model.width_scales import scale_start, width_scales
 from storage.seeds import seed_for
 from train.data.mixture import Mixture
 from train.data.unusable import Unusable
 from train.going_on import Event
 from train.loop.optim import Updater
 from train.settings import Precision, TrainSettings
+
+if TYPE_CHECKING:
+    from train.loop.step import StepReport
 
 _WAY_ON = (
     "To replace such samples by others, allow a number of them: --skip-unusable, with --resume "
@@ -42,6 +47,8 @@ class TrainState:
     """Steps that were not finite and changed nothing."""
     skipped_in_a_row: int = 0
     """Those of them since the last update, or since a decision about the run."""
+    reports: "list[StepReport]" = field(default_factory=list)
+    """The steps since the last row of the log, whose next row is of them too."""
     history: tuple[Event, ...] = ()
     """What happened to the run beside its steps, oldest first."""
     mixture: Mixture | None = None
@@ -87,6 +94,7 @@ def new_state(
     model = RenderFormer(settings.model)
     if begin_with is None:
         model.initialise(torch.Generator().manual_seed(seed_for(settings.seed, "weights")))
+        scale_start(model, width_scales(model, settings.base_widths))
     else:
         model.load_state_dict(begin_with.state_dict())
     model.recompute_activations(settings.recompute_activations)

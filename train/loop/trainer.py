@@ -3,7 +3,9 @@
 import math
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import Any
 
 import torch
 
@@ -14,7 +16,7 @@ from train.folder import RunFolder
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.crew import Crew
 from train.loop.enough_memory import enough_memory
-from train.loop.interrupts import Stopped, deferred_interrupts
+from train.loop.interrupts import Stopped, ValidationLeft, deferred_interrupts
 from train.loop.recorder import Recorder
 from train.loop.schedule import decay_begins, learning_rate
 from train.loop.state import TrainState
@@ -108,8 +110,9 @@ class Trainer:
         self.stepper = Stepper(state, settings, objective, crew)
         self.copies = CopyStream(crew.device)
         self.start_watch = StartWatch(settings)
-        self.window = Window()
+        self.window = Window(state.reports)
         self.num_noted = 0
+        self.saved_step: int | None = None
         progress = TrainProgress() if recorder is None else recorder.progress
         self.progress = progress
         self.watch = Watch(
@@ -130,21 +133,36 @@ class Trainer:
                 the steps keep failing.
         """
         with self.watch, deferred_interrupts(self.progress.interrupted) as asked_to_stop:
+            self._catch_up(asked_to_stop)
             while self.state.step < self.settings.num_steps:
-                self._after_step(self._step(steps))
+                report = self._step(steps)
+                self._after_step(report, asked_to_stop)
+                self._leave_if_asked(asked_to_stop)
                 if self.state.step == self.settings.num_steps:
                     return
-                # one process may be signalled before another; all stop at the same step
-                with self.watch.exchange():
-                    stopping = self.crew.any(asked_to_stop())
-                if stopping:
-                    self._leave(Stopped(self.state.step))
                 if verdict := self.start_watch.verdict(self.state.step):
                     self._leave(verdict)
 
+    def _catch_up(self, asked_to_stop: Callable[[], bool]) -> None:
+        """Make up for the validation that a signal ended, after which the state was saved."""
+        if self.state.step == 0 or not self._validates():
+            return
+        missing = self.recorder is not None and not self.recorder.has_validated(self.state.step)
+        if self.crew.any(missing):
+            self._validate(asked_to_stop)
+            self._leave_if_asked(asked_to_stop)
+
+    def _leave_if_asked(self, asked_to_stop: Callable[[], bool]) -> None:
+        # one process may be signalled before another; all stop at the same step
+        with self.watch.exchange():
+            stopping = self.crew.any(asked_to_stop())
+        if stopping:
+            self._leave(Stopped(self.state.step))
+
     def _leave(self, reason: TrilightError) -> None:
         with self.watch.pause("saving"):
-            self._save()
+            if self.saved_step != self.state.step:
+                self._save()
             # a barrier: torchrun ends all processes with the first that ends, so wait for the file
             self.crew.any(False)
         raise reason
@@ -201,7 +219,21 @@ class Trainer:
                 "another folder, --branch."
             )
 
-    def _after_step(self, report: StepReport) -> None:
+    def _validates(self) -> bool:
+        """Return whether a validation follows the state's step."""
+        step, settings = self.state.step, self.settings
+        return step == settings.num_steps or step % settings.validate_every == 0
+
+    def _validate(self, asked_to_stop: Callable[[], bool]) -> None:
+        def between() -> None:
+            if asked_to_stop():
+                raise ValidationLeft
+
+        with self.window.pause(), self.watch.pause("validation"), suppress(ValidationLeft):
+            if self.recorder is not None:
+                self.recorder.validate(self.state, between)
+
+    def _after_step(self, report: StepReport, asked_to_stop: Callable[[], bool]) -> None:
         settings, step = self.settings, self.state.step
         last = step == settings.num_steps
         self.progress.advance(
@@ -212,10 +244,8 @@ class Trainer:
         )
         if self.watch.ends_window(step):
             self._end_window()
-        if last or step % settings.validate_every == 0:
-            with self.window.pause(), self.watch.pause("validation"):
-                if self.recorder is not None:
-                    self.recorder.validate(self.state)
+        if self._validates():
+            self._validate(asked_to_stop)
         if last or step % settings.checkpoint_every == 0 or step == decay_begins(settings):
             with self.window.pause(), self.watch.pause("saving"):
                 self._save()
@@ -223,10 +253,16 @@ class Trainer:
     def _end_window(self) -> None:
         """Exchange what was seen since the last window, and write the row."""
         seen, spikes = self.watch.window()
-        if self.recorder is None:
-            return
+        if self.recorder is not None:
+            self._write_window(self.recorder, seen, spikes)
+        self.state.reports = []
+        self.window = Window(self.state.reports)
+
+    def _write_window(
+        self, recorder: Recorder, seen: Mapping[str, Any], spikes: Sequence[Mapping[str, Any]]
+    ) -> None:
         for spike in spikes:
-            self.recorder.row(spike)
+            recorder.row(spike)
         peak = device_peak(self.crew.device, PRODUCTS[self.settings.precision])
         row = {
             "step": self.state.step,
@@ -235,8 +271,7 @@ class Trainer:
             **self.window.row(peak),
         }
         assert all(value is None or math.isfinite(value) for value in row.values())
-        self.recorder.row({**row, **seen})
-        self.window = Window()
+        recorder.row({**row, **seen})
 
     def _note(self, text: str) -> None:
         """Tell the user, in the first process."""
@@ -244,6 +279,7 @@ class Trainer:
             self.recorder.note(self.state.step, text)
 
     def _save(self) -> None:
+        self.saved_step = self.state.step
         if self.crew.is_first:
             keep_checkpoint(
                 self.folder.checkpoints,

@@ -14,8 +14,13 @@ from train.loop.step import StepReport
 class Window:
     """Collects steps until a row is written."""
 
-    def __init__(self) -> None:
-        self._reports: list[StepReport] = []
+    def __init__(self, reports: list[StepReport]) -> None:
+        """Begin with steps before this call, whose losses count and whose time does not.
+
+        Args:
+            reports: of those; is kept up to date.
+        """
+        self._reports = reports
         self._began = time.monotonic()
         self._views = 0
         self._waited_s = 0.0

@@ -27,7 +27,8 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, assets_of
 from pipeline.objects.generated import BENCHMARK
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.compose import compose_scene
 from storage.conventions import log10_radiance

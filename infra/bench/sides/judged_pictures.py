@@ -22,7 +22,8 @@ from pipeline.builds.training import smoke
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import Curve, clamped_radiance, secant_slope
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import PASS_SPP, RenderSettings
 from storage.conventions import log10_radiance
 from storage.errors import Rejected

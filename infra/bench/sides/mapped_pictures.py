@@ -17,7 +17,8 @@ from infra.bench.subjects.named_scenes import first_composed
 from pipeline.builds.training import smoke
 from pipeline.renders.camera import Camera
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import PASS_SPP, RenderSettings
 from pipeline.renders.sky_share import sky_share
 from scene_templates.skies.settings import SkySettings

@@ -1,10 +1,12 @@
-"""Trainings of equal core-seconds: the schedule runs by the processor's clock, not by steps.
+"""Short trainings beside each other: of equal core-seconds, or of equal steps.
 
-So a network that is cheaper a step takes more of them, and each is warmed up and cooled down alike.
+Of equal core-seconds the schedule runs by the processor's clock, not by steps. So a network that is
+cheaper a step takes more of them, and each is warmed up and cooled down alike.
 """
 
 import dataclasses
 import time
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -47,11 +49,14 @@ class Course:
     """What was seen and what was judged on, for the result's notes."""
 
     @classmethod
-    def of(cls, data: str, held_out: int) -> "Course":
-        """Return that of a dataset, judged on the first scenes of its validation split."""
+    def of(cls, data: str, held_out: int, resolution: int | None = None) -> "Course":
+        """Return that of a dataset, judged on the first scenes of its validation split.
+
+        Pictures are as wide as those of the run `builtin` unless a width in pixels is given.
+        """
         opened = open_training_data([data])
         samples = list(first_samples(opened.split("validation"), held_out, Unusable(0)))
-        resolution = builtin().resolution
+        resolution = resolution or builtin().resolution
         black = np.zeros((resolution, resolution, 3))
         train = opened.split("train")
         count = sum(train.num_samples(number) for number in range(len(train.names)))
@@ -86,7 +91,25 @@ def train_for(course: Course, model: ModelConfig, *, seed: int, core_s: float) -
     """
     torch.set_num_threads(1)  # core-seconds of waiting threads are not the network's
     settings = _settings(model, seed)
-    network, steps, spent = _trained(course.train, settings, core_s)
+
+    def rate(step: int, spent: float) -> float | None:
+        part = int(_PARTS * spent / core_s)
+        return learning_rate(part, settings) if part < _PARTS else None
+
+    return _judged(course, *_trained(course.train, settings, rate))
+
+
+def train_steps(course: Course, settings: TrainSettings) -> Trained:
+    """Train a network on one thread for as many steps as its run has, and judge it."""
+    torch.set_num_threads(1)
+
+    def rate(step: int, spent: float) -> float | None:
+        return learning_rate(step, settings) if step < settings.num_steps else None
+
+    return _judged(course, *_trained(course.train, settings, rate))
+
+
+def _judged(course: Course, network: RenderFormer, steps: int, spent: float) -> Trained:
     began = time.process_time()
     found = course.judge.judge(network.eval())
     each = (time.process_time() - began) / len(found.views)
@@ -108,8 +131,9 @@ def _settings(model: ModelConfig, seed: int) -> TrainSettings:
 
 
 def _trained(
-    shards: ShardSet, settings: TrainSettings, core_s: float
+    shards: ShardSet, settings: TrainSettings, rate: Callable[[int, float], float | None]
 ) -> tuple[RenderFormer, int, float]:
+    """Return network, steps and core-seconds; `rate` says None after the last step."""
     crew = Crew(device=torch.device("cpu"))
     state = new_state(settings, muon_precision=fitting_precision(crew))
     stepper = Stepper(state, settings, Objective(settings.loss, None), crew)
@@ -129,10 +153,9 @@ def _trained(
         unusable=state.unusable,
     )
     with closing(batches):
-        while spent < core_s:
-            part = int(_PARTS * spent / core_s)
+        while (now := rate(state.step, spent)) is not None:
             buckets = bucket_scenes(next(batches), flops, settings.scenes_per_pass)
-            stepper.step(buckets, learning_rate(part, settings))
+            stepper.step(buckets, now)
             state.step += 1
             spent = time.process_time() - began
     return state.model, state.step, spent

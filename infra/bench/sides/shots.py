@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.denoiser import Quality, denoise
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Chosen, Features, HostSum, Tracer
 from storage.metrics import MAX_DB

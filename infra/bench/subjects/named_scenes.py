@@ -23,7 +23,8 @@ from pipeline.exchange.scene_files import build_scene
 from pipeline.isolation import IsolatedChild
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, assets_of, attempt_scene
 from pipeline.objects.licences import USER_PROVIDED
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
 from pipeline.scenes.compose import compose_scene
 from scene_templates.settings import SceneSettings

@@ -102,6 +102,17 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     assert calls[0] == ("a", "cheap")
 
 
+def test_where_points_stand_alone_only_what_a_turn_lacks_is_measured_again(tmp_path: Path) -> None:
+    one = dataclasses.replace(experiment("a", "killed", "c"), by_point=True)
+    with pytest.raises(KeyboardInterrupt):
+        measured(tmp_path, one)
+    assert calls[-1] == ("killed", "waste")
+    calls.clear()
+    with pytest.raises(KeyboardInterrupt):
+        measured(tmp_path, one)
+    assert calls == [("killed", "waste")]
+
+
 @settings(max_examples=30, deadline=None)  # each writes a dozen lines to the disk
 @given(cut=st.integers(0, 900))
 def test_whatever_is_left_of_a_file_can_be_gone_on_with(
@@ -186,6 +197,26 @@ def test_a_figure_of_kinds_shows_every_cost(tmp_path: Path) -> None:
     with Image.open(tmp_path / "made-up-quick.png") as picture:
         red = np.asarray(picture.convert("RGB")).astype(int)
         assert picture.width > 800 and (red[..., 0] - red[..., 2] > 100).sum() > 50
+
+
+def test_a_figure_of_lines_has_a_panel_for_every_column_that_was_measured(tmp_path: Path) -> None:
+    def shape(*figures: str) -> tuple[int, int]:
+        one = dataclasses.replace(
+            experiment("a", "c"),
+            columns=tuple(Column(name=f"of {figure}", figure=figure) for figure in figures),
+            line_of=lambda point: (
+                "others" if point.name == "waste" else "line",
+                1.0 + len(point.name),
+            ),
+        )
+        measured(tmp_path, one)
+        with Image.open(tmp_path / "made-up-quick.png") as picture:
+            colours = set(picture.convert("RGB").get_flattened_data())
+            assert {(31, 119, 180), (255, 127, 14)} <= colours  # both lines
+            return picture.size
+
+    (one, high), (two, same) = shape("db", "absent"), shape("db", "core_s")
+    assert high == same and 1.6 * one < two < 2 * one
 
 
 def test_points_of_what_is_asked_for_come_first_and_names_are_of_one_thing(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
+from train.loop.interrupts import SAVED_STATUS
 from train.watching.rows import read_rows
 
 TRILIGHT = [sys.executable, "-m", "trilight"]
@@ -108,7 +109,7 @@ def _stopped_after(arguments: list[str], out: Path, step: int) -> tuple[str, str
         time.sleep(0.05)
     started.send_signal(signal.SIGINT)
     words, mistake = started.communicate()
-    assert started.returncode == 1, mistake
+    assert started.returncode == SAVED_STATUS, mistake
     return words, mistake
 
 

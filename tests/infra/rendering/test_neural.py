@@ -22,7 +22,7 @@ from tests.command_line import trilight
 from tests.infra.rendering.render_kit import SMALL, mistake, render, write_network
 from tests.model.test_neural_renderer import many_lights
 from tests.scenes_by_hand import tiny_sample, tiny_scene
-from train.evaluation.sheet import error_picture
+from train.evaluation.error_colours import error_picture
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from pipeline.builds.named import named_build
 from pipeline.making import render_sample as module
 from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
-from pipeline.renders.renderer import RenderedView, Sampling
+from pipeline.renders.results import RenderedView, Sampling
 from pipeline.renders.variant import activate, choose_variant
 from pipeline.scenes.compose import compose_scene
 from storage.errors import Rejected

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.making import view_progress
 from pipeline.making.view_progress import ViewProgress
-from pipeline.renders.renderer import RenderedView, Sampling
+from pipeline.renders.results import RenderedView, Sampling
 from storage.dataset.layout import DatasetFolder
 
 DONE: Any = object()

@@ -8,7 +8,8 @@ import pytest
 
 from pipeline.renders.kernel_textures import KernelTextures
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
 from storage.errors import Rejected, TrilightError
 from storage.records.environment import Environment

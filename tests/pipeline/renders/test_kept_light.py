@@ -17,7 +17,8 @@ from pipeline.renders.kept_light import (
 )
 from pipeline.renders.load_tracer import load_tracer
 from pipeline.renders.noise_floor import Half, measure_floor
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tiles import TileChoice

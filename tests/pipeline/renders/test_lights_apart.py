@@ -12,7 +12,8 @@ from pipeline.making.view_progress import ViewProgress
 from pipeline.renders.denoiser import denoise
 from pipeline.renders.kept_light import with_mean_of
 from pipeline.renders.load_tracer import load_tracer
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.samples import HalfSamples
 from pipeline.renders.settings import RenderSettings
 from storage.dataset.manifest import Manifest

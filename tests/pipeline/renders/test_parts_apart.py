@@ -9,7 +9,8 @@ from pipeline.builds.named import named_build
 from pipeline.making.path_tracer import PathTracer
 from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.view_progress import ViewProgress
-from pipeline.renders.renderer import RenderedView, SceneRenderer
+from pipeline.renders.renderer import SceneRenderer
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant
 from storage.dataset.manifest import Manifest

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.renders import renderer as renderer_module
 from pipeline.renders.denoiser import Quality
-from pipeline.renders.renderer import RenderedView, SceneRenderer, set_threads
+from pipeline.renders.renderer import SceneRenderer, set_threads
+from pipeline.renders.results import RenderedView
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.tracer import Features
 from storage.conventions import look_at_c2w

@@ -12,15 +12,14 @@ from storage.records.scene import Scene
 from storage.seeds import rng_for
 from tests.train.toy import toy_sample, toy_scene
 from train.data.scenes import training_scene
+from train.evaluation.error_colours import ERROR_WHITE, error_picture
 from train.evaluation.judge import hit_masks
 from train.evaluation.rivals import median_picture
 from train.evaluation.scores import ViewScore, lead, score_view, share_better, summarise
 from train.evaluation.sheet import (
-    ERROR_WHITE,
     NOISE_WHITE,
     SheetView,
     drawn_sheet,
-    error_picture,
     noise_picture,
     write_picture,
 )

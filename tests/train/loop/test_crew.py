@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from storage.errors import TrilightError
-from train.loop.crew import choose_device, join_crew
+from train.loop.crew import Crew, choose_device, join_crew
 
 
 def test_without_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -15,6 +15,22 @@ def test_without_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch) ->
         assert crew.any(True) and not crew.any(False)
         assert crew.gather_text("å") == ["å"]
         assert (crew.share.rank, crew.share.world_size) == (0, 1)
+
+
+@pytest.mark.parametrize(("local_rank", "order"), [(0, "made waited"), (1, "waited made")])
+def test_the_first_process_of_each_machine_makes_a_thing_before_the_others(
+    monkeypatch: pytest.MonkeyPatch, local_rank: int, order: str
+) -> None:
+    done: list[str] = []
+
+    def made() -> int:
+        done.append("made")
+        return 7
+
+    monkeypatch.setattr(Crew, "any", lambda *_: done.append("waited"))
+    crew = Crew(device=torch.device("cpu"), rank=8, world_size=16, local_rank=local_rank)
+    assert crew.once_a_machine(made) == 7
+    assert done == order.split()
 
 
 def test_a_device_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

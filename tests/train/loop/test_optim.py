@@ -6,7 +6,9 @@ import math
 import pytest
 import torch
 
+from model.base_widths import BaseWidths
 from model.renderformer import RenderFormer
+from model.width_scales import width_scales
 from tests.train.kit import tiny_run
 from train.loop.optim import Updater
 from train.loop.state import new_state
@@ -17,6 +19,9 @@ each_kind = pytest.mark.parametrize(
     ("muon_rate", "precision"), [(0.0, "bfloat16"), (3.0, "bfloat16"), (3.0, "float32")]
 )
 """AdamW alone, and with Muon on each kind of processor."""
+
+BASE = BaseWidths(width=18, head_width=18)
+"""Half as wide as the network here."""
 
 
 def with_gradients(seed: int = 0) -> RenderFormer:
@@ -124,3 +129,27 @@ def test_what_is_remembered_can_be_taken_over(muon_rate: float, precision: Preci
         own.step(RATE)
     for ours, theirs in zip(model.parameters(), twin.parameters(), strict=True):
         assert torch.equal(ours, theirs)
+
+
+@each_kind
+def test_steps_and_not_decay_follow_the_width(muon_rate: float, precision: Precision) -> None:
+    """The same step times the factor of each weight; what it forgets is the same share."""
+
+    def steps(base: BaseWidths, decay: float) -> dict[str, torch.Tensor]:
+        model = with_gradients()
+        run = tiny_run(muon_rate=muon_rate, weight_decay=decay, base_widths=base)
+        return moved(model, Updater(model, run, precision))
+
+    plain, scaled = steps(BaseWidths(), 0.0), steps(BASE, 0.0)
+    decayed = {name: step - scaled[name] for name, step in steps(BASE, 0.5).items()}
+    model = with_gradients()
+    scales, weights = width_scales(model, BASE), dict(model.named_parameters())
+    factors = set()
+    for name, step in scaled.items():
+        with_muon = muon_rate and step.ndim == 2
+        factor = scales[name].muon if with_muon else scales[name].adamw
+        factors.add(round(factor, 6))
+        torch.testing.assert_close(step, factor * plain[name], rtol=1e-3, atol=1e-7)
+        forgotten = -0.5 * RATE * (muon_rate if with_muon else 1) * weights[name].detach()
+        torch.testing.assert_close(decayed[name], forgotten, rtol=1e-2, atol=1e-6)
+    assert len(factors) > 1

@@ -1,11 +1,14 @@
 """One process, several, and passes added up: the same training. With real processes of torchrun."""
 
+import contextlib
+import functools
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +16,9 @@ import pytest
 from safetensors.numpy import load_file
 
 from storage.dataset.dataset import Dataset
+from storage.seeds import rng_for
 from tests.conftest import ROOT
+from tests.infra.slurm.fake_slurm import commands_in
 from tests.train.toy import write_toy_dataset
 from train.loop.checkpoints import saved_steps
 from train.watching.rows import read_rows
@@ -37,6 +42,9 @@ SMALL = {
 }
 """In this order, since each change must fit to those before it."""
 
+CURVE = ("step", "loss", "l1", "grad_norm", "learning_rate", "validation", "layers", "spike")
+"""What a row of the log says of the training itself."""
+
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
@@ -53,6 +61,17 @@ def command(dataset: Dataset, out: Path, processes: int, *rest: str, **changes: 
         return [sys.executable, *run]
     launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
     return [sys.executable, *launcher, *run]
+
+
+def children(pid: int) -> list[int]:
+    """Return the processes that a process started."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it ended meanwhile
+            state, parent = stat.read_text().rpartition(")")[2].split()[:2]
+            if int(parent) == pid and state != "Z":
+                found.append(int(stat.parent.name))
+    return found
 
 
 def environment() -> dict[str, str]:
@@ -100,6 +119,12 @@ def same_to_rounding(ours: Path, theirs: Path) -> None:
     np.testing.assert_allclose(first, second, rtol=1e-4)
 
 
+def curve(out: Path) -> list[dict]:
+    """Return the log without what clocks and memory say."""
+    rows = read_rows(out / "metrics.jsonl")
+    return [{name: row[name] for name in CURVE if name in row} for row in rows]
+
+
 @pytest.mark.parametrize("processes", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_several_processes_train_as_one(
     dataset: Dataset, alone: Path, tmp_path: Path, processes: int
@@ -118,37 +143,108 @@ def test_passes_that_add_up_train_as_one_batch(
     same_to_rounding(run(dataset, tmp_path / "passes", 1, scenes_per_pass=1), alone)
 
 
+LONGER = {"num_steps": 60, "validate_every": 20, "checkpoint_every": 20, "muon_rate": 3.0}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(
+    dataset: Dataset, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[int], Path]:
+    """Return what makes a longer run of so many processes that nobody disturbs, once."""
+    return functools.cache(
+        lambda processes: run(dataset, tmp_path_factory.mktemp("whole"), processes, **LONGER)
+    )
+
+
+def same_to_the_bit(out: Path, whole: Path) -> None:
+    names = ("model.safetensors", "checkpoints/step-000000060.safetensors", "validation_sheet.png")
+    for name in names:
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    assert curve(out) == curve(whole)
+
+
+def started(words: list, **variables: str) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        words,
+        cwd=ROOT,
+        env=environment() | variables,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for_step(out: Path, step: int, process: "subprocess.Popen[str]") -> None:
+    while not any(row["step"] >= step for row in read_rows(out / "metrics.jsonl")):
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.01)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("processes", [2, 3])
 def test_several_processes_that_are_stopped_go_on_to_the_bit(
-    dataset: Dataset, tmp_path: Path, processes: int
+    dataset: Dataset, undisturbed: Callable[[int], Path], tmp_path: Path
 ) -> None:
     """SIGTERM to torchrun, as a scheduler sends it; resumed with as many processes.
 
     Three, because the sum of two numbers has but one order.
     """
-    longer = {"num_steps": 60, "validate_every": 60, "checkpoint_every": 60, "muon_rate": 3.0}
-    out, whole = tmp_path / "stopped", tmp_path / "whole"
-    started = subprocess.Popen(
-        command(dataset, out, processes, **longer),
-        cwd=ROOT,
-        env=environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    while started.poll() is None and not read_rows(out / "metrics.jsonl"):
-        time.sleep(0.05)
-    started.send_signal(signal.SIGTERM)
-    _, errors = started.communicate()
-    assert started.returncode != 0
-    (stopped,) = saved_steps(out / "checkpoints")
+    out, processes = tmp_path / "stopped", 3
+    torchrun = started(command(dataset, out, processes, **LONGER))
+    wait_for_step(out, 1, torchrun)
+    torchrun.send_signal(signal.SIGTERM)
+    _, errors = torchrun.communicate()
+    assert torchrun.returncode != 0
+    stopped = saved_steps(out / "checkpoints")[-1]
     assert 0 < stopped < 60
     assert f"stopped at step {stopped} by a signal" in errors
-    run(dataset, out, processes, "--resume", **longer)
-    run(dataset, whole, processes, **longer)
-    for name in ("model.safetensors", "checkpoints/step-000000060.safetensors"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    run(dataset, out, processes, "--resume", **LONGER)
+    same_to_the_bit(out, undisturbed(processes))
+
+
+@pytest.mark.slow
+def test_processes_that_are_killed_at_random_are_restarted_to_the_bit(
+    dataset: Dataset, undisturbed: Callable[[int], Path], tmp_path: Path
+) -> None:
+    """kill -9 of one of two, at any time."""
+    seed = int.from_bytes(os.urandom(4), "little")
+    rng, out = rng_for(seed, "kill"), tmp_path / "killed"
+    sys.stdout.write(f"seed {seed}\n")  # shown where the test fails
+    words = command(dataset, out, 2, **LONGER)
+    words.insert(words.index("--standalone"), "--max-restarts=1")
+    torchrun = started(words, TORCH_DISABLE_SHARE_RDZV_TCP_STORE="1")  # as in train.sbatch
+    wait_for_step(out, int(rng.integers(1, 59)), torchrun)
+    os.kill(children(torchrun.pid)[rng.integers(2)], signal.SIGKILL)
+    _, errors = torchrun.communicate()
+    assert torchrun.returncode == 0, errors
+    same_to_the_bit(out, undisturbed(2))
+    texts = [row["text"] for row in read_rows(out / "notes.jsonl")]
+    assert len([text for text in texts if text.endswith("2 processes")]) == 2
+
+
+@pytest.mark.slow
+def test_a_job_of_slurm_whose_time_is_up_goes_on_to_the_bit(
+    dataset: Dataset, undisturbed: Callable[[int], Path], tmp_path: Path
+) -> None:
+    """The job file itself, on two nodes with one process each that are not there (fake_slurm)."""
+    (place := tmp_path / "slurm").mkdir()
+    place_of_run = ["--out", str(tmp_path / "job")]
+    words = [word for word in command(dataset, tmp_path / "job", 1, **LONGER)[4:]
+             if word not in place_of_run]  # fmt: skip
+    options = ["--nodes=2", "--gpus-per-node=1", "--cpus-per-task=1"]
+    script = ROOT / "infra/slurm/train.sbatch"
+    job = started(
+        [commands_in(place) / "sbatch", *options, script, *words],
+        PATH=f"{place}:{os.environ['PATH']}",
+        FAKE_SLURM=str(place),
+        PYTHON=sys.executable,
+        OUT=str(tmp_path / "job"),
+    )
+    wait_for_step(tmp_path / "job", 1, job)
+    (place / "time-is-up").touch()
+    _, errors = job.communicate()
+    assert job.returncode == 0, errors
+    assert "by a signal, nothing is lost" in errors
+    same_to_the_bit(tmp_path / "job", undisturbed(2))
 
 
 @pytest.mark.slow

@@ -1,0 +1,70 @@
+"""`trilight view`: a page on this machine to look at a scene, a dataset or a training run."""
+
+import os
+import signal
+import sys
+import threading
+import webbrowser
+from typing import Annotated
+
+from infra.cli.console import console, first_words, look_at
+from infra.cli.options import command
+from infra.torch_library import require_torch
+from storage.remote.safe_url import safe_url
+from storage.settings.described import checked
+from storage.settings.ranges import Within
+
+
+@checked()
+class Viewed:
+    """What to look at, and where the page is."""
+
+    source: str
+    """A scene in any form that render reads, a dataset (folder or URL), or the folder of a training
+    run."""
+    checkpoint: str | None = None
+    """A network to show beside the two that come with Trilight, in any form that render takes; by
+    default only these."""
+    port: Annotated[int, Within(0, 65_535)] = 0
+    """Port of this machine at which the page is served; 0 finds a free one."""
+    threads: Annotated[int | None, Within(1, 1024, unit="threads")] = None
+    """Number of CPU threads of the path tracer; by default one for each core."""
+    no_browser: bool = False
+    """Print the address only, and open no browser."""
+
+
+@command("source")
+def view(asked: Viewed) -> None:
+    first_words(f"Opening {safe_url(asked.source)}")
+    from infra.viewer.later import LaterRoom, page_of
+    from infra.viewer.server import PageServer
+
+    if asked.checkpoint is not None:
+        require_torch("--checkpoint")
+    later = LaterRoom(page_of(asked.source))
+    server = PageServer(later.gets, later.posts, port=asked.port)
+    stopped = threading.Event()
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    look_at(f"Look at {server.address}")
+    console.print("Only this machine reaches it, with this address. Ctrl-C ends it.", style="dim")
+    if not asked.no_browser and _has_screen():
+        webbrowser.open(server.address)
+    from infra.viewer.open_source import opened_room  # slow: formats, renderers
+
+    room = opened_room(asked.source, checkpoint=asked.checkpoint, threads=asked.threads)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
+    later.opened.set_result(room)
+    while not stopped.wait(3600):
+        pass
+    room.close()
+    server.shutdown()
+    server.server_close()
+    console.print("Ended.", style="dim")
+
+
+def _has_screen() -> bool:
+    """Return whether a browser would open a window: others take over the terminal."""
+    screens = ("DISPLAY", "WAYLAND_DISPLAY")
+    return sys.platform != "linux" or any(os.environ.get(name) for name in screens)

@@ -1,0 +1,165 @@
+"""What the page of a dataset may ask: rows, small pictures, and any scene as a page of its own."""
+
+import dataclasses
+import re
+import threading
+from collections import OrderedDict
+from pathlib import Path
+
+from infra.viewer.dataset_filter import SceneFilter, filter_of
+from infra.viewer.dataset_index import DatasetIndex, SceneRow
+from infra.viewer.painters import TargetPainter, painters_of
+from infra.viewer.scene_room import SceneRoom
+from infra.viewer.server import Answer, NotThere, Question, Route, json_answer, routed
+from infra.viewer.static_files import static_routes
+from pipeline.documents.png import encode_png
+from pipeline.documents.scene_page import preview
+from pipeline.making.progressive_tracer import ProgressiveTracer
+from storage.dataset.dataset import Dataset, LocalFiles, reading
+from storage.errors import TrilightError
+from storage.records.exr import decode_exr
+from storage.remote.safe_url import safe_url
+
+MOST_ROWS = 200
+"""Scenes of one answer."""
+
+_MOST_THUMBNAILS = 1000
+_WIDEST = 1024
+_MOST_OPEN = 3
+"""Scenes whose pages are open."""
+_SCENE = re.compile(r"scene/([0-9A-Za-z_\-]+)/(.*)", re.DOTALL)
+
+
+class DatasetRoom:
+    """A dataset, and the scenes of it that are open."""
+
+    def __init__(
+        self, dataset: Dataset, source: str, tracer: ProgressiveTracer, checkpoint: str | None
+    ) -> None:
+        """Begin to read the index.
+
+        Args:
+            dataset: that was opened.
+            source: as the user named it.
+            tracer, checkpoint: for the pages of its scenes.
+        """
+        self._dataset, self._source = dataset, source
+        self._tracer, self._checkpoint = tracer, checkpoint
+        self._thumbnails = OrderedDict[tuple[str, int, int], bytes]()
+        self._opening = threading.Lock()
+        self._open = OrderedDict[str, SceneRoom]()
+        self.index = DatasetIndex(dataset)
+        self.index.begin()
+
+    def gets(self) -> dict[str, Route]:
+        """Return what is asked by GET."""
+        return {
+            "api/dataset": self._facts,
+            "api/rows": self._rows,
+            "api/thumbnail/": self._thumbnail,
+            "scene/": lambda question: self._below(question, by_post=False),
+        }
+
+    def posts(self) -> dict[str, Route]:
+        """Return what is asked by POST."""
+        return {"scene/": lambda question: self._below(question, by_post=True)}
+
+    def close(self) -> None:
+        """End what is being read or made."""
+        self.index.close()
+        for room in self._open.values():
+            room.close()
+        self._tracer.close()
+
+    def _facts(self, _: Question) -> Answer:
+        manifest, rows = self._dataset.manifest, self.index.rows
+        return json_answer(
+            {
+                "name": safe_url(self._source),
+                "build": manifest.build,
+                "scenes": manifest.num_samples,
+                "indexed": len(rows),
+                "shards": len(manifest.shards),
+                "shards_read": self.index.shards_read,
+                "splits": sorted({row.split for row in rows}),
+                "templates": sorted({row.template for row in rows}),
+                "problems": self.index.problems[:5],
+            }
+        )
+
+    def _rows(self, question: Question) -> Answer:
+        query, every = question.query, self.index.rows
+        chosen = filter_of(query)
+        shown = chosen.rows(every)
+        first = int(query["from"]) if query.get("from", "").isdecimal() else 0
+        page = shown[first : first + MOST_ROWS]
+        return json_answer(
+            {
+                "of": len(every),
+                "total": len(shown),
+                "rows": [dataclasses.asdict(row) for row in page],
+                "command": self._command(chosen),
+            }
+        )
+
+    def _command(self, chosen: SceneFilter) -> str:
+        if not isinstance(self._dataset.files, LocalFiles):
+            return ""
+        root = Path(self._source)
+        return chosen.command(root, root.with_name(f"{root.resolve().name}-selected"))
+
+    def _thumbnail(self, question: Question) -> Answer:
+        key, _, view = question.path.removeprefix("api/thumbnail/").partition("/")
+        row, width = self.index.row(key), question.query.get("px", "160")
+        if not view.isdecimal() or int(view) >= row.views:
+            raise NotThere("the scene has no such view.")
+        if not width.isdecimal() or not 16 <= int(width) <= _WIDEST:
+            raise TrilightError(f"px is {width:.10}; expected 16 to {_WIDEST}.")
+        wanted = (key, int(view), int(width))
+        png = self._thumbnails.get(wanted)
+        if png is None:
+            png = self._thumbnails[wanted] = self._small_picture(row, int(view), int(width))
+            while len(self._thumbnails) > _MOST_THUMBNAILS:
+                self._thumbnails.popitem(last=False)
+        return Answer(body=png, kind="image/png")
+
+    def _small_picture(self, row: SceneRow, view: int, width: int) -> bytes:
+        shard = self._dataset.manifest.shards[row.shard]
+        with (
+            self._dataset.files.open(shard, checked=False) as stream,
+            reading(self._dataset.shown, shard.name),
+        ):
+            offset, num_bytes = shard.index[row.key][f"{view}.exr"]
+            stream.seek(offset)
+            radiance_rgb = decode_exr(stream.read(num_bytes))
+        return encode_png(preview(radiance_rgb, width))
+
+    def _below(self, question: Question, *, by_post: bool) -> Answer:
+        found = _SCENE.fullmatch(question.path)
+        if found is None:
+            raise NotThere("there is no such scene.")
+        room = self._room(found[1])
+        routes = room.posts() if by_post else {**static_routes("scene.html"), **room.gets()}
+        return routed(routes, dataclasses.replace(question, path=found[2]))
+
+    def _room(self, key: str) -> SceneRoom:
+        with self._opening:
+            room = self._open.pop(key, None) or self._opened(key)
+            self._open[key] = room
+            while len(self._open) > _MOST_OPEN:
+                self._open.popitem(last=False)[1].close()
+            return room
+
+    def _opened(self, key: str) -> SceneRoom:
+        row = self.index.row(key)
+        shard = self._dataset.manifest.shards[row.shard]
+        (sample,) = self._dataset.read_samples(shard, [key])
+        floors = [view.noise_floor_db for view in sample.views]
+        target = TargetPainter(sample.radiance_rgb, floors)
+        return SceneRoom(
+            name=f"scene {key}, {row.split}",
+            scene=sample.scene,
+            notes=(),
+            painters=painters_of(self._tracer, target, self._checkpoint),
+            target_px=target.width_px,
+        )

@@ -1,0 +1,44 @@
+// Questions to the server that this page came from, and what it says of mistakes.
+
+export async function ask(path, body) {
+  const options = body === undefined ? {} : {
+    method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
+  };
+  let answer;
+  try {
+    answer = await fetch(path, options);
+  } catch {
+    throw new Error("The server does not answer: has `trilight view` ended?");
+  }
+  if (!answer.ok) throw new Error(await sentence(answer));
+  return answer;
+}
+
+export async function askJson(path, body) {
+  return (await ask(path, body)).json();
+}
+
+async function sentence(answer) {
+  try {
+    return (await answer.json()).error;
+  } catch {
+    return `The server answered ${answer.status}.`;
+  }
+}
+
+export function say(error) {
+  const place = document.getElementById("mistake");
+  place.textContent = error ? String(error.message || error) : "";
+  place.hidden = !error;
+}
+
+export function element(tag, attributes = {}, ...content) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name in made && name !== "list") made[name] = value; else made.setAttribute(name, value);
+  }
+  made.append(...content);
+  return made;
+}
+
+export const sleep = (ms) => new Promise((done) => setTimeout(done, ms));

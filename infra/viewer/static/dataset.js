@@ -1,0 +1,128 @@
+// The page of a dataset: any number of scenes, of which only those in sight are fetched.
+
+import { askJson, element, say, sleep } from "./ask.js";
+
+const byId = (name) => document.getElementById(name);
+const form = byId("filters");
+const LOOK_AGAIN_MS = 700;
+let rows = [];
+let generation = 0;
+
+function query(first) {
+  const asked = new URLSearchParams({ from: first });
+  for (const [name, value] of new FormData(form)) if (value !== "") asked.set(name, value);
+  return asked.toString();
+}
+
+async function show(first) {
+  const mine = first ? generation : ++generation;
+  try {
+    const found = await askJson(`api/rows?${query(first)}`);
+    if (mine !== generation) return;
+    if (!first) {
+      rows = [];
+      byId("scenes").replaceChildren();
+    }
+    rows.push(...found.rows);
+    byId("scenes").append(...found.rows.map(card));
+    byId("count").textContent = `${found.total.toLocaleString("en")} of ${
+      found.of.toLocaleString("en")} scenes${rows.length < found.total
+      ? `, the first ${rows.length} shown` : ""}`;
+    byId("more").hidden = rows.length >= found.total;
+    byId("command-part").hidden = !found.command;
+    byId("command").textContent = found.command;
+    say("");
+  } catch (error) {
+    if (mine === generation) say(error);
+  }
+}
+
+function thumbnail(row, view, px) {
+  return element("img", {
+    src: `api/thumbnail/${row.key}/${view}?px=${px}`, loading: "lazy", decoding: "async",
+    alt: `scene ${row.key}, view ${view}`,
+  });
+}
+
+function card(row) {
+  const made = element("button", { type: "button", className: "card" },
+    element("span", { className: "thumb" }, thumbnail(row, 0, 160)),
+    element("b", {}, row.key), element("small", {}, short(row)));
+  made.addEventListener("click", () => enlarge(rows.indexOf(row)));
+  return made;
+}
+
+const short = (row) => `${row.template}, ${row.split}; ${row.triangles.toLocaleString("en")} tri, ${
+  row.lights} lamp${row.lights === 1 ? "" : "s"}; ${row.floor.toFixed(1)} dB`;
+
+function enlarge(at) {
+  const row = rows[at];
+  if (!row) return;
+  byId("large").dataset.at = at;
+  byId("large-name").textContent = `Scene ${row.key}`;
+  byId("large-open").href = `scene/${row.key}/`;
+  byId("large-facts").textContent = `${short(row)} in its worst view; objects cover at least ${
+    (100 * row.coverage).toFixed(0)} % of a view; at most ${row.spp} samples a pixel.`;
+  byId("large-views").replaceChildren(
+    ...Array.from({ length: row.views }, (_, view) => thumbnail(row, view, 512)));
+  byId("before").disabled = at === 0;
+  byId("after").disabled = at === rows.length - 1;
+  if (!byId("large").open) byId("large").showModal();
+}
+
+const move = (step) => enlarge(Number(byId("large").dataset.at) + step);
+
+async function copy() {
+  const text = byId("command").textContent;
+  try {
+    await navigator.clipboard.writeText(text);
+    byId("copy").textContent = "Copied";
+  } catch {
+    getSelection().selectAllChildren(byId("command"));
+    byId("copy").textContent = "Selected: press Ctrl-C";
+  }
+  setTimeout(() => { byId("copy").textContent = "Copy"; }, 2500);
+}
+
+function fill(name, values) {
+  const select = form.elements[name];
+  const known = new Set([...select.options].map((option) => option.value));
+  for (const value of values) if (!known.has(value)) select.append(new Option(value, value));
+}
+
+// While the index is read, the page grows with it.
+async function watch() {
+  for (let before = -1; ;) {
+    const facts = await askJson("api/dataset");
+    document.title = `${facts.name} – Trilight`;
+    byId("name").textContent = facts.name;
+    fill("split", facts.splits);
+    fill("template", facts.templates);
+    const going = facts.shards_read < facts.shards;
+    byId("facts").textContent = `${facts.build}; ${facts.scenes.toLocaleString("en")} scenes in ${
+      facts.shards} shards${going ? `; reading the index: ${facts.indexed.toLocaleString("en")}` : ""}`;
+    if (facts.problems.length) say(facts.problems.join(" "));
+    if (facts.indexed !== before && (before <= 0 || !going)) await show(0);
+    before = facts.indexed;
+    if (!going) return;
+    await sleep(LOOK_AGAIN_MS);
+  }
+}
+
+let calm;
+form.addEventListener("input", () => {
+  clearTimeout(calm);
+  calm = setTimeout(() => show(0), 200);
+});
+form.addEventListener("submit", (event) => event.preventDefault());
+form.addEventListener("reset", () => setTimeout(() => show(0)));
+byId("more").addEventListener("click", () => show(rows.length));
+byId("copy").addEventListener("click", copy);
+byId("close").addEventListener("click", () => byId("large").close());
+byId("before").addEventListener("click", () => move(-1));
+byId("after").addEventListener("click", () => move(1));
+byId("large").addEventListener("keydown", (event) => {
+  if (event.key === "ArrowLeft") move(-1);
+  if (event.key === "ArrowRight") move(1);
+});
+watch().then(() => document.body.classList.add("ready")).catch(say);

@@ -1,0 +1,79 @@
+"""What a renderer gives: a finished picture, and on the way to it how far it is."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.renders.noise_floor import MeasuredFloor
+from storage.records.parts import Parts
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RenderedView:
+    """One finished picture and how far to trust it."""
+
+    radiance_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance, finite, at least 0, below HALF_FLOAT_MAX; the background is 0."""
+    spp: int
+    """Samples per pixel that were spent, on each light where they are apart: the mean over the
+    pixels that show anything, rounded down."""
+    noise_floor_db: float
+    """Measured error as psnr_log_db."""
+    noise_floor_linear_db: float
+    """Measured error as psnr_linear_db."""
+    object_noise_floor_db: float
+    """Measured error as object_psnr_log_db, over `hits`."""
+    at_cap: bool
+    """Whether sampling ended at max_spp with a floor below its target."""
+    hits: NDArray[np.bool_]
+    """[R, R] whether the ray through the pixel's centre meets geometry (emitters do not count)."""
+    lights_rgb: NDArray[np.float32] | None = None
+    """With `per_light`: [L, R, R, 3] radiance of each emitter object alone, rounded to half floats;
+    `radiance_rgb` is their storage.records.lights.sum_of_lights in every bit."""
+    parts_rgb: Parts | None = None
+    """With `split` or `split_lobes`: [R, R, 3] radiance of each part, rounded to half floats, or
+    [L, R, R, 3] of lights apart. Their storage.records.parts.sum_of_parts is `radiance_rgb`, or
+    `lights_rgb`, in every bit."""
+    part_floors: Mapping[str, MeasuredFloor] | None = None
+    """Measured error of each part, of all lights together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """How far the sampling of a view has come."""
+
+    spp: int
+    """Samples per pixel so far."""
+    expected_spp: int
+    """Samples at which all targets should be reached, or the cap; a guess that improves."""
+    missing_db: float | None
+    """The widest gap to a target when the floors were measured last; None before that."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GrowingPicture(Sampling):
+    """A picture of the samples so far, for whoever watches it become better."""
+
+    radiance_rgb: NDArray[np.float32]
+    """[R, R, 3] linear radiance that half floats can hold."""
+    floor: MeasuredFloor | None
+    """Its measured error; None where too few samples tell."""
+    core_s: float
+    """Core-seconds that a picture as good as this one takes, without the looks before it and
+    without loading the scene."""
+
+
+class UsedTime:
+    """Core-seconds of this process since a view began, less what was left out."""
+
+    def __init__(self) -> None:
+        self._began_s = time.process_time()
+
+    def core_s(self) -> float:
+        return time.process_time() - self._began_s
+
+    def leave_out(self, core_s: float) -> None:
+        self._began_s += core_s

@@ -1,0 +1,257 @@
+"""`trilight view` as a person meets it: by mouse and by keyboard, on a desk and on a phone."""
+
+import contextlib
+import os
+import re
+import shlex
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from storage.records.scene_file import read_scene_file
+from tests.end_to_end.browser_kit import Browser, browser
+from tests.end_to_end.conftest import command
+from tests.infra.run_page.run_by_hand import write_run
+from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
+
+DRAWING = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""WebGL without a graphics card."""
+
+DESKTOP, PHONE = (1280, 900), (390, 844)
+PATIENCE_S = 120.0
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+@contextlib.contextmanager
+def viewed(source: Path) -> Iterator[str]:
+    """Yield the address of a page; its server has to end cleanly at Ctrl-C."""
+    run = subprocess.Popen(
+        command("view", str(source), "--no-browser", "--threads", "1"),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "COLUMNS": "200"},
+    )  # fmt: skip
+    assert run.stdout is not None
+    try:
+        assert run.stdout.readline().startswith("Opening")
+        address = ""
+        while not (found := re.search(r"http://\S+", address)):
+            address = run.stdout.readline()
+        yield found[0]
+        run.send_signal(signal.SIGINT)
+        out, errors = run.communicate(timeout=60)
+        assert (run.returncode, errors) == (0, ""), errors
+        assert out.rstrip().endswith("Ended.")
+    finally:
+        run.kill()
+        run.wait()
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Browser]:
+    with browser(*DRAWING) as found:
+        found.call("Emulation.setFocusEmulationEnabled", enabled=True)
+        yield found
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    root = tmp_path_factory.mktemp("viewed") / "set"
+    scenes = [furnished(["cube"] * (1 + row % 3), ("plane", "wall")[row % 2]) for row in range(6)]
+    samples = [sample(row, scene, noise_floor_db=30.0 + row) for row, scene in enumerate(scenes)]
+    shards = {"train-000000.tar": samples[:4], "test-000001.tar": samples[4:]}
+    write_dataset(root, shards, objects=[locked("cube")])
+    with viewed(root) as found:
+        yield found
+
+
+def opened(page: Browser, url: str, size: tuple[int, int] = DESKTOP, scheme: str = "light") -> None:
+    page.in_colours(scheme)
+    page.show(*size)
+    page.open(url)
+    page.until("document.body?.classList.contains('ready')")
+    assert page.run("document.getElementById('mistake').hidden")
+
+
+def fits(page: Browser) -> bool:
+    return bool(page.run("document.documentElement.scrollWidth <= window.innerWidth"))
+
+
+def told(page: Browser, engine: str) -> dict[str, Any]:
+    found: dict[str, Any] = page.run(f"viewer.pictures.told.get('{engine}')") or {}
+    return found
+
+
+def until_done(page: Browser, engine: str) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while told(page, engine).get("state") not in ("done", "failed"):
+        assert time.monotonic() < deadline, page.run("document.body.innerText")
+        time.sleep(0.1)
+    assert told(page, engine)["state"] == "done", told(page, engine)
+
+
+@pytest.mark.parametrize(("size", "scheme"), [(DESKTOP, "light"), (PHONE, "dark")])
+def test_a_scene_is_turned_and_every_way_to_its_picture_follows(
+    page: Browser, address: str, size: tuple[int, int], scheme: str
+) -> None:
+    opened(page, f"{address}scene/000000002/", size, scheme)
+    assert fits(page)
+    assert page.run("getComputedStyle(document.body).backgroundColor") == (
+        "rgb(255, 255, 255)" if scheme == "light" else "rgb(21, 23, 27)"
+    )
+    until_done(page, "traced")
+    for engine in ("hits", "direct", "target"):
+        until_done(page, engine)
+    assert told(page, "hits")["truth"] == "target"
+    assert told(page, "traced")["floor_db"] > 20 and told(page, "traced")["core_s"] > 0
+    before = page.run("[...viewer.orbit.pose.elements]")
+    page.drag("#stage", 60, 20)
+    after = page.run("[...viewer.orbit.pose.elements]")
+    assert np.abs(np.subtract(before, after)).max() > 0.05
+    assert page.run("document.getElementById('view').value") == ""
+    page.until("viewer.pictures.told.size === 0 || !viewer.pictures.told.has('traced')")
+    until_done(page, "hits")
+    assert page.run("document.getElementById('picture').naturalWidth") == 16
+    assert page.run("viewer.stage.frames.length") > 1
+
+
+def test_the_picture_is_what_the_3d_view_frames(page: Browser, address: str) -> None:
+    """What stands in the middle of the drawing stands in the middle of the pass: the same thing."""
+    opened(page, f"{address}scene/000000000/")
+    seen = page.run(
+        "(() => {const b = viewer.stage.canvas.getBoundingClientRect();"
+        "return [.3, .5, .7].map(x => {const hit = viewer.stage.at(b.x + x * b.width, "
+        "b.y + .6 * b.height); return hit ? hit.object : -1})})()"
+    )
+    page.run("document.getElementById('pass-part').open = true")
+    page.run("document.querySelector('[data-engine=pass-object]').click()")
+    until_done(page, "pass-object")
+    number = told(page, "pass-object")["id"]
+    page.until(f"document.getElementById('picture').src.includes('shown/{number}?')")
+    pixels = page.run(
+        "(() => {const c = document.createElement('canvas');"
+        "const i = document.getElementById('picture');"
+        "c.width = c.height = i.naturalWidth; const g = c.getContext('2d'); g.drawImage(i, 0, 0);"
+        "return [.3, .5, .7].map(x => [...g.getImageData(Math.floor(x * c.width), "
+        "Math.floor(.6 * c.width), 1, 1).data].slice(0, 3))})()"
+    )
+    assert any(row >= 0 for row in seen)
+    for row, pixel in zip(seen, pixels, strict=True):
+        assert (row < 0) == (max(pixel) == 0)
+
+
+def test_a_lamp_and_a_material_are_changed_and_saved(
+    page: Browser, address: str, tmp_path: Path
+) -> None:
+    opened(page, f"{address}scene/000000001/")
+    page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    until_done(page, "traced")
+    bright = told(page, "traced")["id"]
+    page.run("(() => {const g = document.getElementById('gain'); g.value = -3;"
+             "g.dispatchEvent(new Event('input'))})()")  # fmt: skip
+    page.run("(() => {const r = document.getElementById('roughness'); r.value = 0.25;"
+             "r.dispatchEvent(new Event('input'))})()")  # fmt: skip
+    assert "1 of the lamps, 1 of the materials" in page.run("document.body.innerText")
+    page.until(f"(viewer.pictures.told.get('traced') || {{id: '{bright}'}}).id !== '{bright}'")
+    until_done(page, "traced")
+    page.until("viewer.pictures.told.get('target')")
+    assert "without your changes" in told(page, "target")["error"]
+    page.run("document.getElementById('form').value = '.safetensors'")
+    page.run("document.getElementById('export').click()")
+    page.until("document.getElementById('exported').textContent.startsWith('Saved')")
+    deadline = time.monotonic() + PATIENCE_S
+    while not (tmp_path / "scene.safetensors").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    saved = read_scene_file(tmp_path / "scene.safetensors")
+    assert saved.materials[1, 7:10].tolist() == [12.5, 12.5, 12.5]
+    assert saved.materials[0, 6] == pytest.approx(0.25)
+
+
+def test_by_keyboard_alone(page: Browser, address: str) -> None:
+    opened(page, f"{address}scene/000000000/")
+    page.tab_to("#stage")
+    before = page.run("[...viewer.orbit.pose.elements]")
+    page.press("ArrowRight")
+    page.press("+")
+    assert page.run("[...viewer.orbit.pose.elements]") != before
+    page.tab_to("#ways .card")
+    chosen = page.run("viewer.pictures.engine")
+    page.press("ArrowRight")
+    now = page.run("viewer.pictures.engine")
+    assert now != chosen
+    assert page.run("document.activeElement.dataset.engine") == now
+    assert page.run("document.activeElement.getAttribute('aria-checked')") == "true"
+    outline = page.run("getComputedStyle(document.activeElement).outlineStyle")
+    assert outline != "none"
+    page.tab_to("#ev")
+    page.press("ArrowRight")
+    assert page.run("document.getElementById('ev-shown').textContent") == "0.25 stops"
+    page.tab_to("#export")
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_a_dataset_is_filtered_enlarged_and_opened(
+    page: Browser, address: str, size: tuple[int, int]
+) -> None:
+    opened(page, address, size, "dark")
+    assert fits(page)
+    page.until("document.querySelectorAll('#scenes .card').length === 6")
+    page.run("(() => {const s = document.querySelector('[name=template]'); s.value = 'wall';"
+             "s.dispatchEvent(new Event('input', {bubbles: true}))})()")  # fmt: skip
+    page.tab_to("[name=floor_min]")
+    page.write("33")
+    page.until("document.querySelectorAll('#scenes .card').length === 2")
+    words = shlex.split(page.run("document.getElementById('command').textContent"))
+    assert words[:3] == ["trilight", "shards", "select"]
+    assert "min(noise_floor_db) >= 33" in words and "wall" in words
+    page.tab_to("#scenes .card")
+    page.press("Enter")
+    page.until("document.getElementById('large').open")
+    page.until("[...document.querySelectorAll('#large-views img')].every(i => i.naturalWidth > 0)")
+    name = page.run("document.getElementById('large-name').textContent")
+    page.press("ArrowRight")
+    assert page.run("document.getElementById('large-name').textContent") != name
+    assert fits(page)
+    page.run("document.getElementById('large-open').click()")
+    page.until("document.body?.classList.contains('scene')")
+    page.until("document.body?.classList.contains('ready')")
+    assert page.run("document.getElementById('name').textContent").startswith("scene 00000000")
+
+
+def test_a_run_shows_its_pictures_over_steps(page: Browser, tmp_path: Path) -> None:
+    write_run(tmp_path / "run")
+    pictures = tmp_path / "run" / "pictures"
+    (pictures / "step-000000008.png").write_bytes((pictures / "target.png").read_bytes())
+    with viewed(tmp_path / "run") as address:
+        opened(page, address, PHONE)
+        assert fits(page)
+        assert page.run("document.getElementById('caption').textContent") == "step 8"
+        page.tab_to("#step")
+        page.press("ArrowLeft")
+        assert page.run("document.getElementById('caption').textContent") == "step 4"
+        page.until("document.getElementById('picture').naturalWidth === 4")
+        assert page.run("document.querySelectorAll('#curves path').length") == 3
+
+
+def test_a_page_of_another_origin_reads_nothing(
+    page: Browser, address: str, tmp_path: Path
+) -> None:
+    """Even one that knows the whole address."""
+    page.serve("http://evil.example/", "<!doctype html><title>evil</title>")
+    page.open("http://evil.example/")
+    reads = page.run(f"fetch('{address}api/dataset').then(a => a.text(), () => 'refused')")
+    opaque = page.run(
+        f"fetch('{address}api/dataset', {{mode: 'no-cors'}}).then(a => a.type, () => 'refused')"
+    )
+    image = page.run(
+        "new Promise(done => {const i = new Image(); i.onload = () => done('shown');"
+        f"i.onerror = () => done('refused'); i.src = '{address}api/thumbnail/000000000/0'}})"
+    )
+    assert reads == "refused" and image == "refused" and opaque in ("refused", "opaque")

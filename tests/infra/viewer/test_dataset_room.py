@@ -1,0 +1,148 @@
+"""A dataset in the page: its rows, small pictures, and a command that selects what is shown."""
+
+import io
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from infra.viewer.dataset_filter import filter_of
+from infra.viewer.dataset_room import DatasetRoom
+from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.renders.variant import Variant
+from pipeline.shards.finished import FinishedDataset
+from pipeline.shards.listing import listed_scenes
+from pipeline.shards.plans import Selection
+from storage.conventions import preview_srgb8
+from storage.dataset.dataset import Dataset
+from storage.errors import TrilightError
+from storage.records.sample import Sample
+from tests.infra.viewer.served_kit import Asker, served
+from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
+
+CUBE, BALL = locked("cube"), locked("ball")
+
+
+def samples() -> dict[str, list[Sample]]:
+    scenes = [furnished(["cube"] * (1 + row % 3), ("plane", "wall")[row % 2]) for row in range(8)]
+    made = [
+        sample(row, scene, noise_floor_db=30.0 + row, coverage=0.1 * row, spp=64 + row)
+        for row, scene in enumerate(scenes)
+    ]
+    return {"train-000000.tar": made[:5], "validation-000001.tar": made[5:]}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    root = tmp_path_factory.mktemp("sets") / "a set"
+    return write_dataset(root, samples(), objects=[CUBE, BALL])
+
+
+@pytest.fixture(scope="module")
+def asker(dataset: Dataset) -> Iterator[Asker]:
+    tracer = ProgressiveTracer(
+        variant=Variant(name="scalar_rgb", libllvm="", note=""), threads=1
+    )  # nothing is traced here
+    room = DatasetRoom(dataset, str(dataset.folder.root), tracer, None)
+    room.index.wait()
+    with served(room, "dataset.html") as found:
+        yield found
+
+
+FILTERS = [
+    {},
+    {"split": "train"},
+    {"template": "wall"},
+    {"split": "validation", "template": "wall"},
+    {"triangles_min": "6"},
+    {"triangles_min": "6", "triangles_max": "8"},
+    {"lights_max": "0"},
+    {"floor_min": "33"},
+    {"floor_min": "31.5", "floor_max": "35"},
+    {"coverage_min": "0.3", "coverage_max": "0.7"},
+    {"coverage_min": "0.7"},
+]
+
+
+@pytest.mark.parametrize("query", FILTERS)
+def test_what_is_shown_is_what_the_printed_command_selects(
+    asker: Asker, dataset: Dataset, query: dict[str, str]
+) -> None:
+    found = asker.ask("api/rows?" + "&".join(f"{name}={text}" for name, text in query.items()))[1]
+    words = shlex.split(found["command"])
+    assert bool(words) == bool(query)
+    options = dict(zip(words[4::2], words[5::2], strict=True))
+    if words:
+        assert words[:4] == ["trilight", "shards", "select", str(dataset.folder.root)]
+        assert Path(options["--out"]) == dataset.folder.root.with_name("a set-selected")
+    selection = Selection(
+        split=options.get("--split"),
+        template=options.get("--template"),
+        where=options.get("--where"),
+    )
+    whole = FinishedDataset(folder=dataset.folder, manifest=dataset.manifest, objects={})
+    chosen = listed_scenes(whole, selection)
+    assert [row["key"] for row in found["rows"]] == [row["key"] for row in chosen.rows]
+    for mine, theirs in zip(found["rows"], chosen.rows, strict=True):
+        for name in ("split", "template", "triangles", "lights", "spp"):
+            assert mine[name] == theirs[name]
+        assert mine["floor"] == pytest.approx(theirs["floor"], abs=0.06)
+        assert mine["coverage"] == pytest.approx(theirs["coverage"], abs=0.0006)
+
+
+def test_rows_are_sorted_and_come_page_by_page(asker: Asker) -> None:
+    falling = asker.ask("api/rows?sort=floor&descending=1")[1]["rows"]
+    assert [row["floor"] for row in falling] == sorted(30.0 + row for row in range(8))[::-1]
+    rest = asker.ask("api/rows?from=6")[1]
+    assert rest["total"] == 8 and len(rest["rows"]) == 2
+    for wrong in ("sort=age", "floor_min=x", "floor_min=inf", "coverage_max=nan"):
+        assert asker.ask(f"api/rows?{wrong}")[0] == 422, wrong
+
+
+def test_small_pictures_are_those_of_the_dataset(asker: Asker) -> None:
+    status, png, _ = asker.ask("api/thumbnail/000000006/1?px=16")
+    assert status == 200
+    wanted = preview_srgb8(samples()["validation-000001.tar"][1].radiance_rgb[1])
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png))), wanted)
+    for wrong, status in (
+        ("000000006/9", 404), ("000000006/x", 404), ("000000099/0", 422), ("../0", 422),
+        ("000000006/0?px=9999", 422), ("000000006/0?px=-1", 422), ("000000006", 404),
+    ):  # fmt: skip
+        assert asker.ask(f"api/thumbnail/{wrong}")[0] == status, wrong
+
+
+def test_a_scene_opens_as_a_page_of_its_own_with_its_target(asker: Asker) -> None:
+    assert b'id="stage"' in asker.ask("scene/000000003/")[1]
+    facts = asker.ask("scene/000000003/api/scene")[1]
+    assert facts["target_px"] == 16 and "target" in [each["name"] for each in facts["engines"]]
+    assert asker.ask("scene/000000003/static/scene.js")[0] == 200
+    for wrong in ("scene/000000099/api/scene", "scene/x/../../", "scene/", "scene/a/b/api/scene"):
+        assert asker.ask(wrong)[0] in (404, 422), wrong
+
+
+def test_a_damaged_shard_costs_itself_alone(tmp_path: Path) -> None:
+    broken = write_dataset(tmp_path / "broken", samples(), objects=[CUBE, BALL])
+    shard = broken.folder.root / "train-000000.tar"
+    shard.write_bytes(shard.read_bytes()[:5000])
+    room = DatasetRoom(broken, "broken", cast(Any, ClosedTracer()), None)
+    room.index.wait()
+    assert {row.split for row in room.index.rows} >= {"validation"}
+    assert len(room.index.problems) == 1 and "train-000000.tar" in room.index.problems[0]
+    room.close()
+
+
+class ClosedTracer:
+    """Traces nothing."""
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_limit_is_compared_as_the_command_says_it() -> None:
+    assert filter_of({"floor_min": "33.1234567"}).least == {"floor": 33.1235}
+    with pytest.raises(TrilightError, match="sort is size"):
+        filter_of({"sort": "size"})

@@ -1,0 +1,176 @@
+"""One picture at a time: what is given up, what is kept, and what judges what."""
+
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+
+from infra.viewer.easel import Easel, Job, agreement_db
+from infra.viewer.painters import Painted, Painter, Show, TargetPainter
+from infra.viewer.scene_room import SceneRoom
+from infra.viewer.wanted import Wanted, wanted_of
+from pipeline.renders.results import Sampling
+from storage.errors import TrilightError
+from storage.records.scene import Scene
+from tests.infra.viewer.served_kit import served
+from tests.scenes_by_hand import tiny_scene
+
+TARGETS = np.full((2, 16, 16, 3), 0.5, np.float32)
+
+
+class GreyPainter:
+    """Paints grey at once, or step by step until it is told to end."""
+
+    title, means = "Grey", "All is grey."
+
+    def __init__(self, grey: float, *, floor_db: float | None = None, waits: bool = False) -> None:
+        self.grey, self.floor_db = grey, floor_db
+        self.painted, self.ended = 0, threading.Event()
+        if not waits:
+            self.ended.set()
+
+    def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
+        self.painted += 1
+        if self.grey < 0:
+            raise ZeroDivisionError("of a library")
+        picture = np.full((wanted.resolution, wanted.resolution, 3), self.grey, np.float32)
+        while not self.ended.wait(0.01):
+            show(Sampling(spp=1, expected_spp=9, missing_db=None))
+        show(Painted(radiance_rgb=picture, core_s=0.25, floor_db=self.floor_db, spp=64))
+
+
+def request(engine: str = "traced", **changes: Any) -> dict[str, Any]:
+    pose = tiny_scene().c2w[0].reshape(-1).tolist()
+    return {"engine": engine, "c2w": pose, "fov": 45.0, "view": 0, "resolution": 16, **changes}
+
+
+def wanted(engine: str = "traced", **changes: Any) -> Wanted:
+    return wanted_of(request(engine, **changes), {engine: None}, 2)
+
+
+def over(easel: Easel, job: Job) -> Job:
+    while job.state in ("waiting", "working"):
+        easel.news(job.id, job.version)
+    return job
+
+
+def test_a_finished_picture_is_kept_and_an_equal_question_costs_nothing() -> None:
+    painter = GreyPainter(0.5)
+    easel = Easel(tiny_scene(), {"traced": painter})
+    first = over(easel, easel.ask(wanted()))
+    assert first.state == "done" and first.painted is not None
+    assert easel.ask(wanted()) is first
+    assert over(easel, easel.ask(wanted(fov=50.0))) is not first
+    assert painter.painted == 2
+    easel.close()
+
+
+def test_who_asks_for_another_gives_up_the_one_at_hand() -> None:
+    slow, quick = GreyPainter(0.1, waits=True), GreyPainter(0.5)
+    easel = Easel(tiny_scene(), {"traced": slow, "hits": quick})
+    given_up = easel.ask(wanted())
+    while given_up.state != "working":
+        easel.news(given_up.id, given_up.version)
+    never_begun = easel.ask(wanted(fov=50.0))
+    last = over(easel, easel.ask(wanted("hits")))
+    assert (given_up.state, never_begun.state, last.state) == ("cancelled", "cancelled", "done")
+    assert slow.painted == 1
+    again = easel.ask(wanted())
+    assert again is not given_up
+    easel.rest()
+    assert over(easel, again).state == "cancelled"
+    easel.close()
+
+
+def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
+    easel = Easel(tiny_scene(), {"bad": GreyPainter(-1), "good": GreyPainter(0.5)})
+    assert over(easel, easel.ask(wanted("bad"))).error == "ZeroDivisionError: of a library"
+    broken = {"materials": {"0": {"diffuse": [0.9, 0.9, 0.9]}}}
+    failed = over(easel, easel.ask(wanted("good", edits=broken)))
+    assert failed.state == "failed" and "diffuse + specular" in failed.error
+    assert over(easel, easel.ask(wanted("good"))).state == "done"
+    with pytest.raises(TrilightError, match="not kept"):
+        easel.job("999")
+    easel.close()
+
+
+def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_one() -> None:
+    painters: dict[str, Painter] = {
+        "traced": GreyPainter(0.4, floor_db=40.0),
+        "hits": GreyPainter(0.3),
+        "target": TargetPainter(TARGETS, [33.0, 34.0]),
+    }
+    easel = Easel(tiny_scene(), painters)
+    hits = over(easel, easel.ask(wanted("hits")))
+    assert easel.truth(hits) is None and agreement_db(hits, None) is None
+    traced = over(easel, easel.ask(wanted("traced")))
+    assert easel.truth(hits) is traced
+    expected = -20 * np.log10(np.log10(1.4) - np.log10(1.3))
+    assert agreement_db(hits, traced) == pytest.approx(expected, abs=1e-3)
+    target = over(easel, easel.ask(wanted("target")))
+    assert easel.truth(hits) is target and easel.truth(traced) is target
+    assert target.painted is not None and target.painted.floor_db == 33.0
+    elsewhere = over(easel, easel.ask(wanted("hits", fov=50.0)))
+    assert easel.truth(elsewhere) is None
+    free = over(easel, easel.ask(wanted("target", view=None, fov=50.0)))
+    assert free.state == "failed" and "own cameras" in free.error
+    easel.close()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"engine": "none"}, {"resolution": 12}, {"resolution": 8192}, {"resolution": "16"},
+        {"resolution": True}, {"view": 2}, {"view": -1}, {"view": "0"}, {"fov": 0}, {"fov": None},
+        {"fov": float("inf")}, {"c2w": [0] * 16}, {"c2w": [1] * 3}, {"c2w": ["x"] * 16},
+        {"c2w": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"edits": [1]},
+        {"error_db": 99},
+    ],
+)  # fmt: skip
+def test_a_wish_that_means_nothing_is_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(TrilightError):
+        wanted_of({**request(), **changes}, {"traced": None}, 2)
+    assert wanted_of(request(), {"traced": None}, 2).resolution == 16
+
+
+def test_the_page_of_a_scene_is_told_all_of_it() -> None:
+    painters: dict[str, Painter] = {
+        "traced": GreyPainter(0.4, floor_db=40.0),
+        "target": TargetPainter(TARGETS, ()),
+    }
+    room = SceneRoom(
+        name="tiny", scene=tiny_scene(), notes=("a note",), painters=painters, target_px=16
+    )
+    with served(room) as asker:
+        facts = asker.ask("api/scene")[1]
+        assert (facts["triangles"], facts["lights"], facts["views"]) == (3, 1, 2)
+        for engine in ("target", "traced"):
+            number = asker.ask("api/picture", request(engine))[1]["id"]
+            told: dict[str, Any] = {"state": "", "version": 0}
+            while told["state"] != "done":
+                told = asker.ask(f"api/picture/{number}?after={told['version']}")[1]
+        assert told["truth"] == "target" and told["floor_db"] == 40.0
+        assert told["prices"] == [{"spp": 64, "core_s": 0.25, "floor_db": 40.0}]
+        assert asker.ask(f"api/shown/{number}?ev=1&tone=plain")[1][:4] == b"\x89PNG"
+        assert asker.ask(f"api/shown/{number}?as=error")[1][:4] == b"\x89PNG"
+        assert asker.ask(f"api/shown/{number}?ev=nan")[0] == 422
+        assert asker.ask(f"api/shown/{number}?ev=x")[0] == 422
+        assert asker.ask("api/texture/0")[0] == asker.ask("api/sky.bin")[0] == 404
+        assert asker.ask("api/shown/77")[0] == 422
+
+
+@pytest.mark.parametrize("form", [".glb", ".usda", ".safetensors", ".h5"])
+def test_a_scene_is_saved_with_its_changes_and_nothing_is_written_here(form: str) -> None:
+    room = SceneRoom(
+        name="tiny", scene=tiny_scene(), notes=(), painters={"traced": GreyPainter(0.4)},
+        target_px=None,
+    )  # fmt: skip
+    with served(room) as asker:
+        edits = {"lamps": {"1": {"gain": 2}}}
+        plain = asker.ask("api/export", {"form": form})
+        changed = asker.ask("api/export", {"form": form, "edits": edits})
+        assert plain[0] == changed[0] == 200
+        assert len(changed[1]) > 500 and changed[1] != plain[1]
+        for bad in ("../x.usda", ".exe", "", None, ".json"):
+            assert asker.ask("api/export", {"form": bad})[0] == 422

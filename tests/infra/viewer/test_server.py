@@ -1,0 +1,157 @@
+"""Who is answered: whoever has the address, on this machine, from this origin, within bounds."""
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from infra.viewer.guard import MAX_BODY_BYTES, MAX_PATH, refusal
+from infra.viewer.server import Answer, PageServer, Question, Route, json_answer
+from infra.viewer.static_files import STATIC
+from storage.errors import TrilightError
+from tests.infra.viewer.served_kit import Asker, served
+
+PORT, WORD = 4711, "secret"
+HERE = f"127.0.0.1:{PORT}"
+
+
+class EchoRoom:
+    """Answers what it was asked, and makes mistakes when told to."""
+
+    def gets(self) -> dict[str, Route]:
+        return {"api/echo": self._echo, "api/below/": self._echo}
+
+    def posts(self) -> dict[str, Route]:
+        return {"api/echo": self._echo}
+
+    def close(self) -> None:
+        pass
+
+    def _echo(self, question: Question) -> Answer:
+        if "mistake" in question.query:
+            raise TrilightError("that is a mistake.")
+        return json_answer({"path": question.path, "body": question.body})
+
+
+@pytest.fixture(scope="module")
+def asker() -> Iterator[Asker]:
+    with served(EchoRoom()) as found:
+        yield found
+
+
+@pytest.mark.parametrize(
+    ("passes", "method", "path", "headers"),
+    [
+        (True, "GET", f"/{WORD}/", {}),
+        (True, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "none"}),
+        (True, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "document"}),
+        (True, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}", "Content-Length": "2"}),
+        (False, "GET", "/", {}),
+        (False, "GET", f"/{WORD}x/", {}),
+        (False, "GET", f"/{WORD[:-1]}/", {}),
+        (False, "GET", f"/x/../{WORD}/", {}),
+        (False, "GET", f"/{WORD}/", {"Host": "evil.example"}),
+        (False, "GET", f"/{WORD}/", {"Host": f"localhost:{PORT}"}),
+        (False, "GET", f"/{WORD}/", {"Host": f"evil.example:{PORT}"}),
+        (False, "GET", f"/{WORD}/", {"Origin": "http://evil.example"}),
+        (False, "GET", f"/{WORD}/", {"Origin": "null"}),
+        (False, "GET", f"/{WORD}/", {"origin": "http://evil.example"}),
+        (False, "GET", f"/{WORD}/", {"sec-fetch-site": "cross-site"}),
+        (False, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}),
+        (False, "GET", f"/{WORD}/", {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Dest": "script"}),
+        (False, "GET", f"/{WORD}/{'x' * MAX_PATH}", {}),
+        (False, "POST", f"/{WORD}/x", {"Content-Length": "2"}),
+        (False, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}"}),
+        (False, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}", "Content-Length": "-1"}),
+        (False, "POST", f"/{WORD}/x", {"Origin": f"http://{HERE}", "Content-Length": "9" * 30}),
+        (
+            False,
+            "POST",
+            f"/{WORD}/x",
+            {"Origin": "http://evil.example", "Content-Length": "2", "Sec-Fetch-Dest": "document"},
+        ),
+    ],
+)
+def test_who_may_ask(passes: bool, method: str, path: str, headers: dict[str, str]) -> None:
+    asked = {"Host": HERE, **headers}
+    assert (refusal(method, path, asked, port=PORT, word=WORD) is None) == passes
+
+
+def test_a_stranger_gets_one_sentence_and_no_header_that_lets_others_read(asker: Asker) -> None:
+    status, answer, headers = asker.ask("api/echo", word="guessed")
+    assert status == 403
+    assert "whole address" in answer["error"]
+    assert "api" not in str(answer)
+    assert not [name for name in headers if name.lower().startswith("access-control")]
+
+
+def test_every_answer_is_shut_in(asker: Asker) -> None:
+    for path in ("", "static/style.css", "api/echo", "api/nothing"):
+        _, _, headers = asker.ask(path)
+        policy = headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy and "http" not in policy
+        assert headers["Referrer-Policy"] == "no-referrer"
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert not [name for name in headers if name.lower().startswith("access-control")]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "static/../guard.py", "static/%2e%2e/guard.py", "static//etc/passwd", "../etc/passwd",
+        "static/..%2f..%2fcli%2fview.py", "static/three", "static/", "%00", "api", "scene",
+    ],
+)  # fmt: skip
+def test_no_path_leads_out_of_the_list_of_files(asker: Asker, path: str) -> None:
+    status, answer, _ = asker.ask(path)
+    assert status == 404, answer
+
+
+def test_routes_mistakes_and_bodies(asker: Asker) -> None:
+    assert asker.ask("api/below/a%20b?x=1")[1]["path"] == "api/below/a b"
+    assert asker.ask("api/echo", {"n": 1})[1]["body"] == {"n": 1}
+    assert asker.ask("api/echo?mistake=1")[:2] == (422, {"error": "that is a mistake."})
+    assert asker.ask("api/below/", {"n": 1})[0] == 404
+    assert asker.ask("api/echo", "x" * MAX_BODY_BYTES)[0] == 413
+
+
+def test_no_other_verb_is_known(asker: Asker) -> None:
+    for verb in ("PUT", "DELETE", "OPTIONS", "HEAD"):
+        with socket.create_connection(("127.0.0.1", asker.port), timeout=30) as line:
+            request = f"{verb} /{asker.word}/api/echo HTTP/1.1\r\nHost: {asker.here}\r\n\r\n"
+            line.sendall(request.encode())
+            answer = line.recv(1 << 16).decode()
+        assert answer.startswith("HTTP/1.1 501"), verb
+        assert "access-control" not in answer.lower()
+
+
+def test_a_body_that_is_no_json_is_a_sentence(asker: Asker) -> None:
+    with socket.create_connection(("127.0.0.1", asker.port), timeout=30) as line:
+        text = "[" * 100_000
+        head = f"POST /{asker.word}/api/echo HTTP/1.1\r\nHost: {asker.here}\r\n"
+        head += f"Origin: http://{asker.here}\r\nContent-Length: {len(text)}\r\n"
+        line.sendall(f"{head}Connection: close\r\n\r\n{text}".encode())
+        assert b"the request is no JSON" in line.makefile("rb").read()
+
+
+def test_it_listens_on_this_machine_alone_and_says_which_port_is_taken() -> None:
+    server = PageServer({}, {})
+    try:
+        assert server.server_address[0] == "127.0.0.1"
+        assert len(server.word) >= 32
+        assert server.address == f"http://127.0.0.1:{server.server_port}/{server.word}/"
+        with pytest.raises(TrilightError, match=f"--port is {server.server_port}"):
+            PageServer({}, {}, port=server.server_port)
+    finally:
+        server.server_close()
+
+
+def test_pages_load_nothing_from_elsewhere() -> None:
+    own = [path for path in STATIC.iterdir() if path.suffix in (".html", ".js", ".css")]
+    assert len(own) > 8
+    for path in own:
+        text = path.read_text().replace("http://www.w3.org/2000/svg", "")
+        assert "http:" not in text and "https:" not in text and "//cdn" not in text, path
+        assert "innerHTML" not in text and "eval(" not in text, path
+        assert "<script>" not in text and " style=" not in text and "onclick=" not in text, path

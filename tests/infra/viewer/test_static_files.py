@@ -1,0 +1,55 @@
+"""What the pages are made of: three.js as its authors built it, and files that find each other."""
+
+import hashlib
+import re
+
+import pytest
+
+from infra.setup.third_party import THREE_SHA256
+from infra.viewer.static_files import STATIC
+from tests.conftest import ROOT
+
+THREE = STATIC / "three"
+
+
+@pytest.mark.parametrize("name", ["three.core.min.js", "three.module.min.js"])
+def test_three_is_the_one_in_the_list_of_third_parties(name: str) -> None:
+    (row,) = re.findall(
+        rf"\| {re.escape(name)} \| (\S+) \| MIT \| (\w{{64}}) \|",
+        (ROOT / "docs/third_party.md").read_text(),
+    )
+    data = (THREE / name).read_bytes()
+    assert hashlib.sha256(data).hexdigest() == row[1] == THREE_SHA256[name]
+    revision = row[0].split(".")[1]
+    core = (THREE / "three.core.min.js").read_text()
+    assert f'="{revision}"' in core
+    assert "The MIT License" in (THREE / "LICENSE").read_text()
+
+
+def test_every_file_that_a_page_names_is_there() -> None:
+    named = 0
+    for path in STATIC.iterdir():
+        if path.suffix not in (".html", ".js"):
+            continue
+        text = path.read_text()
+        for place in re.findall(r'(?:src|href)="static/([^"]+)"', text):
+            assert (STATIC / place).is_file(), (path, place)
+            named += 1
+        for place in re.findall(r'from "\./([^"]+)"', text):
+            assert (STATIC / place).is_file(), (path, place)
+            named += 1
+    assert named > 15
+
+
+def test_every_element_that_a_script_asks_for_is_in_its_page() -> None:
+    scripts = {
+        "scene.html": ("scene.js", "pictures.js", "edits.js", "ask.js"),
+        "dataset.html": ("dataset.js", "ask.js"),
+        "run.html": ("run.js", "ask.js"),
+    }
+    for page, names in scripts.items():
+        there = set(re.findall(r'id="([\w-]+)"', (STATIC / page).read_text()))
+        for name in names:
+            text = (STATIC / name).read_text()
+            asked = set(re.findall(r'(?:byId|getElementById)\("([\w-]+)"\)', text))
+            assert asked and asked <= there, (page, name, asked - there)
