@@ -5,6 +5,9 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from model.attention import Keys
+from model.packing import Packing, pack_lengths, takes_packed
+
 if TYPE_CHECKING:
     from model.hits.lit_scene import LitScene
     from model.hits.tracing import TracedScene
@@ -27,6 +30,26 @@ class TokenPlaces:
     """bool, False in the padding; None where nothing is padded."""
     num_registers: int
     """How many belong to no triangle: registers and cells of the sky, which come first."""
+    lengths: tuple[int, ...] | None = None
+    """Tokens of each scene, where they are the first of each and `is_key_BN` says so too. The host
+    knows them without waiting for the device."""
+
+    def packing(self, x: Tensor, head_width: int, views: int = 1) -> Packing | None:
+        """Return where tokens of the views of scenes are when packed; None where masks are meant.
+
+        Args:
+            x: what attention is computed with.
+            head_width: of that attention.
+            views: of each scene; its tokens come once for each.
+        """
+        if self.lengths is None or not takes_packed(x, head_width):
+            return None
+        lengths = [length for length in self.lengths for _ in range(views)]
+        return pack_lengths(lengths, self.positions_BN33.shape[1], x.device)
+
+    def keys(self, x: Tensor, head_width: int, views: int = 1) -> Keys:
+        """Return which tokens are keys, packed where `packing` is not None."""
+        return self.packing(x, head_width, views) or self.is_key_BN
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

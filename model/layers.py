@@ -8,10 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from model.attention import attend
+from model.attention import Keys, attend
 from model.encoded_scene import KeysValues
 from model.positions import Rotation, rotate
 from model.precision import as_given
+from model.rounding import rounded_call, rounded_weights
 from model.windows import Windows, attend_in_windows
 
 LAYER_NORM_EPS = 1e-6
@@ -47,10 +48,14 @@ def run_layer(layer: nn.Module, *inputs: object, recompute: bool) -> Tensor:
     It is then computed a second time there (Chen et al. 2016): the same gradients, for less memory
     and about a third more time.
     """
+    (device,) = {each.device for each in inputs if isinstance(each, Tensor)}
+    weights = rounded_weights(layer, device)
+    output: Tensor
     if recompute and torch.is_grad_enabled():
-        output: Tensor = checkpoint(layer, *inputs, use_reentrant=False)
-        return output
-    return layer(*inputs)
+        output = checkpoint(rounded_call, layer, weights, *inputs, use_reentrant=False)
+    else:
+        output = rounded_call(layer, weights, *inputs)
+    return output
 
 
 def split_heads(x_BNW: Tensor, num_heads: int) -> Tensor:
@@ -73,8 +78,15 @@ class SwiGLU(nn.Module):
         self.down = nn.Linear(hidden_width, width, bias=False)
 
     def forward(self, x_BNW: Tensor) -> Tensor:
-        """[B, N, W] -> [B, N, W]."""
-        return self.down(nn.functional.silu(self.gate(x_BNW)) * self.up(x_BNW))
+        """[B, N, W] -> [B, N, W].
+
+        On a card gate and up are one product, which reads x once, and once more on the way back.
+        """
+        if x_BNW.device.type != "cuda":
+            return self.down(nn.functional.silu(self.gate(x_BNW)) * self.up(x_BNW))
+        both = nn.functional.linear(x_BNW, torch.cat([self.gate.weight, self.up.weight]))
+        gate, up = both.chunk(2, dim=-1)
+        return self.down(nn.functional.silu(gate) * up)
 
 
 class SelfAttention(nn.Module):
@@ -93,7 +105,7 @@ class SelfAttention(nn.Module):
         x_BNW: Tensor,
         *,
         rotation: Rotation | None = None,
-        is_key_BN: Tensor | None = None,
+        keys: Keys = None,
         windows: Windows | None = None,
     ) -> Tensor:
         """[B, N, W] -> [B, N, W].
@@ -110,7 +122,7 @@ class SelfAttention(nn.Module):
         if rotation is not None:
             q_BHND, k_BHND = rotate(q_BHND, *rotation), rotate(k_BHND, *rotation)
         if windows is None:
-            return self.out(merge_heads(attend(q_BHND, k_BHND, v_BHND, is_key_BN)))
+            return self.out(merge_heads(attend(q_BHND, k_BHND, v_BHND, keys)))
         attended_BNW = merge_heads(attend_in_windows(q_BHND, k_BHND, v_BHND, windows))
         return self.out(attended_BNW)[:, windows.back_Q]
 
@@ -145,10 +157,13 @@ class CrossAttention(nn.Module):
         x_BVQW: Tensor,
         keys_values: KeysValues,
         rotation_BVNA: Rotation,
-        is_key_BN: Tensor | None,
+        keys: Keys,
         rotation_QA: Rotation | None = None,
     ) -> Tensor:
-        """[B, V, Q, W] -> [B, V, Q, W]; keys turn by the first rotation, queries by the second."""
+        """[B, V, Q, W] -> [B, V, Q, W]; keys turn by the first rotation, queries by the second.
+
+        `keys` are those of scenes, or packed for each view of each.
+        """
         num_views = x_BVQW.shape[1]
         k_BHND, v_BHND = keys_values
         k_BVHND = rotate(k_BHND[:, None], *rotation_BVNA)
@@ -156,8 +171,9 @@ class CrossAttention(nn.Module):
         q_BVHQD = split_heads(self.q_norm(self.q(x_BVQW)), self.num_heads)
         if rotation_QA is not None:
             q_BVHQD = rotate(q_BVHQD, *rotation_QA)
-        mask = None if is_key_BN is None else is_key_BN.repeat_interleave(num_views, dim=0)
-        attended = attend(q_BVHQD.flatten(0, 1), k_BVHND.flatten(0, 1), v_BVHND.flatten(0, 1), mask)
+        if isinstance(keys, Tensor):
+            keys = keys.repeat_interleave(num_views, dim=0)
+        attended = attend(q_BVHQD.flatten(0, 1), k_BVHND.flatten(0, 1), v_BVHND.flatten(0, 1), keys)
         return self.out(merge_heads(attended)).unflatten(0, x_BVQW.shape[:2])
 
 
@@ -171,11 +187,9 @@ class EncoderLayer(nn.Module):
         self.ffn_norm = Norm(width, eps=LAYER_NORM_EPS)
         self.ffn = SwiGLU(width, hidden_width)
 
-    def forward(self, x_BNW: Tensor, rotation: Rotation, is_key_BN: Tensor | None) -> Tensor:
+    def forward(self, x_BNW: Tensor, rotation: Rotation, keys: Keys) -> Tensor:
         """[B, N, W] -> [B, N, W]."""
-        x_BNW = x_BNW + self.attention(
-            self.attention_norm(x_BNW), rotation=rotation, is_key_BN=is_key_BN
-        )
+        x_BNW = x_BNW + self.attention(self.attention_norm(x_BNW), rotation=rotation, keys=keys)
         return x_BNW + self.ffn(self.ffn_norm(x_BNW))
 
 
@@ -197,13 +211,13 @@ class DecoderLayer(nn.Module):
         keys_values: KeysValues,
         rotation_BVNA: Rotation,
         rotation_QA: Rotation | None,
-        is_key_BN: Tensor | None,
+        keys: Keys,
         windows: Windows | None,
     ) -> Tensor:
         """[B, V, Q, W] -> [B, V, Q, W]; `keys_values` are those of this layer's `cross`."""
         views = x_BVQW.shape[:2]
         x_BVQW = x_BVQW + self.cross(
-            self.cross_norm(x_BVQW), keys_values, rotation_BVNA, is_key_BN, rotation_QA
+            self.cross_norm(x_BVQW), keys_values, rotation_BVNA, keys, rotation_QA
         )
         x_MQW = torch.flatten(x_BVQW, 0, 1)
         x_MQW = x_MQW + self.self_attention(self.self_norm(x_MQW), windows=windows)

@@ -28,7 +28,7 @@ class TriangleRotary(nn.Module):
     def __init__(self, *, num_freqs: int, max_freq: float, head_width: int) -> None:
         super().__init__()
         self.num_freqs, self.max_freq = num_freqs, max_freq
-        self.half_width = head_width // 2
+        self.head_width, self.half_width = head_width, head_width // 2
         self.register_buffer("freqs_F", None, persistent=False)
         self.reset()
 
@@ -105,9 +105,14 @@ def register_position(triangles_BT33: Tensor, is_triangle_BT: Tensor | None) -> 
 
 
 def token_places(
-    triangles_BT33: Tensor, is_triangle_BT: Tensor | None, *, num_registers: int, eps: float
+    triangles_BT33: Tensor,
+    is_triangle_BT: Tensor | None,
+    *,
+    num_registers: int,
+    eps: float,
+    num_triangles: tuple[int, ...] | None = None,
 ) -> TokenPlaces:
-    """Return where registers and triangles stand.
+    """Return where registers and triangles stand; `num_triangles` says what the mask says.
 
     The published code divides the registers' sum of positions by T + 1e-5, in the world and again
     in each camera's frame, which pulls them towards that frame's origin by 1e-5 / T of their
@@ -130,6 +135,7 @@ def token_places(
         scale_BN11=scale_BN11,
         is_key_BN=is_key_BN,
         num_registers=num_registers,
+        lengths=None if num_triangles is None else tuple(num_registers + n for n in num_triangles),
     )
 
 

@@ -48,6 +48,10 @@ PRECISIONS = {
 float16's numbers make; how fast float16 is, and all of tf32, was not measured."""
 
 
+REDUCED = (torch.bfloat16, torch.float16)
+"""Types that flash attention computes in."""
+
+
 def rounded_parts(model: "RenderFormer") -> list[nn.Module]:
     """Return the parts of a network that a precision rounds; the others stay float32."""
     scene = [] if model.encoder is None else [model.encoder.layers]
@@ -89,14 +93,18 @@ def as_given(device: torch.device) -> AbstractContextManager[None]:
 def tf32(allowed: bool) -> Iterator[None]:
     """Allow or forbid TF32 in CUDA's float32 products and convolutions; no effect on a CPU.
 
-    Torch allows TF32 in convolutions by default, so plain float32 has to be requested too.
+    Torch allows TF32 in convolutions by default, so plain float32 has to be requested too. Within
+    autocast, where a network trains in few bits, convolutions keep torch's default: a head's last
+    layers are rounded to 10 bits of mantissa then, as the way back has them anyway, and not to 7.
+    Products stay as they are asked for: rays and materials are not rounded at all.
     """
     convolution = torch.backends.cudnn.conv  # type: ignore[attr-defined]
     switches = (torch.backends.cuda.matmul, convolution)
     before = [switch.fp32_precision for switch in switches]
     try:
         for switch in switches:
-            switch.fp32_precision = "tf32" if allowed else "ieee"
+            of_training = switch is convolution and torch.is_autocast_enabled("cuda")
+            switch.fp32_precision = "tf32" if allowed or of_training else "ieee"
         yield
     finally:
         for switch, setting in zip(switches, before, strict=True):

@@ -113,6 +113,7 @@ class RenderFormer(nn.Module):
             batch.is_triangle_BT,
             num_registers=registers + (0 if skies is None else self.config.sky_cells),
             eps=self.config.register_eps,
+            num_triangles=batch.num_triangles,
         )
         if skies is not None:
             places = without_absent(places, skies, registers)

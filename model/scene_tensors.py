@@ -103,6 +103,8 @@ class SceneBatch:
     """bool, False in the padding; None where nothing is padded, which spares the mask."""
     columns: tuple[str, ...] = PUBLISHED_COLUMNS
     """As in SceneTensors."""
+    num_triangles: tuple[int, ...] | None = None
+    """Of each scene, where something is padded; None: `is_triangle_BT` alone says it."""
     traced: Traced | None = None
     """As in SceneTensors; None where a scene has None."""
     albedo_BVRR6: Tensor | None = None
@@ -253,6 +255,7 @@ def batch_scenes(scenes: Sequence[SceneTensors]) -> SceneBatch:
         fov_deg_BV=torch.stack([scene.fov_deg_V for scene in scenes]),
         is_triangle_BT=torch.arange(longest) < torch.tensor(lengths)[:, None] if padded else None,
         columns=scenes[0].columns,
+        num_triangles=tuple(lengths) if padded else None,
         traced=stack_traced(traced, longest) if len(traced) == len(scenes) else None,
         albedo_BVRR6=torch.stack(albedo) if len(albedo) == len(scenes) else None,
         textures=None if all(each is None for each in textures) else textures,

@@ -8,10 +8,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
+from model.attention import Keys
 from model.config import ModelConfig
 from model.encoded_scene import TokenPlaces
 from model.layers import TOKEN_NORM_EPS, EncoderLayer, Norm, dtype_of, run_layer
+from model.packing import packed, unpacked
 from model.positions import (
+    Rotation,
     TriangleRotary,
     encode_normals,
     encoded_normal_width,
@@ -118,8 +121,16 @@ class TriangleEncoder(nn.Module):
             parts[1] = tokens_BTW + 0 * sum(weight.sum() for weight in self.sky.parameters())
         x_BNW = torch.cat(parts, dim=1).to(dtype_of(self.layers))
         rotation = world_rotation(self.rotary, places)
+        packing = places.packing(x_BNW, self.rotary.head_width)
+        if packing is None:
+            return self._layers(x_BNW, rotation, places.is_key_BN)
+        cos_PA, sin_PA = (packed(table_BNA, packing) for table_BNA in rotation)
+        x_PW = self._layers(packed(x_BNW, packing)[None], (cos_PA, sin_PA), packing)[0]
+        return unpacked(x_PW, packing)
+
+    def _layers(self, x_BNW: Tensor, rotation: Rotation, keys: Keys) -> Tensor:
         for layer in self.layers:
-            x_BNW = run_layer(layer, x_BNW, rotation, places.is_key_BN, recompute=self.recompute)
+            x_BNW = run_layer(layer, x_BNW, rotation, keys, recompute=self.recompute)
         return x_BNW
 
     def learned_tokens(self) -> list[nn.Parameter]:

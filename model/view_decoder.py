@@ -19,6 +19,7 @@ from model.positions import Rotation, TriangleRotary, camera_rotation
 from model.precision import as_given
 from model.projected import PictureRotary
 from model.rays import bundle_rays, ray_directions
+from model.rounding import rounded_call, rounded_parts_of
 from model.scene_tensors import Cameras
 from model.windows import Windows, cut_windows
 
@@ -64,7 +65,9 @@ class ViewDecoder(nn.Module):
         x_BVQW = self.bundle_tokens(cameras.fov_deg_BV, resolution)
         rotations = self._rotations(scene, cameras, resolution)
         cuts = self._cuts(resolution // self.patch_px, x_BVQW.device)
-        picture_MCRR = self.head(self._taps(x_BVQW, scene, rotations, cuts))
+        taps = self._taps(x_BVQW, scene, rotations, cuts)
+        weights = rounded_parts_of(self.head, self.head.rounded_parts(), x_BVQW.device)
+        picture_MCRR = rounded_call(self.head, weights, taps)
         return picture_MCRR.movedim(1, -1).unflatten(0, cameras.fov_deg_BV.shape)
 
     def where_seen(self, scene: EncodedScene, cameras: Cameras, resolution: int) -> Tensor:
@@ -103,6 +106,7 @@ class ViewDecoder(nn.Module):
     ) -> list[Tensor]:
         """Return what the head reads, [B V, Q, W] each."""
         x_BVQW = x_BVQW.to(dtype_of(self.layers))
+        keys = scene.places.keys(x_BVQW, self.rotary.head_width, views=x_BVQW.shape[1])
         outputs = {}
         for index, (layer, keys_values) in enumerate(
             zip(self.layers, scene.keys_values, strict=True)
@@ -112,7 +116,7 @@ class ViewDecoder(nn.Module):
                 x_BVQW,
                 keys_values,
                 *rotations,
-                scene.places.is_key_BN,
+                keys,
                 cuts[index % 2],
                 recompute=self.recompute,
             )

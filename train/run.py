@@ -118,8 +118,7 @@ def train_run(
         watched=watched,
     )
     with closing(_batches(opened, settings, state, crew, workers)) as batches:
-        cost = partial(scene_flops, settings)
-        most = settings.scenes_per_pass
+        cost, most = partial(scene_flops, settings), settings.scenes_per_pass
         with closing(step_scenes(batches, cost, most, crew.device)) as steps:
             trainer.run(steps)
     if recorder is None:

@@ -211,6 +211,9 @@ def pretrain() -> TrainSettings:
         final_rate_share=0.02,
         betas=(0.9, 0.99),
         ema_decay=0.9995,
+        decayed="matrices",
+        muon_takes="hidden",
+        recompute_activations=False,
     )
 
 

@@ -67,6 +67,17 @@ Precision = Literal["float32", "bfloat16"]
 """Precision of the network's matrix products. Positions, losses, weights and optimisers' memories
 stay float32."""
 
+Compile = Literal["auto", "yes", "no"]
+"""Whether layers, head and LPIPS are compiled by torch: `auto` does so on a card with Triton, `yes`
+also on a processor, where it takes minutes and brings little."""
+
+Decayed = Literal["all", "matrices"]
+"""Weights that decay: `all`, or `matrices` without norms, biases and learned tokens."""
+
+MuonTakes = Literal["matrices", "hidden"]
+"""Weights that Muon updates: all `matrices`, or the `hidden` ones of the layers alone, each of
+queries, keys and values for itself, as its authors do."""
+
 Schedule = Literal["wsd", "cosine"]
 """Course of the learning rate after its warm-up. `wsd` (warm-up, stable, decay) stays at the peak
 and falls over the last steps by 1 - sqrt; `cosine` falls along half a wave from the first."""
@@ -127,6 +138,8 @@ class TrainSettings:
     base_widths: BaseWidths = field(default_factory=BaseWidths)
     """Widths for which the rates above and the initial weights are stated; no other width of the
     network changes them unless `width` is one."""
+    muon_takes: MuonTakes = "matrices"
+    """Weights that Muon updates."""
     warmup_steps: Annotated[int, Within(0, 10**9 - 1, unit="steps")]
     """Steps of linear warm-up to the peak learning rate."""
     schedule: Schedule = "cosine"
@@ -139,7 +152,9 @@ class TrainSettings:
     final_rate_share: Share = 0.05
     """Learning rate at the last step, as a share of the peak."""
     weight_decay: Annotated[float, Within(0, 10)] = 0.01
-    """Decoupled weight decay, applied to every weight (Loshchilov and Hutter 2019)."""
+    """Decoupled weight decay (Loshchilov and Hutter 2019) of the weights that `decayed` names."""
+    decayed: Decayed = "all"
+    """Weights that decay."""
     betas: Annotated[tuple[float, float], BelowOne] = (0.9, 0.99)
     """Decay rates of AdamW's running means of the gradient and of its square."""
     grad_clip: Annotated[float, Within(0, 1e9, low_open=True)] = 1.0
@@ -150,6 +165,8 @@ class TrainSettings:
     recompute_activations: Annotated[bool, EXECUTION] = False
     """Recompute activations in the backward pass, which saves memory and takes a third more time
     (see RenderFormer.recompute_activations)."""
+    compile: Annotated[Compile, EXECUTION] = "auto"
+    """Whether torch compiles layers, head and LPIPS; the first steps then take minutes."""
     shuffle_shards: Annotated[int, Within(1, 100_000, unit="shards")] = 4
     """Number of shards that are open at the same time; samples are shuffled among them."""
     most_unusable: Annotated[int, Within(0, 10**9, unit="samples"), EXECUTION] = 0

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu, softplus
 
-from model.attention import attend
+from model.attention import Keys, attend
 from model.config import ModelConfig
 from model.encoded_scene import EncodedScene, KeysValues, TokenPlaces
 from model.hits.lie import FARTHEST, NEIGHBOURS, PLACE, Lie, lies_to
@@ -96,7 +96,7 @@ class AnchorLayer(nn.Module):
         x_BVAW: Tensor,
         keys_values: KeysValues | None,
         rotation_BVAD: Rotation,
-        is_key_BN: Tensor | None,
+        keys: Keys,
         reads_BV11: Tensor,
     ) -> Tensor:
         """[B, V, A, W] -> [B, V, A, W].
@@ -111,7 +111,7 @@ class AnchorLayer(nn.Module):
         views, anchors = q_BVHAD.shape[1], q_BVHAD.shape[3]
         # the views of a scene ask the same keys: together they are one longer row of questions
         q_BHQD = q_BVHAD.movedim(1, 2).flatten(2, 3)
-        attended = attend(q_BHQD, *keys_values, is_key_BN).unflatten(2, (views, anchors))
+        attended = attend(q_BHQD, *keys_values, keys).unflatten(2, (views, anchors))
         read = cross.out(merge_heads(attended.movedim(2, 1)))
         x_BVAW = x_BVAW + read * reads_BV11.to(read.dtype)
         return x_BVAW + self.ffn(self.ffn_norm(x_BVAW))
@@ -231,6 +231,7 @@ class HitDecoder(nn.Module):
         x_BVAW = self.anchors(silu(self.told(anchor_BVAF))).to(dtype_of(self.layers))
         rotation = self.rotary(position_BVA3[..., None, :].expand(-1, -1, -1, 3, 3))
         reads_BV11 = traced.given_VI[..., INPUTS.index("tokens"), None, None]
+        keys = scene.places.keys(x_BVAW, self.config.head_width)
         known = scene.keys_values or [None] * len(self.layers)
         for layer, keys_values in zip(self.layers, known, strict=True):
             x_BVAW = run_layer(
@@ -238,7 +239,7 @@ class HitDecoder(nn.Module):
                 x_BVAW,
                 keys_values,
                 rotation,
-                scene.places.is_key_BN,
+                keys,
                 reads_BV11,
                 recompute=self.recompute,
             )

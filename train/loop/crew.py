@@ -12,6 +12,7 @@ from typing import TypeVar
 
 import torch
 import torch.distributed as dist
+from torch import Tensor
 
 from storage.errors import TrilightError
 from train.data.order import RankShare
@@ -50,6 +51,17 @@ class Crew:
         total = torch.tensor(values, dtype=torch.float32, device=self.device)
         dist.all_reduce(total)
         return [float(value) / self.world_size for value in total]
+
+    def mean_on_device(self, values: Tensor) -> Tensor:
+        """Return the means [N] over all processes, where they are: nobody waits; all must call it.
+
+        With several processes they are float32, as those of `mean`.
+        """
+        if self.world_size == 1:
+            return values
+        total = values.to(torch.float32, copy=True)
+        dist.all_reduce(total)
+        return total / self.world_size
 
     def gather_text(self, text: str) -> list[str]:
         """Return what each process says, by rank, alike on each; all must call it."""

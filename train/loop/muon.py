@@ -1,11 +1,12 @@
-"""Muon in float32, for processors without bfloat16 products, and which processors those are."""
+"""Muon by stacks of matrices, over all processes; and which products a processor is quick at."""
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
+import torch.distributed as dist
 from torch import Tensor
 
 from train.loop.crew import Crew
@@ -26,56 +27,115 @@ def fitting_precision(crew: Crew) -> Precision:
 
 
 def muon(
-    matrices: Iterable[Tensor] | Iterable[dict[str, Any]], weight_decay: float, precision: Precision
+    matrices: Sequence[Tensor] | Sequence[dict[str, Any]],
+    weight_decay: float,
+    precision: Precision,
+    thirds: Sequence[Tensor] = (),
 ) -> torch.optim.Muon:
-    """Return the optimizer of matrices [M, N]: torch's own, or the same with float32 products.
+    """Return the optimizer of matrices [M, N].
 
-    `matrices` may be groups of them, as torch's optimizers take those, each with its own decay.
+    Args:
+        matrices: what it moves, or groups of that as torch's optimizers take them, each with its
+            own decay.
+        weight_decay: of those without their own.
+        precision: of its products. With bfloat16 on a processor it is torch's own.
+        thirds: those of them that are three matrices, one above the other.
     """
-    kind = torch.optim.Muon if precision == "bfloat16" else Float32Muon
-    return kind(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
+    if precision == "bfloat16" and not thirds and _device(matrices[0]).type == "cpu":
+        return torch.optim.Muon(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
+    return StackedMuon(matrices, weight_decay, PRODUCTS[precision], thirds)
 
 
-class Float32Muon(torch.optim.Muon):
-    """torch's Muon with products in float32, and the matrices of one shape in one product.
+def _device(first: Tensor | dict[str, Any]) -> torch.device:
+    weight: Tensor = first if isinstance(first, Tensor) else first["params"][0]
+    return weight.device
+
+
+PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+"""Types of the products, by precision."""
+
+
+class StackedMuon(torch.optim.Muon):
+    """torch's Muon with the matrices of one shape in one product, shared out over the processes.
 
     Settings, state and update are those of torch.optim.Muon with `match_rms_adamw`; what differs is
     rounding. Stacks cost memory for a moment: five times that of all the matrices of one shape.
+    Each process orthogonalises its part of a stack and is told the others', so a matrix is moved by
+    the same numbers everywhere. Momentum is kept by all of them.
     """
+
+    def __init__(
+        self,
+        matrices: Sequence[Tensor] | Sequence[dict[str, Any]],
+        weight_decay: float,
+        products: torch.dtype,
+        thirds: Sequence[Tensor],
+    ) -> None:
+        """Take what `muon` takes."""
+        super().__init__(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
+        self._products = products
+        self._thirds = {id(weight) for weight in thirds}
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Move every matrix along the gradient it holds; one without a gradient stays."""
         for group in self.param_groups:
-            by_shape = defaultdict[torch.Size, list[Tensor]](list)
-            for weight in group["params"]:
-                if weight.grad is not None:
-                    by_shape[weight.shape].append(weight)
-            for weights in by_shape.values():
-                self._move(weights, group)
+            moved = [weight for weight in group["params"] if weight.grad is not None]
+            by_shape = defaultdict[torch.Size, list[tuple[Tensor, Tensor]]](list)
+            for weight, wanted in zip(moved, self._wanted(moved, group["momentum"]), strict=True):
+                parts = 3 if id(weight) in self._thirds else 1
+                for pair in zip(weight.chunk(parts), wanted.chunk(parts), strict=True):
+                    by_shape[pair[0].shape].append(pair)
+            for pairs in by_shape.values():
+                self._move([w for w, _ in pairs], [wanted for _, wanted in pairs], group)
 
-    def _move(self, weights: Sequence[Tensor], group: Mapping[str, Any]) -> None:
+    def _move(self, weights: list[Tensor], wanted: list[Tensor], group: Mapping[str, Any]) -> None:
         """Move matrices of one shape [M, N]."""
-        wanted_SMN = torch.stack([self._wanted(weight, group["momentum"]) for weight in weights])
-        steps_SMN = orthogonal(
-            wanted_SMN, group["ns_coefficients"], group["ns_steps"], group["eps"]
-        )
+        constants = group["ns_coefficients"], group["ns_steps"], group["eps"]
+
+        def steps(some: Sequence[Tensor]) -> Tensor:
+            return orthogonal(torch.stack(list(some)).to(self._products), *constants)
+
+        steps_SMN = shared_out(wanted, steps, self._products)
         # Liu et al. 2025: as long as a typical step of AdamW, whatever the shape
         rate = group["lr"] * 0.2 * math.sqrt(max(weights[0].shape))
-        for weight, step_MN in zip(weights, steps_SMN, strict=True):
-            weight.mul_(1 - group["lr"] * group["weight_decay"])
-            weight.add_(step_MN, alpha=-rate)
+        torch._foreach_mul_(weights, 1 - group["lr"] * group["weight_decay"])
+        torch._foreach_add_(weights, list(steps_SMN.to(weights[0].dtype)), alpha=-rate)
 
-    def _wanted(self, weight: Tensor, momentum: float) -> Tensor:
-        """Return the gradient [M, N] with Nesterov's momentum, and remember it."""
-        gradient = weight.grad
-        assert gradient is not None
-        memory = self.state[weight]
-        if "momentum_buffer" not in memory:
-            memory["momentum_buffer"] = torch.zeros_like(gradient)
-        mean: Tensor = memory["momentum_buffer"]
-        mean.lerp_(gradient, 1 - momentum)
-        return gradient.lerp(mean, momentum)
+    def _wanted(self, weights: Sequence[Tensor], momentum: float) -> Sequence[Tensor]:
+        """Return the gradients [M, N] with Nesterov's momentum, and remember it."""
+        if not weights:
+            return []
+        gradients: list[Tensor] = []
+        for weight in weights:
+            assert weight.grad is not None
+            gradients.append(weight.grad)
+            if "momentum_buffer" not in self.state[weight]:
+                self.state[weight]["momentum_buffer"] = torch.zeros_like(weight.grad)
+        means: list[Tensor] = [self.state[weight]["momentum_buffer"] for weight in weights]
+        torch._foreach_lerp_(means, gradients, 1 - momentum)
+        return torch._foreach_lerp(gradients, means, momentum)
+
+
+def shared_out(
+    matrices: Sequence[Tensor], work: Callable[[Sequence[Tensor]], Tensor], kind: torch.dtype
+) -> Tensor:
+    """Return work(matrices) [S, M, N], each process doing its part and receiving the others'.
+
+    All processes must call it with matrices of the same shapes; the result is alike on each.
+    """
+    processes = dist.get_world_size() if dist.is_initialized() else 1
+    if processes == 1:
+        return work(matrices)
+    each = -(-len(matrices) // processes)
+    first = dist.get_rank() * each
+    mine = matrices[first : first + each]
+    done_EMN = matrices[0].new_zeros((each, *matrices[0].shape), dtype=kind)
+    if mine:
+        done_EMN[: len(mine)] = work(mine)
+    parts = [torch.empty_like(done_EMN) for _ in range(processes)]
+    dist.all_gather(parts, done_EMN)
+    return torch.cat(parts)[: len(matrices)]
 
 
 def orthogonal(

@@ -43,20 +43,42 @@ class Updater:
 
     def __init__(self, model: RenderFormer, settings: TrainSettings, precision: Precision) -> None:
         """Take the network, the run, and the precision of Muon's products (loop.muon)."""
+        device = next(model.parameters()).device
         self._names: dict[Tensor, str] = {weight: name for name, weight in model.named_parameters()}
         scales = width_scales(model, settings.base_widths)
-        muon_rate, decay = settings.muon_rate, settings.weight_decay
         matrices, others = list[_Scaled](), list[_Scaled]()
         for weight, name in self._names.items():
-            if muon_rate and weight.ndim == 2:
+            if settings.muon_rate and _muon_takes(name, weight, settings):
                 matrices.append((weight, scales[name].muon))
             else:
                 others.append((weight, scales[name].adamw))
-        adamw = torch.optim.AdamW(_groups(others, decay), betas=settings.betas)
+        adamw = torch.optim.AdamW(
+            self._groups(others, settings),
+            betas=settings.betas,
+            fused=True if device.type == "cuda" else None,
+        )
         self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
         self.muon_precision = precision if matrices else None
         if matrices:
-            self._optimizers.append((muon(_groups(matrices, decay), decay, precision), muon_rate))
+            thirds = [weight for weight, _ in matrices if _is_qkv(self._names[weight], settings)]
+            groups = self._groups(matrices, settings)
+            optimizer = muon(groups, settings.weight_decay, precision, thirds=thirds)
+            self._optimizers.append((optimizer, settings.muon_rate))
+
+    def _groups(self, weights: Sequence[_Scaled], settings: TrainSettings) -> list[dict[str, Any]]:
+        """Return the groups of weights whose rates have one factor, and which decay or do not.
+
+        A step takes the same share of every weight for decay, whatever that factor: a share that
+        fell with the rate would keep wide networks from forgetting (Wortsman et al. 2023).
+        """
+        groups = defaultdict[tuple[float, float], list[Tensor]](list)
+        for weight, scale in weights:
+            decays = settings.decayed == "all" or _is_matrix(self._names[weight], weight)
+            groups[scale, settings.weight_decay if decays else 0.0].append(weight)
+        return [
+            {"params": params, "weight_decay": decay / scale, _SCALE: scale}
+            for (scale, decay), params in groups.items()
+        ]
 
     def zero_grad(self) -> None:
         """Forget the gradient."""
@@ -89,23 +111,30 @@ class Updater:
                     for kind in _kept(optimizer)
                 }
                 if isinstance(optimizer, torch.optim.AdamW):
-                    memory["step"] = torch.tensor(float(updates))
+                    fused = optimizer.defaults["fused"]  # it counts on the card
+                    memory["step"] = torch.tensor(
+                        float(updates), device=weight.device if fused else None
+                    )
                 optimizer.state[weight] = memory
 
 
-def _groups(weights: Sequence[_Scaled], weight_decay: float) -> list[dict[str, Any]]:
-    """Return the groups of weights whose rates have one factor.
+_TOKENS = "registers_NW"
+"""End of the name of the learned tokens that come as a matrix, and are none."""
 
-    A step takes the same share of every weight for decay, whatever that factor: a share that fell
-    with the rate would keep wide networks from forgetting (Wortsman et al. 2023).
-    """
-    by_scale = defaultdict[float, list[Tensor]](list)
-    for weight, scale in weights:
-        by_scale[scale].append(weight)
-    return [
-        {"params": params, "weight_decay": weight_decay / scale, _SCALE: scale}
-        for scale, params in by_scale.items()
-    ]
+_LAYERS, _QKV = ".layers.", ".qkv.weight"
+"""Parts of the names of the matrices of both stages' layers, and of those that hold three."""
+
+
+def _is_matrix(name: str, weight: Tensor) -> bool:
+    return weight.ndim > 1 and not name.endswith(_TOKENS)
+
+
+def _muon_takes(name: str, weight: Tensor, settings: TrainSettings) -> bool:
+    return weight.ndim == 2 and (settings.muon_takes == "matrices" or _LAYERS in name)
+
+
+def _is_qkv(name: str, settings: TrainSettings) -> bool:
+    return settings.muon_takes == "hidden" and name.endswith(_QKV)
 
 
 def _kept(optimizer: torch.optim.Optimizer) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from model.renderformer import RenderFormer
 from model.width_scales import scale_start, width_scales
@@ -70,9 +71,9 @@ class TrainState:
             return
         updates = self.step - self.skipped_steps
         decay = min(decay, (1 + updates) / (10 + updates))
-        pairs = zip(self.mean_model.parameters(), self.model.parameters(), strict=True)
-        for mean, weight in pairs:
-            mean.lerp_(weight, 1 - decay)
+        means: list[Tensor] = [*self.mean_model.parameters()]
+        weights: list[Tensor] = [*self.model.parameters()]
+        torch._foreach_lerp_(means, weights, 1 - decay)
 
 
 def new_state(

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from train.data.buckets import TrainingBatch
+from train.loop.compiled import compile_parts
 from train.loop.crew import Crew
 from train.loop.state import TrainState
 from train.loss.objective import Objective
@@ -47,6 +48,7 @@ class Stepper:
         self._crew = crew
         self.activity = Activity()
         self.layers = LayerNorms(state.model)
+        compile_parts(state.model, objective, settings.compile, crew.device)
         self._net: nn.Module = state.model
         if crew.world_size > 1:
             # Every weight is used. Told so, torch would regroup the gradients after the first step,
@@ -68,14 +70,16 @@ class Stepper:
             last = index == len(batches) - 1
             with contextlib.nullcontext() if last else self._apart():
                 sums += self._add_gradient(batch.to(self._crew.device), num_views, last=last)
-        activity.begin("device")
-        means = (sums / num_views).tolist()
-        activity.begin("exchange")
-        loss, l1, shown, wanted = self._crew.mean(means)
         activity.begin("optimiser")
         self.layers.gradients()
-        grad_norm = nn.utils.clip_grad_norm_(state.model.parameters(), self._settings.grad_clip)
-        applied = bool(torch.isfinite(grad_norm)) and math.isfinite(loss)
+        norm = nn.utils.clip_grad_norm_(state.model.parameters(), self._settings.grad_clip)
+        activity.begin("exchange")
+        means = self._crew.mean_on_device(sums / num_views)
+        activity.begin("device")
+        # the one moment of a step in which a card is waited for
+        loss, l1, shown, wanted, grad_norm = torch.cat([means, norm.to(means)[None]]).tolist()
+        activity.begin("optimiser")
+        applied = math.isfinite(grad_norm) and math.isfinite(loss)
         if applied:
             state.updater.step(learning_rate)
             state.follow_with_mean(self._settings.ema_decay)
@@ -84,7 +88,7 @@ class Stepper:
             loss=loss,
             l1=l1,
             brightness=shown / wanted if wanted > 0 else 1.0,
-            grad_norm=float(grad_norm),
+            grad_norm=grad_norm,
             applied=applied,
         )
 

@@ -9,8 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from train.loop import muon as muon_file
 from train.loop.crew import Crew
-from train.loop.muon import fitting_precision, muon, orthogonal
+from train.loop.muon import fitting_precision, muon, orthogonal, shared_out
 
 JORDAN = (3.4445, -4.7750, 2.0315)
 SHAPES = [(24, 8), (24, 8), (8, 24), (12, 12), (12, 12), (12, 12), (1, 9), (9, 1), (1, 1)]
@@ -157,3 +158,32 @@ def test_the_processor_answers() -> None:
     assert fitting_precision(Crew(device=CPU)) == (
         "bfloat16" if "avx512_bf16" in flags else "float32"
     )
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+def test_processes_that_share_the_work_move_alike(
+    processes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each does its part of a stack, also where there are fewer matrices than processes."""
+    stack = torch.randn(4, 6, 5, generator=torch.Generator().manual_seed(0))
+    told: dict[int, Tensor] = {}
+    monkeypatch.setattr(muon_file.dist, "is_initialized", lambda: True)
+    monkeypatch.setattr(muon_file.dist, "get_world_size", lambda: processes)
+    for several in (stack, stack[:1]):
+
+        def work(some: Sequence[Tensor]) -> Tensor:
+            return orthogonal(torch.stack(list(some)), JORDAN, 5, 1e-7)
+
+        def gather(parts: list[Tensor], done: Tensor, rank: int = 0) -> None:
+            told[rank] = done
+            for number, part in enumerate(parts):
+                part.copy_(told.get(number, torch.zeros(1)).expand_as(part))
+
+        for rank in range(processes):
+            monkeypatch.setattr(muon_file.dist, "get_rank", lambda rank=rank: rank)
+            monkeypatch.setattr(
+                muon_file.dist, "all_gather", lambda p, d, rank=rank: gather(p, d, rank)
+            )
+            found = shared_out(list(several), work, torch.float32)
+        assert torch.equal(found, work(list(several))), "the last to be asked was told everything"
+        told.clear()

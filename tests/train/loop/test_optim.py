@@ -10,6 +10,7 @@ from model.base_widths import BaseWidths
 from model.renderformer import RenderFormer
 from model.width_scales import width_scales
 from tests.train.kit import tiny_run
+from train.loop.muon import orthogonal
 from train.loop.optim import Updater
 from train.loop.state import new_state
 from train.settings import Precision, TrainSettings
@@ -153,3 +154,38 @@ def test_steps_and_not_decay_follow_the_width(muon_rate: float, precision: Preci
         forgotten = -0.5 * RATE * (muon_rate if with_muon else 1) * weights[name].detach()
         torch.testing.assert_close(decayed[name], forgotten, rtol=1e-2, atol=1e-6)
     assert len(factors) > 1
+
+
+def test_what_is_said_not_to_decay_does_not() -> None:
+    """Norms, biases and learned tokens, also those that come as a matrix."""
+    model = with_gradients()
+    for weight in model.parameters():
+        weight.grad = torch.zeros_like(weight)
+    steps = moved(model, Updater(model, tiny_run(weight_decay=0.5, decayed="matrices"), "float32"))
+    still = {name for name, step in steps.items() if not step.any()}
+    weights = dict(model.named_parameters())
+    vectors = {name for name, weight in weights.items() if weight.ndim == 1 and weight.any()}
+    assert "encoder.registers_NW" in still and vectors <= still
+    matrices = [name for name in weights if name.endswith("qkv.weight")]
+    assert matrices and still.isdisjoint(matrices)
+
+
+def test_muon_leaves_inputs_tokens_and_the_head_and_takes_queries_keys_and_values_apart() -> None:
+    model = with_gradients()
+    settings = tiny_run(muon_rate=3.0, weight_decay=0, muon_takes="hidden")
+    twin = copy.deepcopy(model)
+    for ours, theirs in zip(twin.parameters(), model.parameters(), strict=True):
+        assert theirs.grad is not None
+        ours.grad = theirs.grad.clone()
+    without = moved(twin, Updater(twin, tiny_run(weight_decay=0), "float32"))
+    steps = moved(model, Updater(model, settings, "float32"))
+    for name, step in steps.items():
+        by_adamw = torch.equal(step, without[name])
+        assert by_adamw == (".layers." not in name or step.ndim != 2), name
+    name = "encoder.layers.0.attention.qkv.weight"
+    gradient = dict(model.named_parameters())[name].grad
+    assert gradient is not None
+    for step, alone in zip(steps[name].chunk(3), gradient.chunk(3), strict=True):
+        (length_one,) = orthogonal(alone[None], (3.4445, -4.7750, 2.0315), 5, 1e-7)
+        wanted = -3 * RATE * 0.2 * math.sqrt(max(alone.shape)) * length_one
+        torch.testing.assert_close(step, wanted, rtol=0, atol=1e-3 * RATE)

@@ -1,0 +1,143 @@
+"""Sequences of several lengths, one after the other and without padding, for flash attention.
+
+With a mask, torch takes its memory-efficient kernel, which reaches half of what flash attention
+does on a card. Flash attention takes no mask, but it takes sequences that follow each other, with
+the places where they start. Packing and unpacking read memory once, both on the way and back, and
+add nothing up: they are exact, and the same in every run.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import scaled_dot_product_attention
+
+from model.precision import REDUCED
+
+LONGEST_STEP = 512
+"""The longest sequence is said in multiples of this, so that compiled code meets few values."""
+
+MOST_HEAD_WIDTH = 256
+"""Widest head that flash attention takes; widths are multiples of 8."""
+
+
+class Packing(NamedTuple):
+    """Where the tokens of S padded sequences [S, N] are when P of them that exist are packed.
+
+    A named tuple, since compiled code takes its parts as inputs.
+    """
+
+    index_P: Tensor
+    """int64 place of each token among the S N padded ones."""
+    back_M: Tensor
+    """int64 [S N] place of each padded one among the packed; 0 where it does not exist."""
+    exists_M: Tensor
+    """bool [S N]."""
+    starts_S1: Tensor
+    """int32 [S + 1] where sequences start, and where the last one ends."""
+    longest: int
+    """At least the length of each."""
+
+
+def pack_lengths(lengths: Sequence[int], longest: int, device: torch.device) -> Packing:
+    """Return where tokens go: the first `lengths[s]` of the `longest` of each sequence exist."""
+    total, count = sum(lengths), len(lengths)
+    lengths_S = torch.tensor(lengths, device=device)
+    starts_S1 = torch.nn.functional.pad(lengths_S.cumsum(0), (1, 0))
+    row_P = torch.repeat_interleave(
+        torch.arange(count, device=device), lengths_S, output_size=total
+    )
+    place_P = torch.arange(total, device=device) - starts_S1[row_P]
+    place_N = torch.arange(longest, device=device)
+    exists_SN = place_N < lengths_S[:, None]
+    back_SN = (starts_S1[:-1, None] + place_N) * exists_SN
+    return Packing(
+        index_P=row_P * longest + place_P,
+        back_M=back_SN.flatten(),
+        exists_M=exists_SN.flatten(),
+        starts_S1=starts_S1.int(),
+        longest=-(-max(lengths) // LONGEST_STEP) * LONGEST_STEP,
+    )
+
+
+def takes_packed(x: Tensor, head_width: int) -> bool:
+    """Return whether there is a kernel for packed sequences where a tensor is computed with.
+
+    The one that torch has is for cards and half precision; elsewhere masks are as quick.
+    """
+    device = x.device.type
+    reduced = x.dtype in REDUCED or (device == "cuda" and torch.is_autocast_enabled("cuda"))
+    return device == "cuda" and reduced and head_width % 8 == 0 and head_width <= MOST_HEAD_WIDTH
+
+
+class _Pack(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, x_MK: Tensor, index_P: Tensor, back_M: Tensor, exists_M: Tensor
+    ) -> Tensor:
+        ctx.save_for_backward(index_P, back_M, exists_M)
+        return x_MK.index_select(0, index_P)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        index_P, back_M, exists_M = ctx.saved_tensors
+        return _Unpack.apply(grads[0], index_P, back_M, exists_M), None, None, None
+
+
+class _Unpack(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, x_PK: Tensor, index_P: Tensor, back_M: Tensor, exists_M: Tensor
+    ) -> Tensor:
+        ctx.save_for_backward(index_P, back_M, exists_M)
+        exists = exists_M.reshape(-1, *[1] * (x_PK.ndim - 1))
+        return torch.where(exists, x_PK.index_select(0, back_M), 0)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        index_P, back_M, exists_M = ctx.saved_tensors
+        return _Pack.apply(grads[0], index_P, back_M, exists_M), None, None, None
+
+
+def packed(x_SNK: Tensor, packing: Packing) -> Tensor:
+    """Return the tokens that exist: [S, N, ...] -> [P, ...]."""
+    found: Tensor = _Pack.apply(x_SNK.flatten(0, 1), *packing[:3])
+    return found
+
+
+def unpacked(x_PK: Tensor, packing: Packing) -> Tensor:
+    """Return them where they were, and 0 in the padding: [P, ...] -> [S, N, ...]."""
+    found: Tensor = _Unpack.apply(x_PK, *packing[:3])
+    return found.unflatten(0, (len(packing.starts_S1) - 1, -1))
+
+
+def attend_packed(
+    q_QHD: Tensor, k_PHD: Tensor, v_PHD: Tensor, asks_S1: Tensor, longest: int, keys: Packing
+) -> Tensor:
+    """Return softmax(q k^T / sqrt(D)) v, [Q, H, D], of each sequence to its own keys.
+
+    Args:
+        q_QHD: packed queries, half precision on a card.
+        k_PHD, v_PHD: keys and values, packed as `keys` says.
+        asks_S1: int32 where the queries of each sequence start.
+        longest: at least the number of queries of each.
+        keys: of the same sequences.
+    """
+    if q_QHD.device.type == "cuda":
+        from torch.nn.attention.varlen import varlen_attn
+
+        starts = asks_S1, keys.starts_S1
+        found: Any = varlen_attn(q_QHD, k_PHD, v_PHD, *starts, longest, keys.longest)
+        return found  # one tensor, where nothing else is asked for
+    parts = []
+    for (first, end), (low, high) in zip(_spans(asks_S1), _spans(keys.starts_S1), strict=True):
+        q, k, v = (x.transpose(0, 1) for x in (q_QHD[first:end], k_PHD[low:high], v_PHD[low:high]))
+        parts.append(scaled_dot_product_attention(q[None], k[None], v[None])[0].transpose(0, 1))
+    return torch.cat(parts)
+
+
+def _spans(starts_S1: Tensor) -> list[tuple[int, int]]:
+    starts = starts_S1.tolist()
+    return list(itertools.pairwise(starts))

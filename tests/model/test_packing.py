@@ -1,0 +1,65 @@
+"""Scenes of several lengths packed give what they give padded behind a mask, and its gradients.
+
+On a card the kernel is torch's; here its slow twin, sequence after sequence, so all around it runs.
+"""
+
+import pytest
+import torch
+from torch import Tensor
+
+from model import encoded_scene
+from model.packing import pack_lengths, packed, unpacked
+from model.renderformer import RenderFormer
+from model.scene_tensors import SceneBatch, batch_scenes
+from tests.model.kit import FAMILIES, RESOLUTION, awake, random_scene, tiny_config
+
+LENGTHS = (5, 9, 1)
+
+
+def _batch() -> SceneBatch:
+    return batch_scenes([random_scene(length, seed=length) for length in LENGTHS])
+
+
+def _results(model: RenderFormer, batch: SceneBatch) -> dict[str, Tensor]:
+    model.zero_grad()
+    picture = model(batch, RESOLUTION)
+    picture.square().sum().backward()
+    weights = {name: weight.grad for name, weight in model.named_parameters()}
+    return {"picture": picture.detach(), **{k: v for k, v in weights.items() if v is not None}}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_packed_batch_is_the_padded_one(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, batch = awake(tiny_config(family)), _batch()
+    padded = _results(model, batch)
+    monkeypatch.setattr(encoded_scene, "takes_packed", lambda *_: True)
+    monkeypatch.setattr("model.attention.scaled_dot_product_attention", _forbid_masks)
+    for name, found in _results(model, batch).items():
+        wanted = padded[name]
+        assert (found - wanted).abs().max() <= 1e-11 * wanted.abs().max().clamp(min=1), name
+
+
+def _forbid_masks(q: Tensor, k: Tensor, v: Tensor, attn_mask: Tensor | None) -> Tensor:
+    assert attn_mask is None, "nothing that is padded is attended with a mask"
+    return torch.nn.functional.scaled_dot_product_attention(q, k, v)
+
+
+def test_packing_keeps_what_exists_and_unpacking_puts_it_back() -> None:
+    packing = pack_lengths(LENGTHS, 9, torch.device("cpu"))
+    x = torch.arange(27.0).reshape(3, 9, 1).requires_grad_()
+    exists = torch.arange(9) < torch.tensor(LENGTHS)[:, None]
+    there = packed(x, packing)
+    assert torch.equal(there.detach(), x.detach()[exists])
+    assert packing.starts_S1.tolist() == [0, 5, 14, 15] and packing.longest >= 9
+    back = unpacked(there, packing)
+    assert torch.equal(back.detach()[..., 0], x.detach()[..., 0] * exists)
+    (back * x.detach()).sum().backward()
+    assert x.grad is not None
+    assert torch.equal(x.grad[..., 0], x.detach()[..., 0] * exists), "and gradients go that way"
+
+
+def test_where_a_mask_says_more_than_lengths_there_is_a_mask() -> None:
+    batch = _batch()
+    assert batch.num_triangles == LENGTHS
+    alone = batch_scenes([random_scene(5), random_scene(5)])
+    assert alone.num_triangles is None and alone.is_triangle_BT is None

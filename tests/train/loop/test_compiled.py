@@ -1,0 +1,109 @@
+"""Compiled layers compute what layers compute, from one graph for all of them and all lengths."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+from torch._dynamo.testing import CompileCounterWithBackend
+
+from model.renderformer import RenderFormer
+from model.scene_tensors import batch_scenes
+from storage.errors import TrilightError
+from tests.model.kit import RESOLUTION, awake, random_scene, tiny_config
+from train.loop import compiled
+from train.loop.compiled import compile_parts, compiled_parts
+from train.loss.objective import Objective
+from train.settings import LossSettings
+
+CPU = torch.device("cpu")
+QUICK = ((3, 5), (4, 9, 2))
+PASSES = (*QUICK, (6, 6), (7,), (11, 2), (8, 3, 5, 1))
+"""Lengths of the scenes of passes: padded, of one length, and one alone."""
+
+
+@pytest.fixture(autouse=True)
+def forgets() -> Iterator[None]:
+    torch._dynamo.reset()
+    yield
+    torch._dynamo.reset()
+
+
+def _objective() -> Objective:
+    return Objective(LossSettings(perceptual="none"), None)
+
+
+def _results(model: RenderFormer, lengths: tuple[int, ...]) -> dict[str, Tensor]:
+    model.zero_grad()
+    scenes = [random_scene(n, num_views=1, seed=n, dtype=torch.float32) for n in lengths]
+    picture = model(batch_scenes(scenes), RESOLUTION)
+    picture.square().sum().backward()
+    grads = {name: weight.grad for name, weight in model.named_parameters()}
+    return {"picture": picture.detach(), **{k: v for k, v in grads.items() if v is not None}}
+
+
+def _check(
+    monkeypatch: pytest.MonkeyPatch,
+    backend: str,
+    head: str,
+    passes: tuple[tuple[int, ...], ...],
+    most_graphs: int,
+) -> None:
+    """Compile a network by a backend, and hold its results beside those without."""
+    model = awake(tiny_config(head), dtype=torch.float32)
+    plain = [_results(model, lengths) for lengths in passes]
+    counter = CompileCounterWithBackend(backend)
+    real = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda f, **_: real(f, backend=counter, dynamic=True))
+    monkeypatch.setattr(
+        torch.nn.Module,
+        "compile",
+        lambda module, **_: setattr(
+            module, "_compiled_call_impl", real(module._call_impl, backend=counter, dynamic=True)
+        ),
+    )
+    names = [name for name, _ in model.named_parameters()]
+    assert compile_parts(model, _objective(), "yes", CPU)
+    assert [name for name, _ in model.named_parameters()] == names, "checkpoints stay"
+    for lengths, wanted in zip(passes, plain, strict=True):
+        for name, found in _results(model, lengths).items():
+            scale = wanted[name].abs().max().clamp(min=1e-3)
+            assert (found - wanted[name]).abs().max() <= 2e-5 * scale, (lengths, name)
+    assert 0 < counter.frame_count <= most_graphs
+    if backend != "eager":
+        return
+    before = counter.frame_count
+    _results(model, (2, 10, 4))
+    assert counter.frame_count == before, "another length is no other graph"
+
+
+def test_layers_of_a_stage_share_a_graph_for_every_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four functions, and a fifth graph where a layer is the first to be asked."""
+    _check(monkeypatch, "eager", "linear", QUICK, 5)
+
+
+@pytest.mark.slow
+def test_three_kinds_of_pass_are_three_times_as_many_graphs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _check(monkeypatch, "eager", "linear", PASSES, 15)
+
+
+@pytest.mark.slow
+def test_inductor_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It guards on more than the lengths' being variables, so the second pass has graphs too."""
+    _check(monkeypatch, "inductor", "linear", QUICK, 10)
+
+
+def test_what_is_compiled_where(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, objective, card = awake(tiny_config()), _objective(), torch.device("cuda")
+    layers = len(model.encoder.layers) + len(model.decoder.layers)
+    assert len(list(compiled_parts(model, objective))) == layers + 2
+    assert not compile_parts(model, objective, "auto", CPU)
+    assert not compile_parts(model, objective, "no", card)
+    monkeypatch.setattr(compiled, "_has_triton", lambda: False)
+    assert not compile_parts(model, objective, "auto", card)
+    with pytest.raises(TrilightError, match="triton"):
+        compile_parts(model, objective, "yes", card)
+    monkeypatch.setattr(compiled, "_has_triton", lambda: True)
+    assert compile_parts(model, objective, "auto", card)
