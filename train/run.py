@@ -94,8 +94,7 @@ def train_run(
     early = _EarlyNotes(progress)
     for note in (*opened.notes, *(() if VALIDATION in opened.splits else (UNJUDGED,))):
         early.noted(note)
-    if workers is None:
-        workers = _fitting_workers(settings, crew, early)
+    workers = _fitting_workers(settings, crew, early) if workers is None else workers
     plan = beginning(settings, folder, opened.digest, start, crew, early)
     settings = plan.settings
     lpips = crew.once_a_machine(partial(load_lpips, start.lpips))

@@ -16,7 +16,7 @@ class PushAsked:
     repository: str
     """Repository USER/NAME; made where it is missing."""
     private: bool = False
-    """Make a new repository private."""
+    """Make a new repository private; refuse one that is public."""
     dry_run: bool = False
     """Only check and say what would be uploaded."""
 
@@ -45,7 +45,8 @@ def push(asked: PushAsked, shown: Shown) -> None:
     title = "Would be uploaded" if asked.dry_run else "Uploaded"
     print_rows(title, [*rows, ("size", f"{upload.num_bytes / 1e6:.1f} MB")])
     if asked.dry_run:
-        next_step(["push", str(asked.folder), asked.repository])
+        private = ["--private"] if asked.private else []
+        next_step(["push", str(asked.folder), asked.repository, *private])
     elif upload.kind == "dataset":
         next_step(["verify", f"hf://datasets/{upload.repository}"])
     else:

@@ -66,5 +66,6 @@ def _say_finished(order: DatasetOrder, *, as_json: bool) -> None:
 
 
 def _line(job: ArrayJob) -> str:
+    """Return the command for a shell; without the folder of their logs, Slurm fails all tasks."""
     settings = [f"{name}={shlex.quote(value)}" for name, value in job.environment.items()]
-    return " ".join([*settings, shlex.join(job.command())])
+    return " ".join(["mkdir -p logs &&", *settings, shlex.join(job.command())])

@@ -26,6 +26,11 @@ def plot_leaderboard(widths: Sequence[WidthStandings], title: str, path: Path) -
     import matplotlib
 
     matplotlib.use("Agg")  # before pyplot: no display is needed
+    with matplotlib.rc_context({"text.parse_math": False}):  # names may hold dollar signs
+        _plot(widths, title, path)
+
+
+def _plot(widths: Sequence[WidthStandings], title: str, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, panels = plt.subplots(

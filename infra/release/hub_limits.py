@@ -33,7 +33,7 @@ def require_within_limits(folder: Path) -> tuple[int, int]:
     """Return how many files and bytes a folder uploads.
 
     Raises:
-        TrilightError: nothing is there, or more than the hub takes.
+        TrilightError: nothing is there, or more than the hub advises.
     """
     files = list(uploaded_files(folder))
     sizes = {path: path.stat().st_size for path in files}
@@ -46,7 +46,7 @@ def require_within_limits(folder: Path) -> tuple[int, int]:
     ):
         if got > limit:
             raise TrilightError(
-                f"{folder}: {got} {what}; the hub takes at most {limit}. Make larger or smaller "
+                f"{folder}: {got} {what}; the hub advises at most {limit}. Make larger or smaller "
                 "shards: trilight shards reshard."
             )
     if not files:

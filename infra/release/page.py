@@ -14,6 +14,7 @@ from storage.conventions import preview_srgb8
 from train.evaluation.sheet import ERROR_WHITE, error_picture
 
 _TITLE = "Trilight: traced, learned and filtered"
+_PICTURES = "pictures"
 
 _STYLE = """
 .row { display: grid; grid-template-columns: repeat(auto-fill, minmax(9rem, 1fr)); gap: .6rem;
@@ -27,6 +28,8 @@ figcaption { font-size: .85rem; color: var(--soft); margin-top: .2rem }
 def write_page(folder: Path, shown: Sequence[Beside], *, about: Sequence[tuple[str, str]]) -> Path:
     """Write `index.html`, its pictures and the card of a static space, and return the page.
 
+    Pictures of an earlier page, which would be uploaded too, are deleted.
+
     Args:
         folder: where they go.
         shown: the scenes, each by the same ones.
@@ -35,6 +38,8 @@ def write_page(folder: Path, shown: Sequence[Beside], *, about: Sequence[tuple[s
     Raises:
         TrilightError: the folder cannot be written.
     """
+    for old in sorted((folder / _PICTURES).glob("[0-9]" * 9 + "-*.png")):
+        old.unlink()
     rows = [part for each in shown for part in _scene(folder, each)]
     body = [
         element("h1", _TITLE),
@@ -70,7 +75,7 @@ def _scene(folder: Path, each: Beside) -> list[Markup]:
             pictures.append(("error", error, "error of the network"))
     figures = []
     for name, pixels, caption in pictures:
-        relative = f"pictures/{each.key}-{name}.png"
+        relative = f"{_PICTURES}/{each.key}-{name}.png"
         write_atomically(folder / relative, encode_png(pixels))
         figure = enlargeable(relative, f"{each.key}, {caption}")
         figures.append(element("figure", figure, element("figcaption", caption)))

@@ -14,6 +14,7 @@ from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.variant import choose_variant
 from storage.dataset.dataset import Dataset
+from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
 from storage.records.sample import Sample
 
@@ -45,9 +46,17 @@ def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
     """Return up to `count` scenes that no network of this dataset learned from, if there are any.
 
     They are those of the test split; of all splits where it is empty.
+
+    Raises:
+        TrilightError: none is asked for, or the dataset holds none.
     """
     everything = choose_scenes(dataset.manifest, dataset.manifest.num_samples)
     held = [entry for entry in everything if entry.split == "test"] or everything
+    if count < 1 or not held:
+        raise TrilightError(
+            f"--pictures is {count}, of a dataset of {len(everything)} scenes; expected at least "
+            "one scene to show."
+        )
     rows = np.linspace(0, len(held) - 1, min(count, len(held))).round().astype(int)
     return [held[row] for row in rows]
 

@@ -1,17 +1,25 @@
 """Uploads a folder to a repository of the Hugging Face hub, by its own package."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from infra.release.hub_limits import IGNORED, require_within_limits
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
 
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+
 RepositoryKind = Literal["dataset", "model", "space"]
 
 NETWORK_FILE = "model.safetensors"
+
+_PART = r"(?!\S*(?:--|\.\.))\w(?:[\w.-]{0,94}\w)?"
+_REPOSITORY = re.compile(f"{_PART}/{_PART}", re.ASCII)
+"""As huggingface_hub refuses others, only later."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,11 +57,13 @@ def planned_upload(folder: Path, repository: str) -> Upload:
 
     Raises:
         TrilightError: the name is none, the folder is no release, an unfinished or damaged dataset,
-            a network without its card, or more than the hub takes.
+            a network without its card, or more than the hub advises.
     """
-    owner, _, name = repository.partition("/")
-    if not owner or not name or "/" in name:
-        raise TrilightError(f"repository is {repository}; expected USER/NAME.")
+    if not _REPOSITORY.fullmatch(repository) or repository.endswith(".git"):
+        raise TrilightError(
+            f"repository is {repository}; expected USER/NAME of letters, digits and single -, _ "
+            "and . between them, as the hub takes them."
+        )
     kind = kind_of(folder)
     if kind == "dataset":
         _require_sound(folder)
@@ -72,7 +82,8 @@ def push(upload: Upload, *, private: bool) -> str:
     The token is that of HF_TOKEN or of `hf auth login`; the hub is HF_ENDPOINT or the usual one.
 
     Raises:
-        TrilightError: the package is missing, or the hub refuses.
+        TrilightError: the package is missing, the hub refuses, or a repository that should be
+            private is public.
     """
     try:
         from huggingface_hub import HfApi
@@ -88,6 +99,8 @@ def push(upload: Upload, *, private: bool) -> str:
             exist_ok=True,
             space_sdk="static" if upload.kind == "space" else None,
         )
+        if private:
+            _require_private(hub, upload)
         hub.upload_folder(
             repo_id=upload.repository,
             repo_type=upload.kind,
@@ -95,6 +108,8 @@ def push(upload: Upload, *, private: bool) -> str:
             ignore_patterns=list(IGNORED),
             commit_message=f"Upload of {upload.files} files",
         )
+    except TrilightError:
+        raise
     except LocalTokenNotFoundError as error:
         raise TrilightError(_NO_TOKEN.format(repository=upload.repository)) from error
     except HfHubHTTPError as error:
@@ -104,6 +119,15 @@ def push(upload: Upload, *, private: bool) -> str:
     except Exception as error:  # of whichever library the package speaks HTTP with
         raise _broken_off(upload, "the upload broke off", error) from error
     return str(made.url)
+
+
+def _require_private(hub: "HfApi", upload: Upload) -> None:
+    """Refuse to show the world what should be private: who made a repository, chose that."""
+    if not hub.repo_info(upload.repository, repo_type=upload.kind).private:
+        raise TrilightError(
+            f"{upload.repository}: is there already and public; expected a private one. Make it "
+            "private in its settings on the hub, or leave out --private."
+        )
 
 
 _NO_TOKEN = (

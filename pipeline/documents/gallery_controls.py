@@ -78,9 +78,10 @@ def gallery_controls(cards: Sequence[CardFacts]) -> Controls:
         "layout": [card.template for card in cards],
         "views": [_CAPS[card.at_cap] for card in cards],
     }
+    named = {name: filter(None, values) for name, values in filters.items()}  # some have no layout
     choices = {
         name: list(dict.fromkeys(sorted(values) if name == "layout" else values))[:_MOST_CHOICES]
-        for name, values in filters.items()
+        for name, values in named.items()
     }
     choices = {name: values for name, values in choices.items() if len(values) > 1}
     orders = list(cards[0].orders) if len(cards) > 1 else []

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pipeline.builds.named import BUILDS, named_build
 from pipeline.making.dataset_order import DatasetOrder, generate_words
+from storage.dataset.dataset import dataset_files
 from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import missing_shards, number_ranges
 from storage.dataset.splits import shards_for
@@ -76,8 +77,7 @@ def array_job(
     scenes = order.scenes or BUILDS.find(order.build).num_scenes
     splits = changed(named_build(order.build), order.changes).splits
     planned = shards_for(scenes, splits)
-    begun = "://" in order.place or dataset_folder(order.place).manifest.exists()
-    missing = missing_shards(order.place) if begun else list(range(planned))
+    missing = missing_shards(order.place) if _is_begun(order.place) else list(range(planned))
     each = per_task or -(-planned // MOST_TASKS)
     tasks = sorted({shard // each for shard in missing})
     if tasks and tasks[-1] >= MOST_TASKS:
@@ -128,6 +128,18 @@ def submit_array(job: ArrayJob) -> str:
         said = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise TrilightError(f"submit slurm: sbatch refused ({said}).")
     return done.stdout.strip().partition(";")[0]
+
+
+def _is_begun(place: str) -> bool:
+    """Return whether a folder or bucket holds a dataset's manifest."""
+    folder = dataset_folder(place)
+    if not folder.bucket:
+        return folder.manifest.exists()
+    found = dataset_files(place).open_beside(folder.manifest.name)
+    if found is None:
+        return False
+    found.close()
+    return True
 
 
 def _without(words: Sequence[str], options: Sequence[str]) -> list[str]:

@@ -115,12 +115,23 @@ def _quotas(folder: Path) -> Iterator[float]:
 
 
 def _free_in(folder: Path) -> Iterator[int]:
-    """Yield the memory that a control group has left, where it is limited."""
+    """Yield the memory that a control group has left or can take back, where it is limited."""
     old = ("memory.limit_in_bytes", "memory.usage_in_bytes")
     for limit, used in (("memory.max", "memory.current"), old):
         lines = [_lines(folder / name) for name in (limit, used)]
         if all(lines) and lines[0][0] != "max" and int(lines[0][0]) < _NO_LIMIT:
-            yield max(int(lines[0][0]) - int(lines[1][0]), 0)
+            held = int(lines[1][0]) - _files_held(folder)
+            yield max(int(lines[0][0]) - held, 0)
+
+
+def _files_held(folder: Path) -> int:
+    """Return the bytes of files that a control group holds until somebody wants the memory.
+
+    They count as used: after an epoch, the shards that were read fill every group.
+    """
+    words = (line.split() for line in _lines(folder / "memory.stat"))
+    counts = {name: int(value) for name, value in words}
+    return counts.get("total_inactive_file", counts.get("inactive_file", 0))
 
 
 def _lines(path: Path) -> list[str]:

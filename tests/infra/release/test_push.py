@@ -57,8 +57,11 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
         home = {"HF_ENDPOINT": url, "HF_HOME": str(tmp_path / "home")}
         words = [str(dataset.folder.root), "ada/set", "--json"]
         refused = pushed(words, HF_TOKEN="hf_other", **home)
+        public = pushed([*words, "--private"], HF_TOKEN=TOKEN, **home)
+        assert list(there.iterdir()) == []
         result = pushed(words, HF_TOKEN=TOKEN, **home)
     assert refused.returncode == 1 and "set HF_TOKEN" in refused.stderr + refused.stdout
+    assert public.returncode == 1 and "already and public" in public.stderr + public.stdout
     assert result.returncode == 0, result.stderr
     said = json.loads(result.stdout)
     assert said["address"] == f"{url}/datasets/ada/set"
@@ -85,7 +88,16 @@ def test_what_kind_a_folder_is(dataset: Dataset, tmp_path: Path) -> None:
 
 def test_nothing_is_sent_that_nobody_could_use(dataset: Dataset, tmp_path: Path) -> None:
     root = dataset.folder.root
-    for name in ("set", "a/b/c", "/set", "ada/"):
+    for name in (
+        "set",
+        "a/b/c",
+        "/set",
+        "ada/",
+        "ada/my set",
+        "ada/-set",
+        "a--b/set",
+        "ada/set.git",
+    ):
         with pytest.raises(TrilightError, match="expected USER/NAME"):
             planned_upload(root, name)
     (root / "README.md").unlink()
@@ -105,8 +117,8 @@ def test_the_limits_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     (tmp_path / "below" / "3.bin").write_bytes(bytes(1))
     assert require_within_limits(tmp_path) == (4, 61)
     for limit, value, message in (
-        ("MOST_FILES", 3, "4 files; the hub takes at most 3"),
-        ("MOST_ENTRIES", 2, "3 entries in one folder; the hub takes at most 2"),
+        ("MOST_FILES", 3, "4 files; the hub advises at most 3"),
+        ("MOST_ENTRIES", 2, "3 entries in one folder; the hub advises at most 2"),
         ("MOST_FILE_BYTES", 29, "30 bytes in one file"),
     ):
         with monkeypatch.context() as patched:
@@ -116,7 +128,8 @@ def test_the_limits_of_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_dry_run_sends_nothing(dataset: Dataset) -> None:
-    result = trilight(["push", str(dataset.folder.root), "ada/set", "--dry-run"])
+    words = ["push", str(dataset.folder.root), "ada/my_set-1.0"]
+    result = trilight([*words, "--private", "--dry-run"])
     assert result.exit_code == 0, result.exception
     assert "Would be uploaded" in result.output
-    assert f"Next: trilight push {dataset.folder.root} ada/set" in result.output
+    assert f"Next: trilight {' '.join(words)} --private" in result.output

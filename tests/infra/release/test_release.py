@@ -11,6 +11,7 @@ from infra.release.page import write_page
 from infra.release.pictures import NETWORK, Beside, chosen_scenes
 from infra.release.push import planned_upload
 from model.open import open_network
+from storage.errors import TrilightError
 from tests.pipeline.documents.dataset_by_hand import (
     five_scenes,
     furnished,
@@ -45,6 +46,9 @@ def test_the_page_shows_everybody_and_opens_from_disk(tmp_path: Path) -> None:
     assert "traced, noise floor 41.3 dB" in text
     assert not {"script", "link"} & set(tags.tags)
     assert planned_upload(tmp_path, "ada/page").kind == "space"
+    write_page(tmp_path, [beside("000000002", 28.0)], about=[])
+    left = {path.name[:9] for path in (tmp_path / "pictures").iterdir()}
+    assert left == {"000000002"}, "an earlier page's pictures would be uploaded too"
 
 
 def test_scenes_are_those_that_nobody_learned_from(tmp_path: Path) -> None:
@@ -53,6 +57,9 @@ def test_scenes_are_those_that_nobody_learned_from(tmp_path: Path) -> None:
     shards = {"train-000000.tar": [sample(key, furnished(["a"])) for key in range(4)]}
     only_train = write_dataset(tmp_path / "train", shards)
     assert [entry.split for entry in chosen_scenes(only_train, 3)] == ["train"] * 3
+    for none, count in ((write_dataset(tmp_path / "none", {}), 24), (dataset, 0), (dataset, -1)):
+        with pytest.raises(TrilightError, match=f"pictures is {count}, .* at least one scene"):
+            chosen_scenes(none, count)
 
 
 def test_a_network_that_is_released_opens(tmp_path: Path) -> None:

@@ -62,6 +62,14 @@ def test_a_command_for_each_combination(controls: Controls) -> None:
     assert "--where &#x27;not any(at_cap)&#x27;" in found
 
 
+def test_scenes_of_no_layout_are_no_choice() -> None:
+    """Such as those of scene files: no command selects them, and none claims to."""
+    controls = gallery_controls([card("train", name) for name in ("", "plane", "room")])
+    assert "layout" not in controls.classes[0] and "layout-1" in controls.classes[1]
+    assert commands(controls.markup) == {"--template plane", "--template room"}
+    assert len([name for name in read(controls.markup.encode()).ids if "layout" in name]) == 3
+
+
 def test_no_choice_no_button() -> None:
     assert gallery_controls([]).markup == ""
     one = gallery_controls([card("train", "plane")])

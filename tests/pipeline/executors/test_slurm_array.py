@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -132,4 +133,18 @@ def test_refusals(cluster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert dry.exit_code == 0 and "sbatch --parsable --array=0-5" in dry.stdout
     result = trilight(["submit", "generate-scenes", "smoke", "--dry-run"])
     assert "options of submit slurm" in str(result.exception)
-    assert shlex.split(dry.stdout.splitlines()[-1])[0] == "OUT=set"
+    assert shlex.split(dry.stdout.splitlines()[-1])[4] == "OUT=set"
+
+
+def test_the_printed_command_does_what_submitting_does(cluster: Path) -> None:
+    words = ["submit", "slurm", "smoke", "--out", "my set", "--objects", "my objects"]
+    dry = trilight([*words, "--dry-run"])
+    assert dry.exit_code == 0 and not (cluster / "logs").exists()
+    subprocess.run(["bash", "-c", dry.stdout.splitlines()[-1]], check=True, capture_output=True)
+    assert (cluster / "logs").is_dir()
+    printed = (cluster / "asked").read_text()
+    assert {"OUT=my set", "OBJECTS=my objects"} <= set(
+        (cluster / "asked.env").read_text().splitlines()
+    )
+    assert trilight(words).exit_code == 0
+    assert (cluster / "asked").read_text() == printed

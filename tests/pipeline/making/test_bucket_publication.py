@@ -6,6 +6,8 @@ from typing import Any
 
 import pytest
 
+from pipeline.executors.slurm_array import array_job
+from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.publication import Publication
 from pipeline.shards.mirror import Mirror
 from pipeline.shards.pack import pack_shard
@@ -42,6 +44,16 @@ def make(publication: Publication, *shards: int) -> None:
 def names(bucket: Any) -> set[str]:
     bucket.invalidate_cache()
     return {path.removeprefix("shards/set/") for path in bucket.find("shards/set")}
+
+
+def test_an_array_is_of_what_a_bucket_lacks(bucket: Any, machines: Machines) -> None:
+    machines.use("a")
+    splits = {f"splits.{name}": value for name, value in vars(_build().splits).items()}
+    order = DatasetOrder(build="smoke", out=OUT, scenes=8, changes=splits)
+    assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
+    with machines.maker("a") as publication:
+        make(publication, 0)
+    assert array_job(order, per_task=None, at_once=None).tasks == [1]
 
 
 def test_two_machines_end_in_the_bytes_of_one_folder(

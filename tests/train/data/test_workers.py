@@ -41,6 +41,16 @@ def system(root: Path, files: dict[str, str]) -> Path:
         ),
         (
             {
+                "proc/self/cgroup": "0::/job\n",
+                "sys/fs/cgroup/job/memory.max": f"{8 * GIB}",
+                "sys/fs/cgroup/job/memory.current": f"{8 * GIB}",
+                "sys/fs/cgroup/job/memory.stat": f"anon {2 * GIB}\ninactive_file {6 * GIB}\n",
+            },
+            16.0,
+            6 * GIB,
+        ),
+        (
+            {
                 "proc/self/cgroup": "4:memory:/x\n",
                 "sys/fs/cgroup/cpu/cpu.cfs_quota_us": "200000",
                 "sys/fs/cgroup/cpu/cpu.cfs_period_us": "100000",
@@ -51,7 +61,7 @@ def system(root: Path, files: dict[str, str]) -> Path:
             None,
         ),
     ],
-    ids=["nothing", "memory", "quota", "no quota", "group of a job", "old groups"],
+    ids=["nothing", "memory", "quota", "no quota", "group of a job", "files held", "old groups"],
 )
 def test_a_machine_is_what_its_files_say(
     files: dict[str, str],
