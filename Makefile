@@ -36,9 +36,9 @@ RELEASE_PIXELS := 128
 RELEASE_SHARD := 32
 
 release: setup-all  ## dataset, network and pictures to publish, in $(RELEASE); an hour or two of two cores, goes on where it stopped
-	trilight generate smoke --objects builtin: --out $(RELEASE)/dataset --scenes $(RELEASE_SCENES) --resolution $(RELEASE_PIXELS) \
+	trilight generate smoke --objects builtin: --out '$(RELEASE)/dataset' --scenes $(RELEASE_SCENES) --resolution $(RELEASE_PIXELS) \
 		--set splits.scenes_per_shard=$(RELEASE_SHARD) --set 'storage.passes=[depth,normal,object]'
-	python -m infra.release $(RELEASE)
+	python -m infra.release '$(RELEASE)'
 
 serve: setup  ## Prefect's server, a pool, a worker and the flows as deployments, on this machine
 	python -m infra.serving.local start

@@ -9,6 +9,7 @@ from infra.cli.console import console, look_at, next_step, print_json, print_row
 from infra.cli.options import Shown, command
 from pipeline.making.price import CorePrice
 from storage.dataset.progress import DatasetStatus, missing_shards, number_ranges, read_status
+from storage.errors import TrilightError
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
@@ -24,6 +25,12 @@ class StatusOrder:
     scheduler needs to start them again."""
     shards_per_task: Annotated[int, Within(1, 10**6, unit="shards")] = 1
     """With --missing: print instead the numbers of the tasks that make so many shards each."""
+
+    def __post_init__(self) -> None:
+        if self.shards_per_task != 1 and not self.missing:
+            raise TrilightError(
+                f"--shards-per-task is {self.shards_per_task}; expected it only with --missing."
+            )
 
 
 @command("dataset")

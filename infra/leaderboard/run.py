@@ -160,7 +160,7 @@ def _nearest(order: LeaderboardOrder, opened: TrainingData) -> NearestContestant
         name,
         lambda width: make_rivals(pool.split(split), width),
         pool=f"{pool.digest} {split}",
-        not_itself=pool is opened,
+        not_itself=pool.digest == opened.digest,
         notes=(note,),
     )
 

@@ -19,6 +19,7 @@ from storage.dataset.layout import dataset_folder
 from storage.dataset.progress import missing_shards, number_ranges
 from storage.dataset.splits import shards_for
 from storage.errors import TrilightError
+from storage.remote.safe_url import safe_url
 from storage.settings.changes import changed
 
 MOST_TASKS = 1000
@@ -66,13 +67,19 @@ def array_job(
         options: of sbatch, besides.
 
     Raises:
-        TrilightError: the order is of scene files or of a part, its dataset cannot be read, or the
-            array would have too many tasks.
+        TrilightError: the order is of scene files or of a part, names a password, its dataset
+            cannot be read, or the array would have too many tasks.
     """
     if order.scenes_from or order.revisits or order.shards:
         raise TrilightError(
             "submit slurm: expected no --scenes-from, --revisits or --shards: the array divides "
             "scenes that are composed. Start such a dataset by trilight generate on each machine."
+        )
+    if order.objects and safe_url(order.objects) != order.objects and "://" in order.objects:
+        raise TrilightError(
+            f"submit slurm: --objects {safe_url(order.objects)} holds a password, which every user "
+            "of the cluster could read in the queue; expected env:TRILIGHT_SOURCE_NAME, with the "
+            "address in that variable of the tasks."
         )
     scenes = order.scenes or BUILDS.find(order.build).num_scenes
     splits = changed(named_build(order.build), order.changes).splits
@@ -93,7 +100,7 @@ def array_job(
         "SCENES": str(scenes),
         "SHARDS_PER_TASK": str(each),
         "TRILIGHT": str(Path(sys.executable).with_name("trilight")),
-        **({"OBJECTS": order.objects} if order.objects else {}),
+        "OBJECTS": order.objects or "",  # also where this shell has one of its own
     }
     return ArrayJob(
         tasks=tasks,

@@ -122,6 +122,13 @@ def test_tasks_that_died_are_all_that_is_submitted_again(
     assert trilight(["status", order.place, "--missing"]).stdout == ""
 
 
+def test_passwords_do_not_reach_the_queue() -> None:
+    order = DatasetOrder(build="smoke", objects="http://ada:secret@host/objects/")
+    with pytest.raises(TrilightError, match="holds a password") as refused:
+        array_job(order, per_task=None, at_once=None)
+    assert "secret" not in str(refused.value)
+
+
 def test_refusals(cluster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FAKE_REFUSES", "1")
     words = ["submit", "slurm", "smoke", "--out", "set"]
@@ -133,6 +140,8 @@ def test_refusals(cluster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert dry.exit_code == 0 and "sbatch --parsable --array=0-5" in dry.stdout
     result = trilight(["submit", "generate-scenes", "smoke", "--dry-run"])
     assert "options of submit slurm" in str(result.exception)
+    alone = trilight(["status", "set", "--shards-per-task", "4"])
+    assert "expected it only with --missing" in str(alone.exception)
     assert shlex.split(dry.stdout.splitlines()[-1])[4] == "OUT=set"
 
 
