@@ -47,8 +47,9 @@ def kind_of(folder: Path) -> RepositoryKind:
     if (folder / "index.html").is_file():
         return "space"
     raise TrilightError(
-        f"{folder}: expected a dataset (manifest.json), a network ({NETWORK_FILE}) or a page "
-        "(index.html); make one with trilight generate, trilight train or make release."
+        f"{folder}: expected a folder of this machine with a dataset (manifest.json), a network "
+        f"({NETWORK_FILE}) or a page (index.html); make one with trilight generate, trilight train "
+        "or make release."
     )
 
 

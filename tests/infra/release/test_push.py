@@ -82,7 +82,7 @@ def test_what_kind_a_folder_is(dataset: Dataset, tmp_path: Path) -> None:
         place.mkdir()
         (place / name).write_bytes(b"x")
         assert kind_of(place) == kind
-    with pytest.raises(TrilightError, match="expected a dataset"):
+    with pytest.raises(TrilightError, match="expected a folder of this machine"):
         kind_of(tmp_path / "absent")
 
 
