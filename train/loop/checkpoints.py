@@ -52,6 +52,13 @@ def save_checkpoint(
     path: Path, state: TrainState, settings: TrainSettings, *, data_digest: str, world_size: int
 ) -> None:
     """Write the checkpoint; raises TrilightError where the folder is full or cannot be written."""
+    _write_sealed(path, _encoded(state, settings, data_digest, world_size))
+
+
+def _encoded(
+    state: TrainState, settings: TrainSettings, data_digest: str, world_size: int
+) -> bytes:
+    """Return a copy of all that a checkpoint holds, without its sha256; steps may go on."""
     tensors = state.updater.memories()
     for name, weight in state.model.named_parameters():
         tensors[f"model/{name}"] = weight.detach()
@@ -76,7 +83,10 @@ def save_checkpoint(
         "sha256": UNSEALED,
     }
     contiguous = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
-    data = save(contiguous, metadata={HEADER_KEY: json.dumps(header)})
+    return save(contiguous, metadata={HEADER_KEY: json.dumps(header)})
+
+
+def _write_sealed(path: Path, data: bytes) -> None:
     before, after = _around(data, UNSEALED)
     with atomic_writer(path) as stream:
         for part in (before, _seal(before, after).encode(), after):
@@ -237,7 +247,13 @@ def _newest_whole(folder: Path, steps: list[int], noted: Callable[[str], None]) 
 
 
 def keep_checkpoint(
-    folder: Path, state: TrainState, settings: TrainSettings, *, data_digest: str, world_size: int
+    folder: Path,
+    state: TrainState,
+    settings: TrainSettings,
+    *,
+    data_digest: str,
+    world_size: int,
+    begin: Callable[[Callable[[], None]], None] = lambda work: work(),
 ) -> None:
     """Save the state, whole or not at all, and only then delete what the run does not keep.
 
@@ -245,13 +261,26 @@ def keep_checkpoint(
     decay of the learning rate begins, from which a longer run can go on. One of a later step was
     damaged when the run resumed from an earlier one, and does not count.
 
+    Args:
+        folder: of the checkpoints.
+        state: is copied before this returns.
+        settings: of the run.
+        data_digest: of what it learns from.
+        world_size: number of processes.
+        begin: does the writing, which takes as long as the disk: at once unless said.
+
     Raises:
         TrilightError: the folder is full or cannot be written; the older ones are still there.
     """
-    path = path_of_step(folder, state.step)
-    save_checkpoint(path, state, settings, data_digest=data_digest, world_size=world_size)
+    step = state.step
+    data = _encoded(state, settings, data_digest, world_size)
+    begin(lambda: _put(folder, step, data, settings))
+
+
+def _put(folder: Path, newest: int, data: bytes, settings: TrainSettings) -> None:
+    _write_sealed(path_of_step(folder, newest), data)
     remove_leftovers(folder)
-    passed = [step for step in saved_steps(folder) if step <= state.step]
+    passed = [step for step in saved_steps(folder) if step <= newest]
     for step in passed[: -settings.checkpoints_kept]:
         milestone = settings.keep_every and step % settings.keep_every == 0
         if not milestone and step != decay_begins(settings):

@@ -13,6 +13,7 @@ from model.costs import Workload, training_flops
 from storage.errors import TrilightError
 from train.data.arrival import CopyStream, StepScenes
 from train.folder import RunFolder
+from train.loop.background import Background
 from train.loop.checkpoints import keep_checkpoint
 from train.loop.crew import Crew
 from train.loop.enough_memory import enough_memory
@@ -113,6 +114,7 @@ class Trainer:
         self.window = Window(state.reports)
         self.num_noted = 0
         self.saved_step: int | None = None
+        self.writing = Background()
         progress = TrainProgress() if recorder is None else recorder.progress
         self.progress = progress
         self.watch = Watch(
@@ -132,7 +134,11 @@ class Trainer:
             TrilightError: a signal asked to stop or the start went dead (the state is saved), or
                 the steps keep failing.
         """
-        with self.watch, deferred_interrupts(self.progress.interrupted) as asked_to_stop:
+        with (
+            self.watch,
+            self.writing,
+            deferred_interrupts(self.progress.interrupted) as asked_to_stop,
+        ):
             self._catch_up(asked_to_stop)
             while self.state.step < self.settings.num_steps:
                 report = self._step(steps)
@@ -163,6 +169,7 @@ class Trainer:
         with self.watch.pause("saving"):
             if self.saved_step != self.state.step:
                 self._save()
+            self.writing.wait()
             # a barrier: torchrun ends all processes with the first that ends, so wait for the file
             self.crew.any(False)
         raise reason
@@ -287,4 +294,5 @@ class Trainer:
                 self.settings,
                 data_digest=self.data_digest,
                 world_size=self.crew.world_size,
+                begin=self.writing.begin,
             )
