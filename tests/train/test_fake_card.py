@@ -64,6 +64,7 @@ def test_a_run_goes_on_and_a_second_one_begins_on_a_card(
     card.submit(card_cases.resume, data, lpips, tmp_path).result()
 
 
+@pytest.mark.slow  # a rival is traced as well
 def test_evaluate_has_everything_on_the_card(
     card: ProcessPoolExecutor, data: str, lpips: str, tmp_path: Path
 ) -> None:

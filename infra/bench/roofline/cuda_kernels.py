@@ -17,7 +17,7 @@ from torch._subclasses.fake_tensor import FakeTensor
 from torch.optim.adamw import AdamW
 from torch.utils import _foreach_utils
 
-import model.attention
+from model import attention
 
 _optimizer = sys.modules[AdamW.__mro__[2].__module__]
 """torch.optim takes the module's name out of its own reach."""
@@ -33,7 +33,7 @@ def cuda_kernels() -> Iterator[None]:
     """Have them chosen for as long as it lasts."""
     with ExitStack() as stack:
         for owner, name, chosen in (
-            (model.attention, "scaled_dot_product_attention", _attention),
+            (attention, "scaled_dot_product_attention", _attention),
             (torch.nn.functional, "rms_norm", _norm),
             (_optimizer, "_foreach_supported_types", _Any()),
             (_foreach_utils, "_foreach_supported_types", _Any()),

@@ -77,6 +77,7 @@ def _check(
     assert counter.frame_count == before, "another length is no other graph"
 
 
+@pytest.mark.slow  # Dynamo traces every layer
 def test_layers_of_a_stage_share_a_graph_for_every_length(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four functions, and a fifth graph where a layer is the first to be asked."""
     _check(monkeypatch, "eager", "linear", QUICK, 5)
