@@ -218,7 +218,7 @@ def test_processes_that_are_killed_at_random_are_restarted_to_the_bit(
     assert torchrun.returncode == 0, errors
     same_to_the_bit(out, undisturbed(2))
     texts = [row["text"] for row in read_rows(out / "notes.jsonl")]
-    assert len([text for text in texts if text.endswith("2 processes")]) == 2
+    assert len([text for text in texts if text.endswith("on cpu, 2 processes")]) == 2
 
 
 @pytest.mark.slow
