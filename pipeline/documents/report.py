@@ -29,7 +29,6 @@ _STYLE = """
 .cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: 1rem }
 .card { overflow-wrap: anywhere; font-size: .85rem; line-height: 1.35 }
 .card img { display: block; width: 100%; background: #111; margin-bottom: .25rem }
-.digest { overflow-wrap: anywhere }
 pre { columns: 22rem; font-size: .8rem; line-height: 1.45; padding: .7rem;
   white-space: pre-wrap; overflow-wrap: anywhere }
 """
