@@ -3,6 +3,7 @@
 import logging
 from collections import Counter
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 from pipeline.assets.stage import PreparedAsset
@@ -10,13 +11,23 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.isolation import is_passing
 from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
+from pipeline.making.frozen_pool import FrozenPool
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.objects.sources import FoundObjects
 from storage.conventions import SPLITS
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
+from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.records.objects import Failure, LockedObject, count_by_reason, read_objects_lock
+from storage.records.asset import least_triangles_in
+from storage.records.object_index import IndexedObject, write_object_index
+from storage.records.objects import (
+    OBJECT,
+    Failure,
+    LockedObject,
+    count_by_reason,
+    read_objects_lock,
+)
 from storage.remote.safe_url import safe_url
 
 log = logging.getLogger("trilight.objects")
@@ -26,18 +37,23 @@ log = logging.getLogger("trilight.objects")
 class AcceptedObjects:
     """What scenes may use."""
 
-    objects: tuple[tuple[LockedObject, Path], ...]
-    """Every locked object with its asset file in the store."""
+    num_objects: int
+    """Objects that scenes may draw from."""
     num_found: int
     """Objects in the source, refused ones included."""
+    pool: FrozenPool | None = None
+    """Where scenes are composed: the frozen objects."""
+    maps: tuple[tuple[LockedObject, Path], ...] = ()
+    """A user's own textures and skies with their prepared files."""
     files: SceneFiles | None = None
-    """Where scenes come from files: those, and `objects` are the files themselves."""
+    """Where scenes come from files: those, and the objects are the files themselves."""
     revisited: RevisitedScenes | None = None
     """Where scenes are those of a finished dataset: that, whose objects these are."""
 
 
 def freeze_objects(
     source: str,
+    licence: str | None,
     found: FoundObjects,
     prepared: list[PreparedAsset],
     rejected: list[Failure],
@@ -48,7 +64,8 @@ def freeze_objects(
     """Freeze the objects at the first time, and later require that they are the same.
 
     Args:
-        source: where the objects come from, for messages.
+        source: where the objects come from.
+        licence: of files without a statement, as the user states it.
         found: what the source has.
         prepared, rejected: what the mesh stage made of it, or later of what is frozen.
         settings: the build, which says how objects are dealt to splits.
@@ -63,7 +80,8 @@ def freeze_objects(
     shown, frozen = safe_url(source), frozen_objects(publication)
     passing = [failure for failure in rejected if is_passing(failure.reason)]
     if frozen is not None:
-        _require_tried(shown, passing)
+        for failure in passing:
+            require_tried(shown, failure)
     publication.add_failures([*found.failures, *rejected, *maps.failures])
     objects = [_locked(asset, settings) for asset in prepared]
     locked = [*objects, *(entry for entry, _ in maps.rows)]
@@ -74,9 +92,54 @@ def freeze_objects(
         publication.lock_objects(locked)
     else:
         _require_same_objects(shown, frozen, locked)
-    paths = [asset.path for asset in prepared] + [path for _, path in maps.rows]
+    _index(publication, locked, prepared, asked_digest(source, licence), found.num_found)
+    folder = publication.folder
     return AcceptedObjects(
-        objects=tuple(zip(locked, paths, strict=True)), num_found=found.num_found
+        num_objects=len(objects),
+        num_found=found.num_found,
+        pool=FrozenPool(
+            lock=folder.objects_lock, index=folder.staged_index, source=source, licence=licence
+        ),
+        maps=maps.rows,
+    )
+
+
+def asked_digest(source: str, licence: str | None) -> str:
+    """Return the digest of what a source is asked for, which may hold a secret."""
+    return sha256_hex(canonical_json([source, licence]))
+
+
+def _index(
+    publication: Publication,
+    locked: list[LockedObject],
+    prepared: list[PreparedAsset],
+    asked: str,
+    num_found: int,
+) -> None:
+    """Write the index of the lock, by which later makers trust it."""
+    lock, assets = publication.folder.objects_lock, {asset.record.uid: asset for asset in prepared}
+    objects, offset = [], 0
+    with lock.open("rb") as lines:
+        for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
+            if entry.kind == OBJECT:
+                asset = assets[entry.uid]
+                objects.append(
+                    IndexedObject(
+                        locked=entry,
+                        offset=offset,
+                        asset_name=asset.path.stem,
+                        least_triangles=least_triangles_in(asset.path),
+                    )
+                )
+            offset += len(line)
+    write_object_index(
+        publication.folder.staged_index,
+        objects,
+        lock_sha256=publication.manifest.objects_lock_sha256,
+        lock_bytes=offset,
+        asked=asked,
+        num_found=num_found,
+        num_maps=len(locked) - len(objects),
     )
 
 
@@ -115,14 +178,22 @@ def _require_enough(
     )
 
 
-def _require_tried(source: str, passing: list[Failure]) -> None:
+def require_tried(source: str, failure: Failure) -> None:
     """Refuse to judge an object of the dataset where the environment has kept it from us."""
-    for failure in passing:
+    if is_passing(failure.reason):
         raise EnvironmentFailure(
             f"objects {source!r}: {failure.item!r}, which the dataset was begun with, could not be "
             f"prepared this time ({failure.reason}: {failure.message}). Nothing has changed; run "
             "the same command again."
         )
+
+
+def changed(source: str, uid: str, state: str) -> TrilightError:
+    """Return the error of a frozen object that its source has not got any more as it was."""
+    return TrilightError(
+        f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was begun "
+        "with (objects.lock.jsonl). Restore it, or choose another --out."
+    )
 
 
 def _warn_of(source: str, passing: list[Failure]) -> None:
@@ -160,7 +231,4 @@ def _require_same_objects(
     for uid, entry in frozen.items():
         if by_uid.get(uid) != entry:
             state = "has changed" if uid in by_uid else "is missing or no longer usable"
-            raise TrilightError(
-                f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was "
-                "begun with (objects.lock.jsonl). Restore it, or choose another --out."
-            )
+            raise changed(source, uid, state)

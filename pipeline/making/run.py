@@ -21,7 +21,6 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
-from storage.records.objects import OBJECT
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,7 +73,7 @@ class Run:
         return Outcome(
             digest=publication.manifest.dataset_digest,
             num_objects_found=self.accepted.num_found,
-            num_objects_used=sum(row.kind == OBJECT for row, _ in self.accepted.objects),
+            num_objects_used=self.accepted.num_objects,
             num_scenes_given_up=publication.num_given_up(),
             num_shards=len(publication.manifest.shards),
             num_shards_planned=publication.num_shards,
@@ -109,7 +108,7 @@ class ShardJob:
     environment: Mapping[str, Any]
     """What the dataset was begun with, which every maker must have too; empty to accept any."""
     accepted: AcceptedObjects
-    """What scenes are made of; the files are in the shared cache."""
+    """What scenes are made of; prepared files are in the user's cache, or are made there again."""
     lock_sha256: str
     """Digest of the frozen objects."""
     num_at_once: int

@@ -75,6 +75,8 @@ class DatasetFolder:
     staging = _Below(".staging")
     staged_objects = _Below(".staging/objects")
     """Built-in objects, written out as files."""
+    staged_index = _Below(".staging/objects.index")
+    """The index of the frozen objects (storage.records.object_index)."""
     staged_failures = _Below(".staging/failures")
     """Rejections of shards that are packed but not yet in the manifest."""
     staged_entries = _Below(".staging/entries")

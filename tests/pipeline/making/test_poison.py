@@ -107,13 +107,13 @@ def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
     deaths, small = workshop / "objects" / poison.DEATHS, {"scenes": 4}
     deaths.write_text("3")
     begun = prepare_dataset(order(workshop, cold / "without", **small))
-    assert len(begun.accepted.objects) == 7
+    assert begun.accepted.num_objects == 7
     (failure,) = open_dataset(str(cold / "without")).failures()
     assert (failure.item, failure.reason) == ("knot0", "killed")
     (record,) = caplog.records
     assert "1 could not be prepared this time (1 x killed)" in record.getMessage()
     begun = prepare_dataset(order(workshop, cold / "with", **small))
-    assert len(begun.accepted.objects) == 8
+    assert begun.accepted.num_objects == 8
     shutil.rmtree(cold / "cache")
     deaths.write_text("3")
     with pytest.raises(

@@ -38,7 +38,7 @@ def without_rendering(
     ) -> AcceptedObjects:
         if not publication.manifest.objects_lock_sha256:
             publication.lock_objects([_locked()])
-        return AcceptedObjects(objects=(), num_found=1)
+        return AcceptedObjects(num_objects=0, num_found=1)
 
     def make(split: str, scene: int, *more: Any) -> tuple[Sample, list[Failure]]:
         scenes.append((split, scene))
