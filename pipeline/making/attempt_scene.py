@@ -2,9 +2,10 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from pipeline.assets.store import AssetStore
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.making.frozen_pool import AssetAway, FrozenPool
@@ -41,6 +42,8 @@ class SceneRecipe:
     """Graphics card of this child, as CUDA_VISIBLE_DEVICES names it; None where none is used."""
     pool: FrozenPool | None = None
     """The frozen objects, where scenes are composed of them."""
+    assets: AssetStore = field(default_factory=asset_store)
+    """Where their prepared files are, as the maker sees it."""
     maps: tuple[tuple[LockedObject, Path], ...] = ()
     """A user's own textures and skies with their prepared files."""
     files: SceneFiles | None = None
@@ -137,7 +140,7 @@ def assets_of(split: str) -> Sequence[PooledAsset]:
     if split not in _state.pool:
         frozen = _state.source.pool
         assert frozen is not None, "only composed scenes draw objects"
-        _state.pool[split] = frozen.opened(split, asset_store())
+        _state.pool[split] = frozen.opened(split, _state.source.assets)
     return _state.pool[split]
 
 
