@@ -1,5 +1,7 @@
 """From a source to frozen objects; where they are frozen already, from the lock and its index."""
 
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
 
 from pipeline.builds.settings import BuildSettings
@@ -11,13 +13,41 @@ from pipeline.making.freeze_objects import (
     frozen_objects,
 )
 from pipeline.making.frozen_pool import FrozenPool
+from pipeline.making.object_parts import Proof, prepare_in_parts, proved
 from pipeline.making.prepare_isolated import prepare_isolated
 from pipeline.making.publication import Publication
-from pipeline.objects.sources import find_objects
+from pipeline.objects.sources import FoundObjects, find_objects
+from storage.dataset.layout import DatasetFolder
 from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.errors import TrilightError
 from storage.records.lock_rows import LockRows
 from storage.records.object_index import ObjectIndex
+
+
+def share_mesh_work(
+    source: str,
+    licence: str | None,
+    settings: BuildSettings,
+    publication: Publication,
+    workers: int,
+) -> FoundObjects | None:
+    """Prepare the objects of a dataset that is not frozen yet, with all who make it; in no turn.
+
+    Returns:
+        What the source has, for `accept_objects`; None where they are frozen.
+
+    Raises:
+        TrilightError: as `find_objects` and `prepare_in_parts`.
+    """
+    folder = publication.folder
+    with folder.turn("objects"):  # one maker downloads, and the others find it done
+        publication.refresh()
+        if publication.manifest.objects_lock_sha256:
+            return None
+        found = _found(source, licence, settings, folder)
+        announce_objects(folder, len(found.records))
+    _proofs(found, settings, folder, workers, enough=folder.staged_index.exists)
+    return found
 
 
 def accept_objects(
@@ -27,10 +57,20 @@ def accept_objects(
     publication: Publication,
     workers: int,
     own: MapFolders = NO_FOLDERS,
+    found: FoundObjects | None = None,
 ) -> AcceptedObjects:
     """Turn a source into frozen meshes: of all its objects, or of those that were frozen before.
 
-    Textures and maps of a user's own are frozen with them.
+    Textures and maps of a user's own are frozen with them. Call in the turn `objects`.
+
+    Args:
+        source: as `find_objects` takes it.
+        licence: of files without a statement, as the user states it.
+        settings: the build.
+        publication: the dataset.
+        workers: objects at a time.
+        own: folders of textures and maps.
+        found: what the source has, where that is known.
 
     Raises:
         TrilightError, EnvironmentFailure: as `find_objects` and `freeze_objects`.
@@ -38,22 +78,52 @@ def accept_objects(
     if trusted := trusted_objects(source, licence, settings, publication, workers, own):
         return trusted
     folder, frozen = publication.folder, frozen_objects(publication)
-    found = find_objects(
+    found = found or _found(source, licence, settings, folder)
+    maps = accept_maps(own, settings, workers=workers)
+    if frozen is None:
+        prepared, rejected = _proofs(found, settings, folder, workers)
+    else:
+        wanted = [record for record in found.records if record.uid in frozen]
+        announce_objects(folder, len(wanted))
+        assets, rejected = prepare_isolated(
+            wanted, settings.mesh_settings, workers=workers, done=lambda: count_object(folder)
+        )
+        prepared = [*map(proved, assets)]
+        maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
+    accepted = freeze_objects(
+        source, licence, found, prepared, rejected, settings, publication, maps
+    )
+    shutil.rmtree(folder.staged_parts, ignore_errors=True)
+    return accepted
+
+
+def _found(
+    source: str, licence: str | None, settings: BuildSettings, folder: DatasetFolder
+) -> FoundObjects:
+    return find_objects(
         source,
         work_dir=folder.staged_objects,
         allowed_licences=settings.allowed_licences,
         licence=licence,
         downloaded=lambda done, total: announce_downloads(folder, done, total),
     )
-    wanted = [record for record in found.records if frozen is None or record.uid in frozen]
-    announce_objects(folder, len(wanted))
-    prepared, rejected = prepare_isolated(
-        wanted, settings.mesh_settings, workers=workers, done=lambda: count_object(folder)
+
+
+def _proofs(
+    found: FoundObjects,
+    settings: BuildSettings,
+    folder: DatasetFolder,
+    workers: int,
+    enough: Callable[[], bool] = lambda: False,
+) -> Proof:
+    return prepare_in_parts(
+        found.records,
+        settings.mesh_settings,
+        folder.staged_parts,
+        workers=workers,
+        done=lambda count: count_object(folder, count),
+        enough=enough,
     )
-    maps = accept_maps(own, settings, workers=workers)
-    if frozen is not None:
-        maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
-    return freeze_objects(source, licence, found, prepared, rejected, settings, publication, maps)
 
 
 def trusted_objects(

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
-from pipeline.assets.stage import PreparedAsset
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.isolation import is_passing
 from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
 from pipeline.making.frozen_pool import FrozenPool
+from pipeline.making.object_parts import ProvedObject
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.objects.sources import FoundObjects
@@ -19,7 +19,6 @@ from storage.conventions import SPLITS
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.records.asset import least_triangles_in
 from storage.records.object_index import IndexedObject, write_object_index
 from storage.records.objects import (
     OBJECT,
@@ -55,7 +54,7 @@ def freeze_objects(
     source: str,
     licence: str | None,
     found: FoundObjects,
-    prepared: list[PreparedAsset],
+    prepared: list[ProvedObject],
     rejected: list[Failure],
     settings: BuildSettings,
     publication: Publication,
@@ -112,7 +111,7 @@ def asked_digest(source: str, licence: str | None) -> str:
 def _index(
     publication: Publication,
     locked: list[LockedObject],
-    prepared: list[PreparedAsset],
+    prepared: list[ProvedObject],
     asked: str,
     num_found: int,
 ) -> None:
@@ -127,8 +126,8 @@ def _index(
                     IndexedObject(
                         locked=entry,
                         offset=offset,
-                        asset_name=asset.path.stem,
-                        least_triangles=least_triangles_in(asset.path),
+                        asset_name=asset.asset_name,
+                        least_triangles=asset.least_triangles,
                     )
                 )
             offset += len(line)
@@ -141,6 +140,7 @@ def _index(
         num_found=num_found,
         num_maps=len(locked) - len(objects),
     )
+    publication.send_index()
 
 
 def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
@@ -150,7 +150,7 @@ def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
     return {entry.uid: entry for entry in read_objects_lock(publication.folder.objects_lock)}
 
 
-def _locked(asset: PreparedAsset, settings: BuildSettings) -> LockedObject:
+def _locked(asset: ProvedObject, settings: BuildSettings) -> LockedObject:
     record = asset.record
     return LockedObject(
         uid=record.uid,
@@ -209,7 +209,7 @@ def _warn_of(source: str, passing: list[Failure]) -> None:
         )
 
 
-def _tell_of_materials(source: str, prepared: list[PreparedAsset]) -> None:
+def _tell_of_materials(source: str, prepared: list[ProvedObject]) -> None:
     """Say which objects get drawn materials although their own were asked for."""
     reasons = Counter(asset.without_own for asset in prepared if asset.without_own)
     if reasons:

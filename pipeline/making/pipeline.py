@@ -35,7 +35,7 @@ from pipeline.documents.sheets import write_first_pictures
 from pipeline.exchange.scene_folder import SceneFolder
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.making.accept_maps import MapFolders, map_folders
-from pipeline.making.accept_objects import accept_objects, trusted_objects
+from pipeline.making.accept_objects import accept_objects, share_mesh_work, trusted_objects
 from pipeline.making.accept_revisited import accept_revisited
 from pipeline.making.accept_scene_files import accept_scene_files
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
@@ -124,19 +124,22 @@ def _accepted(
     own: MapFolders,
 ) -> AcceptedObjects:
     """Return what scenes are made of: at once where it is frozen and known, else in turn."""
-    source = ""
+    source, found = "", None
     if not listed and not order.revisits:
         source = object_source(settings, order.objects)
         trusted = trusted_objects(source, order.licence, settings, publication, cores_owned(), own)
         if trusted:
             return trusted
+        found = share_mesh_work(source, order.licence, settings, publication, cores_owned())
     with publication.folder.turn("objects"):  # one maker prepares, and the others find it done
         publication.refresh()
         if listed:
             return accept_scene_files(listed, order.licence, settings, publication)
         if order.revisits:
             return accept_revisited(order.revisits, settings, publication)
-        return accept_objects(source, order.licence, settings, publication, cores_owned(), own)
+        return accept_objects(
+            source, order.licence, settings, publication, cores_owned(), own, found
+        )
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:

@@ -37,9 +37,7 @@ def write_catalogue(folder: Path, assets: Sequence[tuple[str, str, int]], count:
             stream.write(line)
             digest.update(line)
             indexed.append(
-                IndexedObject(
-                    locked=locked, offset=offset, asset_name=name, least_triangles=least
-                )
+                IndexedObject(locked=locked, offset=offset, asset_name=name, least_triangles=least)
             )
             offset += len(line)
     write_object_index(

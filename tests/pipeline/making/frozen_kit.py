@@ -1,6 +1,7 @@
 """Datasets with frozen objects that no mesh stage has made: assets by hand in a store."""
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ from pipeline.assets.stage import PreparedAsset
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
+from pipeline.making.object_parts import proved
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication, begin
 from pipeline.objects.sources import FoundObjects
@@ -28,9 +30,12 @@ def build() -> BuildSettings:
     return named_build("smoke", resolution=16)
 
 
+_pool = functools.cache(small_pool)
+
+
 def prepared(number: int) -> PreparedAsset:
     """Put an object of its own geometry into the store; return it as the mesh stage would."""
-    asset, uid = small_pool()[number % 5].asset, f"object {number:05d}"
+    asset, uid = _pool()[number % 5].asset, f"object {number:05d}"
     name = hashlib.sha256(uid.encode()).hexdigest()
     data = encode_asset(dataclasses.replace(asset, geometry_sha256=name, source_sha256=name))
     path = asset_store().asset_path(name[:32])
@@ -58,4 +63,5 @@ def begun(root: Path) -> Publication:
 def frozen(publication: Publication, objects: Sequence[PreparedAsset]) -> AcceptedObjects:
     """Freeze objects, as after the mesh stage."""
     found = FoundObjects(records=tuple(asset.record for asset in objects), failures=())
-    return freeze_objects(SOURCE, None, found, list(objects), [], build(), publication)
+    proofs = [*map(proved, objects)]
+    return freeze_objects(SOURCE, None, found, proofs, [], build(), publication)

@@ -17,7 +17,7 @@ from pipeline.making.publication import Publication
 from pipeline.scenes.fitting import drawn_rows
 from pipeline.scenes.pool import PooledAsset, fits_of
 from storage.errors import TrilightError
-from storage.records.asset import decode_asset
+from storage.records.asset import Asset, decode_asset
 from storage.records.object_index import ObjectIndex
 from storage.records.objects import read_objects_lock
 from tests.pipeline.making.frozen_kit import SOURCE, begun, build, frozen, prepared
@@ -74,9 +74,12 @@ def test_only_a_few_objects_are_open(
 ) -> None:
     monkeypatch.setattr(frozen_pool, "_MOST_OPEN", 3)
     read: list[bytes] = []
-    monkeypatch.setattr(
-        frozen_pool, "decode_asset", lambda data: read.append(data) or decode_asset(data)
-    )
+
+    def counted(data: bytes) -> Asset:
+        read.append(data)
+        return decode_asset(data)
+
+    monkeypatch.setattr(frozen_pool, "decode_asset", counted)
     pool = _opened(made[1])
     assert not read
     for row in (0, 1, 2, 0, 3, 0, 1):

@@ -45,6 +45,7 @@ def without_rendering(
         made(scene)
         return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
 
+    monkeypatch.setattr("pipeline.making.pipeline.share_mesh_work", lambda *given: None)
     monkeypatch.setattr("pipeline.making.pipeline.accept_objects", accept)
     monkeypatch.setattr("pipeline.making.pipeline.make_scene", make)
     monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")  # needs no probe
