@@ -10,9 +10,9 @@ from pipeline.making.freeze_objects import (
     AcceptedObjects,
     asked_digest,
     freeze_objects,
-    frozen_objects,
 )
 from pipeline.making.frozen_pool import FrozenPool
+from pipeline.making.lock_parts import LockPart
 from pipeline.making.object_parts import Proof, prepare_in_parts, proved
 from pipeline.making.prepare_isolated import prepare_isolated
 from pipeline.making.publication import Publication
@@ -30,11 +30,13 @@ def share_mesh_work(
     settings: BuildSettings,
     publication: Publication,
     workers: int,
+    part: LockPart,
+    found: FoundObjects | None = None,
 ) -> FoundObjects | None:
-    """Prepare the objects of a dataset that is not frozen yet, with all who make it; in no turn.
+    """Prepare the objects of a part that is not frozen yet, with all who make it; in no turn.
 
     Returns:
-        What the source has, for `accept_objects`; None where they are frozen.
+        What the source has, for `accept_objects`, where it has been listed.
 
     Raises:
         TrilightError: as `find_objects` and `prepare_in_parts`.
@@ -42,11 +44,11 @@ def share_mesh_work(
     folder = publication.folder
     with folder.turn("objects"):  # one maker downloads, and the others find it done
         publication.refresh()
-        if publication.manifest.objects_lock_sha256:
-            return None
-        found = _found(source, licence, settings, folder)
+        if part.frozen(publication) is not None:
+            return found
+        found = found or _found(source, licence, settings, folder)
         announce_objects(folder, len(found.records))
-    _proofs(found, settings, folder, workers, enough=folder.staged_index.exists)
+    _proofs(found, settings, part, workers, enough=part.index.exists)
     return found
 
 
@@ -57,6 +59,7 @@ def accept_objects(
     publication: Publication,
     workers: int,
     own: MapFolders = NO_FOLDERS,
+    part: LockPart | None = None,
     found: FoundObjects | None = None,
 ) -> AcceptedObjects:
     """Turn a source into frozen meshes: of all its objects, or of those that were frozen before.
@@ -70,18 +73,20 @@ def accept_objects(
         publication: the dataset.
         workers: objects at a time.
         own: folders of textures and maps.
+        part: what is to be frozen; by default the whole.
         found: what the source has, where that is known.
 
     Raises:
         TrilightError, EnvironmentFailure: as `find_objects` and `freeze_objects`.
     """
-    if trusted := trusted_objects(source, licence, settings, publication, workers, own):
+    part = part or LockPart(folder=publication.folder, splits=settings.splits)
+    if trusted := trusted_objects(source, licence, settings, publication, workers, own, part):
         return trusted
-    folder, frozen = publication.folder, frozen_objects(publication)
+    folder, frozen = publication.folder, part.frozen(publication)
     found = found or _found(source, licence, settings, folder)
     maps = accept_maps(own, settings, workers=workers)
     if frozen is None:
-        prepared, rejected = _proofs(found, settings, folder, workers)
+        prepared, rejected = _proofs(found, settings, part, workers)
     else:
         wanted = [record for record in found.records if record.uid in frozen]
         announce_objects(folder, len(wanted))
@@ -91,9 +96,10 @@ def accept_objects(
         prepared = [*map(proved, assets)]
         maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
     accepted = freeze_objects(
-        source, licence, found, prepared, rejected, settings, publication, maps
+        source, licence, found, prepared, rejected, settings, publication, maps, part
     )
-    shutil.rmtree(folder.staged_parts, ignore_errors=True)
+    if part.number is None:
+        shutil.rmtree(folder.staged_parts, ignore_errors=True)
     return accepted
 
 
@@ -112,16 +118,16 @@ def _found(
 def _proofs(
     found: FoundObjects,
     settings: BuildSettings,
-    folder: DatasetFolder,
+    part: LockPart,
     workers: int,
     enough: Callable[[], bool] = lambda: False,
 ) -> Proof:
     return prepare_in_parts(
-        found.records,
+        [record for record in found.records if part.holds(record.uid)],
         settings.mesh_settings,
-        folder.staged_parts,
+        part.folder.staged_parts,
         workers=workers,
-        done=lambda count: count_object(folder, count),
+        done=lambda count: count_object(part.folder, count),
         enough=enough,
     )
 
@@ -133,6 +139,7 @@ def trusted_objects(
     publication: Publication,
     workers: int,
     own: MapFolders = NO_FOLDERS,
+    part: LockPart | None = None,
 ) -> AcceptedObjects | None:
     """Return the frozen objects by their index, without a look at any of them.
 
@@ -143,15 +150,16 @@ def trusted_objects(
     Raises:
         TrilightError: as `accept_maps`.
     """
-    folder = publication.folder
+    part = part or LockPart(folder=publication.folder, splits=settings.splits)
     try:
-        facts = ObjectIndex(folder.staged_index).facts
-        lock = LockRows(folder.objects_lock)
+        facts = ObjectIndex(part.index).facts
+        lock = LockRows(part.lock)
+        known = facts.lock_bytes, facts.asked
+        if known != (lock.num_bytes, asked_digest(source, licence)):
+            return None
+        if not part.is_public(publication, facts.lock_sha256):
+            return None
     except TrilightError:
-        return None
-    known = facts.lock_sha256, facts.lock_bytes, facts.asked
-    frozen = publication.manifest.objects_lock_sha256
-    if known != (frozen, lock.num_bytes, asked_digest(source, licence)):
         return None
     found = accept_maps(own, settings, workers=workers)
     maps = tuple(row for row in found.rows if lock.find(row[0].uid) == row[0])
@@ -160,8 +168,6 @@ def trusted_objects(
     return AcceptedObjects(
         num_objects=facts.num_objects,
         num_found=facts.num_found,
-        pool=FrozenPool(
-            lock=folder.objects_lock, index=folder.staged_index, source=source, licence=licence
-        ),
+        pool=FrozenPool(lock=part.lock, index=part.index, source=source, licence=licence),
         maps=maps,
     )

@@ -11,13 +11,14 @@ from pipeline.exchange.scene_files import SceneFiles
 from pipeline.isolation import is_passing
 from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
 from pipeline.making.frozen_pool import FrozenPool
+from pipeline.making.lock_parts import LockPart
 from pipeline.making.object_parts import ProvedObject
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.objects.sources import FoundObjects
 from storage.conventions import SPLITS
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
-from storage.digests import canonical_json, sha256_hex
+from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.object_index import IndexedObject, write_object_index
 from storage.records.objects import (
@@ -59,6 +60,7 @@ def freeze_objects(
     settings: BuildSettings,
     publication: Publication,
     maps: AcceptedMaps = NO_MAPS,
+    part: LockPart | None = None,
 ) -> AcceptedObjects:
     """Freeze the objects at the first time, and later require that they are the same.
 
@@ -70,13 +72,15 @@ def freeze_objects(
         settings: the build, which says how objects are dealt to splits.
         publication: the dataset.
         maps: textures and maps of the user's own, which are frozen with the objects.
+        part: of the lock that `prepared` is; by default the whole.
 
     Raises:
         TrilightError: no object is accepted, a split has none, or the objects are not those that
             the dataset was begun with.
         EnvironmentFailure: one of those could not be prepared this time.
     """
-    shown, frozen = safe_url(source), frozen_objects(publication)
+    part = part or LockPart(folder=publication.folder, splits=settings.splits)
+    shown, frozen = safe_url(source), part.frozen(publication)
     passing = [failure for failure in rejected if is_passing(failure.reason)]
     if frozen is not None:
         for failure in passing:
@@ -85,20 +89,18 @@ def freeze_objects(
     objects = [_locked(asset, settings) for asset in prepared]
     locked = [*objects, *(entry for entry, _ in maps.rows)]
     if frozen is None:
-        _require_enough(objects, settings, publication, shown)
+        _require_enough(objects, part, publication, shown)
         _warn_of(shown, passing)
         _tell_of_materials(shown, prepared)
-        publication.lock_objects(locked)
+        part.freeze(publication, locked)
     else:
         _require_same_objects(shown, frozen, locked)
-    _index(publication, locked, prepared, asked_digest(source, licence), found.num_found)
-    folder = publication.folder
+    part.write_rows(locked)
+    _index(publication, part, locked, prepared, asked_digest(source, licence), found.num_found)
     return AcceptedObjects(
         num_objects=len(objects),
         num_found=found.num_found,
-        pool=FrozenPool(
-            lock=folder.objects_lock, index=folder.staged_index, source=source, licence=licence
-        ),
+        pool=FrozenPool(lock=part.lock, index=part.index, source=source, licence=licence),
         maps=maps.rows,
     )
 
@@ -110,15 +112,16 @@ def asked_digest(source: str, licence: str | None) -> str:
 
 def _index(
     publication: Publication,
+    part: LockPart,
     locked: list[LockedObject],
     prepared: list[ProvedObject],
     asked: str,
     num_found: int,
 ) -> None:
     """Write the index of the lock, by which later makers trust it."""
-    lock, assets = publication.folder.objects_lock, {asset.record.uid: asset for asset in prepared}
+    assets = {asset.record.uid: asset for asset in prepared}
     objects, offset = [], 0
-    with lock.open("rb") as lines:
+    with part.lock.open("rb") as lines:
         for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
             if entry.kind == OBJECT:
                 asset = assets[entry.uid]
@@ -132,15 +135,16 @@ def _index(
                 )
             offset += len(line)
     write_object_index(
-        publication.folder.staged_index,
+        part.index,
         objects,
-        lock_sha256=publication.manifest.objects_lock_sha256,
+        lock_sha256=sha256_of_file(part.lock),
         lock_bytes=offset,
         asked=asked,
         num_found=num_found,
         num_maps=len(locked) - len(objects),
     )
-    publication.send_index()
+    if part.number is None:
+        publication.send_index()
 
 
 def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
@@ -165,14 +169,15 @@ def _locked(asset: ProvedObject, settings: BuildSettings) -> LockedObject:
 
 
 def _require_enough(
-    locked: list[LockedObject], settings: BuildSettings, publication: Publication, source: str
+    locked: list[LockedObject], part: LockPart, publication: Publication, source: str
 ) -> None:
     if not locked:
         raise TrilightError(
             f"objects {source!r}: none was accepted; expected at least one usable object with an "
             f"allowed licence. The reasons are in {publication.folder.failures}."
         )
-    needed = {split_of_shard(i, settings.splits) for i in range(publication.num_shards)}
+    shards = filter(part.has_shard, range(publication.num_shards))
+    needed = {split_of_shard(index, part.splits) for index in shards}
     require_objects(
         {split: sum(entry.split == split for entry in locked) for split in SPLITS}, needed
     )

@@ -32,7 +32,6 @@ from pipeline.builds.named import object_source
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
-from pipeline.exchange.scene_folder import SceneFolder
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
 from pipeline.making.accept_maps import MapFolders, map_folders
 from pipeline.making.accept_objects import accept_objects, share_mesh_work, trusted_objects
@@ -42,6 +41,7 @@ from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.making.bucket_publication import joined
 from pipeline.making.dataset_order import DatasetOrder, generate_words
 from pipeline.making.freeze_objects import AcceptedObjects
+from pipeline.making.lock_parts import LockPart, lock_parts
 from pipeline.making.machine import cores_owned
 from pipeline.making.publication import Publication
 from pipeline.making.render_children import close_children, cores_of_child, render_child
@@ -81,7 +81,8 @@ def make_dataset(
         TrilightError: what the user can mend; what is finished is safe.
     """
     with _begun(order) as run:  # objects, meshes
-        make_shards(run, runner, watch)  # scenes, renders, shards
+        for part in _by_parts(run):
+            make_shards(part, runner, watch)  # scenes, renders, shards
         run.require_within_budget()
         run.publication.publish()
         statistics = None
@@ -105,7 +106,19 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
     with joined(folder):
         own = map_folders(order, settings)
         publication = begun_publication(order, settings, folder)
-        accepted = _accepted(order, settings, listed, publication, own)
+        part = None
+        if listed or order.revisits:
+            with folder.turn("objects"):
+                publication.refresh()
+                accepted = (
+                    accept_scene_files(listed, order.licence, settings, publication)
+                    if listed
+                    else accept_revisited(order.revisits or "", settings, publication)
+                )
+        else:
+            shards = _wanted_shards(order, settings, publication)
+            part = lock_parts(folder, settings.splits, shards, maps=bool(own.folders))[0]
+            accepted = accept_part(order, settings, publication, own, part)
         write_asked(folder, generate_words(order))
         yield Run(
             order=order,
@@ -113,33 +126,53 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
             listed=listed,
             publication=publication,
             accepted=accepted,
+            part=part,
         )
 
 
-def _accepted(
+def _wanted_shards(
+    order: DatasetOrder, settings: BuildSettings, publication: Publication
+) -> list[int]:
+    """Return the shards whose parts an order asks for, those that are missing first."""
+    if settings.splits.object_parts == 1:
+        return []
+    wanted = order.shard_range() or range(publication.num_shards)
+    missing = [index for index in publication.missing_shards() if index in wanted]
+    return [*missing, *wanted]
+
+
+def _by_parts(run: Run) -> Iterator[Run]:
+    """Yield the run for each part of the objects whose shards are missing, frozen when it is due.
+
+    Where objects are frozen as a whole, that is the run as it is.
+    """
+    yield run
+    if run.part is None or run.part.number is None:
+        return
+    everything, own = replace(run, part=None), MapFolders()
+    folder, splits = run.publication.folder, run.settings.splits
+    for part in lock_parts(folder, splits, everything.missing_shards()):
+        if part != run.part:
+            accepted = accept_part(run.order, run.settings, run.publication, own, part)
+            yield replace(run, accepted=accepted, part=part)
+
+
+def accept_part(
     order: DatasetOrder,
     settings: BuildSettings,
-    listed: SceneFolder | None,
     publication: Publication,
     own: MapFolders,
+    part: LockPart,
 ) -> AcceptedObjects:
-    """Return what scenes are made of: at once where it is frozen and known, else in turn."""
-    source, found = "", None
-    if not listed and not order.revisits:
-        source = object_source(settings, order.objects)
-        trusted = trusted_objects(source, order.licence, settings, publication, cores_owned(), own)
-        if trusted:
-            return trusted
-        found = share_mesh_work(source, order.licence, settings, publication, cores_owned())
-    with publication.folder.turn("objects"):  # one maker prepares, and the others find it done
+    """Return the frozen objects of a part: at once where they are known, else made with others."""
+    source, workers = object_source(settings, order.objects), cores_owned()
+    asked = (source, order.licence, settings, publication, workers)
+    if trusted := trusted_objects(*asked, own, part):
+        return trusted
+    found = share_mesh_work(*asked, part)
+    with publication.folder.turn("objects"):  # one maker freezes, and the others find it done
         publication.refresh()
-        if listed:
-            return accept_scene_files(listed, order.licence, settings, publication)
-        if order.revisits:
-            return accept_revisited(order.revisits, settings, publication)
-        return accept_objects(
-            source, order.licence, settings, publication, cores_owned(), own, found
-        )
+        return accept_objects(*asked, own, part, found)
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:

@@ -1,8 +1,10 @@
 """The mesh stage in parts: shared by makers, resumed, remembered, and never of another file."""
 
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -107,7 +109,7 @@ def test_nothing_is_made_twice(mesher: Mesher, tmp_path: Path) -> None:
 
 def test_makers_share_the_parts(mesher: Mesher, tmp_path: Path) -> None:
     records, results = _records(tmp_path / "objects"), []
-    mesher.at_each = lambda: threading.Event().wait(0.002)
+    mesher.at_each = partial(time.sleep, 0.002)
     threads = [
         threading.Thread(target=lambda: results.append(_prepare(records, tmp_path / "set")))
         for _ in range(4)
