@@ -72,7 +72,7 @@ def draw_in_child(folder: Path, store: Path, scenes: int) -> dict[str, float]:
     """
     modules = ["pipeline.making.frozen_pool", "pipeline.assets.store", "pipeline.scenes.fitting"]
     command = [sys.executable, "-c", _CHILD, str(folder), str(store), str(scenes)]
-    command += map(module_name, modules)
+    command += [module_name(name) for name in modules]
     ran = subprocess.run(command, cwd=IMPORT_ROOT, capture_output=True, text=True, check=True)
     held, open_s, draw_s, tight_s = map(float, ran.stdout.split())
     return {"held_bytes": held, "open_s": open_s, "draw_s": draw_s, "tight_s": tight_s}
