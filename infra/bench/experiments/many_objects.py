@@ -1,4 +1,4 @@
-"""What a render child takes of a catalogue of any size: memory, opening, and the draw of a scene."""
+"""What a render child takes of a catalogue of any size: memory, opening, a draw of a scene."""
 
 from pathlib import Path
 
