@@ -68,7 +68,7 @@ def draw_in_child(folder: Path, store: Path, scenes: int) -> dict[str, float]:
     """Draw scenes' objects in a fresh process; returns its memory and times.
 
     `held_bytes` is what the process grows by, `open_s` the time to open the catalogue, `draw_s`
-    that of a scene: three objects drawn where all fit, and three where a third does not, opened.
+    and `tight_s` those of a scene of three objects: all fit, or the largest do not.
     """
     modules = ["pipeline.making.frozen_pool", "pipeline.assets.store", "pipeline.scenes.fitting"]
     command = [sys.executable, "-c", _CHILD, str(folder), str(store), str(scenes)]
@@ -100,6 +100,7 @@ def draw(room):
             pool[row]
     return (time.process_time() - began) / scenes
 most = max(sizes.most for sizes in pool.fits.sizes.values())
-all_fit, tight = draw(3 * most), draw(2 * most)
+least = min(sizes.least for sizes in pool.fits.sizes.values())
+all_fit, tight = draw(3 * most), draw(2 * least + max(least, most - 1))
 print(held() - before, opened, all_fit, tight)
 """
