@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from infra.release import hub_limits
-from infra.release.hub_limits import require_within_limits, uploaded_files
+from infra.release.hub_limits import require_within_limits
 from infra.release.push import kind_of, planned_upload
+from pipeline.documents.sums import published_files
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
@@ -67,7 +68,7 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
     assert said["address"] == f"{url}/datasets/ada/set"
     assert made[-1]["type"] == "dataset" and made[-1]["name"] == "set"
     root = dataset.folder.root
-    sent = {path.relative_to(root) for path in uploaded_files(root)}
+    sent = {path.relative_to(root) for path in published_files(root)}
     assert said["files"] == len(sent)
     assert not any(path.parts[0] == "logs" for path in sent)
     for path in sent:
