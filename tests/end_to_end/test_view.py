@@ -1,11 +1,7 @@
 """`trilight view` as a person meets it: by mouse and by keyboard, on a desk and on a phone."""
 
 import contextlib
-import os
-import re
 import shlex
-import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +14,7 @@ from pipeline.exchange.convert import write_scene
 from storage.records.scene_file import read_scene_file
 from tests.end_to_end.browser_kit import Browser, browser
 from tests.end_to_end.conftest import command
+from tests.end_to_end.tutorial_kit import viewed as served_page
 from tests.infra.run_page.run_by_hand import write_run
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
 from tests.scenes_by_hand import tiny_scene
@@ -31,28 +28,9 @@ PATIENCE_S = 120.0
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
-@contextlib.contextmanager
-def viewed(source: Path) -> Iterator[str]:
+def viewed(source: Path) -> contextlib.AbstractContextManager[str]:
     """Yield the address of a page; its server has to end cleanly at Ctrl-C."""
-    run = subprocess.Popen(
-        command("view", str(source), "--no-browser", "--threads", "1"),
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "COLUMNS": "200"},
-    )  # fmt: skip
-    assert run.stdout is not None
-    try:
-        assert run.stdout.readline().startswith("Opening")
-        address = ""
-        while not (found := re.search(r"http://\S+", address)):
-            address = run.stdout.readline()
-        yield found[0]
-        run.send_signal(signal.SIGINT)
-        out, errors = run.communicate(timeout=60)
-        assert (run.returncode, errors) == (0, ""), errors
-        assert out.rstrip().endswith("Ended.")
-    finally:
-        run.kill()
-        run.wait()
+    return served_page(command("view", str(source), "--threads", "1"), Path.cwd())
 
 
 @pytest.fixture(scope="module")
