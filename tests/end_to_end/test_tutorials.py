@@ -5,6 +5,7 @@ first on, as a reader does.
 """
 
 import contextlib
+import csv
 import dataclasses
 import os
 import re
@@ -17,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from infra.leaderboard.contestants import TRACER
 from infra.release.__main__ import main as release
 from infra.viewer.later import page_of
 from infra.viewer.open_source import opened_room
@@ -147,7 +149,19 @@ def test_every_step_of_a_page_does_what_is_said(page: str, made: list[str], desk
     for name in made:
         assert (desk / name).stat().st_size > 0, name
     if page == "stand-on-a-leaderboard":
-        rows = (desk / "boards/mine/leaderboard.md").read_text()
-        assert "pictures of theirs" in rows and "network mine" in rows
+        require_board(desk / "boards" / "mine" / "leaderboard.csv")
     if page == "publish":
         assert not verify_dataset(desk / "data" / "hub").problems
+
+
+def require_board(path: Path) -> None:
+    """Look for the rows that a board of a user's network and pictures has."""
+    rows = {row["name"]: row for row in csv.DictReader(path.open())}
+    assert {"pictures of theirs", "network mine", "network builtin:"} < set(rows)
+    assert rows["pictures of theirs"]["first_core_s"] == ""
+    traced = [rows[name] for name in ("1 sample, fast", "4 samples, fast", "16 samples, fast")]
+    for row in traced:
+        assert row["kind"] == TRACER and row["processor"]
+        assert float(row["first_core_s"]) > 0 < float(row["further_core_s"])
+    # the toys' pictures are no path tracer's: what is traced has their shapes, not their light
+    assert len({row["psnr_log_db_median"] for row in traced}) == 3

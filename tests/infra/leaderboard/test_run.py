@@ -9,12 +9,10 @@ from typing import Any
 
 import pytest
 
-import infra.cli.leaderboard
 from infra.bench.experiments.rungs import LAMPS, PHYSICS
 from infra.leaderboard import contest as contest_module
 from infra.leaderboard import run as run_module
 from infra.leaderboard.contest import NOISE
-from infra.leaderboard.contestants import TRACER
 from infra.leaderboard.order import LeaderboardOrder
 from infra.leaderboard.run import (
     NEAREST_OTHER,
@@ -183,11 +181,16 @@ def test_one_scene_has_its_table_without_intervals(short: LeaderboardOrder, tmp_
         assert said in str(board.notes)
     (row,) = [row for row in tables(one.out, "leaderboard.csv") if row["lead_mean_db"]]
     assert (row["lead_low_db"], row["lead_high_db"]) == ("", "")
-    assert (
-        f"| {float(row['lead_mean_db']):+.2f} | n/a |" in (one.out / "leaderboard.md").read_text()
-    )
-    shown = infra.cli.leaderboard._row(board.widths[0].standings[-1])
-    assert not shown["lead, dB"].endswith(")")
+    page = (one.out / "leaderboard.md").read_text()
+    assert f"| {float(row['lead_mean_db']):+.2f} | n/a |" in page
+    words = ["leaderboard", one.source, "--split", "validation", "--checkpoint", "builtin:"]
+    words += ["--scenes", "2", "--timed-scenes", "1", "--out", str(one.out)]
+    shown, told = trilight(words), trilight([*words, "--json"])
+    assert shown.exit_code == 0 and "None" not in shown.stdout
+    (plain,) = json.loads(told.stdout)["widths"]
+    assert plain["scenes"] == 1
+    leads = [each["lead"] for each in plain["standings"] if each["lead"]]
+    assert leads and all(lead["low"] is lead["high"] is None for lead in leads)
 
 
 def test_prices_of_two_machines_do_not_mix(
@@ -232,17 +235,3 @@ def test_mistakes_are_one_line(order: LeaderboardOrder, root: Path) -> None:
         board_of(lacks)
     with pytest.raises(TrilightError, match="the test split holds no scene"):
         board_of(dataclasses.replace(order, split="test"))
-
-
-@pytest.mark.slow
-def test_the_path_tracer_stands_on_it_too(root: Path, tmp_path: Path) -> None:
-    words = ["leaderboard", str(root / "toy"), "--split", "validation", "--scenes", "1", "--json"]
-    result = trilight([*words, "--out", str(tmp_path / "out")])
-    assert result.exit_code == 0, result.exception
-    (one,) = json.loads(result.stdout)["widths"]
-    found = {each["name"]: each for each in one["standings"]}
-    traced = [found[name] for name in ("1 sample, fast", "4 samples, fast", "16 samples, fast")]
-    assert all(each["first_s"] > 0 < each["further_s"] for each in traced)
-    assert all(each["kind"] == TRACER and each["timed_scenes"] == 1 for each in traced)
-    # the toy's pictures are no path tracer's: what is traced has their shapes, not their light
-    assert len({each["scores"]["psnr_log_db"]["median"] for each in traced}) == 3
