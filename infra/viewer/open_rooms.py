@@ -36,7 +36,7 @@ class OpenRooms:
         return routed(room.posts(), below)
 
     def close(self) -> None:
-        """End what is being made."""
+        """End what is being made, and wait for it."""
         for room in self._open.values():
             room.close()
 
@@ -49,5 +49,5 @@ class OpenRooms:
             room = self._open.pop(key, None) or self._opened(key)
             self._open[key] = room
             while len(self._open) > MOST_OPEN:
-                self._open.popitem(last=False)[1].close()
+                self._open.popitem(last=False)[1].easel.close()
         return room, dataclasses.replace(question, path=found[2])

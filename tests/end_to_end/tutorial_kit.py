@@ -5,6 +5,7 @@ import os
 import re
 import signal
 import subprocess
+import urllib.error
 import urllib.request
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -61,6 +62,10 @@ def viewed(command: Sequence[str], folder: Path) -> Iterator[str]:
         while not (found := re.search(r"http://\S+", address)):
             address = run.stdout.readline()
         yield found[0]
+        with contextlib.suppress(urllib.error.HTTPError):
+            answer_of(
+                found[0], "api/none"
+            )  # comes once the source is open, and Ctrl-C is waited for
         run.send_signal(signal.SIGINT)
         out, errors = run.communicate(timeout=60)
         assert (run.returncode, errors) == (0, ""), errors
