@@ -67,8 +67,8 @@ def move_towards(
     if decision is None or not decision.is_late:
         assert not isinstance(share, Tensor), "only kernels that decide late take it from a device"
         torch._foreach_lerp_(list(tensors), list(goals), share)
-    else:  # x - share (x - goal)
-        _fused(tensors, goals, rate=share, decay=1.0, maximize=True, decision=decision)
+    else:  # x + share (goal - x)
+        _fused(tensors, goals, rate=-share, decay=-1.0, decision=decision)
 
 
 def move_along(
@@ -91,7 +91,7 @@ def move_along(
         torch._foreach_mul_(list(weights), 1 - decay)
         torch._foreach_add_(list(weights), list(steps), alpha=-rate)
     else:  # w - rate (step + decay / rate w), which reads and writes each weight once
-        _fused(weights, steps, rate=rate, decay=decay / rate, maximize=False, decision=decision)
+        _fused(weights, steps, rate=rate, decay=decay / rate, decision=decision)
 
 
 def _fused(
@@ -100,11 +100,12 @@ def _fused(
     *,
     rate: float | Tensor,
     decay: float,
-    maximize: bool,
     decision: Decision,
 ) -> None:
-    settings: dict[str, Any] = {
-        "momentum": 0.0, "dampening": 0.0, "nesterov": False, "is_first_step": False,
+    """Take rate (other + decay tensor) off each tensor, unless it is decided otherwise."""
+    off: dict[str, Any] = {
+        "momentum": 0.0, "dampening": 0.0, "nesterov": False, "maximize": False,
+        "is_first_step": False,
     }  # fmt: skip
     torch._fused_sgd_(
         list(tensors),
@@ -112,9 +113,8 @@ def _fused(
         [],
         weight_decay=decay,
         lr=rate,
-        maximize=maximize,
         found_inf=decision.refused,
-        **settings,
+        **off,
     )
 
 

@@ -248,8 +248,12 @@ def _tensors(tree: Any) -> list[Tensor]:
 
 
 def _written(func: Any, args: Any) -> list[Tensor]:
-    """Return what an operation without results on the card writes in place."""
-    places = zip(func._schema.arguments, args, strict=False)
+    """Return what an operation without results on the card writes in place.
+
+    Fused updates write gradients only where they also divide them by a scale, which none does here.
+    """
+    given = zip(func._schema.arguments, args, strict=False)
+    places = [(place, arg) for place, arg in given if place.name != "grads"]
     written = [arg for place, arg in places if place.alias_info and place.alias_info.is_write]
     return [tensor for tensor in _tensors(written) if tensor.device.type == "cuda"]
 
