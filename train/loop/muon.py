@@ -98,7 +98,7 @@ class StackedMuon(torch.optim.Muon):
         constants = group["ns_coefficients"], group["ns_steps"], group["eps"]
 
         def steps(some: Sequence[Tensor]) -> Tensor:
-            return orthogonal(torch.stack(list(some)).to(self._products), *constants)
+            return orthogonal(_stacked(some, self._products), *constants)
 
         steps_SMN = shared_out(wanted, steps, self._products)
         # Liu et al. 2025: as long as a typical step of AdamW, whatever the shape
@@ -120,6 +120,13 @@ class StackedMuon(torch.optim.Muon):
         means: list[Tensor] = [self.state[weight]["momentum_buffer"] for weight in weights]
         move_towards(means, gradients, 1 - momentum, self.decision)
         return torch._foreach_lerp(gradients, means, momentum)
+
+
+def _stacked(matrices: Sequence[Tensor], kind: torch.dtype) -> Tensor:
+    """Return [S, M, N] of a type: all are rounded on their way, and read once."""
+    stack_SMN = matrices[0].new_empty((len(matrices), *matrices[0].shape), dtype=kind)
+    torch._foreach_copy_(list(stack_SMN), list(matrices))
+    return stack_SMN
 
 
 def shared_out(
