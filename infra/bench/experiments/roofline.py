@@ -102,6 +102,7 @@ EXPERIMENTS = (
         points=_points,
         turns=lambda effort: ["counted"],
         measure=_measure,
+        by_point=True,
         because="A prediction, and nothing here has run on a card. A kernel takes the longest of "
         "its launch (4 us), its bytes (80 % of 3.35 TB/s) and its products (65 % of 989 TFLOP/s in "
         "bfloat16, 50 % of 494 in TF32; flash attention 40 % forth and 30 % back, on packed "

@@ -53,7 +53,7 @@ def roofline(case: Case) -> RooflineRow:
     return RooflineRow(**vars(found), case=case, scenes=scenes, scenes_that_fit=fit)
 
 
-COMPILED = ("encoder layers", "decoder layers", "keys and values", "head", "LPIPS")
+COMPILED = ("encoder layers", "decoder layers", "keys and values", "filter", "head", "LPIPS")
 """Parts of train.loop.compiled."""
 
 
