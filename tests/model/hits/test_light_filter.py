@@ -140,7 +140,7 @@ def test_a_level_may_be_compiled() -> None:
     given = [torch.randn(2, size, 16, 16, generator=generator) for size in (_ALIKE + 1, 6)]
     alike, both = (each.requires_grad_() for each in given)
     near = torch.randn(9, generator=generator)
-    results = []
+    results: list[tuple[Tensor, ...]] = []
     for mixed in (one.mixed, torch.compile(one.mixed, backend="aot_eager")):
         alike.grad = both.grad = None
         shown = mixed(alike, near, both, 2)
