@@ -1,11 +1,12 @@
 """The mesh stage in children with limits, with the shared asset store."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset, prepare_assets
 from pipeline.assets.store import AssetStore
-from pipeline.isolation import ChildLimits, IsolatedChild, preload
+from pipeline.isolation import NO_FILES, ChildLimits, IsolatedChild, Reach, preload, reach
 from pipeline.making.children import ChildPool
 from storage.cache import cache_folder
 from storage.errors import TrilightError
@@ -22,10 +23,10 @@ def asset_store() -> AssetStore:
     return AssetStore(cache_folder("assets"))
 
 
-def asset_child() -> IsolatedChild:
-    """Return a child for mesh work."""
+def asset_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
+    """Return a child for mesh work, which may read these files, and what it is let by `may`."""
     preload_mesh_libraries()
-    return IsolatedChild(limits=_LIMITS, setup=require_filters)
+    return IsolatedChild(limits=_LIMITS, setup=require_filters, confined_to=confined_to)
 
 
 def preload_mesh_libraries() -> None:
@@ -42,7 +43,8 @@ def prepare_isolated(
     done: Callable[[], None],
 ) -> tuple[list[PreparedAsset], list[Failure]]:
     """Prepare objects in `workers` children; arguments and errors as `prepare_assets`."""
-    pool = ChildPool(lambda _: asset_child(), workers)
+    all_files = reach(files=(Path(record.path) for record in records))
+    pool = ChildPool(lambda _: asset_child(all_files), workers)
     try:
         return prepare_assets(
             records,
