@@ -3,11 +3,11 @@
 # Every file has a digest that its lock names, and is a wheel, but for the packages named here: they
 # have none, and are built by what the lock `build` has installed, without fetching anything more.
 set -eu
-python=$1
+case $1 in /*) python=$1 ;; *) python=$PWD/$1 ;; esac
 shift
 cd "$(dirname "$0")/../../requirements"
 
-without_wheel=meshoptimizer,gputil
+without_wheel=meshoptimizer,gputil,jsonpath-rw
 
 install() {
     "$python" -m pip install --quiet --require-hashes --no-build-isolation \

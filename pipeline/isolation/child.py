@@ -82,7 +82,8 @@ class IsolatedChild:
 
     def may(self, more: Reach) -> None:
         """Let a confined child use more files. One that runs and may not is replaced: a kernel
-        lets nothing out again that it has confined. Not while another thread calls."""
+        lets nothing out again that it has confined. Not while another thread calls.
+        """
         if self._reach is not None and not self._reach.covers(more):
             self._reach = self._reach.with_all_of(more)
             self._stop()

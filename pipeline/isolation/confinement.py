@@ -162,7 +162,9 @@ def _few(paths: Iterable[Path]) -> frozenset[Path]:
     """Return at most MOST_FOLDERS paths that hold all of these, never the root of the system."""
     found = frozenset(paths)
     while len(found) > MOST_FOLDERS:
-        above = frozenset(path if path.parent == path.parent.parent else path.parent for path in found)
+        above = frozenset(
+            path if path.parent == path.parent.parent else path.parent for path in found
+        )
         if above == found:
             break
         found = above
