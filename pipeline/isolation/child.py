@@ -81,8 +81,9 @@ class IsolatedChild:
         self._reach, self._code = confined_to, frozenset[Path]()
 
     def may(self, more: Reach) -> None:
-        """Let a confined child use more files. One that runs and may not is replaced: a kernel
-        lets nothing out again that it has confined. Not while another thread calls.
+        """Let a confined child use more files; not while another thread calls.
+
+        One that runs and may not is replaced: a kernel lets nothing out that it has confined.
         """
         if self._reach is not None and not self._reach.covers(more):
             self._reach = self._reach.with_all_of(more)
