@@ -9,8 +9,10 @@ cd "$(dirname "$0")/../../requirements"
 
 without_wheel=meshoptimizer,gputil,jsonpath-rw
 
+# A lock names all that is needed, so pip need not look further: some releases refuse
+# `package[extra]` of another package beside the digest of `package`. `pip check` says what is missing.
 install() {
-    "$python" -m pip install --quiet --require-hashes --no-build-isolation \
+    "$python" -m pip install --quiet --require-hashes --no-build-isolation --no-deps \
         --only-binary :all: --no-binary "$without_wheel" "$@"
 }
 
@@ -18,7 +20,7 @@ install() {
 install_torch_alone() {
     alone=$(mktemp)
     awk '/^torch==/ { on = 1 } on { print } on && !/\\$/ { exit }' all.txt >"$alone"
-    install --no-deps --requirement "$alone"
+    install --requirement "$alone"
     rm "$alone"
 }
 needs_cuda() {
@@ -37,3 +39,7 @@ for lock in "$@"; do
     # shellcheck disable=SC2086
     install --requirement "$lock.txt" $more
 done
+"$python" -m pip check >/dev/null || {
+    "$python" -m pip check
+    exit 1
+}

@@ -52,7 +52,9 @@ def test_pip_refuses_a_file_of_another_digest(tmp_path: Path) -> None:
 
 def test_nothing_installs_a_lock_but_the_script_that_demands_digests() -> None:
     script = (ROOT / "infra/setup/install.sh").read_text()
-    assert re.search(r"--require-hashes --no-build-isolation \\\n\s+--only-binary :all:", script)
+    assert re.search(
+        r"--require-hashes --no-build-isolation --no-deps \\\n\s+--only-binary :all:", script
+    )
     for path in [ROOT / "Makefile", *(ROOT / "infra/images").glob("*.Dockerfile")]:
         text = path.read_text()
         assert "infra/setup/install.sh" in text
