@@ -1,11 +1,13 @@
 """The mesh stage in children with limits, with the shared asset store."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset, prepare_assets
 from pipeline.assets.store import AssetStore
-from pipeline.isolation import ChildLimits, IsolatedChild, preload
+from pipeline.isolation import NO_FILES, ChildLimits, IsolatedChild, Reach, preload, reach
 from pipeline.making.children import ChildPool
 from storage.cache import cache_folder
 from storage.errors import TrilightError
@@ -22,10 +24,10 @@ def asset_store() -> AssetStore:
     return AssetStore(cache_folder("assets"))
 
 
-def asset_child() -> IsolatedChild:
-    """Return a child for mesh work."""
+def asset_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
+    """Return a child for mesh work, which may read these files, and what it is let by `may`."""
     preload_mesh_libraries()
-    return IsolatedChild(limits=_LIMITS, setup=require_filters)
+    return IsolatedChild(limits=_LIMITS, setup=require_filters, confined_to=confined_to)
 
 
 def preload_mesh_libraries() -> None:
@@ -51,11 +53,19 @@ class MeshWork:
         self, records: list[ObjectRecord], done: Callable[[], None]
     ) -> tuple[list[PreparedAsset], list[Failure]]:
         """Prepare objects; arguments and errors as `prepare_assets`; from any thread."""
+        all_files = reach(files=(Path(record.path) for record in records))
+
+        @contextlib.contextmanager
+        def borrow() -> Iterator[IsolatedChild]:
+            with self._pool.borrow() as child:
+                child.may(all_files)  # at once: a child is replaced for a file that it may not read
+                yield child
+
         return prepare_assets(
             records,
             self._settings,
             asset_store(),
-            borrow_child=self._pool.borrow,
+            borrow_child=borrow,
             workers=self._workers,
             done=done,
         )
