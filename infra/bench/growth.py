@@ -6,7 +6,7 @@ import numpy as np
 
 _STEPS = np.arange(0.05, 3.001, 0.01)
 """Exponents that are tried."""
-_FLAT = 1.3
+_FLAT = 1.5
 """Costs whose largest is less than this many times their smallest do not grow."""
 
 
