@@ -7,7 +7,7 @@ machines are slow.
 """
 
 import math
-from collections import Counter, deque
+from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -157,7 +157,7 @@ class _Making:
         self._clock = Clock()
         self._turn, self._server = Turn(self._clock), Turn(self._clock)
         self._cores = Turn(self._clock, fleet.cores_together) if fleet.cores_together else None
-        self._spent: Counter[str] = Counter()
+        self._spent: defaultdict[str, float] = defaultdict(float)
         self._done = self._listed = self._vanished = 0
         each = _shard_seconds(fleet, self._rng)
         size = fleet.task_shards

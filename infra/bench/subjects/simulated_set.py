@@ -21,7 +21,7 @@ from pipeline.renders.variant import choose_variant
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, MemberTable, ShardEntry, write_manifest
-from storage.dataset.progress import log_name
+from storage.dataset.scene_logs import log_name
 from storage.dataset.shard import scan_members, write_tar
 from storage.dataset.splits import shard_name, split_of_shard
 from storage.digests import sha256_hex
@@ -72,20 +72,21 @@ class ShardTemplate:
         return bytes(data)
 
 
-def write_outline(root: Path, num_shards: int) -> None:
-    """Write a dataset of holes, whose last shard is still to make."""
+def write_outline(root: Path, num_shards: int, *, made: int | None = None) -> None:
+    """Write a dataset of holes, whose last shard is still to make, or all but the first `made`."""
+    made = num_shards - 1 if made is None else made
     build = simulated_build(SCENES_OF_OUTLINE)
     template = ShardTemplate("train", SCENES_OF_OUTLINE, first=0)
     folder = DatasetFolder(root)
-    entries = [outlined(index, build, template) for index in range(num_shards)]
-    for index, entry in enumerate(entries[:-1]):
+    entries = [outlined(index, build, template) for index in range(made)]
+    for index, entry in enumerate(entries):
         path, log = folder.shard(entry.name), root / log_name(entry.name)
         for place in (path, log):
             place.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
         os.truncate(path, entry.num_bytes)
         log.write_text(_log(index * SCENES_OF_OUTLINE))
-    _finish(folder, build, entries[:-1], num_shards)
+    _finish(folder, build, entries, num_shards)
 
 
 def write_whole(root: Path, num_shards: int, *, first: int = 0) -> None:
