@@ -116,7 +116,7 @@ class Experiment:
     """Whether one turn that is not counted comes first, where all turns are repeats."""
     takes_scenes: bool = False
     """Whether the scenes of the user's folder are turns as well."""
-    needs: tuple[Literal["torch", "blender", "data"], ...] = ()
+    needs: tuple[Literal["torch", "blender", "data", "moto"], ...] = ()
     """What the machine or the user has to provide."""
 
 

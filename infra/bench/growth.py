@@ -4,16 +4,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-_STEPS = np.arange(0.05, 3.001, 0.01)
+_STEPS = np.concatenate([np.arange(-1.5, -0.04, 0.01), np.arange(0.05, 3.001, 0.01)])
 """Exponents that are tried."""
 _FLAT = 1.5
-"""Costs whose largest is less than this many times their smallest do not grow."""
+"""Costs whose largest is less than this many times their smallest neither grow nor fall."""
 
 
 def fitted_exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
     """Return p of the costs c + a size^p that fit best, relative errors counting; c, a >= 0.
 
-    0 where the costs do not grow. Of two sizes c is taken as 0.
+    0 where the costs do not grow or fall. Of two sizes c is taken as 0.
 
     Args:
         sizes: rising, two at least.

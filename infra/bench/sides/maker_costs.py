@@ -57,17 +57,21 @@ def _timed(turn: "contextlib.AbstractContextManager[bool]") -> Iterator[bool]:
             _turn_s += time.process_time() - began
 
 
-def step_figures(place: str, log: Path | None = None) -> StepFigures:
+def step_figures(place: str, log: Path | None = None, cache: Path | None = None) -> StepFigures:
     """Measure the steps of one maker of an outline in a fresh process.
 
     Args:
         place: the dataset: a folder or the URL of a bucket, whose last shard is missing; it is
             there afterwards.
         log: of the bucket's server.
+        cache: of the maker's machine, where that is a bucket.
     """
     code = "import sys; from importlib import import_module as i; i(sys.argv[1]).main(sys.argv[2:])"
     words = [sys.executable, "-c", code, __name__, place, str(log or "")]
-    ran = subprocess.run(words, cwd=IMPORT_ROOT, stdout=subprocess.PIPE, text=True, check=True)
+    environ = {**os.environ, **({"TRILIGHT_CACHE": str(cache)} if cache else {})}
+    ran = subprocess.run(
+        words, cwd=IMPORT_ROOT, env=environ, stdout=subprocess.PIPE, text=True, check=True
+    )
     found: dict[str, list[float]] = json.loads(ran.stdout.splitlines()[-1])
     return found
 
