@@ -8,7 +8,7 @@ import heapq
 import itertools
 import math
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import TypeAlias
 
 Steps: TypeAlias = Generator["float | Turn", None, None]
@@ -98,14 +98,14 @@ class Turn:
                 return
         self._free += 1
 
-    def held(self, seconds: float, *, kept_s: float = 0.0) -> Steps:
-        """Wait for a place and keep it so long.
+    def held(self, seconds: Callable[[], float], *, kept_s: float = 0.0) -> Steps:
+        """Wait for a place and keep it for the seconds that are said once it is there.
 
         What vanishes meanwhile frees its place only `kept_s` later, as a lease on a lock does.
         """
         yield self
         try:
-            yield seconds
+            yield seconds()
         except Vanished:
             self._clock.start(self._leave_later(kept_s))
             raise

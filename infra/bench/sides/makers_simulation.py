@@ -8,7 +8,7 @@ machines are slow.
 
 import math
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -227,32 +227,43 @@ class _Making:
         self._done += 1
 
     def _publish(self) -> Steps:
-        yield from self._step(self._protocol.publish)
-        self._listed = self._done
+        yield from self._step(self._protocol.publish, publishes=True)
 
-    def _step(self, step: MakerStep) -> Steps:
-        planned, listed, protocol = self._fleet.num_shards, self._listed, self._protocol
-        in_turn_s = step.in_turn_s.of(planned, listed)
-        alone_s = max(0.0, step.work_s.of(planned, listed) - in_turn_s)
-        requests = step.requests.of(planned, listed)
-        if in_turn_s > 0:
-            yield from self._in(self._turn, in_turn_s, kept_s=_LEASE_S)
+    def _step(self, step: MakerStep, *, publishes: bool = False) -> Steps:
+        protocol, planned = self._protocol, self._fleet.num_shards
+
+        def now(grows: Growing) -> float:
+            return grows.of(planned, self._listed)
+
+        alone_s = max(0.0, now(step.work_s) - now(step.in_turn_s))
+        requests = now(step.requests)
+        if step.in_turn_s != NOTHING:
+            yield from self._in(self._turn, lambda: now(step.in_turn_s), kept_s=_LEASE_S)
+        if publishes:
+            self._listed = self._done
         if self._cores is None:
             yield from self._spend(OWN_STEPS, alone_s)
         else:
-            yield from self._in(self._cores, alone_s, kept_s=0.0)
+            yield from self._in(self._cores, lambda: alone_s, kept_s=0.0)
         if requests:
             yield from self._spend(OWN_STEPS, requests * protocol.latency_s)
-            yield from self._in(self._server, requests / protocol.requests_a_s, kept_s=0.0)
+            server_s = requests / protocol.requests_a_s
+            yield from self._in(self._server, lambda: server_s, kept_s=0.0)
 
-    def _in(self, turn: Turn, seconds: float, *, kept_s: float) -> Steps:
-        asked = self._clock.now
+    def _in(self, turn: Turn, seconds: Callable[[], float], *, kept_s: float) -> Steps:
+        asked, held_s = self._clock.now, 0.0
+
+        def wanted() -> float:
+            nonlocal held_s
+            held_s = seconds()
+            return held_s
+
         try:
-            yield from turn.held(seconds, kept_s=kept_s)
+            yield from turn.held(wanted, kept_s=kept_s)
         finally:
             taken_s = self._clock.now - asked
-            self._spent[OWN_STEPS] += min(seconds, taken_s)
-            self._spent[WAITING] += max(0.0, taken_s - seconds)
+            self._spent[OWN_STEPS] += min(held_s, taken_s)
+            self._spent[WAITING] += max(0.0, taken_s - held_s)
 
     def _spend(self, what: str, seconds: float) -> Steps:
         began = self._clock.now
