@@ -97,6 +97,11 @@ class Experiment:
     line_of: Callable[[Point], tuple[str, float]] | None = None
     """Names the line that a point stands on, and where on it. The figure then shows each further
     column along the lines, and no costs."""
+    size_of: Callable[[Point], tuple[str, float]] | None = None
+    """Names the line that a point stands on, and its size. The figure then shows every cost against
+    the size, with the exponent of its growth."""
+    against_size: str = ""
+    """What the size is, where there is one."""
     because: str = ""
     """The default and its reason, or what the figures mean."""
     covers: tuple[str, ...] = ()
@@ -111,7 +116,7 @@ class Experiment:
     """Whether one turn that is not counted comes first, where all turns are repeats."""
     takes_scenes: bool = False
     """Whether the scenes of the user's folder are turns as well."""
-    needs: tuple[Literal["torch", "blender", "data"], ...] = ()
+    needs: tuple[Literal["torch", "blender", "data", "moto"], ...] = ()
     """What the machine or the user has to provide."""
 
 

@@ -2,7 +2,7 @@
 
 Points are named where there is room: the table beside the figure has all names. An experiment of
 several kinds of points has the figure of infra.bench.series_plot, one of lines that of
-infra.bench.line_plot.
+infra.bench.line_plot, one of sizes that of infra.bench.growth_plot.
 """
 
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from typing import Any
 
 from infra.bench.curve import Row, rows
 from infra.bench.experiment import Experiment
+from infra.bench.growth_plot import plot_growth
 from infra.bench.labels import place_labels, plain_log
 from infra.bench.line_plot import plot_lines
 from infra.bench.series_plot import plot_series
@@ -28,6 +29,9 @@ def plot(experiment: Experiment, run: Run, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     points = rows(experiment, run)
+    if experiment.size_of is not None:
+        plot_growth(experiment, experiment.size_of, points, path)
+        return
     if experiment.line_of is not None:
         plot_lines(experiment, experiment.line_of, points, path)
         return

@@ -125,6 +125,8 @@ def lacking(experiment: Experiment, asked: Asked) -> str:
     """Return what an experiment needs that is missing; empty if nothing is."""
     if "torch" in experiment.needs and importlib.util.find_spec("torch") is None:
         return "torch is not installed; run `make setup-all`"
+    if "moto" in experiment.needs and importlib.util.find_spec("moto") is None:
+        return "moto is not installed, which stands for a bucket; run `make setup-all`"
     if "data" in experiment.needs and not asked.data:
         return "expected --data SET, the root of a finished dataset"
     return ""

@@ -15,7 +15,7 @@ from pipeline.shards.pack import pack_shard
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder, numbered
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.progress import log_scene
+from storage.dataset.scene_logs import log_scene
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard, shard_name, split_of_shard
 from storage.dataset.staging import is_staged, stage_scene

@@ -31,7 +31,7 @@ from storage.dataset.manifest import (
     shard_of_row,
     write_manifest,
 )
-from storage.dataset.progress import log_name
+from storage.dataset.scene_logs import log_name
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.objects import decode_failures, read_failures, write_failures

@@ -39,6 +39,16 @@ def numbered(number: int, name: str) -> str:
     return f"part-{part:04d}/{name}" if part else name
 
 
+def shard_names_in(root: Path) -> Iterator[str]:
+    """Yield the names of the files in a folder and its parts that are called like a shard."""
+    with contextlib.suppress(FileNotFoundError), os.scandir(root) as entries:
+        for entry in entries:
+            if entry.name.endswith(".tar"):
+                yield entry.name
+            elif entry.name.startswith("part-") and entry.is_dir():
+                yield from (f"{entry.name}/{name}" for name in shard_names_in(Path(entry.path)))
+
+
 class _Below:
     """A path below the folder of a dataset."""
 
@@ -122,7 +132,7 @@ class DatasetFolder:
 
     def shard_files(self) -> list[Path]:
         """Return every file that is called like a shard, listed in the manifest or not."""
-        return sorted([*self.root.glob("*.tar"), *self.root.glob("part-*/*.tar")])
+        return sorted(self.root / name for name in shard_names_in(self.root))
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:

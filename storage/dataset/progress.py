@@ -1,17 +1,14 @@
 """Progress of a dataset, from its files alone: counts, the rate of the last scenes, time left.
 
-Any process may read it. `logs/<shard>.jsonl` holds what must not be in a dataset, one row per
-scene: times, hosts, retries.
+Any process may read it. The rate is that of the logs (storage.dataset.scene_logs).
 """
 
 import contextlib
 import functools
 import itertools
 import json
-import os
-import socket
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,13 +16,19 @@ from storage.atomic import write_atomically, write_error
 from storage.dataset.asked import read_asked
 from storage.dataset.dataset import Dataset, LocalFiles, open_dataset
 from storage.dataset.derived import derivation_of
-from storage.dataset.layout import DatasetFolder, numbered
+from storage.dataset.layout import DatasetFolder, numbered, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
+from storage.dataset.scene_logs import (
+    LookedAt,
+    SceneLog,
+    decode_scene_log,
+    log_name,
+    look_at_logs,
+)
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason, decode_failures
-from storage.records.sample import sample_key
 from storage.settings.described import from_record
 
 _AT_WORK_S = 600.0
@@ -154,11 +157,8 @@ def planned_shards(manifest: Manifest) -> dict[str, int]:
 
 def shards_there(folder: DatasetFolder) -> set[str]:
     """Return the names of the shards that are there under their final names, listed or not."""
-    here = {path.relative_to(folder.root).as_posix() for path in folder.shard_files()}
-    if not folder.bucket:
-        return here
-    sent = folder.staged_sent
-    return here | {path.relative_to(sent).as_posix() for path in sent.rglob("*.tar")}
+    here = set(shard_names_in(folder.root))
+    return here | set(shard_names_in(folder.staged_sent)) if folder.bucket else here
 
 
 def missing_shards(url: str) -> list[int]:
@@ -205,78 +205,6 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
     return sum(planned[name] for name in there) + unpacked
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneLog:
-    """Log row of one finished scene."""
-
-    seconds: float
-    """Wall time."""
-    cores: int
-    """Cores that the worker used for it."""
-    finished_unix_s: float
-    """Time of completion by the worker's clock."""
-
-
-def log_scene(
-    folder: DatasetFolder,
-    shard: str,
-    scene_index: int,
-    *,
-    seconds: float,
-    cores: int,
-    num_rejected: int,
-) -> None:
-    """Append the row of a scene that is made.
-
-    Raises:
-        TrilightError: the disk is full or the folder cannot be written.
-    """
-    row = {
-        "scene": sample_key(scene_index),
-        "seconds": round(seconds, 3),
-        "cores": cores,
-        "rejected_attempts": num_rejected,
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-        "finished_unix_s": round(time.time(), 1),
-    }
-    path = folder.root / log_name(shard)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a") as stream:
-            stream.write(json.dumps(row) + "\n")
-    except OSError as error:
-        raise write_error(path, error) from error
-
-
-def read_scene_logs(folder: DatasetFolder) -> Iterator[SceneLog]:
-    """Yield the rows of a dataset's logs; rows that a kill has cut are left out."""
-    for path in sorted(folder.logs.rglob("*.jsonl")):
-        yield from decode_scene_log(path.read_text())
-
-
-def log_name(shard: str) -> str:
-    """Return the name of a shard's log, relative to the dataset."""
-    return f"logs/{shard}.jsonl"
-
-
-def decode_scene_log(text: str) -> Iterator[SceneLog]:
-    """Yield the rows of a log; those that a kill has cut are left out."""
-    for line in text.splitlines():
-        try:
-            row = json.loads(line)
-            yield SceneLog(
-                seconds=float(row["seconds"]),
-                cores=int(row.get("cores", 1)),  # earlier versions did not say
-                finished_unix_s=float(row["finished_unix_s"]),
-            )
-        except (ValueError, KeyError, TypeError, AttributeError):
-            continue
-
-
-_RATE_SCENES = 200
-"""The rate of a local dataset is taken over this many last scenes of all workers."""
-
 _LOGS_READ = 64
 """Maximum number of logs fetched from a remote dataset, evenly spaced over its shards."""
 
@@ -307,7 +235,8 @@ class DatasetStatus:
     remaining_s: float | None
     """Time until all scenes are made at that rate."""
     core_hours: float | None
-    """Core hours spent on finished scenes; killed workers are not counted. None without logs."""
+    """Core hours spent on finished scenes; killed workers are not counted. Of very many logs, some
+    stand for all. None without logs."""
     last_scene_unix_s: float | None
     """When the last scene was made."""
     failures: Sequence[tuple[str, str, int]]
@@ -339,8 +268,8 @@ def read_status(url: str) -> DatasetStatus:
     names = shards_there(local) if local else {entry.name for entry in manifest.shards}
     names &= planned.keys()
     done = num_scenes_done(local, planned) if local else sum(planned[name] for name in names)
-    logs, share = (list(read_scene_logs(local)), 1.0) if local else _sampled_logs(dataset)
-    last = sorted(logs, key=lambda row: row.finished_unix_s)[-_RATE_SCENES if local else 0 :]
+    looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
+    last, core_s = looked.last, looked.core_s
     views_per_hour, remaining_s = _rate(last, share, manifest, manifest.num_scenes - done)
     return DatasetStatus(
         shown=dataset.shown,
@@ -353,16 +282,16 @@ def read_status(url: str) -> DatasetStatus:
         finished=_is_finished(dataset, len(planned)),
         views_per_hour=views_per_hour,
         remaining_s=remaining_s,
-        core_hours=sum(row.seconds * row.cores for row in logs) / share / 3600 if share else None,
-        last_scene_unix_s=max((row.finished_unix_s for row in logs), default=None),
+        core_hours=None if core_s is None else core_s / 3600,
+        last_scene_unix_s=last[-1].finished_unix_s if last else None,
         failures=count_by_reason(decode_failures(dataset.files.read("failures.jsonl") or b"")),
         digest=dataset.digest,
         asked=read_asked(dataset),
     )
 
 
-def _sampled_logs(dataset: Dataset) -> tuple[list[SceneLog], float]:
-    """Return rows of logs on a server, and of what share of the listed scenes; none and 0 without.
+def _sampled_logs(dataset: Dataset) -> tuple[LookedAt, float]:
+    """Return what logs on a server say, and of what share of the listed scenes they are.
 
     A sample of the logs stands for all; where the first is missing, the dataset has none.
     """
@@ -372,11 +301,14 @@ def _sampled_logs(dataset: Dataset) -> tuple[list[SceneLog], float]:
     for entry in shards[:: -(-len(shards) // _LOGS_READ)] if shards else ():
         data = dataset.files.read(log_name(entry.name))
         if data is None and not rows:
-            return [], 0.0
+            break
         if data is not None:
             rows += decode_scene_log(data.decode(errors="replace"))
             scenes += entry.num_samples
-    return rows, scenes / max(dataset.manifest.num_samples, 1)
+    share = scenes / max(dataset.manifest.num_samples, 1)
+    core_s = sum(row.seconds * row.cores for row in rows) / share if share else None
+    rows.sort(key=lambda row: row.finished_unix_s)
+    return LookedAt(last=rows, core_s=core_s), share
 
 
 def _rate(

@@ -1,6 +1,7 @@
 """What a dataset holds, without its pictures."""
 
 import json
+from array import array
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -97,24 +98,45 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
         scenes_by_excursion=tally.excursions,
         scene_digest=digest_of_scenes(tally.scene_members),
         num_bytes=dataset.manifest.num_bytes,
-        spp=np.array([view["spp"] for view in tally.views], np.int64),
-        noise_floor_db=_column(tally.views, "noise_floor_db"),
-        noise_floor_linear_db=_column(tally.views, "noise_floor_linear_db"),
-        object_noise_floor_db=_column(tally.views, "object_noise_floor_db"),
-        at_cap=np.array([view["at_cap"] for view in tally.views], np.bool_),
-        part_noise_floor_db=_of_parts([view.get("parts", {}) for view in tally.views]),
+        spp=np.asarray(tally.views["spp"], np.int64),
+        noise_floor_db=np.asarray(tally.views["noise_floor_db"]),
+        noise_floor_linear_db=np.asarray(tally.views["noise_floor_linear_db"]),
+        object_noise_floor_db=np.asarray(tally.views["object_noise_floor_db"]),
+        at_cap=np.asarray(tally.views["at_cap"], np.bool_),
+        part_noise_floor_db=tally.parts_of_all(),
     )
+
+
+_OF_VIEWS = ("spp", "noise_floor_db", "noise_floor_linear_db", "object_noise_floor_db", "at_cap")
 
 
 @dataclass(kw_only=True, eq=False)
 class _Tally:
-    """Running counts."""
+    """Running counts: of each view eight bytes a column, however many there are."""
 
     splits: Counter[str] = field(default_factory=Counter)
     templates: Counter[str] = field(default_factory=Counter)
     excursions: Counter[str] = field(default_factory=Counter)
-    views: list[Any] = field(default_factory=list)
+    views: Mapping[str, "array[float]"] = field(
+        default_factory=lambda: {name: array("d") for name in _OF_VIEWS}
+    )
+    parts: dict[str, "array[float]"] = field(default_factory=dict)
     scene_members: dict[str, str] = field(default_factory=dict)
+
+    def add_views(self, views: Sequence[Mapping[str, Any]]) -> None:
+        """Count the views of a scene."""
+        for view in views:
+            for name, column in self.views.items():
+                column.append(view[name])
+            for name, part in view.get("parts", {}).items():
+                self.parts.setdefault(name, array("d")).append(part["noise_floor_db"])
+
+    def parts_of_all(self) -> dict[str, NDArray[np.float64]]:
+        """Return the floors of the parts, where every view has all of them."""
+        num_views = len(self.views["spp"])
+        if any(len(column) != num_views for column in self.parts.values()):
+            return {}
+        return {name: np.asarray(column) for name, column in sorted(self.parts.items())}
 
 
 def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
@@ -132,7 +154,7 @@ def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
         tally.templates[record["provenance"]["template"]] += 1
         if excursion := record["provenance"].get("excursion"):
             tally.excursions[excursion["axis"]] += 1
-        tally.views.extend(record["views"])
+        tally.add_views(record["views"])
 
 
 def _require_whole(dataset: Dataset, shard: ShardEntry) -> None:
@@ -145,18 +167,6 @@ def digest_of_scenes(members: Mapping[str, str]) -> str:
     """Return the digest of scenes from the sha256 of each unpacked `KEY.scene.safetensors`."""
     lines = (f"{name} {digest}" for name, digest in sorted(members.items()))
     return sha256_hex("\n".join(lines).encode())
-
-
-def _column(views: Sequence[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
-    return np.array([view[name] for view in views], np.float64)
-
-
-def _of_parts(views: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float64]]:
-    """Return the floors of the parts that every view has."""
-    names = (
-        sorted(views[0]) if views and all(view.keys() == views[0].keys() for view in views) else ()
-    )
-    return {name: _column([view[name] for view in views], "noise_floor_db") for name in names}
 
 
 def _spread(floors_db: NDArray[np.float64], metric: str) -> str:

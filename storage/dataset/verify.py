@@ -1,8 +1,9 @@
 """Checks a dataset against its manifest: every hash, every member, and the laws of every sample."""
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -30,6 +31,9 @@ from storage.remote.tries import TransferFailed
 
 REMOTE_THREADS = 8
 """Shards of a server that are fetched, or asked for, at the same time."""
+
+_AHEAD = 256
+"""Shards of which findings may wait for those before them."""
 
 MOST_DIFFERENT = 0.02
 """Maximum share of the pixels in which a stored pass may differ from the scene's: on another
@@ -97,13 +101,11 @@ def verify_dataset(
     bad: list[str] = []
     threads = os.cpu_count() or 1 if isinstance(dataset.files, LocalFiles) else REMOTE_THREADS
     with ThreadPoolExecutor(threads) as pool:
-        checks = [
-            pool.submit(_check_shard, dataset, shard, locked, fast=fast)
-            for shard in manifest.shards
-        ]
+        checks = _ahead(
+            pool, lambda shard: _check_shard(dataset, shard, locked, fast=fast), manifest.shards
+        )
         try:
-            for shard, check in zip(manifest.shards, checks, strict=True):
-                found = check.result()
+            for shard, found in checks:
                 faults = [*found.faults, *_twice(found.keys, shard, where)]
                 bad += [shard.name] if faults else []
                 problems += [
@@ -120,6 +122,19 @@ def verify_dataset(
         bad_shards=bad,
         num_shards_planned=_num_planned(manifest),
     )
+
+
+def _ahead(
+    pool: ThreadPoolExecutor,
+    check: Callable[[ShardEntry], _Found],
+    shards: Sequence[ShardEntry],
+) -> Iterator[tuple[ShardEntry, _Found]]:
+    """Yield shards in order with what was found, a few of them being checked ahead."""
+    running: deque[Future[_Found]] = deque(pool.submit(check, shard) for shard in shards[:_AHEAD])
+    for row, shard in enumerate(shards):
+        yield shard, running.popleft().result()
+        if row + _AHEAD < len(shards):
+            running.append(pool.submit(check, shards[row + _AHEAD]))
 
 
 def _num_planned(manifest: Manifest) -> int:

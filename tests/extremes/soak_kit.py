@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.progress import SceneLog, read_scene_logs
+from storage.dataset.scene_logs import SceneLog, read_scene_logs
 
 PARTS = 10
 """Of the run, in the order in which scenes were finished."""

@@ -26,7 +26,7 @@ from pipeline.flows.prefect_server import SERVER, prefect_server, quiet_prefect
 from pipeline.making.runner import in_window
 from pipeline.making.tasks import MOST_TASKS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.progress import SceneLog, read_scene_logs
+from storage.dataset.scene_logs import SceneLog, read_scene_logs
 
 _RECORDS_S = 600.0
 

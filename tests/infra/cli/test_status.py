@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from storage.dataset.progress import log_scene
+from storage.dataset.scene_logs import log_scene
 from tests.command_line import trilight
 from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
 

@@ -16,12 +16,11 @@ from storage.dataset.progress import (
     announce_objects,
     count_object,
     forget_views,
-    log_scene,
     read_progress,
-    read_scene_logs,
     read_status,
     tell_views,
 )
+from storage.dataset.scene_logs import log_scene, read_scene_logs
 from storage.errors import TrilightError
 from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
 

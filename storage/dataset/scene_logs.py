@@ -1,0 +1,134 @@
+"""Logs of a dataset: a row for each scene that is made, in `logs/<shard>.jsonl`.
+
+They hold what must not be in a dataset: times, hosts, retries. Any process may read them. Of very
+many, a look reads those that were written last, and evenly spaced ones that stand for all.
+"""
+
+import heapq
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from storage.atomic import write_error
+from storage.dataset.layout import DatasetFolder
+from storage.records.sample import sample_key
+
+LAST_SCENES = 200
+"""Scenes over which a rate is taken."""
+MOST_LOGS = 1024
+"""Maximum number of logs that stand for all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneLog:
+    """Log row of one finished scene."""
+
+    seconds: float
+    """Wall time."""
+    cores: int
+    """Cores that the worker used for it."""
+    finished_unix_s: float
+    """Time of completion by the worker's clock."""
+
+
+def log_scene(
+    folder: DatasetFolder,
+    shard: str,
+    scene_index: int,
+    *,
+    seconds: float,
+    cores: int,
+    num_rejected: int,
+) -> None:
+    """Append the row of a scene that is made.
+
+    Raises:
+        TrilightError: the disk is full or the folder cannot be written.
+    """
+    row = {
+        "scene": sample_key(scene_index),
+        "seconds": round(seconds, 3),
+        "cores": cores,
+        "rejected_attempts": num_rejected,
+        "host": socket.gethostname(),
+        "pid": os.getpid(),
+        "finished_unix_s": round(time.time(), 1),
+    }
+    path = folder.root / log_name(shard)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as stream:
+            stream.write(json.dumps(row) + "\n")
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+def read_scene_logs(folder: DatasetFolder) -> Iterator[SceneLog]:
+    """Yield the rows of a dataset's logs; rows that a kill has cut are left out."""
+    for path in sorted(folder.logs.rglob("*.jsonl")):
+        yield from decode_scene_log(path.read_text())
+
+
+def log_name(shard: str) -> str:
+    """Return the name of a shard's log, relative to the dataset."""
+    return f"logs/{shard}.jsonl"
+
+
+def decode_scene_log(text: str) -> Iterator[SceneLog]:
+    """Yield the rows of a log; those that a kill has cut are left out."""
+    for line in text.splitlines():
+        try:
+            row = json.loads(line)
+            yield SceneLog(
+                seconds=float(row["seconds"]),
+                cores=int(row.get("cores", 1)),  # earlier versions did not say
+                finished_unix_s=float(row["finished_unix_s"]),
+            )
+        except (ValueError, KeyError, TypeError, AttributeError):
+            continue
+
+
+@dataclass(frozen=True, kw_only=True)
+class LookedAt:
+    """What a look at the logs of a folder has found."""
+
+    last: Sequence[SceneLog]
+    """The LAST_SCENES that were made last, by time."""
+    core_s: float | None
+    """Core-seconds of all scenes; where there are more than MOST_LOGS, from as many of them, evenly
+    spaced. None without a log."""
+
+
+def look_at_logs(folder: DatasetFolder) -> LookedAt:
+    """Return what the logs say, reading few of them however many there are."""
+    found = sorted(_logs(folder.logs))
+    if not found:
+        return LookedAt(last=(), core_s=None)
+    # a log that was written before LAST_SCENES others has none of the last scenes
+    newest = heapq.nlargest(LAST_SCENES, found, key=lambda log: log[1])
+    rows = sorted(_rows_of(path for path, _ in newest), key=lambda row: row.finished_unix_s)
+    spaced = found[:: -(-len(found) // MOST_LOGS)]
+    core_s = sum(row.seconds * row.cores for row in _rows_of(path for path, _ in spaced))
+    return LookedAt(last=rows[-LAST_SCENES:], core_s=core_s * len(found) / len(spaced))
+
+
+def _rows_of(paths: Iterator[str]) -> Iterator[SceneLog]:
+    for path in paths:
+        yield from decode_scene_log(Path(path).read_text())
+
+
+def _logs(folder: Path | str) -> Iterator[tuple[str, int]]:
+    """Yield path and time of each log, of the folder and of its parts."""
+    try:
+        entries = list(os.scandir(folder))
+    except FileNotFoundError:
+        return
+    for entry in entries:
+        if entry.name.endswith(".jsonl"):
+            yield entry.path, entry.stat().st_mtime_ns
+        elif entry.is_dir():
+            yield from _logs(entry.path)

@@ -1,0 +1,62 @@
+"""Simulated makers: where the answer is known, it is that one."""
+
+import dataclasses
+import math
+
+import pytest
+
+from infra.bench.sides.makers_simulation import (
+    MAKING,
+    WAITING,
+    Fleet,
+    Growing,
+    MakerStep,
+    Protocol,
+    simulated,
+)
+
+FLEET = Fleet(
+    machines=4, num_shards=40, scenes_per_shard=2, scene_core_s=8.0, spread=0.0, slow_share=0.0,
+    life_s=math.inf, shards_per_task=1,
+)  # fmt: skip
+"""40 shards of one second each, which is ten seconds."""
+FREE = Protocol(start_s=0.0, begin=MakerStep(), note=MakerStep(), publish=MakerStep())
+
+
+def _step(seconds: float, **changes: float) -> MakerStep:
+    return MakerStep(work_s=Growing(fixed=seconds), in_turn_s=Growing(**changes))
+
+
+@pytest.mark.parametrize(
+    ("protocol", "seconds"),
+    [
+        (FREE, 10.0),
+        (dataclasses.replace(FREE, start_s=1.0), 20.0),
+        (dataclasses.replace(FREE, note=_step(0.5)), 15.0),
+        (dataclasses.replace(FREE, publish=_step(1.0, fixed=1.0)), 41.0),  # one after the other
+        (dataclasses.replace(FREE, publish=_step(0.0, planned=1 / 40)), 41.0),
+        (dataclasses.replace(FREE, documents_s=7.0), 17.0),
+    ],
+)
+def test_what_is_known(protocol: Protocol, seconds: float) -> None:
+    fate = simulated(FLEET, protocol)
+    assert fate.seconds == pytest.approx(seconds)
+    assert fate.spent_s[MAKING] == pytest.approx(40.0)
+    assert sum(fate.spent_s.values()) == pytest.approx(4 * seconds)
+
+
+def test_a_turn_that_grows_with_what_is_listed_stops_to_scale() -> None:
+    protocol = dataclasses.replace(FREE, publish=_step(0.0, listed=0.05))
+    fates = [simulated(dataclasses.replace(FLEET, machines=n), protocol) for n in (4, 40)]
+    assert fates[1].seconds > 0.7 * fates[0].seconds
+    assert fates[1].shares()[WAITING] > 0.4
+
+
+@pytest.mark.parametrize("keeps_scenes", [True, False])
+def test_all_is_made_by_machines_that_vanish(keeps_scenes: bool) -> None:
+    fleet = dataclasses.replace(FLEET, life_s=3.0, replaced_s=1.0, shards_per_task=4)
+    protocol = dataclasses.replace(FREE, keeps_scenes=keeps_scenes)
+    fate = simulated(fleet, protocol)
+    assert fate.vanished > 3 and fate.seconds > 10.0
+    # what is made, without what is made twice, is all there is
+    assert fate.spent_s[MAKING] == pytest.approx(40.0)
