@@ -91,13 +91,14 @@ class Publication:
                 if name not in listed and self._is_there(name)
             }
             found |= self._noted
-            self._add_failures(
-                failure
-                for name in found
-                for failure in read_failures(rejections_of_shard(self.folder, name))
-            )
-            entries = sorted((listed | found).values(), key=_number)
-            self._write(shards=tuple(entries))
+            if found:  # writing the manifest costs the whole set
+                self._add_failures(
+                    failure
+                    for name in found
+                    for failure in read_failures(rejections_of_shard(self.folder, name))
+                )
+                entries = sorted((listed | found).values(), key=_number)
+                self._write(shards=tuple(entries))
             self._noted.clear()
         for name in found:
             forget_note(self.folder, name)
@@ -223,8 +224,9 @@ def begin(
                 shards=(),
                 extensions=recorded("data"),
             )
-        manifest = dataclasses.replace(manifest, num_scenes=whole)
-        write_manifest(folder.manifest, manifest)
+        if not folder.manifest.exists() or whole != manifest.num_scenes:
+            manifest = dataclasses.replace(manifest, num_scenes=whole)
+            write_manifest(folder.manifest, manifest)
     return Publication(folder, manifest, settings.splits)
 
 

@@ -202,17 +202,22 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
 
 
 def write_manifest(path: Path, manifest: Manifest) -> None:
-    """Write the manifest atomically; equal manifests give equal bytes."""
+    """Write the manifest atomically, a shard a line; equal manifests give equal bytes."""
     record = _fields(manifest)
-    record["shards"] = [shard_row(shard) for shard in manifest.shards]
     record["totals"] = {"samples": manifest.num_samples, "bytes": manifest.num_bytes}
     record["dataset_digest"] = manifest.dataset_digest
     if not manifest.extensions:  # as manifests are that were written before there were any
         del record["extensions"]
-    with atomic_writer(path) as stream:  # bit by bit: the whole text has many small ones
-        for text in json.JSONEncoder(indent=1, sort_keys=True).iterencode(record):
-            stream.write(text.encode())
-        stream.write(b"\n")
+    record["shards"] = []
+    head, mark, tail = json.dumps(record, indent=1, sort_keys=True).partition(
+        '\n "shards": ['
+    )  # no text of JSON holds a line break
+    with atomic_writer(path) as stream:  # row by row: the whole has a million members
+        stream.write(f"{head}{mark}".encode())
+        for number, shard in enumerate(manifest.shards):
+            row = json.dumps(shard_row(shard), sort_keys=True)
+            stream.write(f"{',' if number else ''}\n  {row}".encode())
+        stream.write(f"{tail}\n".encode())
 
 
 def shard_row(shard: ShardEntry) -> dict[str, Any]:
