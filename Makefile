@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 export PATH := $(abspath $(BIN)):$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: setup setup-all dataset test test-slow test-elsewhere train release serve stop lint lock third-party settings docs clean
+.PHONY: setup setup-all dataset test test-slow test-elsewhere train release serve stop lint lock sbom third-party settings docs clean
 
 setup: $(VENV)/.dataset-ready  ## what making data needs
 
@@ -52,8 +52,11 @@ lint: setup-all  ## format, style, types, layers
 	mypy
 	lint-imports
 
-lock: setup-all  ## write the lock files anew from requirements/*.in
+lock: setup-all  ## write the lock files anew from requirements/*.in, and docs/sbom.cdx.json
 	infra/setup/lock.sh
+
+sbom: setup-all  ## write docs/sbom.cdx.json anew: what is installed, as CycloneDX
+	python -m infra.setup.sbom
 
 third-party: setup-all  ## write docs/third_party.md anew
 	python -m infra.setup.third_party
@@ -71,19 +74,19 @@ docs: $(VENV)/.docs-ready  ## the documentation as a site that opens from disk: 
 clean:  ## everything that make has made, except data/ and runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache *.egg-info site
 
-$(VENV)/.dataset-ready: requirements/dataset.txt pyproject.toml infra/setup/system_libraries.sh
+$(VENV)/.dataset-ready: requirements/dataset.txt requirements/build.txt pyproject.toml infra/setup/system_libraries.sh infra/setup/install.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	PYTHON=$(BIN)/python infra/setup/system_libraries.sh
-	$(BIN)/python -m pip install --quiet --requirement requirements/dataset.txt
+	infra/setup/install.sh $(BIN)/python dataset
 	$(if $(WITHOUT_GPL),infra/setup/without_gpl.sh $(BIN)/python)
-	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
 $(VENV)/.all-ready: requirements/all.txt $(VENV)/.dataset-ready
-	$(BIN)/python -m pip install --quiet --requirement requirements/all.txt
+	infra/setup/install.sh $(BIN)/python all
 	$(if $(WITHOUT_GPL),infra/setup/without_gpl.sh $(BIN)/python)
 	touch $@
 
 $(VENV)/.docs-ready: requirements/docs.txt $(VENV)/.dataset-ready
-	$(BIN)/python -m pip install --quiet --requirement requirements/docs.txt
+	infra/setup/install.sh $(BIN)/python docs
 	touch $@

@@ -13,6 +13,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
+from pipeline.isolation.confinement import VARIABLE, missing_parts, wanted_confinement
+from pipeline.isolation.landlock import landlock_version
+from pipeline.isolation.seccomp import seccomp_works
 from pipeline.renders.facts import render_facts
 from pipeline.renders.variant import choose_variant
 from storage.cache import cache_folder
@@ -139,7 +142,7 @@ def _mesh_filters() -> Finding:
             state="slower",
             found="no pymeshlab (GPL)",
             consequence="decimated meshes have twice the error, and the profile uniform is missing",
-            mend="pip install -r requirements/dataset.txt",
+            mend="make setup",
         )
     code = (
         f"from {module_name('pipeline.assets.environment')} import missing_filters; "
@@ -152,6 +155,26 @@ def _mesh_filters() -> Finding:
         found=f"pymeshlab {metadata.version('pymeshlab')}",
         consequence="every object is rejected, or decimated by meshoptimizer with twice the error",
         mend=f"{_APT} libgl1 libopengl0",
+    )
+
+
+def _confinement() -> Finding:
+    wanted, missing = wanted_confinement(), missing_parts()
+    version = landlock_version()
+    has = [f"Landlock {version}"] if version else []
+    found = ", ".join([*has, *(["seccomp"] if seccomp_works() else [])]) or "nothing to confine by"
+    if wanted != "off" and not missing:
+        return Finding(name="confinement", state="ok", found=found)
+    if wanted == "off":
+        found, mend = f"{found}; {VARIABLE}=off", f"unset {VARIABLE}"
+    else:
+        mend = "run on Linux 5.13 or later, or read strangers' files in a container"
+    return Finding(
+        name="confinement",
+        state="missing" if wanted == "required" else "slower",
+        found=found,
+        consequence="a file that takes over its parser can do all that you can",
+        mend=mend,
     )
 
 
@@ -244,6 +267,7 @@ CHECKS: Mapping[str, Callable[[], Finding]] = {
     "denoiser": _denoiser,
     "mesh filters": _mesh_filters,
     "mesh decimation": _mesh_decimation,
+    "confinement": _confinement,
     "orchestrator": _orchestrator,
     "learning": _learning,
     "GPU": _accelerator,

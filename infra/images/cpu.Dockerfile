@@ -11,14 +11,14 @@ SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends g++ \
     && rm -rf /var/lib/apt/lists/*
-COPY requirements/dataset.txt requirements/served.txt requirements/
+COPY requirements/ requirements/
+COPY infra/setup/install.sh infra/setup/install.sh
 COPY infra/setup/without_gpl.sh infra/setup/without_gpl.sh
 RUN python -m venv /opt/venv \
-    && /opt/venv/bin/python -m pip install --no-cache-dir --requirement requirements/dataset.txt \
-    && /opt/venv/bin/python -m pip install --no-cache-dir --requirement requirements/served.txt \
+    && PIP_NO_CACHE_DIR=1 infra/setup/install.sh /opt/venv/bin/python dataset served \
     && if [ -n "$WITHOUT_GPL" ]; then infra/setup/without_gpl.sh /opt/venv/bin/python; fi
 COPY . .
-RUN /opt/venv/bin/python -m pip install --no-cache-dir --no-deps --editable .
+RUN /opt/venv/bin/python -m pip install --no-cache-dir --no-deps --no-build-isolation --editable .
 
 FROM python:3.11.13-slim-bookworm
 ARG WITHOUT_GPL=""

@@ -14,12 +14,12 @@ SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends g++ \
     && rm -rf /var/lib/apt/lists/*
-COPY requirements/all.txt requirements/served.txt requirements/
+COPY requirements/ requirements/
+COPY infra/setup/install.sh infra/setup/install.sh
 RUN python -m venv /opt/venv \
-    && /opt/venv/bin/python -m pip install --no-cache-dir --requirement requirements/all.txt \
-    && /opt/venv/bin/python -m pip install --no-cache-dir --requirement requirements/served.txt
+    && PIP_NO_CACHE_DIR=1 infra/setup/install.sh /opt/venv/bin/python all served
 COPY . .
-RUN /opt/venv/bin/python -m pip install --no-cache-dir --no-deps --editable .
+RUN /opt/venv/bin/python -m pip install --no-cache-dir --no-deps --no-build-isolation --editable .
 
 FROM python:3.11.13-slim-bookworm
 LABEL org.opencontainers.image.title="trilight-cuda" \

@@ -12,7 +12,7 @@ from pipeline.assets.reading.source_file import needs_child, read_source
 from pipeline.assets.recipe import methods_of
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.store import AssetStore
-from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from storage.digests import sha256_hex
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level, decode_asset
@@ -120,6 +120,7 @@ def _key(
             kind, digest = source_digest(source, settings)
         else:
             with borrow_child() as child:
+                child.may(reach(files=[source]))
                 kind, digest = call_with_retries(child, source_digest, source, settings)
     except ChildFailed as failure:
         raise Rejected(failure.reason, failure.message) from failure
@@ -149,6 +150,7 @@ def _outcome(
     """
     try:
         with borrow_child() as child:
+            child.may(reach(files=[source]))
             return _by_any_method(child, source, settings, methods)
     except Rejected as rejection:
         return rejection

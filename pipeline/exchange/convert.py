@@ -21,8 +21,9 @@ from pipeline.exchange.formats import (
     writable,
 )
 from pipeline.exchange.open_scene import load_source, source_keys
-from pipeline.exchange.reader import file_child
+from pipeline.exchange.reader import file_child, reach_of
 from pipeline.isolation import ChildFailed, call_with_retries
+from storage.atomic import write_error
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 
@@ -52,7 +53,7 @@ def convert_scene(
             written.
     """
     form = _form_of(target)
-    child = file_child()
+    child = file_child(reach_of(source, writes=[_made_folder(target)]))
     try:
         keys = call_with_retries(child, source_keys, source)
         if not keys:
@@ -95,6 +96,15 @@ def write_scene(
     assert form.write is not None
     shown = carried_scene(scene, form.carried)
     return (*lost_members(scene, form.carried), *form.write(target, shown, radiance_rgb))
+
+
+def _made_folder(target: Path) -> Path:
+    """Make the folder of a file, for a child that may write there and nowhere else."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(target, error) from error
+    return target.parent
 
 
 def _form_of(target: Path) -> SceneFormat:

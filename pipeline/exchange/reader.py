@@ -1,7 +1,7 @@
 """Reads scenes of a user's files in a child process with limits; only checked scenes come out."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -11,7 +11,16 @@ from pipeline.exchange.formats import Cameras, LoadedScene, SceneSource
 from pipeline.exchange.from_description import AlbedoOverOne, LoadedMesh
 from pipeline.exchange.open_scene import load_cameras, load_source, source_keys
 from pipeline.exchange.scene_files import load_mesh_file
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, Result, call_with_retries
+from pipeline.isolation import (
+    NO_FILES,
+    ChildFailed,
+    ChildLimits,
+    IsolatedChild,
+    Reach,
+    Result,
+    call_with_retries,
+    reach,
+)
 from storage.errors import TrilightError
 from storage.records.scene import Scene
 
@@ -34,6 +43,7 @@ class SceneReader:
         Raises:
             TrilightError: the file is unusable, or holds no scene.
         """
+        self._child.may(reach_of(source))
         keys = self._call(source.name, source_keys, source)
         if not keys:
             raise TrilightError(f"{source.name}: holds no scene.")
@@ -42,14 +52,17 @@ class SceneReader:
     def load(self, source: SceneSource, *, pictures: bool = False) -> LoadedScene:
         """Read one scene; arguments and TrilightError as of `scene_source.load_source`."""
         source = dataclasses.replace(source, albedo_over_one=self._over_one)
+        self._child.may(reach_of(source))
         return self._call(source.name, _load_with_pictures if pictures else load_source, source)
 
     def cameras(self, source: SceneSource) -> Cameras:
         """Return poses and angles; raises TrilightError as `scene_source.load_cameras`."""
+        self._child.may(reach_of(source))
         return self._call(source.name, load_cameras, source)
 
     def mesh(self, path: Path, licence: str) -> LoadedMesh:
         """Read a file of an object, as it is; raises TrilightError as `load_mesh_file`."""
+        self._child.may(reach(files=[path]))
         wanted = (path, path.name, path.name, AssetSettings(), licence)
         return self._call(path.name, load_mesh_file, *wanted)[0]
 
@@ -93,9 +106,23 @@ def _within_budget(scene: Scene, max_triangles: int) -> LoadedScene:
 _LIMITS = ChildLimits(memory_bytes=16 << 30, wall_s=1800, calls_per_child=1000)
 
 
-def file_child() -> IsolatedChild:
-    """Return a child with limits that nothing was set up in; close it."""
+def file_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
+    """Return a child with limits that nothing was set up in; close it.
+
+    It may use these files, and what it is let by `may`.
+    """
+    return IsolatedChild(limits=_LIMITS, setup=_no_set_up, confined_to=confined_to)
+
+
+def unconfined_child() -> IsolatedChild:
+    """Return the same for what is read already, such as to render it; close it."""
     return IsolatedChild(limits=_LIMITS, setup=_no_set_up)
+
+
+def reach_of(source: SceneSource, *, writes: Iterable[Path] = ()) -> Reach:
+    """Return what a child needs to read a source, and to write into folders that exist."""
+    folders = [] if source.usd_folder is None else [source.usd_folder]
+    return reach(files=[source.path, *folders], writes=writes)
 
 
 def _no_set_up() -> None:

@@ -3,6 +3,7 @@
 - `child`: the owner's side: children are started, called, replaced and ended.
 - `inside`: the child's side: it keeps its limits and never outlives its owner.
 - `waiting`: for an answer, without punishing a child for a pause of the whole command.
+- `confinement`: what a child may reach that reads strangers' files, by `landlock` and `seccomp`.
 - `deaths`: what can end a call, how often it is tried again, and which ends are verdicts.
 """
 
@@ -13,6 +14,7 @@ from pipeline.isolation.child import (
     call_with_retries,
     preload,
 )
+from pipeline.isolation.confinement import NO_FILES, Reach, reach
 from pipeline.isolation.deaths import ChildFailed, Result, is_passing, with_retries
 from pipeline.isolation.inside import die_with_parent
 
@@ -21,10 +23,13 @@ __all__ = [
     "ChildFailed",
     "ChildLimits",
     "IsolatedChild",
+    "NO_FILES",
+    "Reach",
     "Result",
     "call_with_retries",
     "die_with_parent",
     "is_passing",
     "preload",
+    "reach",
     "with_retries",
 ]

@@ -14,9 +14,11 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from pipeline.isolation.confinement import Reach, code_of, confine, confinement_wanted
 from pipeline.isolation.deaths import ChildFailed, Result, with_retries
 from pipeline.isolation.inside import serve
 from pipeline.isolation.waiting import wait_for_answer
@@ -54,7 +56,12 @@ class IsolatedChild:
     """One child process at a time, started when first needed and replaced when it ends."""
 
     def __init__(
-        self, *, limits: ChildLimits, setup: Callable[..., None], setup_args: tuple[Any, ...] = ()
+        self,
+        *,
+        limits: ChildLimits,
+        setup: Callable[..., None],
+        setup_args: tuple[Any, ...] = (),
+        confined_to: Reach | None = None,
     ) -> None:
         """Remember how to start a child.
 
@@ -62,6 +69,8 @@ class IsolatedChild:
             limits: what it may use.
             setup: an importable function that prepares a new child, such as loading a library.
             setup_args: its arguments; they must survive the way into another process.
+            confined_to: the files that it may use, beside libraries, where children can be
+                confined; `may` adds to them. None for a child that nothing confines.
         """
         self._limits = limits
         self._setup = (setup, setup_args)
@@ -69,6 +78,16 @@ class IsolatedChild:
         self._connection: Connection | None = None
         self._calls_left = 0
         self._closed = False
+        self._reach, self._code = confined_to, frozenset[Path]()
+
+    def may(self, more: Reach) -> None:
+        """Let a confined child use more files; not while another thread calls.
+
+        One that runs and may not is replaced: a kernel lets nothing out that it has confined.
+        """
+        if self._reach is not None and not self._reach.covers(more):
+            self._reach = self._reach.with_all_of(more)
+            self._stop()
 
     def call(self, function: Callable[..., Result], *args: Any) -> Result:
         """Run an importable function in the child and return its result.
@@ -82,6 +101,9 @@ class IsolatedChild:
         """
         if self._closed:
             raise ChildClosed
+        if self._reach is not None and not (code := code_of(function)) <= self._code:
+            self._code |= code
+            self._stop()
         try:
             if self._calls_left == 0:
                 self._start()
@@ -120,7 +142,11 @@ class IsolatedChild:
         self._stop()
         self._process, self._connection = _launched(self._limits)
         try:
-            if files := loaded_files():  # first: what follows may be made of what they define
+            files = loaded_files()
+            if self._reach is not None and confinement_wanted():  # while it has one thread
+                own = {Path(path).parent for path, _ in files} | code_of(self._setup[0])
+                self._exchange((confine, (self._reach, self._code | own)), _START_UP_S)
+            if files:  # first: what follows may be made of what they define
                 self._exchange((load_same, (files,)), _START_UP_S)
             self._exchange(self._setup, _START_UP_S)
         except ChildFailed as failure:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.builds.settings import BuildSettings
-from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, call_with_retries, reach
 from pipeline.making.children import ChildPool
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.objects.maps.listing import PLURALS, FoundMap, find_maps
@@ -125,7 +125,10 @@ def _prepared(
 ) -> list[tuple[LockedObject, Path] | Failure]:
     scenes = settings.scenes
     size = scenes.textures.surfaces.size if kind == TEXTURE else scenes.skies.maps.height
-    pool = ChildPool(lambda _: IsolatedChild(limits=_LIMITS, setup=_nothing), workers)
+    all_files = reach(files=(path for found in maps for path in found.files.values()))
+    pool = ChildPool(
+        lambda _: IsolatedChild(limits=_LIMITS, setup=_nothing, confined_to=all_files), workers
+    )
 
     def prepare(found: FoundMap) -> tuple[LockedObject, Path] | Failure:
         try:

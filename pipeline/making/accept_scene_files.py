@@ -10,7 +10,7 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.from_description import AlbedoOverOne, scaled_albedo_notes
 from pipeline.exchange.scene_files import SceneFiles, build_scene
 from pipeline.exchange.scene_folder import SceneFolder, require_usable
-from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
+from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries, reach
 from pipeline.making.freeze_objects import AcceptedObjects, frozen_objects
 from pipeline.making.prepare_isolated import asset_child
 from pipeline.making.publication import Publication
@@ -65,7 +65,7 @@ def accept_scene_files(
     else:
         _require_same_files(frozen, locked)
     return AcceptedObjects(
-        objects=tuple((entry, folder.root / entry.uid) for entry in locked),
+        num_objects=len(locked),
         num_found=len(locked),
         files=files,
     )
@@ -79,7 +79,7 @@ def _built_once(
     sha256: dict[str, str] = {}
     notes: list[str] = []
     unusable = dict(folder.unusable)
-    child = asset_child()
+    child = asset_child(reach(files=[folder.root]))
     try:
         for name in folder.names:
             if name not in unusable:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange.open_scene import SceneSource, load_source
-from pipeline.exchange.reader import file_child
+from pipeline.exchange.reader import file_child, reach_of, unconfined_child
 from pipeline.isolation import ChildFailed, call_with_retries
 from pipeline.renders.settings import RenderSettings
 from pipeline.renders.variant import Variant, activate, choose_variant
@@ -51,13 +51,14 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
     """
     if turntable is not None and turntable.suffix.lower() != ".png":
         raise TrilightError(f"--turntable is {turntable}; expected the name of a file X.png.")
-    child = file_child()
+    child, renderer = file_child(reach_of(source)), unconfined_child()
     try:
         found = call_with_retries(child, _facts, source)
         if turntable is not None:
             from pipeline.documents.png import encode_png
 
-            sheet = call_with_retries(child, _turntable, source, choose_variant())
+            scene = call_with_retries(child, load_source, source).scene
+            sheet = call_with_retries(renderer, _turntable, scene, choose_variant())
             write_atomically(turntable, encode_png(sheet))
     except ChildFailed as failure:
         raise TrilightError(f"{source.name}: cannot be inspected ({failure}).") from failure
@@ -65,6 +66,7 @@ def inspect_scene(source: SceneSource, turntable: Path | None) -> InspectedScene
         raise TrilightError(f"{source.name}: cannot be rendered ({rejection}).") from rejection
     finally:
         child.close()
+        renderer.close()
     return found
 
 
@@ -112,7 +114,7 @@ def _maps(scene: Scene) -> dict[str, Any]:
     return found
 
 
-def _turntable(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
+def _turntable(scene: Scene, variant: Variant) -> NDArray[np.uint8]:
     """Return a sheet [H, W, 3] of the scene from all sides, lit by its own lights.
 
     Walls that stand before what they hold are left out of a picture, and with them their light.
@@ -120,7 +122,6 @@ def _turntable(source: SceneSource, variant: Variant) -> NDArray[np.uint8]:
     from pipeline.renders.renderer import SceneRenderer
 
     activate(variant)
-    scene = load_source(source).scene
     settings = RenderSettings(
         resolution=_RESOLUTION,
         noise_floor_db=99.0,

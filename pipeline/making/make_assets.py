@@ -19,7 +19,7 @@ from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset
 from pipeline.documents.attribution import encode_attribution
 from pipeline.documents.quality_page import Pair, encode_quality_page
-from pipeline.isolation import ChildFailed, call_with_retries
+from pipeline.isolation import ChildFailed, call_with_retries, reach
 from pipeline.making.prepare_isolated import asset_child, prepare_isolated
 from pipeline.objects.glb import encode_glb
 from pipeline.objects.ply import encode_ply
@@ -258,6 +258,7 @@ def _pairs(
         for name, indices in groups.items():
             for i in indices:
                 path = prepared[i].record.path
+                child.may(reach(files=[Path(path)]))
                 with contextlib.suppress(ChildFailed):  # a picture less is no reason to stop
                     pair = call_with_retries(
                         child, _pair_in_child, path, settings, levels[i], rows[i]

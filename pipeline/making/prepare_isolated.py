@@ -1,11 +1,13 @@
 """The mesh stage in children with limits, with the shared asset store."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from pipeline.assets.settings import AssetSettings
 from pipeline.assets.stage import PreparedAsset, prepare_assets
 from pipeline.assets.store import AssetStore
-from pipeline.isolation import ChildLimits, IsolatedChild, preload
+from pipeline.isolation import NO_FILES, ChildLimits, IsolatedChild, Reach, preload, reach
 from pipeline.making.children import ChildPool
 from storage.cache import cache_folder
 from storage.errors import TrilightError
@@ -22,16 +24,57 @@ def asset_store() -> AssetStore:
     return AssetStore(cache_folder("assets"))
 
 
-def asset_child() -> IsolatedChild:
-    """Return a child for mesh work."""
+def asset_child(confined_to: Reach = NO_FILES) -> IsolatedChild:
+    """Return a child for mesh work, which may read these files, and what it is let by `may`."""
     preload_mesh_libraries()
-    return IsolatedChild(limits=_LIMITS, setup=require_filters)
+    return IsolatedChild(limits=_LIMITS, setup=require_filters, confined_to=confined_to)
 
 
 def preload_mesh_libraries() -> None:
     """Have every new child begin with the mesh libraries; call before the first one starts."""
     names = ("pipeline.assets.prepare", "pipeline.assets.decimation.pymeshlab_filters")
     preload([module_name(name) for name in names])
+
+
+class MeshWork:
+    """Children for mesh work that several batches of objects share; a context that ends them."""
+
+    def __init__(self, settings: AssetSettings, workers: int) -> None:
+        """Remember what to do; a child is started where an object needs one.
+
+        Args:
+            settings: of the mesh stage.
+            workers: objects at a time.
+        """
+        self._settings, self._workers = settings, workers
+        self._pool = ChildPool(lambda _: asset_child(), workers)
+
+    def prepare(
+        self, records: list[ObjectRecord], done: Callable[[], None]
+    ) -> tuple[list[PreparedAsset], list[Failure]]:
+        """Prepare objects; arguments and errors as `prepare_assets`; from any thread."""
+        all_files = reach(files=(Path(record.path) for record in records))
+
+        @contextlib.contextmanager
+        def borrow() -> Iterator[IsolatedChild]:
+            with self._pool.borrow() as child:
+                child.may(all_files)  # at once: a child is replaced for a file that it may not read
+                yield child
+
+        return prepare_assets(
+            records,
+            self._settings,
+            asset_store(),
+            borrow_child=borrow,
+            workers=self._workers,
+            done=done,
+        )
+
+    def __enter__(self) -> "MeshWork":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._pool.close()
 
 
 def prepare_isolated(
@@ -42,18 +85,8 @@ def prepare_isolated(
     done: Callable[[], None],
 ) -> tuple[list[PreparedAsset], list[Failure]]:
     """Prepare objects in `workers` children; arguments and errors as `prepare_assets`."""
-    pool = ChildPool(lambda _: asset_child(), workers)
-    try:
-        return prepare_assets(
-            records,
-            settings,
-            asset_store(),
-            borrow_child=pool.borrow,
-            workers=workers,
-            done=done,
-        )
-    finally:
-        pool.close()
+    with MeshWork(settings, workers) as work:
+        return work.prepare(records, done)
 
 
 def require_filters() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from infra.setup.locks import read_lock
 from storage.dataset.dataset import open_dataset
 from storage.records.scene_file import encode_scene, read_scene_file
 from tests.conftest import ROOT
@@ -56,7 +57,10 @@ def place(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("place")
     _call([sys.executable, "-m", "venv", "env"], folder)
     pip = [str(folder / "env/bin/python"), "-m", "pip", "install", "--quiet"]
-    _call([*pip, "--constraint", str(ROOT / "requirements/all.txt"), f"{wheel}[train]"], folder)
+    pins = folder / "pins.txt"  # with digests, pip would ask for the wheel's own too
+    rows = read_lock(ROOT / "requirements/all.txt")
+    pins.write_text("".join(f"{row.name}=={row.version}\n" for row in rows))
+    _call([*pip, "--constraint", str(pins), f"{wheel}[train]"], folder)
     (folder / "train").mkdir()
     for name in ("model.py", "train/__init__.py", "storage.py", "pipeline.py"):
         (folder / name).write_text('WHOSE = "mine"\n')

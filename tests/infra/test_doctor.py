@@ -3,6 +3,7 @@
 import pytest
 
 from infra import doctor
+from pipeline.isolation import confinement
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +35,26 @@ def test_whatever_is_not_well_names_its_consequence_and_cure(
 ) -> None:
     for finding in findings:
         assert bool(finding.consequence) == bool(finding.mend) == (finding.state != "ok")
+
+
+@pytest.mark.parametrize(
+    ("word", "version", "state", "said"),
+    [
+        ("auto", 7, "ok", "Landlock 7, seccomp"),
+        ("off", 7, "slower", "TRILIGHT_CONFINE=off"),
+        ("auto", 0, "slower", "seccomp"),
+        ("required", 0, "missing", "seccomp"),
+    ],
+)
+def test_what_confines_children_is_said(
+    monkeypatch: pytest.MonkeyPatch, word: str, version: int, state: str, said: str
+) -> None:
+    monkeypatch.setenv("TRILIGHT_CONFINE", word)
+    for module in (doctor, confinement):
+        monkeypatch.setattr(module, "landlock_version", lambda: version)
+        monkeypatch.setattr(module, "seccomp_works", lambda: True)
+    finding = doctor._confinement()
+    assert (finding.state, finding.found.endswith(said)) == (state, True)
 
 
 @pytest.mark.parametrize(

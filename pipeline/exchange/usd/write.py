@@ -149,7 +149,7 @@ def _new_layer(path: Path, root: str) -> Any:
 
 def _save(path: Path, layer: Any, files: Mapping[str, bytes]) -> None:
     suffix = ".usda" if path.suffix.lower() == ".usda" else ".usdc"
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=path.parent if path.parent.is_dir() else None) as folder:
         plain = Path(folder) / f"scene{suffix}"
         if not layer.Export(str(plain)):
             raise TrilightError(f"{path.name}: USD could not write the scene.")

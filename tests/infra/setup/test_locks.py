@@ -1,0 +1,76 @@
+"""Locks: a digest for every package, one script that demands them, and the bill made of them."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from infra.setup.locks import LockedPackage, read_lock, write_lock
+from infra.setup.sbom import PLACE, bill_of_materials
+from tests.conftest import ROOT
+
+LOCKS = sorted((ROOT / "requirements").glob("*.txt"))
+
+
+@pytest.mark.parametrize("path", LOCKS, ids=lambda path: path.stem)
+def test_every_package_of_a_lock_has_a_digest(path: Path) -> None:
+    rows = read_lock(path)
+    assert rows
+    assert [row.name for row in rows if not row.sha256] == []
+    assert len({row.name for row in rows}) == len(rows)
+    assert "://" not in path.read_text()
+
+
+def test_locks_that_share_a_package_share_its_version_and_its_digests() -> None:
+    seen: dict[str, LockedPackage] = {}
+    for path in LOCKS:
+        for row in read_lock(path):
+            assert seen.setdefault(row.name, row) == row, path.name
+
+
+def test_a_lock_is_read_as_it_was_written(tmp_path: Path) -> None:
+    rows = [LockedPackage(name="a-b", version="1.0", sha256=("0" * 64, "1" * 64))]
+    write_lock(tmp_path / "x.txt", rows)
+    assert read_lock(tmp_path / "x.txt") == rows
+    (tmp_path / "x.txt").write_text("a-b>=1\n")
+    with pytest.raises(ValueError, match="NAME==VERSION"):
+        read_lock(tmp_path / "x.txt")
+
+
+def test_pip_refuses_a_file_of_another_digest(tmp_path: Path) -> None:
+    wheel = tmp_path / "a-1.0-py3-none-any.whl"
+    wheel.write_bytes(b"not what was locked")
+    write_lock(tmp_path / "x.txt", [LockedPackage(name="a", version="1.0", sha256=("0" * 64,))])
+    command = [sys.executable, "-m", "pip", "install", "--no-index", "--find-links", tmp_path]
+    command += ["--require-hashes", "--target", tmp_path / "t", "--requirement", tmp_path / "x.txt"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode and "DO NOT MATCH" in done.stderr
+
+
+def test_nothing_installs_a_lock_but_the_script_that_demands_digests() -> None:
+    script = (ROOT / "infra/setup/install.sh").read_text()
+    assert re.search(
+        r"--require-hashes --no-build-isolation --no-deps \\\n\s+--only-binary :all:", script
+    )
+    for path in [ROOT / "Makefile", *(ROOT / "infra/images").glob("*.Dockerfile")]:
+        text = path.read_text()
+        assert "infra/setup/install.sh" in text
+        assert not re.search(r"pip install[^\n]*(--requirement|-r )", text), path.name
+        for line in re.findall(r"pip install[^\n]*", text):
+            assert "--no-deps --no-build-isolation --editable ." in line, path.name
+
+
+def test_the_bill_of_materials_is_that_of_the_locks() -> None:
+    bill = json.loads((ROOT / PLACE).read_text())
+    assert bill == bill_of_materials(ROOT), "run `make sbom`"
+    assert (bill["bomFormat"], bill["specVersion"]) == ("CycloneDX", "1.6")
+    names = [row["bom-ref"] for row in bill["components"]]
+    assert len(set(names)) == len(names)
+    pinned = {f"{row.name.lower()}@{row.version}" for path in LOCKS for row in read_lock(path)}
+    listed = {name.removeprefix("pkg:pypi/") for name in names if "pypi" in name}
+    assert {name.replace("_", "-").replace(".", "-") for name in listed} == {
+        name.replace("_", "-").replace(".", "-") for name in pinned
+    }

@@ -1,0 +1,190 @@
+"""A child that a file has taken over: what it then tries is refused, and reading goes on."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild, confinement, reach
+from pipeline.isolation.landlock import landlock_version
+from pipeline.isolation.seccomp import _NUMBERS, _program, seccomp_works
+from storage.errors import EnvironmentFailure, TrilightError
+from tests.pipeline.isolation.test_isolation import _nothing, double, process_id
+
+LIMITS = ChildLimits(memory_bytes=2 << 30, wall_s=20, calls_per_child=100)
+needs_landlock = pytest.mark.skipif(not landlock_version(), reason="no Landlock here")
+needs_seccomp = pytest.mark.skipif(not seccomp_works(), reason="no seccomp here")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three folders: of inputs, of outputs, and of nobody's business."""
+    root = tmp_path_factory.mktemp("place")
+    for name in ("in", "out", "outside"):
+        (root / name).mkdir()
+        (root / name / "file").write_text(name)
+    (root / "in" / "link").symlink_to(root / "outside" / "file")
+    return root
+
+
+@pytest.fixture(scope="module")
+def child(place: Path) -> Iterator[IsolatedChild]:
+    allowed = reach(files=[place / "in" / "file"], writes=[place / "out"])
+    child = IsolatedChild(limits=LIMITS, setup=_nothing, confined_to=allowed)
+    yield child
+    child.close()
+
+
+def read(path: Path) -> str:
+    return path.read_text()
+
+
+def write(path: Path) -> None:
+    path.write_text("written")
+
+
+def replace(path: Path, by: Path) -> None:
+    os.replace(by, path)
+
+
+def connect(family: int, kind: int) -> None:
+    socket.socket(family, kind).close()
+
+
+def start_program() -> None:
+    subprocess.run([sys.executable, "-c", ""], check=True)
+
+
+def end_process(number: int) -> None:
+    os.kill(number, signal.SIGTERM)
+
+
+def call_kernel(number: int) -> int:
+    import ctypes
+
+    libc = ctypes.CDLL(None, use_errno=True)
+    return ctypes.get_errno() if libc.syscall(number, 0, 0, 0, 0, 0) < 0 else 0
+
+
+def _refused(child: IsolatedChild, function: object, *args: object) -> None:
+    with pytest.raises(ChildFailed, match="PermissionError"):
+        child.call(function, *args)  # type: ignore[arg-type]
+
+
+@needs_landlock
+def test_inputs_are_read_and_outputs_written(child: IsolatedChild, place: Path) -> None:
+    assert child.call(read, place / "in" / "file") == "in"
+    child.call(write, place / "out" / "new")
+    child.call(replace, place / "out" / "file", place / "out" / "new")
+    assert (place / "out" / "file").read_text() == "written"
+
+
+@needs_landlock
+@pytest.mark.parametrize("name", ["outside/file", "in/link", "in/../outside/file"])
+def test_a_file_outside_is_not_read(child: IsolatedChild, place: Path, name: str) -> None:
+    _refused(child, read, place / name)
+
+
+@needs_landlock
+@pytest.mark.parametrize("name", ["in/file", "in/new", "outside/file", "new"])
+def test_nothing_is_written_outside_of_the_output(
+    child: IsolatedChild, place: Path, name: str
+) -> None:
+    _refused(child, write, place / name)
+    assert (place / "in" / "file").read_text() == "in"
+
+
+@needs_landlock
+def test_secrets_of_other_processes_stay_theirs(child: IsolatedChild) -> None:
+    _refused(child, read, Path(f"/proc/{os.getpid()}/environ"))
+
+
+@needs_seccomp
+@pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6, socket.AF_UNIX])
+def test_nothing_is_connected_to(child: IsolatedChild, family: int) -> None:
+    _refused(child, connect, family, socket.SOCK_STREAM)
+    _refused(child, connect, family, socket.SOCK_DGRAM)
+
+
+@needs_seccomp
+def test_no_program_is_started(child: IsolatedChild) -> None:
+    _refused(child, start_program)
+
+
+@pytest.mark.skipif(landlock_version() < 6, reason="Landlock of Linux 6.12 is needed")
+def test_no_signal_reaches_another_process(child: IsolatedChild) -> None:
+    _refused(child, end_process, os.getpid())
+
+
+@needs_seccomp
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="numbers of x86_64")
+@pytest.mark.parametrize("name", ["ptrace", "mount", "bpf", "unshare", "keyctl", "io_uring_setup"])
+def test_ways_around_are_refused(child: IsolatedChild, name: str) -> None:
+    assert child.call(call_kernel, _NUMBERS[name][0]) == 1  # EPERM
+    assert child.call(call_kernel, _NUMBERS[name][0] | 0x40000000) == 1  # by the second set
+    assert child.call(call_kernel, 39) == 0  # getpid
+
+
+@needs_landlock
+def test_another_folder_costs_a_fresh_child_and_the_same_one_none(place: Path) -> None:
+    child = IsolatedChild(limits=LIMITS, setup=_nothing, confined_to=reach(files=[place / "in"]))
+    try:
+        first = child.call(process_id)
+        child.may(reach(files=[place / "in" / "file"]))
+        assert child.call(process_id) == first
+        child.may(reach(files=[place / "outside" / "file"]))
+        assert child.call(read, place / "outside" / "file") == "outside"
+        assert child.call(read, place / "in" / "file") == "in"
+        assert child.call(process_id) != first
+    finally:
+        child.close()
+
+
+def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(confinement.VARIABLE, "off")
+    child = IsolatedChild(limits=LIMITS, setup=_nothing, confined_to=reach(files=[place / "in"]))
+    try:
+        assert child.call(read, place / "outside" / "file") == "outside"
+    finally:
+        child.close()
+
+
+@pytest.mark.parametrize(
+    ("word", "error", "said"),
+    [("no", TrilightError, "auto"), ("required", EnvironmentFailure, "lacks Landlock")],
+)
+def test_what_cannot_be_had_is_said(
+    monkeypatch: pytest.MonkeyPatch, word: str, error: type[Exception], said: str
+) -> None:
+    monkeypatch.setenv(confinement.VARIABLE, word)
+    monkeypatch.setattr(confinement, "landlock_version", lambda: 0)
+    child = IsolatedChild(limits=LIMITS, setup=_nothing, confined_to=reach())
+    with pytest.raises(error, match=said):
+        child.call(double, 2)
+    monkeypatch.setenv(confinement.VARIABLE, "auto")
+    assert confinement.confinement_wanted()
+
+
+def test_very_many_folders_become_those_above_and_never_the_whole_disk() -> None:
+    many = reach(files=(Path(f"/models/{number % 9}/{number}/a.obj") for number in range(3000)))
+    assert len(many.reads) <= confinement.MOST_FOLDERS
+    assert all(path.is_relative_to("/models") for path in many.reads)
+    assert many.covers(reach(files=[Path("/models/3/12/a.obj")]))
+    assert not many.covers(reach(files=[Path("/other/a.obj")]))
+    wide = reach(files=(Path(f"/{number}/a.obj") for number in range(3000)))
+    assert Path("/") not in wide.reads
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+def test_every_jump_of_the_filter_ends_at_its_last_two_steps(machine: str) -> None:
+    steps = _program(machine)
+    assert [step[0] for step in steps[-2:]] == [0x06, 0x06]
+    for at, (_, taken, other, _) in enumerate(steps[3:-2], start=3):
+        assert at + 1 + taken == len(steps) - 1
+        assert other == 0
+    assert 1 + 1 + steps[1][2] == len(steps) - 1  # another architecture
