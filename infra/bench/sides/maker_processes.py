@@ -153,7 +153,7 @@ def one_stint(stint: Stint) -> StintTimes:
             settings=simulated_build(stint.scenes_per_shard),
             listed=None,
             publication=publication,
-            accepted=AcceptedObjects(objects=(), num_found=0),
+            accepted=AcceptedObjects(num_objects=0, num_found=0),
         )
         times.append(_now())
         make_shards(run, StandIns(stint.scene_s), lambda run, outcome: None)
