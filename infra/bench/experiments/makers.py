@@ -37,6 +37,8 @@ from infra.bench.sides.makers_simulation import (
 )
 from infra.bench.subjects.simulated_set import write_outline
 from infra.bench.workshop import Workshop
+from pipeline.making.environment import environment
+from pipeline.renders.variant import choose_variant
 
 MACHINES = (10, 100, 1_000)
 PLACES = ("folder", "bucket")
@@ -158,12 +160,14 @@ def _real(workshop: Workshop, point: Point, turn: str) -> Figures:
 
 def _stints(workshop: Workshop, place: str, count: int, scene_s: float) -> list[Stint]:
     root = workshop.folder()
+    found = workshop.kept("environment", lambda: environment(choose_variant()))
     to = str(root / "set") if place == "folder" else f"{_server(workshop).url}-of-{count}"
     return [
         Stint(
             place=to, cache=str(root / f"cache-{number}"),
             shards=(number * _SHARDS_EACH, (number + 1) * _SHARDS_EACH),
             num_shards=count * _SHARDS_EACH, scenes_per_shard=_SCENES, scene_s=scene_s,
+            environment=found,
         )
         for number in range(count)
     ]  # fmt: skip

@@ -9,23 +9,22 @@ import itertools
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from infra.bench.subjects.simulated_set import simulated_build
 from infra.bench.subjects.stand_in import stand_in_objects, stand_in_sample
 from pipeline.making.bucket_publication import begin_dataset, joined
 from pipeline.making.dataset_order import DatasetOrder
-from pipeline.making.environment import environment
 from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.pipeline import make_shards
 from pipeline.making.publication import Publication
 from pipeline.making.run import Run, ShardJob, TaskOutcome
 from pipeline.making.tasks import Piece
 from pipeline.making.unfinished_shard import UnfinishedShard
-from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.statistics import Statistics
@@ -52,6 +51,8 @@ class Stint:
     """Scenes of each."""
     scene_s: float
     """What a scene takes, waiting."""
+    environment: Mapping[str, Any]
+    """What the machine has, looked for once: 64 probes at a time on few cores run out of time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +129,7 @@ def _begun(stint: Stint) -> Publication:
     return begin_dataset(
         dataset_folder(stint.place),
         simulated_build(stint.scenes_per_shard),
-        environment(choose_variant()),
+        stint.environment,
         stint.num_shards * stint.scenes_per_shard,
         accept_environment=False,
     )
@@ -152,7 +153,7 @@ def one_stint(stint: Stint) -> StintTimes:
             settings=simulated_build(stint.scenes_per_shard),
             listed=None,
             publication=publication,
-            accepted=AcceptedObjects(objects=(), num_found=0),
+            accepted=AcceptedObjects(num_objects=0, num_found=0),
         )
         times.append(_now())
         make_shards(run, StandIns(stint.scene_s), lambda run, outcome: None)
@@ -220,7 +221,6 @@ def _result(connection: Connection) -> StintTimes:
 def _in_process(connection: Connection, stint: Stint, environ: dict[str, str]) -> None:
     os.environ.update(environ)  # the process that this is forked from has an earlier one
     stand_in_sample(0)
-    choose_variant()
     Path(stint.cache).mkdir(parents=True, exist_ok=True)
     connection.send(None)
     connection.recv()
