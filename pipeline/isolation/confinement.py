@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 from pipeline.isolation.landlock import give_up_privileges, landlock_version, restrict_files
 from pipeline.isolation.seccomp import refuse_calls, seccomp_works
@@ -80,9 +80,8 @@ def reach(*, files: Iterable[Path] = (), writes: Iterable[Path] = ()) -> Reach:
 def wanted_confinement() -> Wanted:
     """Return what TRILIGHT_CONFINE says, `auto` by default; TrilightError where it is no such."""
     text = os.environ.get(VARIABLE, "auto")
-    for known in get_args(Wanted):
-        if text == known:
-            return known  # type: ignore[no-any-return]
+    if text in get_args(Wanted):
+        return cast(Wanted, text)
     raise TrilightError(f"{VARIABLE} is {text!r}; {expected_one_of(text, get_args(Wanted))}.")
 
 

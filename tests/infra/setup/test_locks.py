@@ -44,8 +44,9 @@ def test_pip_refuses_a_file_of_another_digest(tmp_path: Path) -> None:
     wheel = tmp_path / "a-1.0-py3-none-any.whl"
     wheel.write_bytes(b"not what was locked")
     write_lock(tmp_path / "x.txt", [LockedPackage(name="a", version="1.0", sha256=("0" * 64,))])
-    command = [sys.executable, "-m", "pip", "install", "--no-index", "--find-links", tmp_path]
-    command += ["--require-hashes", "--target", tmp_path / "t", "--requirement", tmp_path / "x.txt"]
+    command = [sys.executable, "-m", "pip", "install", "--no-index", "--find-links", str(tmp_path)]
+    command += ["--require-hashes", "--target", str(tmp_path / "t")]
+    command += ["--requirement", str(tmp_path / "x.txt")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode and "DO NOT MATCH" in done.stderr
 
