@@ -21,7 +21,7 @@ class ArrayForm:
     """What one scheduler takes."""
 
     name: str
-    """Of the job: the same for the same array, so that a scheduler refuses it twice."""
+    """Of the job: the same for the same array, which Kubernetes and Google then refuse twice."""
     files: Mapping[str, str]
     """Texts by file name."""
     commands: Sequence[Sequence[str]]
@@ -85,7 +85,7 @@ def require_bucket_alone(job: ArrayJob, on: str) -> None:
     if is_reference(order.build):
         raise TrilightError(
             f"submit {on}: the build is {order.build}, a file of this machine; expected a name. "
-            "Put the file into an image of your own, with TRILIGHT_EXTEND, and use its build's name."
+            "Put the file into an image of your own, with TRILIGHT_EXTEND, and name its build."
         )
 
 
