@@ -1,4 +1,4 @@
-"""What falls to a task of an array that counts from 0, by the variables that the manuals promise."""
+"""What falls to a task of an array that counts from 0, by the variables of its scheduler."""
 
 from pathlib import Path
 

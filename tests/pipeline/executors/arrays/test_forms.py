@@ -1,6 +1,6 @@
-"""Files of an array as schedulers take them: by their schemas where these are installed, and rules.
+"""Files of an array as schedulers take them, by their schemas where these are installed.
 
-Google's and SkyPilot's schemas are not: docs/log/2026-11-25-arrays.md says how they were asked once.
+Google's and SkyPilot's are not; docs/log/2026-11-25-arrays.md says how they were asked once.
 """
 
 import json
@@ -76,7 +76,7 @@ def _container(on: str, form: ArrayForm) -> tuple[list[str], dict[str, str], int
 @pytest.mark.parametrize("on", FORMS)
 def test_every_place_makes_what_is_missing_and_nothing_else(made: Made, on: str) -> None:
     assert FORMS.keys() == INDEX_VARIABLES.keys()
-    job, form = made(on)
+    _, form = made(on)
     words, environment, number = _container(on, form)
     shares = [
         shards_of_place({**environment, INDEX_VARIABLES[on]: str(place)}, on)
