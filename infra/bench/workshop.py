@@ -27,9 +27,9 @@ from infra.bench.subjects.named_scenes import (
 from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
+from pipeline.making.accept_objects import accept_objects
 from pipeline.making.attempt_scene import SceneRecipe, set_up_child
 from pipeline.making.environment import environment
-from pipeline.making.pipeline import accept_objects
 from pipeline.making.prepare_isolated import preload_mesh_libraries
 from pipeline.making.publication import begin
 from pipeline.renders.variant import choose_variant
@@ -131,9 +131,7 @@ class Workshop:
         folder = DatasetFolder(self.folder())  # keeps the record of the objects
         publication = begin(folder, build, environment(variant), 1, accept_environment=False)
         accepted = accept_objects(objects, None, build, publication, workers=workers)
-        recipe = SceneRecipe(
-            settings=build, variant=variant, threads=workers, objects=accepted.objects
-        )
+        recipe = SceneRecipe(settings=build, variant=variant, threads=workers, pool=accepted.pool)
         return self.closing(IsolatedChild(limits=_LIMITS, setup=set_up_child, setup_args=(recipe,)))
 
     @functools.cached_property

@@ -30,7 +30,7 @@ def prepare_assets(**parameters: Any) -> None:
     """Begin a dataset: list, clean, decimate and freeze its objects, without a picture."""
     run = prepare_dataset(dataset_order(parameters))
     get_run_logger().info(
-        "%d of %d objects accepted", len(run.accepted.objects), run.accepted.num_found
+        "%d of %d objects accepted", run.accepted.num_objects, run.accepted.num_found
     )
 
 

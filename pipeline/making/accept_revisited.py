@@ -11,6 +11,7 @@ from pipeline.shards.finished import open_finished
 from storage.dataset.settings import ListedShard
 from storage.digests import canonical_json
 from storage.errors import TrilightError
+from storage.records.objects import OBJECT
 
 
 def settings_for_revisit(settings: BuildSettings, place: str | None) -> BuildSettings:
@@ -83,7 +84,7 @@ def accept_revisited(
         publication.lock_objects(locked)
     root = source.folder.root.resolve()
     return AcceptedObjects(
-        objects=tuple((entry, source.folder.objects_lock) for entry in locked),
+        num_objects=sum(entry.kind == OBJECT for entry in locked),
         num_found=len(locked),
         revisited=RevisitedScenes(root=root, digest=source.manifest.dataset_digest),
     )

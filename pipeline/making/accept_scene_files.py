@@ -65,7 +65,7 @@ def accept_scene_files(
     else:
         _require_same_files(frozen, locked)
     return AcceptedObjects(
-        objects=tuple((entry, folder.root / entry.uid) for entry in locked),
+        num_objects=len(locked),
         num_found=len(locked),
         files=files,
     )

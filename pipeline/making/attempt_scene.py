@@ -2,12 +2,15 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from pipeline.assets.store import AssetStore
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
+from pipeline.making.frozen_pool import AssetAway, FrozenPool
 from pipeline.making.own_maps import own_maps
+from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.render_sample import BegunScene, render_sample
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.making.view_progress import ViewProgress
@@ -18,8 +21,7 @@ from pipeline.scenes.pool import PooledAsset
 from scene_templates.own_maps import OwnMaps
 from storage.dataset.layout import DatasetFolder
 from storage.errors import Rejected
-from storage.records.asset import decode_asset
-from storage.records.objects import OBJECT, Failure, LockedObject
+from storage.records.objects import Failure, LockedObject
 from storage.records.sample import Sample, sample_key
 
 MAX_ATTEMPTS = 16
@@ -38,8 +40,12 @@ class SceneRecipe:
     """Threads of this child."""
     gpu: str | None = None
     """Graphics card of this child, as CUDA_VISIBLE_DEVICES names it; None where none is used."""
-    objects: tuple[tuple[LockedObject, Path], ...]
-    """Every locked object with its asset file."""
+    pool: FrozenPool | None = None
+    """The frozen objects, where scenes are composed of them."""
+    assets: AssetStore = field(default_factory=asset_store)
+    """Where their prepared files are, as the maker sees it."""
+    maps: tuple[tuple[LockedObject, Path], ...] = ()
+    """A user's own textures and skies with their prepared files."""
     files: SceneFiles | None = None
     """Where scenes are read from files; otherwise they are composed of the objects."""
     revisited: RevisitedScenes | None = None
@@ -56,10 +62,12 @@ class SceneAttempt:
     """The finished sample, or nothing where the attempt was rejected."""
     failures: list[Failure]
     """The rejection of the attempt, and of cameras on the way to a sample."""
+    away: tuple[str, str] | None = None
+    """uid and file of an object that must be prepared again before this attempt can be made."""
 
 
 class _ChildState:
-    """The assets of a render child by split, read once."""
+    """The objects and maps of a render child by split, each opened where a scene takes it."""
 
     source: SceneRecipe
     pool: dict[str, Sequence[PooledAsset]]
@@ -101,6 +109,8 @@ def attempt_scene(split: str, scene_index: int, attempt: int) -> SceneAttempt:
             )
         )
         return SceneAttempt(sample=None, failures=failures)
+    except AssetAway as missing:
+        return SceneAttempt(sample=None, failures=[], away=(missing.uid, missing.asset_name))
     finally:
         told.end()
     return SceneAttempt(sample=sample, failures=failures)
@@ -126,19 +136,16 @@ def _scene(split: str, scene_index: int, attempt: int) -> BegunScene:
 
 
 def assets_of(split: str) -> Sequence[PooledAsset]:
-    """Return the objects of a split, sorted by uid; read at the first call in a child."""
+    """Return the objects of a split, sorted by uid; each is opened when it is taken."""
     if split not in _state.pool:
-        source = _state.source
-        _state.pool[split] = [
-            PooledAsset(locked=locked, asset=decode_asset(path.read_bytes()))
-            for locked, path in sorted(source.objects, key=lambda pair: pair[0].uid)
-            if locked.split == split and locked.kind == OBJECT
-        ]
+        frozen = _state.source.pool
+        assert frozen is not None, "only composed scenes draw objects"
+        _state.pool[split] = frozen.opened(split, _state.source.assets)
     return _state.pool[split]
 
 
 def maps_of(split: str) -> OwnMaps:
     """Return a user's own textures and maps of a split; each is read when a scene takes it."""
     if split not in _state.own:
-        _state.own[split] = own_maps(_state.source.objects, split)
+        _state.own[split] = own_maps(_state.source.maps, split)
     return _state.own[split]

@@ -39,6 +39,9 @@ class BucketPublication(Publication):
     def send_documents(self) -> None:
         self._mirror.send_documents()
 
+    def send_index(self) -> None:
+        self._mirror.send_index()
+
     def lock_objects(self, objects: list[LockedObject]) -> None:
         self.add_failures(())  # where nothing was rejected, there is a file that says so
         self._mirror.freeze(encode_objects_lock(objects))

@@ -3,20 +3,31 @@
 import logging
 from collections import Counter
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
-from pipeline.assets.stage import PreparedAsset
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.isolation import is_passing
 from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
+from pipeline.making.frozen_pool import FrozenPool
+from pipeline.making.lock_parts import LockPart
+from pipeline.making.object_parts import ProvedObject
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.objects.sources import FoundObjects
 from storage.conventions import SPLITS
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
+from storage.digests import canonical_json, sha256_hex, sha256_of_file
 from storage.errors import EnvironmentFailure, TrilightError
-from storage.records.objects import Failure, LockedObject, count_by_reason, read_objects_lock
+from storage.records.object_index import IndexedObject, write_object_index
+from storage.records.objects import (
+    OBJECT,
+    Failure,
+    LockedObject,
+    count_by_reason,
+    read_objects_lock,
+)
 from storage.remote.safe_url import safe_url
 
 log = logging.getLogger("trilight.objects")
@@ -26,58 +37,114 @@ log = logging.getLogger("trilight.objects")
 class AcceptedObjects:
     """What scenes may use."""
 
-    objects: tuple[tuple[LockedObject, Path], ...]
-    """Every locked object with its asset file in the store."""
+    num_objects: int
+    """Objects that scenes may draw from."""
     num_found: int
     """Objects in the source, refused ones included."""
+    pool: FrozenPool | None = None
+    """Where scenes are composed: the frozen objects."""
+    maps: tuple[tuple[LockedObject, Path], ...] = ()
+    """A user's own textures and skies with their prepared files."""
     files: SceneFiles | None = None
-    """Where scenes come from files: those, and `objects` are the files themselves."""
+    """Where scenes come from files: those, and the objects are the files themselves."""
     revisited: RevisitedScenes | None = None
     """Where scenes are those of a finished dataset: that, whose objects these are."""
 
 
 def freeze_objects(
     source: str,
+    licence: str | None,
     found: FoundObjects,
-    prepared: list[PreparedAsset],
+    prepared: list[ProvedObject],
     rejected: list[Failure],
     settings: BuildSettings,
     publication: Publication,
     maps: AcceptedMaps = NO_MAPS,
+    part: LockPart | None = None,
 ) -> AcceptedObjects:
     """Freeze the objects at the first time, and later require that they are the same.
 
     Args:
-        source: where the objects come from, for messages.
+        source: where the objects come from.
+        licence: of files without a statement, as the user states it.
         found: what the source has.
         prepared, rejected: what the mesh stage made of it, or later of what is frozen.
         settings: the build, which says how objects are dealt to splits.
         publication: the dataset.
         maps: textures and maps of the user's own, which are frozen with the objects.
+        part: of the lock that `prepared` is; by default the whole.
 
     Raises:
         TrilightError: no object is accepted, a split has none, or the objects are not those that
             the dataset was begun with.
         EnvironmentFailure: one of those could not be prepared this time.
     """
-    shown, frozen = safe_url(source), frozen_objects(publication)
+    part = part or LockPart(folder=publication.folder, splits=settings.splits)
+    shown, frozen = safe_url(source), part.frozen(publication)
     passing = [failure for failure in rejected if is_passing(failure.reason)]
     if frozen is not None:
-        _require_tried(shown, passing)
+        for failure in passing:
+            require_tried(shown, failure)
     publication.add_failures([*found.failures, *rejected, *maps.failures])
     objects = [_locked(asset, settings) for asset in prepared]
     locked = [*objects, *(entry for entry, _ in maps.rows)]
     if frozen is None:
-        _require_enough(objects, settings, publication, shown)
+        _require_enough(objects, part, publication, shown)
         _warn_of(shown, passing)
         _tell_of_materials(shown, prepared)
-        publication.lock_objects(locked)
+        part.freeze(publication, locked)
     else:
         _require_same_objects(shown, frozen, locked)
-    paths = [asset.path for asset in prepared] + [path for _, path in maps.rows]
+    part.write_rows(locked)
+    _index(publication, part, locked, prepared, asked_digest(source, licence), found.num_found)
     return AcceptedObjects(
-        objects=tuple(zip(locked, paths, strict=True)), num_found=found.num_found
+        num_objects=len(objects),
+        num_found=found.num_found,
+        pool=FrozenPool(lock=part.lock, index=part.index, source=source, licence=licence),
+        maps=maps.rows,
     )
+
+
+def asked_digest(source: str, licence: str | None) -> str:
+    """Return the digest of what a source is asked for, which may hold a secret."""
+    return sha256_hex(canonical_json([source, licence]))
+
+
+def _index(
+    publication: Publication,
+    part: LockPart,
+    locked: list[LockedObject],
+    prepared: list[ProvedObject],
+    asked: str,
+    num_found: int,
+) -> None:
+    """Write the index of the lock, by which later makers trust it."""
+    assets = {asset.record.uid: asset for asset in prepared}
+    objects, offset = [], 0
+    with part.lock.open("rb") as lines:
+        for line, entry in zip(lines, sorted(locked, key=attrgetter("uid")), strict=True):
+            if entry.kind == OBJECT:
+                asset = assets[entry.uid]
+                objects.append(
+                    IndexedObject(
+                        locked=entry,
+                        offset=offset,
+                        asset_name=asset.asset_name,
+                        least_triangles=asset.least_triangles,
+                    )
+                )
+            offset += len(line)
+    write_object_index(
+        part.index,
+        objects,
+        lock_sha256=sha256_of_file(part.lock),
+        lock_bytes=offset,
+        asked=asked,
+        num_found=num_found,
+        num_maps=len(locked) - len(objects),
+    )
+    if part.number is None:
+        publication.send_index()
 
 
 def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
@@ -87,7 +154,7 @@ def frozen_objects(publication: Publication) -> dict[str, LockedObject] | None:
     return {entry.uid: entry for entry in read_objects_lock(publication.folder.objects_lock)}
 
 
-def _locked(asset: PreparedAsset, settings: BuildSettings) -> LockedObject:
+def _locked(asset: ProvedObject, settings: BuildSettings) -> LockedObject:
     record = asset.record
     return LockedObject(
         uid=record.uid,
@@ -102,27 +169,36 @@ def _locked(asset: PreparedAsset, settings: BuildSettings) -> LockedObject:
 
 
 def _require_enough(
-    locked: list[LockedObject], settings: BuildSettings, publication: Publication, source: str
+    locked: list[LockedObject], part: LockPart, publication: Publication, source: str
 ) -> None:
     if not locked:
         raise TrilightError(
             f"objects {source!r}: none was accepted; expected at least one usable object with an "
             f"allowed licence. The reasons are in {publication.folder.failures}."
         )
-    needed = {split_of_shard(i, settings.splits) for i in range(publication.num_shards)}
+    shards = filter(part.has_shard, range(publication.num_shards))
+    needed = {split_of_shard(index, part.splits) for index in shards}
     require_objects(
         {split: sum(entry.split == split for entry in locked) for split in SPLITS}, needed
     )
 
 
-def _require_tried(source: str, passing: list[Failure]) -> None:
+def require_tried(source: str, failure: Failure) -> None:
     """Refuse to judge an object of the dataset where the environment has kept it from us."""
-    for failure in passing:
+    if is_passing(failure.reason):
         raise EnvironmentFailure(
             f"objects {source!r}: {failure.item!r}, which the dataset was begun with, could not be "
             f"prepared this time ({failure.reason}: {failure.message}). Nothing has changed; run "
             "the same command again."
         )
+
+
+def changed(source: str, uid: str, state: str) -> TrilightError:
+    """Return the error of a frozen object that its source has not got any more as it was."""
+    return TrilightError(
+        f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was begun "
+        "with (objects.lock.jsonl). Restore it, or choose another --out."
+    )
 
 
 def _warn_of(source: str, passing: list[Failure]) -> None:
@@ -138,7 +214,7 @@ def _warn_of(source: str, passing: list[Failure]) -> None:
         )
 
 
-def _tell_of_materials(source: str, prepared: list[PreparedAsset]) -> None:
+def _tell_of_materials(source: str, prepared: list[ProvedObject]) -> None:
     """Say which objects get drawn materials although their own were asked for."""
     reasons = Counter(asset.without_own for asset in prepared if asset.without_own)
     if reasons:
@@ -160,7 +236,4 @@ def _require_same_objects(
     for uid, entry in frozen.items():
         if by_uid.get(uid) != entry:
             state = "has changed" if uid in by_uid else "is missing or no longer usable"
-            raise TrilightError(
-                f"objects {source!r}: {uid!r} {state}; expected the objects that the dataset was "
-                "begun with (objects.lock.jsonl). Restore it, or choose another --out."
-            )
+            raise changed(source, uid, state)

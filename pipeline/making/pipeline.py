@@ -24,25 +24,28 @@ bucket share what is finished (pipeline.shards.mirror).
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 from pipeline.builds.named import object_source
 from pipeline.builds.settings import BuildSettings
 from pipeline.documents.dataset_documents import write_documents
 from pipeline.documents.sheets import write_first_pictures
 from pipeline.isolation import ChildFailed, IsolatedChild, call_with_retries
-from pipeline.making.accept_maps import NO_FOLDERS, MapFolders, accept_maps, map_folders
+from pipeline.making.accept_maps import MapFolders, map_folders
+from pipeline.making.accept_objects import accept_objects, share_mesh_work, trusted_objects
 from pipeline.making.accept_revisited import accept_revisited
 from pipeline.making.accept_scene_files import accept_scene_files
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.making.bucket_publication import joined
 from pipeline.making.dataset_order import DatasetOrder, generate_words
-from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects, frozen_objects
+from pipeline.making.freeze_objects import AcceptedObjects
+from pipeline.making.lock_parts import LockPart, lock_parts
 from pipeline.making.machine import cores_owned
-from pipeline.making.prepare_isolated import prepare_isolated
 from pipeline.making.publication import Publication
 from pipeline.making.render_children import close_children, cores_of_child, render_child
+from pipeline.making.restore_object import restore_object
 from pipeline.making.run import (
     Outcome,
     Run,
@@ -55,11 +58,9 @@ from pipeline.making.run import (
 from pipeline.making.runner import Runner
 from pipeline.making.tasks import Piece, rounds
 from pipeline.making.unfinished_shard import UnfinishedShard
-from pipeline.objects.sources import find_objects
 from storage.dataset.asked import write_asked
 from storage.dataset.layout import dataset_folder
 from storage.dataset.manifest import ShardEntry
-from storage.dataset.progress import announce_downloads, announce_objects, count_object
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
 from storage.records.objects import Failure
@@ -80,7 +81,8 @@ def make_dataset(
         TrilightError: what the user can mend; what is finished is safe.
     """
     with _begun(order) as run:  # objects, meshes
-        make_shards(run, runner, watch)  # scenes, renders, shards
+        for part in _by_parts(run):
+            make_shards(part, runner, watch)  # scenes, renders, shards
         run.require_within_budget()
         run.publication.publish()
         statistics = None
@@ -104,59 +106,73 @@ def _begun(order: DatasetOrder) -> Iterator[Run]:
     with joined(folder):
         own = map_folders(order, settings)
         publication = begun_publication(order, settings, folder)
-        with folder.turn("objects"):  # one maker prepares, and the others find it done
-            publication.refresh()
-            if listed:
-                accepted = accept_scene_files(listed, order.licence, settings, publication)
-            elif order.revisits:
-                accepted = accept_revisited(order.revisits, settings, publication)
-            else:
-                source = object_source(settings, order.objects)
-                accepted = accept_objects(
-                    source, order.licence, settings, publication, cores_owned(), own
+        part = None
+        if listed or order.revisits:
+            with folder.turn("objects"):
+                publication.refresh()
+                accepted = (
+                    accept_scene_files(listed, order.licence, settings, publication)
+                    if listed
+                    else accept_revisited(order.revisits or "", settings, publication)
                 )
-            write_asked(folder, generate_words(order))
+        else:
+            shards = _wanted_shards(order, settings, publication)
+            part = lock_parts(folder, settings.splits, shards, maps=bool(own.folders))[0]
+            accepted = accept_part(order, settings, publication, own, part)
+        write_asked(folder, generate_words(order))
         yield Run(
             order=order,
             settings=settings,
             listed=listed,
             publication=publication,
             accepted=accepted,
+            part=part,
         )
 
 
-def accept_objects(
-    source: str,
-    licence: str | None,
+def _wanted_shards(
+    order: DatasetOrder, settings: BuildSettings, publication: Publication
+) -> list[int]:
+    """Return the shards whose parts an order asks for, those that are missing first."""
+    if settings.splits.object_parts == 1:
+        return []
+    wanted = order.shard_range() or range(publication.num_shards)
+    missing = [index for index in publication.missing_shards() if index in wanted]
+    return [*missing, *wanted]
+
+
+def _by_parts(run: Run) -> Iterator[Run]:
+    """Yield the run for each part of the objects whose shards are missing, frozen when it is due.
+
+    Where objects are frozen as a whole, that is the run as it is.
+    """
+    yield run
+    if run.part is None or run.part.number is None:
+        return
+    everything, own = replace(run, part=None), MapFolders()
+    folder, splits = run.publication.folder, run.settings.splits
+    for part in lock_parts(folder, splits, everything.missing_shards()):
+        if part != run.part:
+            accepted = accept_part(run.order, run.settings, run.publication, own, part)
+            yield replace(run, accepted=accepted, part=part)
+
+
+def accept_part(
+    order: DatasetOrder,
     settings: BuildSettings,
     publication: Publication,
-    workers: int,
-    own: MapFolders = NO_FOLDERS,
+    own: MapFolders,
+    part: LockPart,
 ) -> AcceptedObjects:
-    """Turn a source into frozen meshes: of all its objects, or of those that were frozen before.
-
-    Textures and maps of a user's own are frozen with them.
-
-    Raises:
-        TrilightError, EnvironmentFailure: as `find_objects` and `freeze_objects`.
-    """
-    folder, frozen = publication.folder, frozen_objects(publication)
-    found = find_objects(
-        source,
-        work_dir=folder.staged_objects,
-        allowed_licences=settings.allowed_licences,
-        licence=licence,
-        downloaded=lambda done, total: announce_downloads(folder, done, total),
-    )
-    wanted = [record for record in found.records if frozen is None or record.uid in frozen]
-    announce_objects(folder, len(wanted))
-    prepared, rejected = prepare_isolated(
-        wanted, settings.mesh_settings, workers=workers, done=lambda: count_object(folder)
-    )
-    maps = accept_maps(own, settings, workers=workers)
-    if frozen is not None:
-        maps = replace(maps, rows=tuple(row for row in maps.rows if row[0].uid in frozen))
-    return freeze_objects(source, found, prepared, rejected, settings, publication, maps)
+    """Return the frozen objects of a part: at once where they are known, else made with others."""
+    source, workers = object_source(settings, order.objects), cores_owned()
+    asked = (source, order.licence, settings, publication, workers)
+    if trusted := trusted_objects(*asked, own, part):
+        return trusted
+    found = share_mesh_work(*asked, part)
+    with publication.folder.turn("objects"):  # one maker freezes, and the others find it done
+        publication.refresh()
+        return accept_objects(*asked, own, part, found)
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:
@@ -214,7 +230,8 @@ def make_piece(job: ShardJob, piece: Piece, child: IsolatedChild) -> tuple[int, 
             if not ours:
                 continue
             began = time.monotonic()
-            sample, failures = make_scene(shard.split, scene_index, attempts, child)
+            restore = partial(restore_object, job)
+            sample, failures = make_scene(shard.split, scene_index, attempts, child, restore)
             shard.stage(
                 scene_index, sample, failures, profile, began=began, cores=cores_of_child(job)
             )
@@ -227,17 +244,25 @@ def make_piece(job: ShardJob, piece: Piece, child: IsolatedChild) -> tuple[int, 
 
 
 def make_scene(
-    split: str, scene_index: int, attempts: int, child: IsolatedChild
+    split: str,
+    scene_index: int,
+    attempts: int,
+    child: IsolatedChild,
+    restore: Callable[[str, str], None],
 ) -> tuple[Sample | None, list[Failure]]:
     """Turn meshes into a scene with pictures: the first attempt that is not rejected, if any is.
 
     In the child, `attempt_scene` composes the scene (or reads its file) and renders its views. If a
-    child is killed, crashes or takes too long, the same attempt is tried again in a new one.
+    child is killed, crashes or takes too long, the same attempt is tried again in a new one. An
+    object whose prepared file is away is brought back by `restore`, for the same attempt.
     """
     failures: list[Failure] = []
     for attempt in range(attempts):
         try:
             tried = call_with_retries(child, attempt_scene, split, scene_index, attempt)
+            while tried.away:
+                restore(*tried.away)
+                tried = call_with_retries(child, attempt_scene, split, scene_index, attempt)
         except ChildFailed as failure:
             failures.append(
                 Failure(

@@ -34,6 +34,39 @@ def preload_mesh_libraries() -> None:
     preload([module_name(name) for name in names])
 
 
+class MeshWork:
+    """Children for mesh work that several batches of objects share; a context that ends them."""
+
+    def __init__(self, settings: AssetSettings, workers: int) -> None:
+        """Remember what to do; a child is started where an object needs one.
+
+        Args:
+            settings: of the mesh stage.
+            workers: objects at a time.
+        """
+        self._settings, self._workers = settings, workers
+        self._pool = ChildPool(lambda _: asset_child(), workers)
+
+    def prepare(
+        self, records: list[ObjectRecord], done: Callable[[], None]
+    ) -> tuple[list[PreparedAsset], list[Failure]]:
+        """Prepare objects; arguments and errors as `prepare_assets`; from any thread."""
+        return prepare_assets(
+            records,
+            self._settings,
+            asset_store(),
+            borrow_child=self._pool.borrow,
+            workers=self._workers,
+            done=done,
+        )
+
+    def __enter__(self) -> "MeshWork":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._pool.close()
+
+
 def prepare_isolated(
     records: list[ObjectRecord],
     settings: AssetSettings,
@@ -42,18 +75,8 @@ def prepare_isolated(
     done: Callable[[], None],
 ) -> tuple[list[PreparedAsset], list[Failure]]:
     """Prepare objects in `workers` children; arguments and errors as `prepare_assets`."""
-    pool = ChildPool(lambda _: asset_child(), workers)
-    try:
-        return prepare_assets(
-            records,
-            settings,
-            asset_store(),
-            borrow_child=pool.borrow,
-            workers=workers,
-            done=done,
-        )
-    finally:
-        pool.close()
+    with MeshWork(settings, workers) as work:
+        return work.prepare(records, done)
 
 
 def require_filters() -> None:

@@ -53,6 +53,9 @@ class Publication:
     def send_documents(self) -> None:
         """Bring the documents of the folder to where the dataset is: here they are."""
 
+    def send_index(self) -> None:
+        """Bring the index of the frozen objects to where the dataset is: here it is."""
+
     @property
     def num_shards(self) -> int:
         """How many shards the dataset will have."""

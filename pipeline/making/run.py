@@ -13,6 +13,7 @@ from pipeline.making.bucket_publication import begin_dataset
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.environment import environment
 from pipeline.making.freeze_objects import AcceptedObjects
+from pipeline.making.lock_parts import LockPart
 from pipeline.making.machine import visible_gpus
 from pipeline.making.publication import Publication
 from pipeline.objects.sources import look_at_source
@@ -21,7 +22,6 @@ from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
-from storage.records.objects import OBJECT
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,11 +38,17 @@ class Run:
     """What is public of the dataset."""
     accepted: AcceptedObjects
     """What scenes are made of."""
+    part: LockPart | None = None
+    """Where objects are frozen in parts: the one that `accepted` is."""
 
     def missing_shards(self) -> list[int]:
         """Return the numbers of the shards that were asked for and are not there."""
         wanted, missing = self.order.shard_range(), self.publication.missing_shards()
-        return [index for index in missing if wanted is None or index in wanted]
+        return [index for index in missing if self._is_ours(index, wanted)]
+
+    def _is_ours(self, index: int, wanted: range | None) -> bool:
+        in_part = self.part is None or self.part.has_shard(index)
+        return in_part and (wanted is None or index in wanted)
 
     def num_workers(self) -> int:
         """Return how many tasks run at a time in one process, where the executor does not say."""
@@ -66,6 +72,9 @@ class Run:
     def outcome(self, statistics: Statistics | None) -> "Outcome":
         """Return what the run leaves behind; `statistics` where the dataset is finished."""
         publication, listed = self.publication, self.listed
+        num_objects, part = self.accepted.num_objects, self.part
+        if part is not None and part.number is not None:
+            num_objects = part.num_frozen()
         notes: tuple[str, ...] = ()
         if listed and self.accepted.files:
             notes = (*self.accepted.files.notes, *listed.notes(self.settings.scenes.num_views))
@@ -74,7 +83,7 @@ class Run:
         return Outcome(
             digest=publication.manifest.dataset_digest,
             num_objects_found=self.accepted.num_found,
-            num_objects_used=sum(row.kind == OBJECT for row, _ in self.accepted.objects),
+            num_objects_used=num_objects,
             num_scenes_given_up=publication.num_given_up(),
             num_shards=len(publication.manifest.shards),
             num_shards_planned=publication.num_shards,
@@ -109,7 +118,7 @@ class ShardJob:
     environment: Mapping[str, Any]
     """What the dataset was begun with, which every maker must have too; empty to accept any."""
     accepted: AcceptedObjects
-    """What scenes are made of; the files are in the shared cache."""
+    """What scenes are made of; prepared files are in the user's cache, or are made there again."""
     lock_sha256: str
     """Digest of the frozen objects."""
     num_at_once: int

@@ -178,7 +178,7 @@ def _wait_for_others(run: Run, pause_s: float) -> float:
     while True:
         time.sleep(pause_s)
         pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-        missing = publication.missing_shards()
+        missing = run.missing_shards()
         shards = (UnfinishedShard(publication.folder, splits, index) for index in missing)
         if not missing or any(shard.is_free() for shard in shards):
             return pause_s

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.scenes.fitting import FitTable, drawn_rows
 from storage.errors import Rejected
 from storage.records.asset import Asset, Level
 
@@ -26,11 +26,7 @@ def drawn_within(
     num_triangles: int,
     camps: Sequence[str] = (),
 ) -> list[Entry]:
-    """Draw entries with replacement, evenly among those that fit beside the ones before.
-
-    If all fit, this is a uniform draw. Otherwise simple objects are drawn more often beside
-    demanding ones, as they would be if whole scenes were drawn until one fits.
-    Entries of two different camps never fit beside each other.
+    """Draw entries with replacement, evenly among those that fit, as `drawn_rows` does.
 
     Args:
         rng: where the numbers come from.
@@ -43,38 +39,8 @@ def drawn_within(
     Raises:
         Rejected: "over_budget" where not even the simplest fit.
     """
-    sizes, camps = np.array(least), camps or [""] * len(least)
-    allowed = np.ones(len(sizes), np.bool_)
-    left = num_triangles
-    drawn: list[Entry] = []
-    for following in range(count - 1, -1, -1):
-        room = left - following * _simplest_beside(sizes, camps, allowed)
-        fitting = np.flatnonzero(allowed & (sizes <= room))
-        if len(fitting) == 0:
-            raise Rejected(
-                "over_budget",
-                f"{count} objects of at least {sizes.min()} triangles each do not fit into the "
-                f"{num_triangles} that the scene has for them",
-            )
-        row = int(fitting[rng.integers(len(fitting))])
-        drawn.append(entries[row])
-        left -= int(sizes[row])
-        if camps[row]:
-            allowed &= np.array([camp in ("", camps[row]) for camp in camps])
-    return drawn
-
-
-def _simplest_beside(
-    sizes: NDArray[np.int64], camps: Sequence[str], allowed: NDArray[np.bool_]
-) -> NDArray[np.int64]:
-    """Return the triangles [N] of the simplest entry that may still come after each one."""
-    of_camp = {
-        camp: sizes[allowed & np.array([other in ("", camp) for other in camps])]
-        for camp in sorted(set(camps) - {""})
-    }
-    simplest = {camp: int(fitting.min(initial=sizes.max())) for camp, fitting in of_camp.items()}
-    simplest[""] = int(sizes[allowed].min())
-    return np.array([simplest[camp] for camp in camps])
+    rows = drawn_rows(rng, FitTable.of(least, camps), count, num_triangles)
+    return [entries[row] for row in rows]
 
 
 def levels_within(

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.scenes.budget import drawn_within, least_triangles, levels_within
+from pipeline.scenes.budget import levels_within
 from pipeline.scenes.drawn_columns import with_drawn_columns
+from pipeline.scenes.fitting import drawn_rows
 from pipeline.scenes.laws import require_laws
 from pipeline.scenes.own_light import with_own_light
 from pipeline.scenes.own_materials import own_skins
@@ -23,7 +24,7 @@ from pipeline.scenes.pieces import (
     object_piece,
     shell_piece,
 )
-from pipeline.scenes.pool import PooledAsset
+from pipeline.scenes.pool import PooledAsset, fits_of
 from pipeline.scenes.posing import posed
 from pipeline.scenes.shapes import MeshShape
 from pipeline.scenes.subdivision import filled
@@ -155,9 +156,8 @@ def _objects_rand(
     plan: ScenePlan,
     pool: Sequence[PooledAsset],
 ) -> list[PooledAsset]:
-    least = [least_triangles(entry.asset) for entry in pool]
-    camps = [entry.camp for entry in pool]
-    return drawn_within(rng, pool, least, plan.num_objects, _object_budget(settings, plan), camps)
+    budget = _object_budget(settings, plan)
+    return [pool[row] for row in drawn_rows(rng, fits_of(pool), plan.num_objects, budget)]
 
 
 def _object_budget(settings: SceneSettings, plan: ScenePlan) -> int:

@@ -78,6 +78,9 @@ class Mirror:
             return
         if (lock := self._files.read("objects.lock.jsonl")) is not None:
             write_atomically(folder.objects_lock, lock)
+            index = self._files.read(self._name(folder.staged_index))
+            if index is not None:
+                write_atomically(folder.staged_index, index)
         self._take_failures()
         write_manifest(folder.manifest, theirs)
 
@@ -179,6 +182,10 @@ class Mirror:
         note = note_of(folder, name)
         self._bucket.write(self._name(note), note)
         return entry
+
+    def send_index(self) -> None:
+        """Put the index of the frozen objects into the bucket: others trust the lock by it."""
+        self._bucket.write(self._name(self._folder.staged_index), self._folder.staged_index)
 
     def send_manifest(self) -> None:
         """Put the folder's manifest and rejections into the bucket, in place of those there."""

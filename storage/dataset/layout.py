@@ -75,6 +75,12 @@ class DatasetFolder:
     staging = _Below(".staging")
     staged_objects = _Below(".staging/objects")
     """Built-in objects, written out as files."""
+    staged_index = _Below(".staging/objects.index")
+    """The index of the frozen objects (storage.records.object_index)."""
+    staged_locks = _Below(".staging/object_locks")
+    """Rows and index of each part of the lock, where it is frozen in parts."""
+    staged_parts = _Below(".staging/object_parts")
+    """What came of parts of the objects, until they are frozen."""
     staged_failures = _Below(".staging/failures")
     """Rejections of shards that are packed but not yet in the manifest."""
     staged_entries = _Below(".staging/entries")

@@ -65,12 +65,12 @@ def announce_objects(folder: DatasetFolder, num_objects: int) -> None:
     write_atomically(folder.staged_plan, json.dumps({"objects": num_objects}).encode())
 
 
-def count_object(folder: DatasetFolder) -> None:
-    """Record that one more object is prepared or rejected: one byte, from any thread."""
+def count_object(folder: DatasetFolder, count: int = 1) -> None:
+    """Record that more objects are prepared or rejected: a byte for each, from any thread."""
     path = folder.staged_done
     try:
         with path.open("ab") as stream:
-            stream.write(b".")
+            stream.write(b"." * count)
     except OSError as error:
         raise write_error(path, error) from error
 

@@ -47,6 +47,9 @@ class SplitSettings:
     for testing."""
     held_out_objects: Annotated[float, Within(0, 0.5, low_open=True, high_open=True)] = 0.125
     """Share of objects held out for validation; the same share is held out for testing."""
+    object_parts: Annotated[int, Within(1, 10_000, unit="parts")] = 1
+    """Number of parts in which the objects are frozen. Scenes begin when the objects of the first
+    part are ready, and draw from those of their own part only: for catalogues that take days."""
     one_split: bool = False
     """Put all objects and scenes into the split `test`, for a dataset that only serves evaluation.
     """
@@ -59,7 +62,17 @@ class SplitSettings:
 
     @pydantic.model_serializer(mode="wrap")
     def _record(self, as_usual: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return _without_empty(as_usual(self), "listed_shards")
+        record = _without_empty(as_usual(self), "listed_shards")
+        if record["object_parts"] == 1:
+            del record["object_parts"]
+        return record
+
+    def __post_init__(self) -> None:
+        if self.object_parts > 1 and (self.listed_shards or self.listed_scenes is not None):
+            raise TrilightError(
+                f"splits.object_parts is {self.object_parts}; expected 1 where scenes are listed, "
+                "since their objects are not drawn."
+            )
 
     @functools.cached_property
     def first_scenes(self) -> tuple[int, ...]:

@@ -7,6 +7,9 @@ from typing import Any
 import pytest
 
 from pipeline.making import publication as publications
+from pipeline.making.accept_objects import trusted_objects
+from pipeline.making.frozen_pool import AssetAway
+from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication
 from pipeline.shards.pack import pack_shard
 from storage.dataset.dataset import open_dataset
@@ -16,6 +19,7 @@ from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures
 from storage.records.sample import sample_key
 from tests.pipeline.making.bucket_kit import OUT, Machines
+from tests.pipeline.making.frozen_kit import SOURCE, build, frozen, prepared
 from tests.pipeline.making.test_publication import _dataset, _locked, make_tiny_shard
 from tests.scenes_by_hand import tiny_sample
 
@@ -108,3 +112,16 @@ def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: 
         publication.add_shard(entry)
         publication.publish()
         assert publication.manifest.shards == (entry,)
+
+
+def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Machines) -> None:
+    """And has no prepared file yet: each is made where a scene draws it."""
+    with machines.maker("a") as first:
+        accepted = frozen(first, [prepared(number) for number in range(30)])
+        assert accepted.num_objects == 30
+    with machines.maker("b") as later:
+        trusted = trusted_objects(SOURCE, None, build(), later, 1)
+        assert trusted is not None and trusted.pool is not None
+        assert trusted.num_objects == 30
+        with pytest.raises(AssetAway):
+            trusted.pool.opened("train", asset_store())[0]

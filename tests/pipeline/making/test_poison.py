@@ -107,14 +107,15 @@ def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
     deaths, small = workshop / "objects" / poison.DEATHS, {"scenes": 4}
     deaths.write_text("3")
     begun = prepare_dataset(order(workshop, cold / "without", **small))
-    assert len(begun.accepted.objects) == 7
+    assert begun.accepted.num_objects == 7
     (failure,) = open_dataset(str(cold / "without")).failures()
     assert (failure.item, failure.reason) == ("knot0", "killed")
     (record,) = caplog.records
     assert "1 could not be prepared this time (1 x killed)" in record.getMessage()
     begun = prepare_dataset(order(workshop, cold / "with", **small))
-    assert len(begun.accepted.objects) == 8
+    assert begun.accepted.num_objects == 8
     shutil.rmtree(cold / "cache")
+    begun.publication.folder.staged_index.unlink()
     deaths.write_text("3")
     with pytest.raises(
         EnvironmentFailure, match="'knot0', which .* begun with.*killed.*run the same"
@@ -122,6 +123,36 @@ def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
         prepare_dataset(order(workshop, cold / "with", **small))
     assert open_dataset(str(cold / "with")).failures() == []
     assert prepare_dataset(order(workshop, cold / "with", **small)).accepted == begun.accepted
+
+
+def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
+    workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of no scene are not, and one that has changed is refused."""
+    begun = prepare_dataset(order(workshop, tmp_path / "set"))
+    monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_die)
+    (workshop / "objects" / poison.DEATHS).write_text("1000")
+    drawn = {
+        row.uid
+        for sample in open_dataset(str(workshop / "plain")).samples()
+        for row in sample.scene.objects
+    }
+    assert "knot0" in drawn
+    assert prepare_dataset(order(workshop, tmp_path / "set")).accepted == begun.accepted
+    with pytest.raises(EnvironmentFailure, match="'knot0', which .*killed.*run the same"):
+        make(workshop, tmp_path / "set")
+    mesh = workshop / "objects" / "knot0.obj"
+    was = mesh.read_bytes()
+    write_obj(mesh, knot(segments=40))
+    (workshop / "objects" / poison.DEATHS).write_text("0")
+    with pytest.raises(TrilightError, match="'knot0' has changed; expected the objects that"):
+        make(workshop, tmp_path / "set")
+    mesh.write_bytes(was)
+    outcome = make(workshop, tmp_path / "set")
+    (workshop / "objects" / poison.DEATHS).unlink()
+    assert outcome.digest == expected(workshop)
+    assert len(list((tmp_path / "cache").glob("assets/??/*.safetensors"))) <= len(drawn) + 1
 
 
 def test_scenes_that_abort_their_child_are_counted(

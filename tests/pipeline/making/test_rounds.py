@@ -53,7 +53,7 @@ def _run(root: Path, scenes: int) -> Run:
         settings=_build(),
         listed=None,
         publication=begin_tiny(root, scenes),
-        accepted=AcceptedObjects(objects=(), num_found=0),
+        accepted=AcceptedObjects(num_objects=0, num_found=0),
     )
 
 

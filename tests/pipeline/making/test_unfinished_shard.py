@@ -60,7 +60,7 @@ def _make(root: Path, first: int, last: int, made: "Counter[int]", broken: int =
         folder=DatasetFolder(root),
         settings=_build(),
         environment={},
-        accepted=AcceptedObjects(objects=(), num_found=0),
+        accepted=AcceptedObjects(num_objects=0, num_found=0),
         lock_sha256="",
         num_at_once=1,
         extensions={},

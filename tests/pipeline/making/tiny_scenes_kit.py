@@ -38,13 +38,14 @@ def without_rendering(
     ) -> AcceptedObjects:
         if not publication.manifest.objects_lock_sha256:
             publication.lock_objects([_locked()])
-        return AcceptedObjects(objects=(), num_found=1)
+        return AcceptedObjects(num_objects=0, num_found=1)
 
     def make(split: str, scene: int, *more: Any) -> tuple[Sample, list[Failure]]:
         scenes.append((split, scene))
         made(scene)
         return dataclasses.replace(tiny_sample(seed=scene), key=sample_key(scene)), []
 
+    monkeypatch.setattr("pipeline.making.pipeline.share_mesh_work", lambda *given: None)
     monkeypatch.setattr("pipeline.making.pipeline.accept_objects", accept)
     monkeypatch.setattr("pipeline.making.pipeline.make_scene", make)
     monkeypatch.setenv("TRILIGHT_VARIANT", "scalar_rgb")  # needs no probe

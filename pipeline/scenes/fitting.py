@@ -1,0 +1,142 @@
+"""Which objects of a split still fit into a scene, and the draw among them.
+
+All of a split may be millions. What a draw has to know of each is its triangles and the camp of its
+licence, two columns that are looked at in parts; where all fit, which is the rule, at none.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from storage.errors import Rejected
+from storage.records.object_index import CampSizes
+
+_PART = 1 << 16
+"""Rows that are looked at together: half a megabyte."""
+
+
+class Column(Protocol):
+    """Numbers of the rows of a split, in memory or in a file."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
+
+
+class FitTable:
+    """Triangles and camp of every object of a split, in the order of their uids."""
+
+    def __init__(
+        self, least: Column, camp: Column, camps: Sequence[str], sizes: Mapping[str, CampSizes]
+    ) -> None:
+        """Remember the columns.
+
+        Args:
+            least: triangles of the coarsest level of each row.
+            camp: number of each row's camp.
+            camps: name of each number; "" is for objects that have no camp.
+            sizes: of the camps that occur.
+        """
+        self._least, self._camp = least, camp
+        self._camps = tuple(camps)
+        self.sizes = sizes
+
+    @classmethod
+    def of(cls, least: Sequence[int], camps: Sequence[str] = ()) -> "FitTable":
+        """Return the table of some entries; without `camps` none has one."""
+        names = sorted({*camps}) or [""]
+        sizes = np.array(least, np.int64)
+        numbers = np.array([names.index(camp) for camp in camps] or [0] * len(least), np.int64)
+        return cls(
+            sizes,
+            numbers,
+            names,
+            {
+                name: CampSizes(count=len(some), least=int(some.min()), most=int(some.max()))
+                for number, name in enumerate(names)
+                if len(some := sizes[numbers == number])
+            },
+        )
+
+    def size(self, row: int) -> int:
+        """Return the triangles of a row."""
+        return int(self._least[row : row + 1][0])
+
+    def camp(self, row: int) -> str:
+        """Return the camp of a row."""
+        return self._camps[int(self._camp[row : row + 1][0])]
+
+    def drawn(self, rng: np.random.Generator, rooms: Mapping[str, int]) -> int | None:
+        """Draw a row evenly among those that fit; None where none does.
+
+        Args:
+            rng: where the number comes from.
+            rooms: most triangles by camp; rows of other camps do not fit.
+        """
+        if rooms.keys() == self.sizes.keys() and all(
+            self.sizes[camp].most <= room for camp, room in rooms.items()
+        ):
+            return int(rng.integers(len(self._least)))
+        limits = np.full(len(self._camps), -1, np.int64)
+        for camp, room in rooms.items():
+            limits[self._camps.index(camp)] = room
+        starts = range(0, len(self._least), _PART)
+        counts = np.cumsum([np.count_nonzero(self._fits(start, limits)) for start in starts])
+        if not counts[-1]:
+            return None
+        number = int(rng.integers(counts[-1]))
+        part = int(np.searchsorted(counts, number, side="right"))
+        before = int(counts[part - 1]) if part else 0
+        fitting = np.flatnonzero(self._fits(starts[part], limits))
+        return starts[part] + int(fitting[number - before])
+
+    def _fits(self, start: int, limits: NDArray[np.int64]) -> NDArray[np.bool_]:
+        part = slice(start, start + _PART)
+        fits: NDArray[np.bool_] = self._least[part] <= limits[self._camp[part]]
+        return fits
+
+
+def drawn_rows(
+    rng: np.random.Generator, table: FitTable, count: int, num_triangles: int
+) -> list[int]:
+    """Draw rows with replacement, evenly among those that fit beside the ones before.
+
+    If all fit, this is a uniform draw. Otherwise simple objects are drawn more often beside
+    demanding ones, as they would be if whole scenes were drawn until one fits.
+    Objects of two different camps never fit beside each other.
+
+    Args:
+        rng: where the numbers come from.
+        table: what to draw from, at least one row.
+        count: how many.
+        num_triangles: for all together.
+
+    Raises:
+        Rejected: "over_budget" where not even the simplest fit.
+    """
+    allowed, left, drawn = set(table.sizes), num_triangles, list[int]()
+    for following in range(count - 1, -1, -1):
+        rooms = {
+            camp: left - following * _simplest_beside(table, camp, allowed) for camp in allowed
+        }
+        row = table.drawn(rng, rooms)
+        if row is None:
+            least = min(sizes.least for sizes in table.sizes.values())
+            raise Rejected(
+                "over_budget",
+                f"{count} objects of at least {least} triangles each do not fit into the "
+                f"{num_triangles} that the scene has for them",
+            )
+        drawn.append(row)
+        left -= table.size(row)
+        if camp := table.camp(row):
+            allowed &= {"", camp}
+    return drawn
+
+
+def _simplest_beside(table: FitTable, camp: str, allowed: set[str]) -> int:
+    """Return the triangles of the simplest object that may still come after one of a camp."""
+    beside = allowed & {"", camp} if camp else allowed
+    return min(table.sizes[other].least for other in beside)

@@ -1,0 +1,240 @@
+"""The index of a frozen lock: where each object stands in it, and what a draw asks of all of them.
+
+A scene draws its objects by their number in their split, by the triangles of their coarsest level
+and by their licences' camp. Those are columns here, of the rows of objects sorted by split and
+uid, so that the one to three that are drawn are found without reading any other. The index follows
+from the lock and the assets that it names; it may be deleted, and is then made again.
+
+The file is a safetensors file of which columns are read in parts: its arrays are `offset` u64 [N]
+(byte of the row in the lock), `least` u32 [N], `camp` u16 [N], and `name` u8 [N, 16].
+"""
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from storage.atomic import write_atomically
+from storage.errors import TrilightError
+from storage.licences import share_alike_camp
+from storage.records.objects import LockedObject
+from storage.records.safe_read import MAX_HEADER_BYTES, open_plain, safetensors_header
+
+_FORMAT = 1
+_TYPES: Mapping[str, np.dtype[Any]] = {
+    "U8": np.dtype("<u1"), "U16": np.dtype("<u2"), "U32": np.dtype("<u4"), "U64": np.dtype("<u8"),
+}  # fmt: skip
+_NAME_BYTES = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class IndexedObject:
+    """An object of a lock, as it is indexed."""
+
+    locked: LockedObject
+    """Its row."""
+    offset: int
+    """Byte of the lock at which the row begins."""
+    asset_name: str
+    """32 hexadecimal digits, by which the asset store knows the prepared file."""
+    least_triangles: int
+    """Of its coarsest level."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampSizes:
+    """The objects of one share-alike camp, or of none."""
+
+    count: int
+    """How many."""
+    least: int
+    """Triangles of the coarsest level of the simplest one."""
+    most: int
+    """The same of the most demanding one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitRows:
+    """The rows of one split."""
+
+    start: int
+    """Of the first one in the index."""
+    stop: int
+    """Behind the last one."""
+    camps: Mapping[str, CampSizes]
+    """Sizes by camp; "" is that of objects without one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IndexFacts:
+    """What an index is of."""
+
+    lock_sha256: str
+    """Digest of the lock."""
+    lock_bytes: int
+    """Its size."""
+    asked: str
+    """Digest of what the source was asked for: another source is looked at again."""
+    num_found: int
+    """Objects in the source, refused ones included."""
+    num_maps: int
+    """Rows of the lock that are textures and skies; they are not in the index."""
+    camps: tuple[str, ...]
+    """Camps by their number in the column."""
+    splits: Mapping[str, SplitRows]
+    """Rows by split."""
+
+    @property
+    def num_objects(self) -> int:
+        """How many objects are frozen."""
+        return sum(rows.stop - rows.start for rows in self.splits.values())
+
+
+def write_object_index(
+    path: Path,
+    objects: Iterable[IndexedObject],
+    *,
+    lock_sha256: str,
+    lock_bytes: int,
+    asked: str,
+    num_found: int,
+    num_maps: int = 0,
+) -> IndexFacts:
+    """Write the index of a lock atomically; arguments as the fields of `IndexFacts`.
+
+    Raises:
+        TrilightError: the file cannot be written.
+    """
+    rows = sorted(objects, key=lambda row: (row.locked.split, row.locked.uid))
+    camps = sorted({share_alike_camp(row.locked.licence) for row in rows})
+    number = {camp: index for index, camp in enumerate(camps)}
+    camp = np.array([number[share_alike_camp(row.locked.licence)] for row in rows], "<u2")
+    names = bytes.fromhex("".join(row.asset_name for row in rows))
+    arrays: dict[str, NDArray[Any]] = {
+        "offset": np.array([row.offset for row in rows], "<u8"),
+        "least": np.array([row.least_triangles for row in rows], "<u4"),
+        "camp": camp,
+        "name": np.frombuffer(names, "<u1").reshape(-1, _NAME_BYTES),
+    }
+    facts = IndexFacts(
+        lock_sha256=lock_sha256,
+        lock_bytes=lock_bytes,
+        asked=asked,
+        num_found=num_found,
+        num_maps=num_maps,
+        camps=tuple(camps),
+        splits=_split_rows(rows, arrays["least"], camp, camps),
+    )
+    header = json.dumps({"format": _FORMAT, **dataclasses.asdict(facts)}, sort_keys=True)
+    write_atomically(path, save(arrays, metadata={"objects": header}))
+    return facts
+
+
+def _split_rows(
+    rows: Sequence[IndexedObject],
+    least: NDArray[Any],
+    camp: NDArray[Any],
+    camps: Sequence[str],
+) -> dict[str, SplitRows]:
+    splits, start = {}, 0
+    for split, group in groupby(rows, key=attrgetter("locked.split")):
+        stop = start + sum(1 for _ in group)
+        sizes = {
+            name: least[start:stop][camp[start:stop] == index] for index, name in enumerate(camps)
+        }
+        splits[split] = SplitRows(
+            start=start,
+            stop=stop,
+            camps={
+                name: CampSizes(count=len(some), least=int(some.min()), most=int(some.max()))
+                for name, some in sizes.items()
+                if len(some)
+            },
+        )
+        start = stop
+    return splits
+
+
+class StoredColumn:
+    """A column of a file, of which only the rows that are asked for are read."""
+
+    def __init__(self, descriptor: int, dtype: np.dtype[Any], position: int, count: int) -> None:
+        self._place = descriptor, dtype, position
+        self._count = count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        start, stop, step = rows.indices(self._count)
+        assert step == 1
+        descriptor, dtype, position = self._place
+        wanted = max(0, stop - start) * dtype.itemsize
+        data = os.pread(descriptor, wanted, position + start * dtype.itemsize)
+        if len(data) != wanted:
+            raise TrilightError(
+                f"objects.index: ends before row {stop}; expected it whole. Delete it, and it is "
+                "made anew."
+            )
+        return np.frombuffer(data, dtype)
+
+
+class ObjectIndex:
+    """An index that is read where it is asked."""
+
+    def __init__(self, path: Path) -> None:
+        """Open an index and read its header.
+
+        Raises:
+            TrilightError: it is missing, damaged, or of another format.
+        """
+        try:
+            self._stream = open_plain(path)
+            head = self._stream.read(8 + MAX_HEADER_BYTES)
+            header = safetensors_header(head, name=str(path))
+            facts = json.loads(header["__metadata__"]["objects"])
+            if facts.pop("format") != _FORMAT:
+                raise ValueError("another format")
+            self.facts = _facts(facts)
+            self._arrays = {
+                name: (_TYPES[entry["dtype"]], int(entry["data_offsets"][0]))
+                for name, entry in header.items()
+                if name != "__metadata__"
+            }
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise TrilightError(
+                f"{path}: is no index of objects ({error}); delete it, and it is made anew."
+            ) from error
+        self._data = 8 + int.from_bytes(head[:8], "little")
+
+    def column(self, name: str, rows: SplitRows) -> StoredColumn:
+        """Return `offset`, `least` or `camp` of the rows of a split."""
+        dtype, begin = self._arrays[name]
+        position = self._data + begin + rows.start * dtype.itemsize
+        return StoredColumn(self._stream.fileno(), dtype, position, rows.stop - rows.start)
+
+    def asset_name(self, row: int) -> str:
+        """Return the name of the prepared file of a row of the whole index."""
+        begin = self._data + self._arrays["name"][1] + row * _NAME_BYTES
+        return os.pread(self._stream.fileno(), _NAME_BYTES, begin).hex()
+
+
+def _facts(record: dict[str, Any]) -> IndexFacts:
+    splits = {
+        split: SplitRows(
+            start=rows["start"],
+            stop=rows["stop"],
+            camps={camp: CampSizes(**sizes) for camp, sizes in rows["camps"].items()},
+        )
+        for split, rows in record.pop("splits").items()
+    }
+    return IndexFacts(camps=tuple(record.pop("camps")), splits=splits, **record)

@@ -1,0 +1,110 @@
+"""A lock is read by uid and by index, whatever its names hold, without reading the rest of it."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from storage.errors import TrilightError
+from storage.licences import share_alike_camp
+from storage.records.lock_rows import LockRows
+from storage.records.object_index import IndexedObject, ObjectIndex, write_object_index
+from storage.records.objects import LockedObject, write_objects_lock
+
+LICENCES = ("CC0-1.0", "CC-BY-SA-4.0", "MIT", "CC-BY-SA-3.0")
+SPLITS = ("train", "test", "train", "validation", "train")
+
+
+def _rows(count: int) -> list[LockedObject]:
+    rng = np.random.default_rng(count)
+    uids = {
+        f"{chr(int(rng.integers(33, 0x3000)))}/{int(rng.integers(10**6))}" for _ in range(count)
+    }
+    return [
+        LockedObject(
+            uid=uid,
+            asset_sha256=f"{number:064x}",
+            split=SPLITS[number % 5],
+            licence=LICENCES[number % 4],
+            licence_source="tests",
+            title="long " * int(rng.integers(900 if number % 17 == 0 else 3)),
+            attribution='"\n\\',
+            source_url="",
+        )
+        for number, uid in enumerate(sorted(uids))
+    ]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 100])
+def test_every_row_is_found_by_its_uid(tmp_path: Path, count: int) -> None:
+    rows = _rows(count)
+    write_objects_lock(tmp_path / "lock", rows)
+    lock = LockRows(tmp_path / "lock")
+    assert list(lock) == rows
+    assert [lock.find(row.uid) for row in rows] == rows
+    for row in rows[::7]:
+        assert lock.find(row.uid + "\0") is None
+    for uid in ("", "\U0010ffff"):
+        assert lock.find(uid) is None
+
+
+def test_a_lock_that_is_none_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "lock").write_bytes(b'{"uid": "a"}\n')
+    with pytest.raises(TrilightError, match="no locked object begins at byte 0"):
+        LockRows(tmp_path / "lock").find("a")
+    with pytest.raises(TrilightError, match="cannot be read"):
+        LockRows(tmp_path / "none")
+
+
+def test_columns_say_what_the_rows_say(tmp_path: Path) -> None:
+    rows, offset, objects = _rows(100), 0, []
+    write_objects_lock(tmp_path / "lock", rows)
+    lines = (tmp_path / "lock").read_bytes().splitlines(keepends=True)
+    for number, (row, line) in enumerate(zip(rows, lines, strict=True)):
+        objects.append(
+            IndexedObject(
+                locked=row, offset=offset, asset_name=f"{number:032x}", least_triangles=7 * number
+            )
+        )
+        offset += len(line)
+    path, lock = tmp_path / "index", LockRows(tmp_path / "lock")
+    facts = write_object_index(
+        path, reversed(objects), lock_sha256="s", lock_bytes=offset, asked="a", num_found=120
+    )
+    index = ObjectIndex(path)
+    assert index.facts == facts
+    assert (facts.num_objects, facts.num_found, facts.num_maps) == (100, 120, 0)
+    for split in ("train", "validation", "test"):
+        here, at = facts.splits[split], index.facts.splits[split].start
+        wanted = [one for one in objects if one.locked.split == split]
+        assert here.stop - here.start == len(wanted)
+        offsets = index.column("offset", here)
+        assert [lock.at(int(where)) for where in offsets[:]] == [one.locked for one in wanted]
+        least = index.column("least", here)
+        assert least[5:9].tolist() == [one.least_triangles for one in wanted[5:9]]
+        assert least[len(wanted) :].tolist() == []
+        camps = [facts.camps[number] for number in index.column("camp", here)[:]]
+        assert camps == [share_alike_camp(one.locked.licence) for one in wanted]
+        for camp, sizes in here.camps.items():
+            of_camp = [
+                o.least_triangles for o in wanted if share_alike_camp(o.locked.licence) == camp
+            ]
+            found = dataclasses.astuple(sizes)
+            assert found == (len(of_camp), min(of_camp), max(of_camp))
+        names = [index.asset_name(at + row) for row in range(len(wanted))]
+        assert names == [one.asset_name for one in wanted]
+
+
+def test_an_index_that_is_cut_off_says_so(tmp_path: Path) -> None:
+    (row,) = _rows(1)
+    one = IndexedObject(locked=row, offset=0, asset_name="0" * 32, least_triangles=1)
+    path = tmp_path / "index"
+    write_object_index(path, [one], lock_sha256="", lock_bytes=1, asked="", num_found=1)
+    path.write_bytes(path.read_bytes()[:-24])
+    index = ObjectIndex(path)
+    with pytest.raises(TrilightError, match="ends before row 1"):
+        index.column("offset", index.facts.splits["train"])[:1]
+    path.write_bytes(path.read_bytes().replace(b'\\"format\\": 1', b'\\"format\\": 9'))
+    with pytest.raises(TrilightError, match="no index of objects .*another format"):
+        ObjectIndex(path)
