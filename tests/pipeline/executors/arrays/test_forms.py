@@ -199,7 +199,8 @@ def test_what_a_scheduler_lacks_is_named(
 )
 @pytest.mark.parametrize("on", FORMS)
 def test_files_of_this_machine_are_refused(on: str, asked: dict[str, str], message: str) -> None:
-    order = DatasetOrder(**{"scenes": 8, "out": "gs://sets/mine", **asked})
+    given: dict[str, Any] = {"scenes": 8, "out": "gs://sets/mine", **asked}
+    order = DatasetOrder(**given)
     job = ArrayJob(order=order, tasks=[0], per_task=1, at_once=1)
     with pytest.raises(TrilightError, match=f"submit {on}: .*{message}"):
         FORMS[on](job, ArrayMachines(image=IMAGE, where="x"))
