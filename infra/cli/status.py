@@ -8,8 +8,9 @@ from typing import Annotated
 from infra.cli.console import console, look_at, next_step, print_json, print_rows
 from infra.cli.options import Shown, command
 from pipeline.making.price import CorePrice
-from storage.dataset.progress import DatasetStatus, missing_shards, number_ranges, read_status
+from storage.dataset.progress import DatasetStatus, missing_shards, read_status
 from storage.errors import TrilightError
+from storage.number_ranges import number_ranges
 from storage.settings.described import checked
 from storage.settings.ranges import Within
 
@@ -25,12 +26,17 @@ class StatusOrder:
     scheduler needs to start them again."""
     shards_per_task: Annotated[int, Within(1, 10**6, unit="shards")] = 1
     """With --missing: print instead the numbers of the tasks that make so many shards each."""
+    lines: bool = False
+    """With --missing: print a range A:B of shards a line instead, as --shards of generate takes
+    it."""
 
     def __post_init__(self) -> None:
         if self.shards_per_task != 1 and not self.missing:
             raise TrilightError(
                 f"--shards-per-task is {self.shards_per_task}; expected it only with --missing."
             )
+        if self.lines and not self.missing:
+            raise TrilightError("--lines is given; expected it only with --missing.")
 
 
 @command("dataset")
@@ -65,8 +71,18 @@ def status(watched: StatusOrder, core: CorePrice, shown: Shown) -> None:
 def _print_missing(watched: StatusOrder, *, as_json: bool) -> None:
     each = watched.shards_per_task
     tasks = sorted({shard // each for shard in missing_shards(watched.dataset)})
+    ranges = [f"{task * each}:{(task + 1) * each}" for task in tasks]
     if as_json:
-        print_json({"missing": tasks, "array": number_ranges(tasks)})
+        print_json(
+            {
+                "missing": tasks,
+                "array": number_ranges(tasks),
+                "shards": ranges,
+                "shards_per_task": each,
+            }
+        )
+    elif watched.lines:
+        console.file.writelines(f"{shards}\n" for shards in ranges)
     elif tasks:
         console.print(number_ranges(tasks), soft_wrap=True)
 

@@ -1,4 +1,4 @@
-"""`trilight submit`: what `generate` does, by a Prefect server's workers or a Slurm cluster."""
+"""`trilight submit`: what `generate` does, by workers of a Prefect server or as an array."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,7 +16,8 @@ from infra.cli.console import (
 )
 from infra.cli.dataset_changes import with_shared
 from infra.cli.options import Shown, command
-from infra.cli.submit_slurm import SLURM, ArrayAsked, submit_to_slurm
+from infra.cli.submit_array import ARRAYS, ArrayAsked, submit_to_array
+from pipeline.executors.arrays.machines import ArrayMachines
 from pipeline.making.dataset_order import DatasetOrder
 from storage.errors import TrilightError
 from storage.settings.described import checked
@@ -33,8 +34,9 @@ class Submission:
     """Who is to make it."""
 
     flow: str
-    """Flow to run: generate-scenes, prepare-assets (objects alone) or build-dataset; or slurm, an
-    array job of what is missing, without any server."""
+    """Flow to run: generate-scenes, prepare-assets (objects alone) or build-dataset; or without any
+    server, as an array of tasks for what is missing: slurm, kubernetes, sky, aws-batch or
+    google-batch."""
     deployment: str | None = None
     """Name of its deployment; by default local, which make serve makes, or the only one there
     is."""
@@ -42,9 +44,10 @@ class Submission:
     """Return as soon as the server has the run, instead of watching it to its end."""
 
     def __post_init__(self) -> None:
-        if self.flow not in (*FLOWS, SLURM):
+        if self.flow not in (*FLOWS, *ARRAYS):
             raise TrilightError(
-                f"flow {self.flow!r} is unknown; expected one of {', '.join(FLOWS)}, or {SLURM}."
+                f"flow {self.flow!r} is unknown; expected one of {', '.join(FLOWS)}, or of "
+                f"{', '.join(ARRAYS)}."
             )
 
 
@@ -54,15 +57,17 @@ def submit(
     order: DatasetOrder,
     shared: Shared,
     array: ArrayAsked,
+    machines: ArrayMachines,
     shown: Shown,
 ) -> None:
-    if submission.flow == SLURM:
-        submit_to_slurm(with_shared(order, shared), array, as_json=shown.json)
+    if submission.flow in ARRAYS:
+        order = with_shared(order, shared)
+        submit_to_array(order, submission.flow, array, machines, as_json=shown.json)
         return
-    if array != ArrayAsked():
+    if (array, machines) != (ArrayAsked(), ArrayMachines()):
         raise TrilightError(
-            f"submit {submission.flow}: --shards-per-task, --at-once, --sbatch and --dry-run are "
-            "options of submit slurm; leave them out."
+            f"submit {submission.flow}: --shards-per-task, --at-once, --dry-run and the options of "
+            f"machines are those of submit {', '.join(ARRAYS)}; leave them out."
         )
     first_words(f"Submitting {submission.flow} with the build {order.build}", silent=shown.json)
     from pipeline.flows import submission as prefect  # reads its settings now

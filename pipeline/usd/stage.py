@@ -32,6 +32,17 @@ _LOOKS = (".mtlx",)
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 
 
+def file_and_member(name: str) -> tuple[Path, str]:
+    """Return the file of a name as USD's resolver gives it, and the member of an archive, or "".
+
+    Brackets of folders are their own: only those at the end of `a.usdz[b.usda]` hold a member.
+    """
+    from pxr import Ar
+
+    outer, member = Ar.SplitPackageRelativePathOuter(name)
+    return Path(outer), str(member)
+
+
 class OutsideFile(TrilightError):
     """A file that is named and may not be read: elsewhere, on the network, or no plain file."""
 
@@ -66,7 +77,7 @@ class OpenedUsd:
     @property
     def files(self) -> list[Path]:
         """The files that are open, the root first and the others sorted."""
-        outer = {Path(name.partition("[")[0]) for name in self._layers}
+        outer = {file_and_member(name)[0] for name in self._layers}
         return [self.path, *sorted(outer - {self.path})]
 
     def inside(self, layer: Any, asset_path: str) -> str | None:
@@ -88,14 +99,15 @@ class OpenedUsd:
         with Ar.ResolverContextBinder(self._context):
             identifier = Sdf.ComputeAssetPathRelativeToLayer(layer, plain)
             found = str(Ar.GetResolver().Resolve(identifier))
-        outer = Path((found or identifier).partition("[")[0])
+        outer = file_and_member(found or identifier)[0]
         if not found and not outer.is_absolute():
             return None  # looked for in several folders
         try:
             target = outer.resolve()
         except (OSError, RuntimeError):
             self._refuse(plain, ", which is a link without an end")
-        if not target.is_relative_to(self.folder) or ".." in Path(plain.partition("[")[2]).parts:
+        member = file_and_member(plain)[1]
+        if not target.is_relative_to(self.folder) or ".." in Path(member).parts:
             self._refuse(plain, ", which is outside of its folder; copy it there")
         if found and not target.is_file():  # opening a FIFO would block forever
             self._refuse(plain, ", which is no plain file")
@@ -115,7 +127,7 @@ class OpenedUsd:
             self._take(error)
         stage = Usd.Stage.Open(self.root, self._context, Usd.Stage.LoadAll)
         for layer in stage.GetUsedLayers():
-            real = Path(layer.realPath.partition("[")[0]).resolve()
+            real = file_and_member(layer.realPath)[0].resolve()
             if not layer.anonymous and not real.is_relative_to(self.folder):
                 raise TrilightError(f"{self.path.name}: uses {real.name!r:.100} of another folder.")
         return stage
@@ -190,7 +202,7 @@ class OpenedUsd:
             return self._layers[resolved]
         if len(self._layers) >= MAX_LAYERS:
             raise TrilightError(f"{self.path.name}: names more than {MAX_LAYERS} layers.")
-        outer = Path(resolved.partition("[")[0])
+        outer = file_and_member(resolved)[0]
         _check_file(outer, self._max_file_bytes)
         try:
             if layer := Sdf.Layer.Find(resolved):  # as an earlier call of this process read it

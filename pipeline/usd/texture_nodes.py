@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.usd.polygons import primvar_corners
-from pipeline.usd.stage import OpenedUsd
+from pipeline.usd.stage import OpenedUsd, file_and_member
 from storage.errors import TrilightError
 
 _MOST_NODES = 8
@@ -153,15 +153,15 @@ def asset_bytes(resolved: str, max_bytes: int) -> bytes | None:
         TrilightError: there are more than `max_bytes`.
     """
     name = Path(resolved).name
-    outer, _, member = resolved.partition("[")
+    outer, member = file_and_member(resolved)
     try:
         if member:
             with zipfile.ZipFile(outer) as archive:
-                found = archive.getinfo(member.rstrip("]"))
+                found = archive.getinfo(member)
                 _require_size(found.file_size, max_bytes, name)
                 return archive.read(found)
-        _require_size(Path(outer).stat().st_size, max_bytes, name)
-        return Path(outer).read_bytes()
+        _require_size(outer.stat().st_size, max_bytes, name)
+        return outer.read_bytes()
     except (OSError, KeyError, zipfile.BadZipFile):
         return None
 

@@ -5,10 +5,9 @@ Any process may read it. The rate is that of the logs (storage.dataset.scene_log
 
 import contextlib
 import functools
-import itertools
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason, decode_failures
+from storage.remote.bucket import WRITABLE, Bucket
 from storage.settings.described import from_record
 
 _AT_WORK_S = 600.0
@@ -161,6 +161,27 @@ def shards_there(folder: DatasetFolder) -> set[str]:
     return here | set(shard_names_in(folder.staged_sent)) if folder.bucket else here
 
 
+def _finished_names(dataset: Dataset) -> set[str]:
+    """Return the names of the shards that are there, listed or not.
+
+    A bucket is asked what it holds, where it may be asked and something is not listed yet: a shard
+    is finished there when it and the note on it have come (pipeline.shards.mirror).
+    """
+    if isinstance(dataset.files, LocalFiles):
+        return shards_there(DatasetFolder(dataset.files.root))
+    listed = {entry.name for entry in dataset.manifest.shards}
+    unlisted = planned_shards(dataset.manifest).keys() - listed
+    if not unlisted or dataset.files.url.scheme not in WRITABLE:
+        return listed
+    with contextlib.suppress(TrilightError):  # it may be read and not listed
+        names = Bucket(dataset.files.url).names()
+        notes = DatasetFolder(Path()).staged_entries
+        listed |= {
+            name for name in unlisted & names if (notes / f"{name}.json").as_posix() in names
+        }
+    return listed
+
+
 def missing_shards(url: str) -> list[int]:
     """Return the indices of the shards that are not there, of a dataset that is begun.
 
@@ -172,20 +193,9 @@ def missing_shards(url: str) -> list[int]:
     """
     dataset = open_dataset(url)
     planned = list(planned_shards(dataset.manifest))
-    local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
-    there = shards_there(local) if local else {entry.name for entry in dataset.manifest.shards}
+    there = _finished_names(dataset)
     missing = [index for index, name in enumerate(planned) if name not in there]
     return missing or ([] if _is_finished(dataset, len(planned)) else [0])
-
-
-def number_ranges(numbers: Iterable[int]) -> str:
-    """Return numbers as schedulers write them, such as 0-3,7; an empty text for none."""
-    pairs = enumerate(sorted(set(numbers)))
-    runs = (
-        [number for _, number in run]
-        for _, run in itertools.groupby(pairs, key=lambda pair: pair[1] - pair[0])
-    )
-    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
 
 
 def _is_finished(dataset: Dataset, planned: int) -> bool:
@@ -265,8 +275,7 @@ def read_status(url: str) -> DatasetStatus:
     manifest = dataset.manifest
     local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
     planned = planned_shards(manifest)
-    names = shards_there(local) if local else {entry.name for entry in manifest.shards}
-    names &= planned.keys()
+    names = _finished_names(dataset) & planned.keys()
     done = num_scenes_done(local, planned) if local else sum(planned[name] for name in names)
     looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
     last, core_s = looked.last, looked.core_s

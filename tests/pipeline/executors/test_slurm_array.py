@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.executors.arrays.job import MOST_TASKS, ArrayJob, array_job
 from pipeline.executors.registry import find_executor
-from pipeline.executors.slurm_array import MOST_TASKS, ArrayJob, array_job
+from pipeline.executors.slurm_array import sbatch_environment, sbatch_words
 from pipeline.making.dataset_order import DatasetOrder
-from storage.dataset.progress import missing_shards, number_ranges
+from storage.dataset.progress import missing_shards
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
+from storage.number_ranges import number_ranges
 from tests.command_line import trilight
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
@@ -62,10 +64,11 @@ def test_settings_that_divide_the_dataset_count() -> None:
     order = DatasetOrder(build="smoke", scenes=64, changes=changes, objects="my objects")
     job = array_job(order, per_task=2, at_once=3)
     assert job.tasks == [0, 1, 2, 3]
-    words = job.command()
+    words = sbatch_words(job)
     assert words[:3] == ["sbatch", "--parsable", "--array=0-3%3"]
     assert words[4:] == ["--changes", "splits.scenes_per_shard=8"]
-    assert job.environment["OBJECTS"] == "my objects" and job.environment["SCENES"] == "64"
+    given = sbatch_environment(job)
+    assert given["OBJECTS"] == "my objects" and given["SCENES"] == "64"
     for refused in (DatasetOrder(shards="0:1"), DatasetOrder(scenes_from="folder")):
         with pytest.raises(TrilightError, match="submit slurm: expected no"):
             array_job(refused, per_task=None, at_once=None)
@@ -139,7 +142,7 @@ def test_refusals(cluster: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dry = trilight([*words, "--dry-run"])
     assert dry.exit_code == 0 and "sbatch --parsable --array=0-5" in dry.stdout
     result = trilight(["submit", "generate-scenes", "smoke", "--dry-run"])
-    assert "options of submit slurm" in str(result.exception)
+    assert "are those of submit slurm" in str(result.exception)
     alone = trilight(["status", "set", "--shards-per-task", "4"])
     assert "expected it only with --missing" in str(alone.exception)
     assert shlex.split(dry.stdout.splitlines()[-1])[4] == "OUT=set"

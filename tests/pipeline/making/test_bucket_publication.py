@@ -6,12 +6,13 @@ from typing import Any
 
 import pytest
 
-from pipeline.executors.slurm_array import array_job
+from pipeline.executors.arrays.job import array_job
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.publication import Publication
 from pipeline.shards.mirror import Mirror
 from pipeline.shards.pack import pack_shard
 from storage.dataset.dataset import open_dataset
+from storage.dataset.progress import read_status
 from storage.dataset.staging import is_staged, stage_scene
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
@@ -46,14 +47,27 @@ def names(bucket: Any) -> set[str]:
     return {path.removeprefix("shards/set/") for path in bucket.find("shards/set")}
 
 
-def test_an_array_is_of_what_a_bucket_lacks(bucket: Any, machines: Machines) -> None:
+def test_an_array_is_of_what_a_bucket_lacks(
+    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(mirror: Mirror) -> None:
+        raise Killed
+
     machines.use("a")
     splits = {f"splits.{name}": value for name, value in vars(_build().splits).items()}
     order = DatasetOrder(build="smoke", out=OUT, scenes=8, changes=splits)
     assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
     with machines.maker("a") as publication:
-        make(publication, 0)
-    assert array_job(order, per_task=None, at_once=None).tasks == [1]
+        publication.lock_objects([_locked()])
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(Mirror, "send_manifest", killed)
+            make_tiny_shard(publication, 0)
+        assert open_dataset(OUT).manifest.shards == ()
+        assert FIRST in names(bucket)
+        assert array_job(order, per_task=None, at_once=None).tasks == [1]
+        assert read_status(OUT).shards_done == 1
+        bucket.rm_file(f"shards/set/.staging/entries/{FIRST}.json")
+        assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
 
 
 def test_two_machines_end_in_the_bytes_of_one_folder(

@@ -12,6 +12,7 @@ import pytest
 from pipeline.exchange.usd.write import write_usd
 from pipeline.usd import stage as opening
 from pipeline.usd.stage import OpenedUsd, quietly
+from pipeline.usd.texture_nodes import asset_bytes
 from storage.errors import TrilightError
 from tests.scenes_by_hand import tiny_scene
 
@@ -123,6 +124,29 @@ def test_a_package_leads_out_no_more_than_a_folder(tmp_path: Path) -> None:
         archive.writestr("lib.usda", f'{HEAD}def "A" ({outer}) {{\ndef "L" {{}}\n}}')
     with pytest.raises(TrilightError, match="which is outside of its folder"):
         prims_of(folder / "a.usdz")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_brackets_in_the_name_of_a_folder_are_no_archive(tmp_path: Path, packed: bool) -> None:
+    folder = tmp_path / "chairs [old]"
+    folder.mkdir()
+    layers = {
+        "s.usda": f'{HEAD}def "x" (references = @./lib.usda@</A>) {{}}',
+        "lib.usda": f'{HEAD}def "A" {{\ndef "L" {{}}\n}}',
+    }
+    if packed:
+        with zipfile.ZipFile(folder / "s.usdz", "w") as archive:
+            for name, text in layers.items():
+                archive.writestr(name, text)
+        assert asset_bytes(f"{folder}/s.usdz[lib.usda]", 100) == layers["lib.usda"].encode()
+    else:
+        for name, text in layers.items():
+            (folder / name).write_text(text)
+        assert asset_bytes(f"{folder}/lib.usda", 100) == layers["lib.usda"].encode()
+    opened = OpenedUsd(folder / ("s.usdz" if packed else "s.usda"))
+    stage = quietly(opened.path, opened.compose)
+    assert [str(prim.GetPath()) for prim in stage.Traverse()] == ["/x", "/x/L"]
+    assert opened.files == [opened.path, *([] if packed else [folder / "lib.usda"])]
 
 
 def test_arguments_of_a_file_format_hide_no_layer(tmp_path: Path) -> None:
