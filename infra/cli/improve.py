@@ -7,7 +7,7 @@ from infra.cli.options import Shown, command
 from infra.improve.local import train_here
 from infra.improve.order import ImproveOrder
 from infra.improve.report import picture_of, rows_of
-from infra.improve.rounds import Workers
+from infra.improve.rounds import LoopWorkers
 from infra.improve.rounds import improve as run_rounds
 from infra.improve.state import Rounds
 from infra.torch_library import require_torch
@@ -31,7 +31,7 @@ def improve(order: ImproveOrder, shown: Shown) -> None:
             console.print(f"Round {number} of {order.rounds}: {what}")
 
     found = run_rounds(
-        order, Workers(make=make, train=partial(train_here, quiet=shown.json), begins=begins)
+        order, LoopWorkers(make=make, train=partial(train_here, quiet=shown.json), begins=begins)
     )
     rounds = Rounds(order)
     rows = rows_of(rounds, found)

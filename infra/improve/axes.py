@@ -15,7 +15,7 @@ from storage.errors import TrilightError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Half:
+class AxisHalf:
     """One half of an axis."""
 
     name: str
@@ -28,13 +28,15 @@ class Half:
     """Scene settings that draw this half."""
 
 
-def _counts(scenes: SceneSettings) -> Sequence[Half]:
+def _counts(scenes: SceneSettings) -> Sequence[AxisHalf]:
     low, high = scenes.lights.count
     middle = (low + high) // 2
     few, all_counts = middle - low + 1, high - low + 1
     return (
-        Half(name="few_lights", share=few / all_counts, changes={"lights.count": [low, middle]}),
-        Half(
+        AxisHalf(
+            name="few_lights", share=few / all_counts, changes={"lights.count": [low, middle]}
+        ),
+        AxisHalf(
             name="many_lights",
             share=1 - few / all_counts,
             changes={"lights.count": [middle + 1, high]},
@@ -42,21 +44,21 @@ def _counts(scenes: SceneSettings) -> Sequence[Half]:
     )
 
 
-def _roughness(scenes: SceneSettings) -> Sequence[Half]:
+def _roughness(scenes: SceneSettings) -> Sequence[AxisHalf]:
     low, high = scenes.materials.roughness_log
     middle = (low * high) ** 0.5  # the range is uniform in the logarithm
     return tuple(
-        Half(name=name, share=0.5, changes={"materials.roughness_log": ends})
+        AxisHalf(name=name, share=0.5, changes={"materials.roughness_log": ends})
         for name, ends in (("glossy", [low, middle]), ("rough", [middle, high]))
     )
 
 
 def _by_family(
     few: str, many: str, size: Callable[[Any], int]
-) -> Callable[[SceneSettings], Sequence[Half]]:
+) -> Callable[[SceneSettings], Sequence[AxisHalf]]:
     """Return an axis of families: below the middle of their sizes, and the others."""
 
-    def halves(scenes: SceneSettings) -> Sequence[Half]:
+    def halves(scenes: SceneSettings) -> Sequence[AxisHalf]:
         sizes = sorted({size(family) for family in scenes.families})
         middle = sizes[(len(sizes) - 1) // 2]
         total = sum(family.weight for family in scenes.families)
@@ -65,7 +67,7 @@ def _by_family(
             many: [family for family in scenes.families if size(family) > middle],
         }
         return tuple(
-            Half(
+            AxisHalf(
                 name=name,
                 share=sum(family.weight for family in part) / total,
                 families=tuple(family.name for family in part),
@@ -77,7 +79,7 @@ def _by_family(
     return halves
 
 
-AXES: Mapping[str, Callable[[SceneSettings], Sequence[Half]]] = {
+AXES: Mapping[str, Callable[[SceneSettings], Sequence[AxisHalf]]] = {
     "walls": _by_family("few_walls", "many_walls", lambda family: family.shell_triangles),
     "objects": _by_family("few_objects", "many_objects", lambda family: family.num_objects[1]),
     "lights": _counts,
@@ -114,7 +116,7 @@ def halves_of(stratum: str) -> tuple[str, ...]:
     return tuple(stratum.split())
 
 
-def _halves(scenes: SceneSettings, axis: str) -> Sequence[Half]:
+def _halves(scenes: SceneSettings, axis: str) -> Sequence[AxisHalf]:
     halves = AXES[axis](scenes)
     if any(half.share <= 0 for half in halves):
         raise TrilightError(
@@ -124,7 +126,7 @@ def _halves(scenes: SceneSettings, axis: str) -> Sequence[Half]:
     return halves
 
 
-def _stratum(halves: Sequence[Half], scenes: SceneSettings) -> Stratum | None:
+def _stratum(halves: Sequence[AxisHalf], scenes: SceneSettings) -> Stratum | None:
     """Return the combination; None where no family is in all of its halves."""
     weights = {family.name: family.weight for family in scenes.families}
     names = set(weights)

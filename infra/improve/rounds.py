@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Workers:
+class LoopWorkers:
     """Who makes and trains, and who is told."""
 
     make: Callable[[DatasetOrder], object]
@@ -45,7 +45,7 @@ class Workers:
     """Is told of the round and what of it begins."""
 
 
-def improve(order: ImproveOrder, workers: Workers) -> list[Lessons]:
+def improve(order: ImproveOrder, workers: LoopWorkers) -> list[Lessons]:
     """Run a closed loop, or what is missing of it; return what each round taught.
 
     Raises:
@@ -90,7 +90,7 @@ def _drawn(rounds: Rounds, number: int, found: list[Lessons]) -> Drawn:
 
 
 def _taught(
-    rounds: Rounds, number: int, drawn: Drawn, found: list[Lessons], workers: Workers
+    rounds: Rounds, number: int, drawn: Drawn, found: list[Lessons], workers: LoopWorkers
 ) -> Lessons:
     """Make, train and judge one round."""
     order, history = rounds.order, rounds.history(number)

@@ -16,7 +16,7 @@ from prefect.logging import get_run_logger
 from infra.improve.local import core_s_of
 from infra.improve.order import ImproveOrder
 from infra.improve.report import picture_of, rows_of
-from infra.improve.rounds import Workers, improve
+from infra.improve.rounds import LoopWorkers, improve
 from infra.improve.state import Drawn, Lessons, Rounds
 from infra.serving.train_model import RunChanges, RunName, train_in_process
 from infra.train_order import TrainOrder
@@ -78,7 +78,7 @@ def improve_loop(**parameters: Any) -> None:
     shown = _Shown(order)
     improve(
         order,
-        Workers(
+        LoopWorkers(
             make=lambda dataset: make_watched(dataset, PrefectRunner()),
             train=train,
             told=shown.round_done,

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from infra.improve.order import ImproveOrder
-from infra.improve.rounds import Workers
+from infra.improve.rounds import LoopWorkers
 from infra.train_order import TrainOrder
 from pipeline.making.dataset_order import DatasetOrder
 from scene_templates.strata import stratum_of
@@ -84,7 +84,7 @@ class Kill(TrainProgress):
             raise Killed
 
 
-def workers(killed_at: str | None = None, *, step: int | None = None) -> Workers:
+def workers(killed_at: str | None = None, *, step: int | None = None) -> LoopWorkers:
     """Return who makes and trains, killed where "ROUND WHAT" begins, or when a step is done."""
 
     def train(order: TrainOrder) -> float:
@@ -104,7 +104,7 @@ def workers(killed_at: str | None = None, *, step: int | None = None) -> Workers
         if f"{number} {what}" == killed_at:
             raise Killed
 
-    return Workers(make=toys, train=train, begins=begins)
+    return LoopWorkers(make=toys, train=train, begins=begins)
 
 
 def strata_of_order(order: DatasetOrder) -> list[Any]:
