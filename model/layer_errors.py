@@ -88,8 +88,9 @@ def _outputs(model: RenderFormer, batch: SceneBatch, resolution: int) -> dict[st
 
     def keep(name: str) -> object:
         def hook(module: nn.Module, inputs: object, output: Any) -> None:
-            main = output[0] if isinstance(output, tuple) else output
-            outputs[name] = main.double()
+            # layers of the encoder leave their last addition to the next one
+            whole = output[0] + output[1] if isinstance(output, tuple) else output
+            outputs[name] = whole.double()
 
         return hook
 

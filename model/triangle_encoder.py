@@ -129,9 +129,12 @@ class TriangleEncoder(nn.Module):
         return unpacked(x_PW, packing)
 
     def _layers(self, x_BNW: Tensor, rotation: Rotation, keys: Keys) -> Tensor:
+        due_BNW = None
         for layer in self.layers:
-            x_BNW = run_layer(layer, x_BNW, rotation, keys, recompute=self.recompute)
-        return x_BNW
+            x_BNW, due_BNW = run_layer(
+                layer, x_BNW, due_BNW, rotation, keys, recompute=self.recompute
+            )
+        return x_BNW if due_BNW is None else x_BNW + due_BNW
 
     def learned_tokens(self) -> list[nn.Parameter]:
         """Return the tokens that are learned as they are: drawn small at the start."""

@@ -8,13 +8,15 @@ import contextlib
 import dataclasses
 import importlib.util
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from infra.bench.effort import Asked, Effort
 from infra.bench.experiment import Experiment, points_of
 from infra.bench.machine import ROOT, machine
 from infra.bench.plot import plot
+from infra.bench.shares import Share, rows_of, shared_rows
 from infra.bench.store import Run, Store
 from infra.bench.subjects.named_scenes import described
 from infra.bench.workshop import Workshop
@@ -54,7 +56,8 @@ def run(
     """Measure what is missing of an experiment, draw its figure, and return its results.
 
     A run of the same plan that was interrupted goes on. Turns that were measured are not measured
-    again; an interrupted turn is, or only what it lacks where points are measured one by one.
+    again; an interrupted turn is, or only what it lacks where points are measured one by one. Rows
+    that shares have measured (`run_share`) are taken over.
 
     Raises:
         TrilightError: something that the experiment needs is missing, or no turn could be measured.
@@ -63,10 +66,11 @@ def run(
         raise TrilightError(f"bench {experiment.name}: {lack}.")
     store = store_of(folder, experiment.name, effort.name)
     current = store.begin(_plan(experiment, effort, asked))
+    taken = _take_shares(store, current)
     began = time.perf_counter()
     with contextlib.closing(Workshop(effort, asked)) as workshop:
         _measure(experiment, current, store, workshop, turn_done)
-        notes = list(workshop.notes)
+        notes = [*workshop.notes, *taken]
     if not current.whole_turns():
         reasons = "; ".join(sorted(set(current.left_out.values())))
         raise TrilightError(f"bench {experiment.name}: no turn could be measured: {reasons}.")
@@ -74,6 +78,47 @@ def run(
     plot(experiment, current, store.path.with_suffix(".png"))
     store.end(current, time.perf_counter() - began, notes)
     return store
+
+
+def run_share(
+    experiment: Experiment,
+    effort: Effort,
+    asked: Asked,
+    share: Share,
+    *,
+    folder: Path = RESULTS,
+    turn_done: TurnDone = lambda done, total: None,
+) -> Store:
+    """Measure what is missing of one share of an experiment, and return the file of the share.
+
+    Raises:
+        TrilightError: as `run`, or its points do not stand alone.
+    """
+    if not experiment.by_point:
+        raise TrilightError(
+            f"bench {experiment.name}: its points are compared with each other in turns of one "
+            "machine; expected an experiment whose points stand alone, such as learning-rates. "
+            "Measure it without a share."
+        )
+    if lack := lacking(experiment, asked):
+        raise TrilightError(f"bench {experiment.name}: {lack}.")
+    store = Store(share.path(store_of(folder, experiment.name, effort.name).path))
+    plan = _plan(experiment, effort, asked)
+    current = store.begin(plan)
+    wanted = rows_of(current.plan["turns"], current.plan["points"], share)
+    with contextlib.closing(Workshop(effort, asked)) as workshop:
+        _measure(experiment, current, store, workshop, turn_done, wanted)
+    return store
+
+
+def _take_shares(store: Store, current: Run) -> list[str]:
+    """Take rows over that shares have measured; return what is to be said of them."""
+    processors = Counter[str]()
+    for turn, point, figures, processor in shared_rows(store.path, current.plan):
+        if point not in current.turns.get(turn, {}):
+            store.add(current, turn, point, figures)
+        processors[processor] += 1
+    return [f"{count} rows are of {name}" for name, count in sorted(processors.items())]
 
 
 def lacking(experiment: Experiment, asked: Asked) -> str:
@@ -116,8 +161,14 @@ def _named(data: str) -> str:
 
 
 def _measure(
-    experiment: Experiment, current: Run, store: Store, workshop: Workshop, turn_done: TurnDone
+    experiment: Experiment,
+    current: Run,
+    store: Store,
+    workshop: Workshop,
+    turn_done: TurnDone,
+    only: Mapping[str, Sequence[str]] | None = None,
 ) -> None:
+    """Measure the points that turns lack; `only` these of each turn, where some are named."""
     points = points_of(experiment, workshop.effort, workshop.asked)
     missing, total = current.missing_turns(), len(current.plan["turns"])
     if experiment.warm_up and missing:
@@ -125,7 +176,12 @@ def _measure(
             pass
     for number, turn in enumerate(missing, total - len(missing) + 1):
         done = current.turns.get(turn, {}) if experiment.by_point else {}
-        wanted = [point for point in points if point.name not in done]
+        named = None if only is None else only[turn]
+        wanted = [
+            point
+            for point in points
+            if point.name not in done and (named is None or point.name in named)
+        ]
         try:
             for point, figures in experiment.measure(workshop, wanted, turn):
                 store.add(current, turn, point, figures)

@@ -1,5 +1,6 @@
 """`trilight bench`: lists the experiments, runs some, or writes the pages made from results."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,11 @@ class Measured:
     """Names of experiments or of families of them; by default all are listed and none is run. The
     name card measures the graphics card here into one file to send back, and card FILE ... shows
     such files."""
+    share: str | None = None
+    """Measure only a share of the rows, K/N for the K-th of N, into a file of its own beside the
+    results; without one, a later call takes all such files over and measures what they lack. For
+    experiments of days whose points stand alone, such as learning-rates: one share for each task of
+    a Slurm array. By default everything is measured."""
     quick: bool = False
     """Measure for minutes instead of carefully."""
     out: Path | None = None
@@ -43,23 +49,30 @@ def bench(measured: Measured, asked: Asked) -> None:
         first_words(f"Measuring {', '.join(measured.names)}")
     from infra.bench.catalogue import chosen
     from infra.bench.effort import CAREFUL, QUICK
-    from infra.bench.run import RESULTS, lacking, run
+    from infra.bench.run import RESULTS, lacking, run, run_share
+    from infra.bench.shares import share_of
 
     folder, experiments = measured.out or RESULTS, chosen(measured.names)
+    share = None if measured.share is None else share_of(measured.share)
+    effort = QUICK if measured.quick else CAREFUL
     for experiment in experiments:
         if (lack := lacking(experiment, asked)) and len(experiments) > 1:
             console.print(f"{experiment.name}: left out: {lack}")
             continue
         with progress_bars() as bars:
             task = bars.add_task("turns", total=None, note=experiment.name)
-            store = run(
+            measure = run if share is None else partial(run_share, share=share)
+            store = measure(
                 experiment,
-                QUICK if measured.quick else CAREFUL,
+                effort,
                 asked,
                 folder=folder,
                 turn_done=lambda done, total: bars.update(task, completed=done, total=total),  # noqa: B023
             )
-        _print(experiment, store)
+        if share is None:
+            _print(experiment, store)
+        else:
+            console.print(f"Written: {store.path}", style="bold")
     if measured.write_docs:
         _write_docs(folder)
     elif not measured.names:

@@ -145,11 +145,13 @@ def _write(
 ) -> None:
     from pipeline.documents.report import write_report
     from pipeline.documents.sheets import write_contact_sheet, write_template_sheet
+    from pipeline.documents.sums import renew_sums
 
     write_contact_sheet(opened, statistics, max_scenes=asked.scenes, out=folder)
     write_report(opened, found, out=folder)
     if asked.by_template is not None:
         write_template_sheet(opened, per_template=asked.by_template, out=folder)
+    renew_sums(folder.root)
 
 
 def _as_json(opened: Dataset, statistics: Statistics, found: "Distributions") -> dict[str, object]:

@@ -41,18 +41,18 @@ def leaderboard(order: LeaderboardOrder, shown: Shown) -> None:
 
 def _row(standing: Any) -> dict[str, str]:
     from infra.bench.table import shown
+    from infra.leaderboard.page import interval
     from train.evaluation.pairs import METRIC
 
     lead, scores = standing.lead, standing.scores[METRIC]
+    ends = interval(lead, 1) if lead is not None else ""
     return {
         "": standing.name,
         "first, s": "" if standing.first_s is None else shown(standing.first_s),
         "further": "" if standing.further_s is None else shown(standing.further_s),
         "dB": f"{scores['median']:.1f}",
         "5th": f"{scores['worse_5_percent']:.1f}",
-        "lead, dB": (
-            "" if lead is None else f"{lead.mean:+.1f} ({lead.low:+.1f} to {lead.high:+.1f})"
-        ),
+        "lead, dB": "" if lead is None else f"{lead.mean:+.1f}" + (f" ({ends})" if ends else ""),
     }
 
 

@@ -49,6 +49,8 @@ class _Mode(FakeTensorMode):
         """Answer with one, or yes, whoever reads a single number."""
         if func is torch.ops.aten._local_scalar_dense.default:
             return {torch.bool: True, torch.int64: 1}.get(args[0].dtype, 1.0)
+        if func._overloadpacket is torch.ops.aten._fused_sgd_:
+            return None  # torch says of all other fused updates that they change no shape
         result: Any = super().dispatch(func, types, args, kwargs or {})
         if func is torch.ops.aten.lift_fresh.default:
             result.constant = None  # of torch.tensor: nobody is to compute with it in earnest

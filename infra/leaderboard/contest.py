@@ -43,6 +43,8 @@ class BoardContest:
     """Cameras of each scene."""
     timed_scenes: int
     """And on the first so many of these everything is timed."""
+    machine: str
+    """On which: prices of another one do not compare with those of this one."""
     widths: Sequence[int]
     """Pixels across, rising."""
     contestants: Sequence[Contestant]
@@ -53,6 +55,8 @@ class BoardContest:
     """What was judged already, and is from now on."""
     left_out: dict[tuple[int, str], str] = field(default_factory=dict)
     """Scenes that somebody could not show, by width and key: why."""
+    notes: Sequence[str] = ()
+    """What a reader should know that no contestant says."""
 
     @functools.cached_property
     def judged_by(self) -> str:
@@ -117,10 +121,10 @@ class _Turn:
         return [one for one in self._contest.present(self._width) if not self._has_all(one)]
 
     def _has_all(self, contestant: Contestant) -> bool:
-        rows = [self._contest.rows.get(self._key(contestant, view)) for view in self._views()]
-        if not self._timed or not contestant.is_timed:
-            return None not in rows
-        return None not in rows and rows[0] is not None and rows[0].first_s is not None
+        rows, machine = self._contest.rows, self._contest.machine
+        keys = [self._key(contestant, view) for view in self._views()]
+        is_priced = not (self._timed and contestant.is_timed) or rows.price(keys[0], machine)
+        return bool(is_priced) and all(rows.get(key) is not None for key in keys)
 
     def _key(self, contestant: Contestant, view: int) -> RowKey:
         return self._contest.key_of(contestant, self._width, self._sample.key, view)
@@ -145,6 +149,7 @@ class _Turn:
                 scores=scores,
                 first_s=shown.first_s if view == 0 else None,
                 further_s=shown.further_s if view == 0 else None,
+                machine=self._contest.machine if timed and view == 0 else None,
             )
             self._contest.rows.add(self._key(contestant, view), row)
 
@@ -190,11 +195,11 @@ def judged_width(contest: BoardContest, width: int) -> JudgedWidth:
     shown = {view.key for view in found.views}
     timed = [key for key in contest.keys[: contest.timed_scenes] if key in shown]
     for one in contest.present(width):
-        rows = [contest.rows.get(contest.key_of(one, width, key, 0)) for key in timed]
-        for row in rows:
-            if row is not None and row.first_s is not None and row.further_s is not None:
-                found.first_s.setdefault(one.name, []).append(row.first_s)
-                found.further_s.setdefault(one.name, []).append(row.further_s)
+        for key in timed:
+            price = contest.rows.price(contest.key_of(one, width, key, 0), contest.machine)
+            if price is not None:
+                found.first_s.setdefault(one.name, []).append(price[0])
+                found.further_s.setdefault(one.name, []).append(price[1])
     return found
 
 

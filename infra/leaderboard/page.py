@@ -87,8 +87,14 @@ def _pairs_of(one: WidthStandings) -> str:
 
 
 def _pair_cells(lead: PairedLead) -> list[str]:
-    interval = f"{lead.low:+.2f} to {lead.high:+.2f}"
-    return [f"{lead.mean:+.2f}", interval, f"{lead.share_better:.0%}"]
+    return [f"{lead.mean:+.2f}", interval(lead, 2) or _NONE, f"{lead.share_better:.0%}"]
+
+
+def interval(lead: PairedLead, decimals: int) -> str:
+    """Return the ends of an interval; empty where there is none."""
+    if lead.low is None or lead.high is None:
+        return ""
+    return f"{lead.low:+.{decimals}f} to {lead.high:+.{decimals}f}"
 
 
 def _paper(widths: Sequence[WidthStandings]) -> list[str]:
@@ -121,15 +127,27 @@ def _mean(metric: str, standing: Standing) -> str:
 _PARTS = ("median", "worse_5_percent", "mean", "median_worse_than_noise")
 
 
-def standings_csv(widths: Sequence[WidthStandings]) -> bytes:
-    """Return leaderboard.csv: a row for each width and contestant, a column for each figure."""
+def standings_csv(widths: Sequence[WidthStandings], machine: str) -> bytes:
+    """Return leaderboard.csv: a row for each width and contestant, a column for each figure.
+
+    Prices go with the machine that they were measured on, since tables are put together.
+    """
     columns = [f"{metric}_{part}" for metric in METRICS for part in _PARTS]
-    head = ["width", "name", "kind", "scenes", "views", "first_core_s", "further_core_s"]
+    head = [
+        "width",
+        "name",
+        "kind",
+        "scenes",
+        "views",
+        "first_core_s",
+        "further_core_s",
+        "processor",
+    ]
     lead = ["lead_mean_db", "lead_low_db", "lead_high_db", "lead_share_better", "on_front"]
     rows = [
         [
             one.width, inert(each.name), each.kind, one.num_scenes, one.num_views,
-            each.first_s, each.further_s,
+            each.first_s, each.further_s, None if each.first_s is None else inert(machine),
             *(each.scores[metric][part] for metric in METRICS for part in _PARTS),
             *_lead_cells(each.lead), each.on_front,
         ]

@@ -14,6 +14,9 @@ from typing import Any
 from storage.atomic import write_error
 from storage.errors import TrilightError
 
+UNKNOWN_MACHINE = "a machine that is not named"
+"""Of rows that were written before they named it."""
+
 Scores = Mapping[str, float | None]
 """Value by metric; None is n/a."""
 
@@ -43,6 +46,8 @@ class BoardRow:
     """Core-seconds of the scene's first view, its loading included; None where it is not timed."""
     further_s: float | None = None
     """And of a further view."""
+    machine: str | None = None
+    """What these were measured on, as infra.bench.machine.processor calls it."""
     facts: Mapping[str, Any] | None = None
     """What is known of the scene, beside the scores of the reference's own noise."""
 
@@ -58,13 +63,15 @@ class BoardRows:
         """
         self.path = path
         self._rows: dict[RowKey, BoardRow] = {}
+        self._priced: dict[tuple[RowKey, str], BoardRow] = {}
         lines = self._whole_lines()
         if not lines:
             self._append({"set": set_digest})
             return
         try:
             found = str(json.loads(lines[0])["set"])
-            self._rows |= dict(_row(json.loads(line)) for line in lines[1:])
+            for line in lines[1:]:
+                self._keep(*_row(json.loads(line)))
         except (ValueError, KeyError, TypeError) as error:
             raise TrilightError(
                 f"{path}: not the rows of a leaderboard ({error}). Choose another --out, or delete "
@@ -80,11 +87,27 @@ class BoardRows:
         """Return the row of a key, if it is there."""
         return self._rows.get(key)
 
+    def price(self, key: RowKey, machine: str) -> tuple[float, float] | None:
+        """Return the core-seconds of first and further view on a machine; None where they lack."""
+        row = self._priced.get((key, machine))
+        if row is None or row.first_s is None or row.further_s is None:
+            return None
+        return row.first_s, row.further_s
+
+    def machines(self) -> set[str]:
+        """Return the names of all machines that something was timed on."""
+        return {machine for _, machine in self._priced}
+
     def add(self, key: RowKey, row: BoardRow) -> None:
         """Write a row at once; of two with one key the later one counts."""
         plain = {name: value for name, value in asdict(row).items() if value is not None}
         self._append({**asdict(key), **plain})
+        self._keep(key, row)
+
+    def _keep(self, key: RowKey, row: BoardRow) -> None:
         self._rows[key] = row
+        if row.first_s is not None:
+            self._priced[key, row.machine or UNKNOWN_MACHINE] = row
 
     def _whole_lines(self) -> list[bytes]:
         """Return the lines, and cut off one that was being written when a run was killed."""

@@ -85,20 +85,24 @@ def make_leaderboard(order: LeaderboardOrder, told: Told) -> Leaderboard:
     keys = first_keys(shards, order.scenes)
     views = [(key, view) for key in keys for view in range(opened.num_views)]
     rival = _names(order.checkpoint or SHIPPED[:1])[0]
+    nearest = _nearest(order, opened, keys)
     with contextlib.ExitStack() as stack:
         contest = BoardContest(
             shards=shards,
             keys=keys,
             num_views=opened.num_views,
             timed_scenes=order.timed_scenes,
+            machine=processor() or "an unnamed processor",
             widths=widths,
             contestants=[
                 *folder_contestants(order.pictures, views, widths).values(),
-                *_never_lacking(order, opened, stack),
+                *([nearest] if nearest else []),
+                *_never_lacking(stack),
                 *_networks(order),
             ],
             lpips=load_lpips(order.lpips),
             rows=BoardRows(order.out / "rows.jsonl", opened.digest),
+            notes=() if nearest else (ALONE,),
         )
         judge_all(contest, told)
     return _written(order, opened, contest, rival)
@@ -120,11 +124,8 @@ def _names(places: Sequence[str]) -> list[str]:
     return [network_name(label) for label in Asked(checkpoint=tuple(places)).network_names]
 
 
-def _never_lacking(
-    order: LeaderboardOrder, opened: TrainingData, stack: contextlib.ExitStack
-) -> Iterator[Contestant]:
-    """Yield who stands on every leaderboard, the networks that come along aside."""
-    yield _nearest(order, opened)
+def _never_lacking(stack: contextlib.ExitStack) -> Iterator[Contestant]:
+    """Yield what is traced, which stands on every leaderboard as the networks that come along."""
     yield RungContestant(LAMPS, lamps_rung, notes=())
     physics = functools.cache(physics_alone)
     yield RungContestant(PHYSICS, lambda width: network_rung(physics(), width), notes=())
@@ -139,8 +140,16 @@ def _never_lacking(
             yield SampledContestant(level, variant, child)
 
 
-def _nearest(order: LeaderboardOrder, opened: TrainingData) -> NearestContestant:
-    """Return the pictures that are looked up: of the training split, or of the other scenes."""
+ALONE = "no picture is looked up: the set has no scene beside the one that is judged"
+
+
+def _nearest(
+    order: LeaderboardOrder, opened: TrainingData, keys: Sequence[str]
+) -> NearestContestant | None:
+    """Return the pictures that are looked up: of the training split, or of the other scenes.
+
+    None where the only scene to look up is the only one that is judged.
+    """
     pool = open_training_data(order.train_data) if order.train_data else opened
     trained = "train" in pool.splits
     split = "train" if trained else order.split
@@ -149,6 +158,8 @@ def _nearest(order: LeaderboardOrder, opened: TrainingData) -> NearestContestant
             f"--train-data {pool.shown}: it has no training split; expected one. Leave it out to "
             "look up the other scenes of the set."
         )
+    if pool.digest == opened.digest and first_keys(pool.split(split), 2) == keys[:2] == keys[:1]:
+        return None
     name = NEAREST_TRAINED if trained else NEAREST_OTHER
     note = (
         f"{name} is found by the target itself, among the first {RIVAL_SCENES} scenes of the "
@@ -202,11 +213,11 @@ def _written(
         "set": f"{opened.build or 'a set of unknown build'}, digest {opened.digest[:12]}",
         "split": order.split,
         "scenes": str(len(contest.keys)),
-        "processor": processor(),
+        "processor": contest.machine,
     }
     notes = tuple(dict.fromkeys([*_notes(contest, tables), *_beyond(contest, judged)]))
     write_atomically(order.out / "leaderboard.md", page(about, tables, notes, rival).encode())
-    write_atomically(order.out / "leaderboard.csv", standings_csv(tables))
+    write_atomically(order.out / "leaderboard.csv", standings_csv(tables, contest.machine))
     write_atomically(order.out / "pairs.csv", pairs_csv(tables))
     title = f"{opened.build or 'leaderboard'}: what core-seconds buy"
     plot_leaderboard(tables, title, order.out / "leaderboard.png")
@@ -218,6 +229,7 @@ FEW_SCENES = 10
 
 
 def _notes(contest: BoardContest, tables: Sequence[WidthStandings]) -> Iterator[str]:
+    yield from contest.notes
     for one in contest.contestants:
         yield from one.notes
         for width in contest.widths:
@@ -225,7 +237,14 @@ def _notes(contest: BoardContest, tables: Sequence[WidthStandings]) -> Iterator[
                 yield f"{one.name} is not judged at {width} pixels: {why}"
     for (width, key), why in contest.left_out.items():
         yield f"scene {key} is left out at {width} pixels: {why}"
-    if min(one.num_scenes for one in tables) < FEW_SCENES:
+    for machine in sorted(contest.rows.machines() - {contest.machine}):
+        yield (
+            f"rows.jsonl also has core-seconds of {machine}, which are not in the table: those of "
+            "two machines do not compare"
+        )
+    if any(one.num_scenes == 1 for one in tables):
+        yield "of one scene there are no intervals: it says nothing of others"
+    elif min(one.num_scenes for one in tables) < FEW_SCENES:
         yield f"fewer than {FEW_SCENES} scenes: intervals are narrower than they should be"
     if contest.lpips is None:
         yield "LPIPS is n/a without its weights (--lpips)"

@@ -14,20 +14,18 @@ import cyclopts
 from cyclopts import Parameter
 
 from infra.cli.console import first_words, next_step, print_rows, progress_bars
-from infra.release.hub_limits import require_within_limits, uploaded_files
+from infra.release.hub_limits import require_within_limits
 from infra.release.page import write_page
 from infra.release.pictures import chosen_scenes, pictures_beside
 from infra.release.push import NETWORK_FILE, kind_of
 from model.open import BUILTIN_NETWORKS
 from pipeline.documents.markdown import front_matter
+from pipeline.documents.sums import write_sums
 from storage.atomic import write_atomically
 from storage.dataset.dataset import open_dataset
 from storage.dataset.verify import verify_dataset
-from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import read_objects_lock
-
-SUMS = "SHA256SUMS"
 
 FREE = {"CC0-1.0"}
 """Licences under which pictures are published."""
@@ -83,12 +81,7 @@ def _sum_and_say(folder: Path) -> None:
     parts = [folder / name for name in ("dataset", "network", "gallery")]
     rows = []
     for part in parts:
-        lines = [
-            f"{sha256_of_file(path)}  {path.relative_to(part).as_posix()}\n"
-            for path in uploaded_files(part)
-            if path.name != SUMS
-        ]
-        write_atomically(part / SUMS, "".join(lines).encode())
+        write_sums(part)
         files, num_bytes = require_within_limits(part)
         size = f"{files} files, {num_bytes / 1e6:.1f} MB, a {kind_of(part)}"
         rows.append((str(part), size))

@@ -4,10 +4,9 @@ Source: https://huggingface.co/docs/hub/storage-limits, "Repository limitations"
 """
 
 from collections import Counter
-from collections.abc import Iterator
-from fnmatch import fnmatch
 from pathlib import Path
 
+from pipeline.documents.sums import published_files
 from storage.errors import TrilightError
 
 MOST_FILES = 100_000
@@ -17,17 +16,6 @@ MOST_ENTRIES = 10_000
 MOST_FILE_BYTES = 20_000_000_000
 """Of one file."""
 
-IGNORED = ("logs/*", ".staging/*", ".cache/*", "*.part", "*.tmp")
-"""Never uploaded: how the files came to be, and what is not finished."""
-
-
-def uploaded_files(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder that are uploaded, in order."""
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if path.is_file() and not any(fnmatch(name, pattern) for pattern in IGNORED):
-            yield path
-
 
 def require_within_limits(folder: Path) -> tuple[int, int]:
     """Return how many files and bytes a folder uploads.
@@ -35,7 +23,7 @@ def require_within_limits(folder: Path) -> tuple[int, int]:
     Raises:
         TrilightError: nothing is there, or more than the hub advises.
     """
-    files = list(uploaded_files(folder))
+    files = list(published_files(folder))
     sizes = {path: path.stat().st_size for path in files}
     entries = Counter(path.parent for path in files).most_common(1)
     largest = max(sizes, key=lambda path: sizes[path], default=None)

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from infra.release.hub_limits import IGNORED, require_within_limits
+from infra.release.hub_limits import require_within_limits
+from pipeline.documents.sums import SUMS, UNPUBLISHED, stale_sums
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.verify import verify_dataset
 from storage.errors import TrilightError
@@ -58,7 +59,7 @@ def planned_upload(folder: Path, repository: str) -> Upload:
 
     Raises:
         TrilightError: the name is none, the folder is no release, an unfinished or damaged dataset,
-            a network without its card, or more than the hub advises.
+            a network without its card, sums of other files, or more than the hub advises.
     """
     if not _REPOSITORY.fullmatch(repository) or repository.endswith(".git"):
         raise TrilightError(
@@ -72,6 +73,11 @@ def planned_upload(folder: Path, repository: str) -> Upload:
         raise TrilightError(
             f"{folder}: has no README.md, the card that the hub shows; a dataset's is written by "
             "trilight inspect, those of a release by make release."
+        )
+    if stale := stale_sums(folder):
+        raise TrilightError(
+            f"{folder / SUMS}: {stale[0]} is not as it says; expected sums of what is uploaded. "
+            f"Delete {SUMS}, or write it again with make release."
         )
     files, num_bytes = require_within_limits(folder)
     return Upload(folder=folder, repository=repository, kind=kind, files=files, num_bytes=num_bytes)
@@ -106,7 +112,7 @@ def push(upload: Upload, *, private: bool) -> str:
             repo_id=upload.repository,
             repo_type=upload.kind,
             folder_path=upload.folder,
-            ignore_patterns=list(IGNORED),
+            ignore_patterns=list(UNPUBLISHED),
             commit_message=f"Upload of {upload.files} files",
         )
     except TrilightError:

@@ -17,8 +17,8 @@ from infra.rendering.ways import Choice, Way, chosen_way, priced_ways
 from infra.torch_library import require_torch
 from pipeline.exchange.open_scene import SceneSource, scene_source
 from pipeline.exchange.reader import SceneReader
-from pipeline.renders.preview import FAST_SPP, PreviewSettings
-from pipeline.renders.settings import Filtered, RenderSettings, one_picture
+from pipeline.renders.preview import PreviewSettings, usual_filter
+from pipeline.renders.settings import RenderSettings, one_picture
 from pipeline.renders.variant import choose_variant
 from storage.errors import TrilightError
 
@@ -145,9 +145,10 @@ def _settings(asked: Asked, resolution: int) -> RenderSettings | PreviewSettings
     if asked.seconds is not None or asked.error_db is not None:
         return PreviewSettings(resolution=resolution, spp=1)
     if asked.spp is not None:
-        usual: Filtered = "fast" if asked.spp <= FAST_SPP else "high"
         return PreviewSettings(
-            resolution=resolution, spp=asked.spp, denoiser=asked.denoiser or usual
+            resolution=resolution,
+            spp=asked.spp,
+            denoiser=asked.denoiser or usual_filter(asked.spp),
         )
     return one_picture(
         resolution=resolution,

@@ -2,16 +2,15 @@
 
 import dataclasses
 import re
-import threading
 from collections import OrderedDict
 from pathlib import Path
 
 from infra.viewer.dataset_filter import SceneFilter, filter_of
 from infra.viewer.dataset_index import DatasetIndex, SceneRow
+from infra.viewer.open_rooms import OpenRooms
 from infra.viewer.painters import TargetPainter, painters_of
 from infra.viewer.scene_room import SceneRoom
-from infra.viewer.server import Answer, NotThere, Question, Route, json_answer, routed
-from infra.viewer.static_files import static_routes
+from infra.viewer.server import Answer, NotThere, Question, Route, json_answer
 from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.making.progressive_tracer import ProgressiveTracer
@@ -25,9 +24,7 @@ MOST_ROWS = 200
 
 _MOST_THUMBNAILS = 1000
 _WIDEST = 1024
-_MOST_OPEN = 3
-"""Scenes whose pages are open."""
-_SCENE = re.compile(r"scene/([0-9A-Za-z_\-]+)/(.*)", re.DOTALL)
+_KEY = re.compile(r"[0-9A-Za-z_\-]+")
 
 
 class DatasetRoom:
@@ -46,8 +43,7 @@ class DatasetRoom:
         self._dataset, self._source = dataset, source
         self._tracer, self._checkpoint = tracer, checkpoint
         self._thumbnails = OrderedDict[tuple[str, int, int], bytes]()
-        self._opening = threading.Lock()
-        self._open = OrderedDict[str, SceneRoom]()
+        self._open = OpenRooms(_KEY, self._opened)
         self.index = DatasetIndex(dataset)
         self.index.begin()
 
@@ -57,18 +53,17 @@ class DatasetRoom:
             "api/dataset": self._facts,
             "api/rows": self._rows,
             "api/thumbnail/": self._thumbnail,
-            "scene/": lambda question: self._below(question, by_post=False),
+            "scene/": self._open.get,
         }
 
     def posts(self) -> dict[str, Route]:
         """Return what is asked by POST."""
-        return {"scene/": lambda question: self._below(question, by_post=True)}
+        return {"scene/": self._open.post}
 
     def close(self) -> None:
         """End what is being read or made."""
         self.index.close()
-        for room in self._open.values():
-            room.close()
+        self._open.close()
         self._tracer.close()
 
     def _facts(self, _: Question) -> Answer:
@@ -133,22 +128,6 @@ class DatasetRoom:
             stream.seek(offset)
             radiance_rgb = decode_exr(stream.read(num_bytes))
         return encode_png(preview(radiance_rgb, width))
-
-    def _below(self, question: Question, *, by_post: bool) -> Answer:
-        found = _SCENE.fullmatch(question.path)
-        if found is None:
-            raise NotThere("there is no such scene.")
-        room = self._room(found[1])
-        routes = room.posts() if by_post else {**static_routes("scene.html"), **room.gets()}
-        return routed(routes, dataclasses.replace(question, path=found[2]))
-
-    def _room(self, key: str) -> SceneRoom:
-        with self._opening:
-            room = self._open.pop(key, None) or self._opened(key)
-            self._open[key] = room
-            while len(self._open) > _MOST_OPEN:
-                self._open.popitem(last=False)[1].close()
-            return room
 
     def _opened(self, key: str) -> SceneRoom:
         row = self.index.row(key)

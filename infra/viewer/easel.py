@@ -26,6 +26,9 @@ MOST_KEPT = 32
 PATIENCE_S = 20.0
 """How long an answer waits for something new."""
 
+LAST_PICTURE_S = 15.0
+"""How long the end waits for the picture at hand."""
+
 _TRUTHS = ("target", "traced")
 
 State = Literal["waiting", "working", "done", "failed", "cancelled"]
@@ -125,6 +128,14 @@ class Easel:
         with self._news:
             self._closed = True
             self._news.notify_all()
+
+    def join(self) -> None:
+        """Wait for the picture at hand, which `close` ends at its next step.
+
+        A process that ends while libraries work in a thread of it is aborted by them.
+        """
+        if self._thread is not None:
+            self._thread.join(LAST_PICTURE_S)
 
     def _work(self) -> None:
         while True:

@@ -37,10 +37,10 @@ def page_of(source: str) -> str:
             return "run.html"
         if DatasetFolder(path).manifest.exists():
             return "dataset.html"
-        raise TrilightError(
-            f"{source}: neither a dataset nor a run; expected a folder that `trilight generate` or "
-            "`trilight train` wrote, or the file of a scene."
-        )
+        from infra.viewer.scene_list import scene_list  # slow: formats
+
+        scene_list(path)
+        return "folder.html"
     if not Path(source.rpartition(_KEY)[0] or source).exists():
         raise TrilightError(
             f"{source}: no such file; expected a scene, or the folder of a dataset or a run."

@@ -1,14 +1,13 @@
-"""Opens what SRC of `trilight view` means: one scene, a dataset, or the folder of a run."""
+"""Opens what SRC of `trilight view` means: one scene or many, a dataset, or the folder of a run."""
 
 import os
 from pathlib import Path
 
 from infra.viewer.dataset_room import DatasetRoom
+from infra.viewer.folder_room import FolderRoom, scene_room
 from infra.viewer.later import PageRoom, page_of
-from infra.viewer.painters import TargetPainter, painters_of
 from infra.viewer.run_room import RunRoom
-from infra.viewer.scene_room import SceneRoom
-from pipeline.exchange.formats import SceneSource
+from infra.viewer.scene_list import scene_list
 from pipeline.exchange.open_scene import scene_source
 from pipeline.exchange.reader import SceneReader
 from pipeline.making.progressive_tracer import ProgressiveTracer
@@ -20,7 +19,8 @@ def opened_room(source: str, *, checkpoint: str | None, threads: int | None) -> 
     """Open a source.
 
     Args:
-        source: a scene as `trilight render` takes it, a dataset (folder or URL), or a run's folder.
+        source: a scene as `trilight render` takes it, a folder of such files, a dataset (folder or
+            URL), or a run's folder.
         checkpoint: a network to show beside the built-in ones.
         threads: of the tracer; None for one for each core.
 
@@ -30,26 +30,18 @@ def opened_room(source: str, *, checkpoint: str | None, threads: int | None) -> 
     page = page_of(source)
     if page == "run.html":
         return RunRoom(Path(source))
-    found = scene_source(source) if page == "scene.html" else open_dataset(source)
-    tracer = ProgressiveTracer(variant=choose_variant(), threads=threads or os.cpu_count() or 1)
-    if isinstance(found, SceneSource):
-        return _scene_room(found, tracer, checkpoint)
-    return DatasetRoom(found, source, tracer, checkpoint)
-
-
-def _scene_room(
-    source: SceneSource, tracer: ProgressiveTracer, checkpoint: str | None
-) -> SceneRoom:
+    if page == "folder.html":
+        return FolderRoom(scene_list(Path(source)), _tracer(threads), checkpoint)
+    if page == "dataset.html":
+        return DatasetRoom(open_dataset(source), source, _tracer(threads), checkpoint)
+    found = scene_source(source)
     with SceneReader() as reader:
-        loaded = reader.load(source, pictures=True)
-    target = None
-    if loaded.radiance_rgb is not None and len(loaded.radiance_rgb):
-        target = TargetPainter(loaded.radiance_rgb, ())
-    return SceneRoom(
-        name=source.name,
-        scene=loaded.scene,
-        notes=loaded.notes,
-        painters=painters_of(tracer, target, checkpoint),
-        target_px=None if target is None else target.width_px,
-        tracer=tracer,
-    )
+        loaded = reader.load(found, pictures=True)
+    tracer = _tracer(threads)
+    room = scene_room(found.name, loaded, tracer, checkpoint)
+    room.tracer = tracer
+    return room
+
+
+def _tracer(threads: int | None) -> ProgressiveTracer:
+    return ProgressiveTracer(variant=choose_variant(), threads=threads or os.cpu_count() or 1)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from infra.viewer.wanted import Wanted
 from pipeline.documents.scene_passes import SHOWN_PASSES, ShownPass
 from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.renders.preview import usual_filter
 from pipeline.renders.results import GrowingPicture, Sampling
-from pipeline.renders.settings import FIRST_SPP, one_picture
+from pipeline.renders.settings import FIRST_SPP, RenderSettings, one_picture
 from storage.conventions import HALF_FLOAT_MAX
 from storage.errors import TrilightError
 from storage.records.passes.declared import pass_names
@@ -24,6 +25,10 @@ from storage.records.scene import Scene
 
 if TYPE_CHECKING:
     from model.neural_renderer import NeuralRenderer, PreparedScene
+
+SAMPLES_PREFIX = "samples-"
+SAMPLES = (1, 4, 16, 64)
+"""Samples a pixel of the tracer's rungs below the picture that grows."""
 
 MOST_SPP = 4096
 """Cap of a tracer's samples."""
@@ -86,9 +91,7 @@ class TracedPainter:
         )
 
     def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
-        settings = one_picture(
-            resolution=wanted.resolution, max_spp=MOST_SPP, noise_floor_db=wanted.error_db
-        )
+        settings = _traced_settings(wanted)
         if self._direct:
             settings = dataclasses.replace(settings, max_depth=2)
 
@@ -97,6 +100,33 @@ class TracedPainter:
 
         camera = (wanted.camera.c2w, wanted.camera.fov_deg)
         self._tracer.paint(scene, (self._number, wanted.scene_key), camera, settings, shown)
+
+
+class SamplesPainter:
+    """Few samples a pixel with one denoise; the loaded scene is that of `TracedPainter`."""
+
+    def __init__(self, tracer: ProgressiveTracer, scene_number: int, spp: int) -> None:
+        """Take what `TracedPainter` takes, and the samples."""
+        self._tracer, self._number, self._spp = tracer, scene_number, spp
+        self.title = f"{spp} sample{'s' if spp > 1 else ''}, filtered"
+        self.means = (
+            f"{spp} path{'s' if spp > 1 else ''} a pixel, then Open Image Denoise "
+            f"({usual_filter(spp)})."
+        )
+
+    def paint(self, scene: Scene, wanted: Wanted, show: Show) -> None:
+        def shown(step: Sampling) -> None:
+            show(_traced(step) if isinstance(step, GrowingPicture) else step)
+
+        camera = (wanted.camera.c2w, wanted.camera.fov_deg)
+        key, settings = (self._number, wanted.scene_key), _traced_settings(wanted)
+        self._tracer.paint(scene, key, camera, settings, shown, preview_spp=self._spp)
+
+
+def _traced_settings(wanted: Wanted) -> RenderSettings:
+    return one_picture(
+        resolution=wanted.resolution, max_spp=MOST_SPP, noise_floor_db=wanted.error_db
+    )
 
 
 def _traced(look: GrowingPicture) -> Painted:
@@ -222,6 +252,8 @@ def painters_of(
         found["tokens"] = NetworkPainter(
             "builtin:tokens", "Network, tokens", "RenderFormer's way: nothing is traced."
         )
+    for spp in SAMPLES:
+        found[f"{SAMPLES_PREFIX}{spp}"] = SamplesPainter(tracer, number, spp)
     found["direct"] = TracedPainter(tracer, number, direct=True)
     if target is not None:
         found["target"] = target

@@ -76,6 +76,7 @@ class SceneRoom:
     def close(self) -> None:
         """End what is being made."""
         self.easel.close()
+        self.easel.join()
         if self.tracer is not None:
             self.tracer.close()
 

@@ -12,7 +12,7 @@ scales with the lamps exactly. There are no pixels from elsewhere in it, so any 
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, cast
 
 import torch
@@ -254,10 +254,10 @@ class HitDecoder(nn.Module):
         place_BVAC: Tensor,
         unit_B1113: Tensor,
     ) -> Tensor:
-        resolution = told.shape[2]
-        side = round(x_BVAW.shape[2] ** 0.5)
+        resolution, parts = told.shape[2], x_BVAW.shape[2]
+        side = round(parts**0.5)
         views = told.shape[:2]
-        unit = unit_B1113.expand(*views, 1, 1, 3).flatten(0, 1)[:, 0]  # [V, 1, 3]
+        unit = unit_B1113.expand(*views, parts, 1, 3).flatten(0, 2)
         head = self.head
         gathered = (traced.gathered_VA3 / unit_B1113[..., 0, :]).flatten(0, 1)
         around = [
@@ -272,22 +272,18 @@ class HitDecoder(nn.Module):
         given = [
             _in_parts(each.flatten(0, 1), side) for each in (told, traced.pixels_VRRC, mirrored)
         ]
-        pictures = []
-        for view in range(len(unit)):
-            step = side * side
-            if not torch.is_grad_enabled():
-                step = max(1, BLOCK_PIXELS * step // resolution**2)
-            rows = []
-            for first in range(0, side * side, step):
-                some = [each[view, first : first + step] for each in (*given, *around)]
-                rows.append(self._some_parts(unit[view], *some))
-            pictures.append(_whole(torch.cat(rows), side))
-        log10 = torch.log1p(torch.stack(pictures)) / math.log(10)
+        every = [each.flatten(0, 1) for each in (*given, *around)]
+        rows = [
+            self._some_parts(unit[some], *(each[some] for each in every))
+            for some in _blocks(told, parts)
+        ]
+        pictures = _whole(torch.cat(rows).unflatten(0, (-1, parts)), side)
+        log10 = torch.log1p(pictures) / math.log(10)
         return log10.reshape(*views, resolution, resolution, 3)
 
     def _some_parts(
         self,
-        unit_13: Tensor,
+        unit_M13: Tensor,
         told_MPF: Tensor,
         pixels_MPC: Tensor,
         mirrored_MP3: Tensor,
@@ -296,11 +292,29 @@ class HitDecoder(nn.Module):
         gathered_M93: Tensor,
         place_M9C: Tensor,
     ) -> Tensor:
-        """Return the radiance [M, P, 3] of some parts of a picture."""
+        """Return the radiance [M, P, 3] of some parts of pictures."""
         lies = lies_to(pixels_MPC, place_M9C)
         met_M9 = place_M9C[..., 0] > 0
         learned, mixed = self.head(told_MPF, key_M9W, value_M9W, lies, met_M9, gathered_M93)
-        return _composed(learned, mixed, mirrored_MP3, pixels_MPC, unit_13)
+        return _composed(learned, mixed, mirrored_MP3, pixels_MPC, unit_M13)
+
+
+def _blocks(told: Tensor, parts: int) -> Iterator[slice]:
+    """Yield the parts, of all views, that are computed together.
+
+    A card is told of all at once while it learns: view by view would be as many times its kernels.
+    A processor takes a view at a time, whose numbers stay near it, and less while rendering.
+    """
+    count = told.shape[0] * told.shape[1]
+    if told.device.type == "cuda" and torch.is_grad_enabled():
+        yield slice(0, count * parts)
+        return
+    step = parts
+    if not torch.is_grad_enabled():
+        step = max(1, BLOCK_PIXELS * parts // told.shape[2] ** 2)
+    for view in range(count):
+        for first in range(0, parts, step):
+            yield slice(view * parts + first, view * parts + min(first + step, parts))
 
 
 def _surface(pixels: Tensor) -> Tensor:
@@ -341,11 +355,11 @@ def _in_parts(values_VRRK: Tensor, side: int) -> Tensor:
     return parts.transpose(2, 3).flatten(3, 4).flatten(1, 2)
 
 
-def _whole(values_MPK: Tensor, side: int) -> Tensor:
-    """[M, P, K] -> [R, R, K]: the inverse of `_in_parts` for one picture."""
-    step = round(values_MPK.shape[1] ** 0.5)
-    parts = values_MPK.unflatten(1, (step, step)).unflatten(0, (side, side))
-    return parts.transpose(1, 2).flatten(2, 3).flatten(0, 1)
+def _whole(values_VMPK: Tensor, side: int) -> Tensor:
+    """[V, M, P, K] -> [V, R, R, K]: the inverse of `_in_parts`."""
+    step = round(values_VMPK.shape[2] ** 0.5)
+    parts = values_VMPK.unflatten(2, (step, step)).unflatten(1, (side, side))
+    return parts.transpose(2, 3).flatten(3, 4).flatten(1, 2)
 
 
 def _around(values_VAK: Tensor, side: int) -> Tensor:

@@ -68,8 +68,12 @@ class LightFilter(nn.Module):
         levels = zip(STEPS_PX, self.light, self.alike, self.near, strict=True)
         for step, light, alike, near in levels:
             at_level = silu(known_VRRW + light(_seen(both)))
-            both = _mixed(alike(at_level).movedim(-1, 1), near, both, step)
+            both = self.mixed(alike(at_level).movedim(-1, 1), near, both, step)
         return _without_albedo(both).movedim(1, -1) * albedo_VRR3
+
+    def mixed(self, alike_VCRR: Tensor, near_9: Tensor, both_V6RR: Tensor, step: int) -> Tensor:
+        """Return one level's light and albedo [V, 6, R, R]; a hundred kernels, or one compiled."""
+        return _mixed(alike_VCRR, near_9, both_V6RR, step)
 
 
 def _without_albedo(both_V6RR: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from pipeline.documents.distributions import dataset_distributions
 from pipeline.documents.report import write_report
 from pipeline.documents.rights import encode_licences, rights_of
 from pipeline.documents.sheets import write_contact_sheet
+from pipeline.documents.sums import renew_sums
 from storage.atomic import write_atomically
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
@@ -35,4 +36,5 @@ def write_documents(dataset: Dataset, out: DatasetFolder | None = None) -> Stati
     write_report(dataset, found, out=out)
     write_atomically(out.croissant, encode_croissant(manifest, rights))
     write_atomically(out.card, encode_card(out, manifest, found, rights))
+    renew_sums(out.root)
     return statistics

@@ -49,7 +49,8 @@ pre { background: var(--box) } label:has(.zoom) { cursor: zoom-in }
 .zoom:checked + img { position: fixed; inset: 0; margin: auto; z-index: 9; cursor: zoom-out;
   width: min(100vw, 100vh); height: min(100vw, 100vh); object-fit: contain; background: #000c;
   image-rendering: pixelated }
-@media (max-width: 40rem) { body { margin-top: 1rem }
+@media (max-width: 40rem) { body { margin-top: 1rem } }
+@media (max-width: 78rem) {
   table:not(.narrow) { display: block; overflow-x: auto }
   table:not(.narrow) td { overflow-wrap: normal } }
 table.narrow { width: auto } table.narrow td, table.narrow th { padding-right: 1.6rem }

@@ -23,7 +23,7 @@ _STYLE = """
 .pair { display: flex; gap: 2rem; align-items: flex-start }
 .figure { flex: 0 0 590px; width: 590px } .numbers { flex: 1 1 0; min-width: 0; font-size: .87rem }
 .numbers table { margin-bottom: 1rem }
-@media (max-width: 60rem) { .pair { display: block } .figure { width: auto } }
+@media (max-width: 78rem) { .pair { display: block } .figure { width: auto } }
 .toc { display: flex; flex-wrap: wrap; gap: 0 1rem }
 .bar { display: inline-block; height: .7em; background: #3b6ea5 }
 .cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: 1rem }

@@ -57,6 +57,10 @@ class SceneReader:
         """Return a scene of fewer triangles; raises TrilightError as `within_budget`."""
         return self._call("scene", _within_budget, scene, max_triangles)
 
+    def close(self) -> None:
+        """End the child."""
+        self._child.close()
+
     def __enter__(self) -> "SceneReader":
         return self
 
@@ -66,7 +70,7 @@ class SceneReader:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._child.close()
+        self.close()
 
     def _call(self, name: str, function: Callable[..., Result], *args: Any) -> Result:
         try:

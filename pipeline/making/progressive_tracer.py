@@ -42,6 +42,8 @@ class ProgressiveTracer:
         camera: tuple[NDArray[np.float32], float],
         settings: RenderSettings,
         shown: Callable[[Sampling], None],
+        *,
+        preview_spp: int | None = None,
     ) -> None:
         """Make one picture; `shown` receives its looks, and between them how far it is.
 
@@ -51,13 +53,15 @@ class ProgressiveTracer:
             camera: pose [4, 4] and full field of view in degrees.
             settings: how good the picture is to become.
             shown: may raise, which ends the picture.
+            preview_spp: samples of a preview, which is made in place of the picture that grows.
 
         Raises:
             TrilightError: it cannot be rendered.
         """
         try:
             with self._one_at_a_time:
-                with_retries(lambda: self._paint(scene, key, camera, settings, shown))
+                begin = ((key, settings), camera, preview_spp)
+                with_retries(lambda: self._paint(scene, begin, shown))
         except Rejected as rejection:
             raise TrilightError(
                 f"the scene cannot be rendered ({rejection}); expected surfaces, lights with an "
@@ -72,18 +76,16 @@ class ProgressiveTracer:
         """End the child."""
         self._child.close()
 
-    def _paint(
-        self,
-        scene: Scene,
-        key: Hashable,
-        camera: tuple[NDArray[np.float32], float],
-        settings: RenderSettings,
-        shown: Callable[[Sampling], None],
-    ) -> None:
-        if not self._child.call(_begin, None, (key, settings), camera):
-            self._child.call(_begin, scene, (key, settings), camera)
+    def _paint(self, scene: Scene, begin: "_Begin", shown: Callable[[Sampling], None]) -> None:
+        if not self._child.call(_begin, None, *begin):
+            self._child.call(_begin, scene, *begin)
         while (step := self._child.call(_advance)) is not None:
             shown(step)
+
+
+_Camera = tuple[NDArray[np.float32], float]
+_Begin = tuple[tuple[Hashable, RenderSettings], _Camera, int | None]
+"""Scene with its settings, camera, and samples of a preview."""
 
 
 class _ChildOfLooks:
@@ -100,7 +102,10 @@ _state = _ChildOfLooks()
 
 
 def _begin(
-    scene: Scene | None, key: tuple[Hashable, RenderSettings], camera: tuple[NDArray, float]
+    scene: Scene | None,
+    key: tuple[Hashable, RenderSettings],
+    camera: _Camera,
+    preview_spp: int | None,
 ) -> bool:
     """Begin a picture; return whether the scene, if it is not given, is still loaded."""
     renderer = _state.loaded.pop(key, None)
@@ -111,7 +116,11 @@ def _begin(
             del _state.loaded[next(iter(_state.loaded))]
         renderer = ProgressiveRenderer(scene, key[1])
     _state.loaded[key] = renderer
-    _state.steps, _state.ended = renderer.view_steps(*camera, 0), False
+    _state.ended = False
+    if preview_spp is None:
+        _state.steps = renderer.view_steps(*camera, 0)
+    else:
+        _state.steps = renderer.preview_steps(*camera, 0, preview_spp)
     return True
 
 

@@ -31,6 +31,12 @@ FAST_SPP = 16
 """Up to so many samples the fast filter is the better trade: more samples cost less than the better
 filter, 0.5 core-seconds at 256 pixels, and bring as much (docs/log)."""
 
+
+def usual_filter(spp: int) -> Filtered:
+    """Return the quality of Open Image Denoise that is used where nobody chooses one."""
+    return "fast" if spp <= FAST_SPP else "high"
+
+
 PASSES = (*PASS_SPP, 1)
 """Samples of a pass, the largest first."""
 

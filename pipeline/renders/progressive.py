@@ -13,8 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.renders.camera import Camera
 from pipeline.renders.noise_floor import MeasuredFloor
-from pipeline.renders.preview import denoised, samples_sum
-from pipeline.renders.renderer import SceneRenderer, representable, require_bounded
+from pipeline.renders.preview import denoised, samples_sum, usual_filter
+from pipeline.renders.renderer import (
+    SceneRenderer,
+    finished,
+    representable,
+    require_bounded,
+)
 from pipeline.renders.results import GrowingPicture, RenderedView, Sampling
 from pipeline.renders.settings import RenderSettings
 from storage.errors import Rejected
@@ -49,7 +54,7 @@ class ProgressiveRenderer:
         pose = np.asarray(c2w, np.float64)
         camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=self._settings.resolution)
         for spp in FIRST_LOOKS_SPP:
-            yield self._preview(camera, seed, spp)
+            yield finished(self._preview(camera, seed, spp))
         view: RenderedView = yield from self._measured.view_steps(c2w, fov_deg, seed)
         floor = MeasuredFloor(
             log_db=view.noise_floor_db,
@@ -65,17 +70,31 @@ class ProgressiveRenderer:
             core_s=self._measured.used_core_s,
         )
 
-    def _preview(self, camera: Camera, seed: int, spp: int) -> GrowingPicture:
+    def preview_steps(
+        self, c2w: ArrayLike, fov_deg: float, seed: int, spp: int
+    ) -> Generator[Sampling, None, GrowingPicture]:
+        """Return a picture of so many samples, with one denoise, yielding after each pass.
+
+        It is the one that `PreviewRenderer` makes, whose arguments and errors these are.
+        """
+        pose = np.asarray(c2w, np.float64)
+        camera = Camera(c2w=pose, fov_deg=fov_deg, resolution=self._settings.resolution)
+        return (yield from self._preview(camera, seed, spp))
+
+    def _preview(
+        self, camera: Camera, seed: int, spp: int
+    ) -> Generator[Sampling, None, GrowingPicture]:
         tracer = self._measured.tracer
         began_s, total, done = time.process_time(), np.zeros(3), 0
         while done < spp:
             part, done = samples_sum(tracer, camera, seed, done, spp)
             total = total + part
+            yield Sampling(spp=done, expected_spp=spp, missing_db=None)
         mean: NDArray[np.float32] = (total / done).astype(np.float32)
         if not np.isfinite(mean).all():
             raise Rejected("nonfinite_radiance", "raw samples are not finite")
         require_bounded(mean)
-        picture = representable(denoised(tracer, camera, mean, done, "fast"))
+        picture = representable(denoised(tracer, camera, mean, done, usual_filter(done)))
         return GrowingPicture(
             spp=done,
             expected_spp=self._settings.first_spp,

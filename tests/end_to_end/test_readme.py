@@ -11,15 +11,21 @@ import pytest
 from tests.command_line import trilight
 from tests.conftest import ROOT
 from tests.end_to_end.production_kit import copy_of_the_project
+from tests.end_to_end.tutorial_kit import answer_of, shell_lines, steps_of, tutorial, viewed
 
 README = ROOT / "README.md"
 TUTORIALS = [
-    ROOT / "docs" / "tutorials" / f"{name}.md"
+    tutorial(name)
     for name in (
         "first-dataset",
         "your-own-objects",
         "train-and-judge",
+        "look-around",
+        "read-the-reports",
+        "stand-on-a-leaderboard",
+        "publish",
         "a-cluster",
+        "mix-datasets",
         "blender-and-back",
     )
 ]
@@ -34,8 +40,7 @@ def _shell_lines(page: Path) -> list[str]:
     text = page.read_text()
     if page.suffix == ".md":
         text = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL))
-    lines = (line.split(" #")[0].strip() for line in text.replace("\\\n", " ").splitlines())
-    return [line for line in lines if line and not line.startswith("#")]
+    return shell_lines(text)
 
 
 PAGES = [README, SCRIPT, *sorted((ROOT / "docs").rglob("*.md"))]
@@ -141,14 +146,27 @@ def test_the_commands_run(tmp_path: Path, shared: Path) -> None:
 @pytest.mark.timeout(5400)
 @pytest.mark.skipif(
     "TRILIGHT_TUTORIALS" not in os.environ,
-    reason="the tutorials take two cores about 40 minutes: set TRILIGHT_TUTORIALS=1",
+    reason="the tutorials take two cores about an hour: set TRILIGHT_TUTORIALS=1",
 )
 def test_the_tutorials_run(tmp_path: Path) -> None:
     copy_of_the_project(tmp_path)
     _run("make dataset", tmp_path)
-    for command in (line for page in TUTORIALS for line in _shell_lines(page)):
-        _run(command, tmp_path)
-    for made in ("runs/mine/validation_sheet.png", "data/both.png"):
+    for step in (step for page in TUTORIALS for step in steps_of(page)):
+        if step.language == "python":
+            (tmp_path / "block.py").write_text(step.text)
+            _run("python block.py", tmp_path)
+        elif step.text.startswith("trilight view"):
+            command = [str(ROOT / ".venv" / "bin" / "trilight"), *shlex.split(step.text)[1:]]
+            with viewed(command, tmp_path) as address:
+                assert b"<title>Trilight view</title>" in answer_of(address, "")
+        else:
+            _run(step.text, tmp_path)
+    made_by_pages = (
+        "runs/mine/validation_sheet.png",
+        "data/both.png",
+        "boards/mine/leaderboard.png",
+    )
+    for made in made_by_pages:
         assert (tmp_path / made).stat().st_size > 10_000
 
 

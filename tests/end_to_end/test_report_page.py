@@ -21,9 +21,9 @@ def test_a_person_looks_around(tmp_path: Path) -> None:
     dataset = five_scenes(tmp_path)
     report = write_report(dataset, dataset_distributions(dataset))
     with browser() as page:
-        for width in (1280, 390):
+        for width in (1280, 1000, 390):
             page.show(width, 844)
-            page.open(report.as_uri())
+            page.open(f"{report.as_uri()}?{width}")  # another address, which is loaded anew
             assert page.run("document.documentElement.scrollWidth") <= width
             assert page.run("document.querySelector('.cards').offsetTop") < 844
             everything = page.run(SHOWN)

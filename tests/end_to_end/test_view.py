@@ -1,11 +1,7 @@
 """`trilight view` as a person meets it: by mouse and by keyboard, on a desk and on a phone."""
 
 import contextlib
-import os
-import re
 import shlex
-import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,11 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.exchange.convert import write_scene
 from storage.records.scene_file import read_scene_file
 from tests.end_to_end.browser_kit import Browser, browser
 from tests.end_to_end.conftest import command
+from tests.end_to_end.tutorial_kit import viewed as served_page
 from tests.infra.run_page.run_by_hand import write_run
 from tests.pipeline.documents.dataset_by_hand import furnished, locked, sample, write_dataset
+from tests.scenes_by_hand import tiny_scene
 
 DRAWING = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """WebGL without a graphics card."""
@@ -29,28 +28,9 @@ PATIENCE_S = 120.0
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
-@contextlib.contextmanager
-def viewed(source: Path) -> Iterator[str]:
+def viewed(source: Path) -> contextlib.AbstractContextManager[str]:
     """Yield the address of a page; its server has to end cleanly at Ctrl-C."""
-    run = subprocess.Popen(
-        command("view", str(source), "--no-browser", "--threads", "1"),
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "COLUMNS": "200"},
-    )  # fmt: skip
-    assert run.stdout is not None
-    try:
-        assert run.stdout.readline().startswith("Opening")
-        address = ""
-        while not (found := re.search(r"http://\S+", address)):
-            address = run.stdout.readline()
-        yield found[0]
-        run.send_signal(signal.SIGINT)
-        out, errors = run.communicate(timeout=60)
-        assert (run.returncode, errors) == (0, ""), errors
-        assert out.rstrip().endswith("Ended.")
-    finally:
-        run.kill()
-        run.wait()
+    return served_page(command("view", str(source), "--threads", "1"), Path.cwd())
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +47,17 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     samples = [sample(row, scene, noise_floor_db=30.0 + row) for row, scene in enumerate(scenes)]
     shards = {"train-000000.tar": samples[:4], "test-000001.tar": samples[4:]}
     write_dataset(root, shards, objects=[locked("cube")])
+    with viewed(root) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    root = tmp_path_factory.mktemp("files")
+    (root / "rooms").mkdir()
+    write_scene(root / "plane.safetensors", tiny_scene())
+    write_scene(root / "rooms" / "a room.glb", tiny_scene())
+    (root / "broken.json").write_text("{}")
     with viewed(root) as found:
         yield found
 
@@ -190,6 +181,13 @@ def test_by_keyboard_alone(page: Browser, address: str) -> None:
     assert page.run("document.activeElement.getAttribute('aria-checked')") == "true"
     outline = page.run("getComputedStyle(document.activeElement).outlineStyle")
     assert outline != "none"
+    page.tab_to("[data-rung=samples-1]")
+    assert page.run("viewer.pictures.cards.get('samples-1').hidden")
+    page.press(" ")
+    until_done(page, "samples-1")
+    few = told(page, "samples-1")
+    assert few["spp"] == 1 and few["floor_db"] is None
+    assert not page.run("viewer.pictures.cards.get('samples-1').hidden")
     page.tab_to("#ev")
     page.press("ArrowRight")
     assert page.run("document.getElementById('ev-shown').textContent") == "0.25 stops"
@@ -223,6 +221,28 @@ def test_a_dataset_is_filtered_enlarged_and_opened(
     page.until("document.body?.classList.contains('scene')")
     page.until("document.body?.classList.contains('ready')")
     assert page.run("document.getElementById('name').textContent").startswith("scene 00000000")
+
+
+@pytest.mark.parametrize(("size", "scheme"), [(DESKTOP, "dark"), (PHONE, "light")])
+def test_a_folder_of_scene_files_is_browsed_by_keyboard(
+    page: Browser, folder: str, size: tuple[int, int], scheme: str
+) -> None:
+    opened(page, folder, size, scheme)
+    assert fits(page)
+    page.until("document.querySelectorAll('#scenes .card[data-told]').length === 3")
+    assert page.run("document.querySelectorAll('#scenes img')[1].naturalWidth") == 128
+    assert "broken.json: " in page.run("document.querySelector('#scenes .card small').textContent")
+    page.tab_to("[name=text]")
+    page.write("ROOM")
+    page.until("document.querySelectorAll('#scenes .card').length === 1")
+    page.tab_to("#scenes .card")
+    page.press("Enter")
+    page.until("document.body?.classList.contains('scene')")
+    page.until("document.body?.classList.contains('ready')")
+    assert page.run("document.getElementById('name').textContent") == "rooms/a room.glb"
+    page.tab_to("#back")
+    page.press("Enter")
+    page.until("document.body?.classList.contains('folder')")
 
 
 def test_a_run_shows_its_pictures_over_steps(page: Browser, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Every way on of docs/how-to/carry-on-a-run.md, tried: what stopped a run, and what goes on."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from train.data.buckets import TrainingBatch
 from train.loop import step as step_module
 from train.loop.checkpoints import network_of_run, path_of_step, read_checkpoint, saved_steps
 from train.loop.recorder import read_rows
-from train.loop.step import Stepper, StepReport
+from train.loop.step import Stepper, Unread
 from train.progress import TrainProgress
 from train.result import TrainResult
 from train.run import train_run
@@ -205,19 +206,16 @@ def test_a_bad_sample_is_left_out_by_its_key(
     assert (event.step, event.name, event.after) == (stopped_at, "most_unusable", 1)
 
 
-def failing(when: Callable[[TrainSettings, int], bool]) -> Callable[..., StepReport]:
+def failing(when: Callable[[TrainSettings, int], bool]) -> Callable[..., Unread]:
     """Return a step that is not finite where `when` says so of the run's settings and step."""
-    original = Stepper.step
+    original = Stepper.take
 
-    def stepped(self: Stepper, batches: Any, rate: float) -> StepReport:
+    def taken(self: Stepper, *given: Any, **rest: Any) -> Unread:
         if when(self._settings, self._state.step):
-            nothing = float("nan")
-            return StepReport(
-                loss=nothing, l1=nothing, brightness=1.0, grad_norm=nothing, applied=False
-            )
-        return original(self, batches, rate)
+            return torch.tensor([math.nan, math.nan, 0.0, 0.0, math.nan, 0.0, 0.0]).double()
+        return original(self, *given, **rest)
 
-    return stepped
+    return taken
 
 
 @pytest.mark.parametrize("decisions", [{"learning_rate": 1e-3}, {"seed": 1}])
@@ -233,7 +231,7 @@ def test_ten_skipped_steps_go_on_by_a_decision(
     def diverges(now: TrainSettings, step: int) -> bool:
         return step >= 8 and (now.learning_rate, now.seed) == (2e-3, 0)
 
-    monkeypatch.setattr(Stepper, "step", failing(diverges))
+    monkeypatch.setattr(Stepper, "take", failing(diverges))
     ways = r"10 steps in a row up to step 18.*--change learning_rate=0\.001.*seed=1.*--branch"
     for again in (False, True):
         with pytest.raises(TrilightError, match=ways):

@@ -18,9 +18,10 @@ class PairedLead:
 
     mean: float
     """Mean of the differences, in dB; above 0 the first one is better."""
-    low: float
-    """Lower end of its 95 % interval, bootstrapped over whole scenes."""
-    high: float
+    low: float | None
+    """Lower end of its 95 % interval, bootstrapped over whole scenes; None of a single scene, which
+    says nothing of others."""
+    high: float | None
     """Upper end."""
     share_better: float
     """Share of the views in which the first one is better."""
@@ -31,10 +32,11 @@ def pair(views: Sequence[JudgedView], first: str, second: str) -> PairedLead:
     leads_db = [
         (view.scores[first][METRIC] or 0.0) - (view.scores[second][METRIC] or 0.0) for view in views
     ]
-    low, high = mean_interval(leads_db, [view.key for view in views])
+    scenes = [view.key for view in views]
+    interval = mean_interval(leads_db, scenes) if len(set(scenes)) > 1 else None
     return PairedLead(
         mean=float(np.mean(leads_db)),
-        low=low,
-        high=high,
+        low=interval and interval[0],
+        high=interval and interval[1],
         share_better=float(np.mean(np.array(leads_db) > 0)),
     )

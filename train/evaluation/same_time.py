@@ -109,9 +109,14 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         f"Over {found['views']} views ({found['which']}) the network has "
         f"{found['network']['psnr_log_db']['median']:.2f} dB and the path tracer "
         f"{found['tracer']['psnr_log_db']['median']:.2f} dB, medians of psnr_log_db; view by view "
-        f"the network less the path tracer is {lead['mean']:+.2f} dB ({lead['low']:+.2f} to "
-        f"{lead['high']:+.2f}, 95 % by scene), and the network is better in "
-        f"{found['share_better']:.0%}.",
+        f"the network less the path tracer is {lead['mean']:+.2f} dB ({_interval(lead)}), and the "
+        f"network is better in {found['share_better']:.0%}.",
         "The targets went through the same denoiser, which favours the path tracer a little.",
     ]
     return [*lines, *([f"{preview['note']}."] if preview["note"] else [])]
+
+
+def _interval(lead: Mapping[str, float | None]) -> str:
+    if lead["low"] is None:
+        return "no interval, of one scene"
+    return f"{lead['low']:+.2f} to {lead['high']:+.2f}, 95 % by scene"

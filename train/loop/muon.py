@@ -10,6 +10,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from train.loop.crew import Crew
+from train.loop.decision import Decision, decides_late, move_along, move_towards
 from train.settings import Precision
 
 
@@ -41,7 +42,7 @@ def muon(
         precision: of its products. With bfloat16 on a processor it is torch's own.
         thirds: those of them that are three matrices, one above the other.
     """
-    if precision == "bfloat16" and not thirds and _device(matrices[0]).type == "cpu":
+    if precision == "bfloat16" and not thirds and not decides_late(_device(matrices[0])):
         return torch.optim.Muon(matrices, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
     return StackedMuon(matrices, weight_decay, PRODUCTS[precision], thirds)
 
@@ -63,6 +64,9 @@ class StackedMuon(torch.optim.Muon):
     Each process orthogonalises its part of a stack and is told the others', so a matrix is moved by
     the same numbers everywhere. Momentum is kept by all of them.
     """
+
+    decision: Decision | None = None
+    """Whether the next step is taken; None: it is."""
 
     def __init__(
         self,
@@ -94,13 +98,14 @@ class StackedMuon(torch.optim.Muon):
         constants = group["ns_coefficients"], group["ns_steps"], group["eps"]
 
         def steps(some: Sequence[Tensor]) -> Tensor:
-            return orthogonal(torch.stack(list(some)).to(self._products), *constants)
+            return orthogonal(_stacked(some, self._products), *constants)
 
         steps_SMN = shared_out(wanted, steps, self._products)
         # Liu et al. 2025: as long as a typical step of AdamW, whatever the shape
         rate = group["lr"] * 0.2 * math.sqrt(max(weights[0].shape))
-        torch._foreach_mul_(weights, 1 - group["lr"] * group["weight_decay"])
-        torch._foreach_add_(weights, list(steps_SMN.to(weights[0].dtype)), alpha=-rate)
+        steps_SMN = steps_SMN.to(weights[0].dtype, memory_format=torch.contiguous_format)
+        decay = group["lr"] * group["weight_decay"]
+        move_along(weights, list(steps_SMN), rate, decay, self.decision)
 
     def _wanted(self, weights: Sequence[Tensor], momentum: float) -> Sequence[Tensor]:
         """Return the gradients [M, N] with Nesterov's momentum, and remember it."""
@@ -113,8 +118,15 @@ class StackedMuon(torch.optim.Muon):
             if "momentum_buffer" not in self.state[weight]:
                 self.state[weight]["momentum_buffer"] = torch.zeros_like(weight.grad)
         means: list[Tensor] = [self.state[weight]["momentum_buffer"] for weight in weights]
-        torch._foreach_lerp_(means, gradients, 1 - momentum)
+        move_towards(means, gradients, 1 - momentum, self.decision)
         return torch._foreach_lerp(gradients, means, momentum)
+
+
+def _stacked(matrices: Sequence[Tensor], kind: torch.dtype) -> Tensor:
+    """Return [S, M, N] of a type: all are rounded on their way, and read once."""
+    stack_SMN = matrices[0].new_empty((len(matrices), *matrices[0].shape), dtype=kind)
+    torch._foreach_copy_(list(stack_SMN), list(matrices))
+    return stack_SMN
 
 
 def shared_out(

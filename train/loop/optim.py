@@ -10,7 +10,8 @@ from torch import Tensor
 
 from model.renderformer import RenderFormer
 from model.width_scales import width_scales
-from train.loop.muon import muon
+from train.loop.decision import Decision, decides_late
+from train.loop.muon import StackedMuon, muon
 from train.settings import Precision, TrainSettings
 
 ADAMW_KEEPS = ("exp_avg", "exp_avg_sq")
@@ -55,7 +56,7 @@ class Updater:
         adamw = torch.optim.AdamW(
             self._groups(others, settings),
             betas=settings.betas,
-            fused=True if device.type == "cuda" else None,
+            fused=True if decides_late(device) else None,
         )
         self._optimizers: list[tuple[torch.optim.Optimizer, float]] = [(adamw, 1.0)]
         self.muon_precision = precision if matrices else None
@@ -85,11 +86,18 @@ class Updater:
         for optimizer, _ in self._optimizers:
             optimizer.zero_grad(set_to_none=True)
 
-    def step(self, learning_rate: float) -> None:
-        """Move every weight along the gradient it holds."""
+    def step(self, learning_rate: float, decision: Decision | None = None) -> None:
+        """Move every weight along the gradient it holds, unless it is decided otherwise."""
+        if decision is not None and decision.is_refused:
+            return
         for optimizer, share in self._optimizers:
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate * share * group[_SCALE]
+            if isinstance(optimizer, StackedMuon):
+                optimizer.decision = decision
+            else:  # torch's name for it
+                late = decision is not None and decision.is_late
+                optimizer.found_inf = decision.refused if decision and late else None  # type: ignore[attr-defined]
             optimizer.step()
 
     def memories(self) -> dict[str, Tensor]:

@@ -18,6 +18,7 @@ from storage.seeds import seed_for
 from train.data.mixture import Mixture
 from train.data.unusable import Unusable
 from train.going_on import Event
+from train.loop.decision import Decision, Updates, move_towards
 from train.loop.optim import Updater
 from train.settings import Precision, TrainSettings
 
@@ -60,20 +61,34 @@ class TrainState:
         """The network that is judged and kept: the mean where there is one."""
         return self.mean_model or self.model
 
+    @property
+    def updates(self) -> int:
+        """How often the weights were moved."""
+        return self.step - self.skipped_steps
+
     @torch.no_grad()
-    def follow_with_mean(self, decay: float) -> None:
-        """Move the mean towards the weights after an update.
+    def follow_with_mean(self, decay: float, decision: Decision) -> None:
+        """Move the mean towards the weights after an update, unless it is decided otherwise.
 
         At first it follows faster, by (1 + n) / (10 + n) after n updates, so that it does not
         remember the random start.
         """
-        if self.mean_model is None:
+        if self.mean_model is None or decision.is_refused:
             return
-        updates = self.step - self.skipped_steps
-        decay = min(decay, (1 + updates) / (10 + updates))
         means: list[Tensor] = [*self.mean_model.parameters()]
         weights: list[Tensor] = [*self.model.parameters()]
-        torch._foreach_lerp_(means, weights, 1 - decay)
+        move_towards(means, weights, mean_share(decay, decision.updates), decision)
+
+
+def mean_share(decay: float, updates: Updates) -> float | Tensor:
+    """Return the share of its way to the weights that a running mean takes after so many updates.
+
+    Of updates that only the device knows it is float32 [] there.
+    """
+    early = (1 + updates) / (10 + updates)
+    if isinstance(early, Tensor):
+        return (1 - early.clamp(max=decay)).float()
+    return 1 - min(decay, early)
 
 
 def new_state(

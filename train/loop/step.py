@@ -1,7 +1,10 @@
-"""One update of the weights, or none: a step that is not finite changes nothing."""
+"""One update of the weights, or none: a step that is not finite changes nothing.
+
+What a step did is known where it was computed. On a processor the host reads it at once, on a card
+once a window (trainer): until then the host goes on telling the card what to do.
+"""
 
 import contextlib
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 from train.data.buckets import TrainingBatch
 from train.loop.compiled import compile_parts
 from train.loop.crew import Crew
+from train.loop.decision import decided, decides_late
 from train.loop.state import TrainState
 from train.loss.objective import Objective
 from train.settings import Precision, TrainSettings
@@ -36,6 +40,21 @@ class StepReport:
     """False where loss or gradient was not finite and the weights stayed as they were."""
 
 
+Unread = Tensor
+"""What a step did, float64 [7] on the device: loss, L1, shown and wanted brightness, length of the
+gradient, whether it was applied, and whether a process was asked to stop."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadSteps:
+    """What some steps did, once it is known."""
+
+    reports: list[StepReport]
+    """Of each."""
+    asked_to_stop: bool
+    """Whether a process was, before one of them; alike in all processes."""
+
+
 class Stepper:
     """Follows the gradient of a state's network, together with the other processes."""
 
@@ -46,6 +65,10 @@ class Stepper:
         self._settings = settings
         self._objective = objective
         self._crew = crew
+        self.is_late = decides_late(crew.device)
+        self._updates = torch.full(
+            (), float(state.updates), dtype=torch.float64, device=crew.device
+        )
         self.activity = Activity()
         self.layers = LayerNorms(state.model)
         compile_parts(state.model, objective, settings.compile, crew.device)
@@ -58,9 +81,25 @@ class Stepper:
             )
 
     def step(self, batches: Sequence[TrainingBatch], learning_rate: float) -> StepReport:
+        """Take a step and wait until it is known what it did; see `take`."""
+        (report,) = self.read([self.take(batches, learning_rate)]).reports
+        return report
+
+    def take(
+        self,
+        batches: Sequence[TrainingBatch],
+        learning_rate: float,
+        *,
+        asked_to_stop: bool = False,
+    ) -> Unread:
         """Average the gradient over all views of this process's `batches`, and of all processes.
 
-        Every process must hold equally many views.
+        A card is not waited for: what the step did is there when it is read.
+
+        Args:
+            batches: of this process; every process must hold equally many views.
+            learning_rate: of AdamW's step.
+            asked_to_stop: whether this process was; all are told with the step's figures.
         """
         state, activity = self._state, self.activity
         state.updater.zero_grad()
@@ -74,22 +113,38 @@ class Stepper:
         self.layers.gradients()
         norm = nn.utils.clip_grad_norm_(state.model.parameters(), self._settings.grad_clip)
         activity.begin("exchange")
-        means = self._crew.mean_on_device(sums / num_views)
-        activity.begin("device")
-        # the one moment of a step in which a card is waited for
-        loss, l1, shown, wanted, grad_norm = torch.cat([means, norm.to(means)[None]]).tolist()
+        asked = torch.full_like(sums[:1], float(asked_to_stop))
+        means = self._crew.mean_on_device(torch.cat([sums / num_views, asked]))
         activity.begin("optimiser")
-        applied = math.isfinite(grad_norm) and math.isfinite(loss)
-        if applied:
-            state.updater.step(learning_rate)
-            state.follow_with_mean(self._settings.ema_decay)
+        applied = self._move(means[0], norm, learning_rate)
         activity.begin("other")
-        return StepReport(
-            loss=loss,
-            l1=l1,
-            brightness=shown / wanted if wanted > 0 else 1.0,
-            grad_norm=grad_norm,
-            applied=applied,
+        return torch.cat([means[:4], torch.stack([norm.to(means), applied.to(means)]), means[4:]])
+
+    @torch.no_grad()
+    def _move(self, loss: Tensor, norm: Tensor, learning_rate: float) -> Tensor:
+        """Move weights and mean where the step is finite; return bool [], whether it is."""
+        state = self._state
+        updates = self._updates if self.is_late else state.updates
+        decision = decided(loss, norm, updates, is_late=self.is_late)
+        state.updater.step(learning_rate, decision)
+        state.follow_with_mean(self._settings.ema_decay, decision)
+        self._updates += decision.applied
+        self.layers.updated()
+        return decision.applied
+
+    def read(self, steps: Sequence[Unread]) -> ReadSteps:
+        """Wait for steps, and for the layers' figures where they were asked for, in one copy."""
+        self.activity.begin("device")
+        layers = self.layers.unread()
+        parts = [*steps, *([] if layers is None else [layers.to(steps[0]).flatten()])]
+        values = torch.cat(parts).tolist()
+        self.activity.begin("other")
+        width = len(steps[0])
+        rows = [values[width * row : width * (row + 1)] for row in range(len(steps))]
+        if layers is not None:
+            self.layers.read(values[width * len(steps) :])
+        return ReadSteps(
+            reports=[_report(row) for row in rows], asked_to_stop=any(row[-1] > 0 for row in rows)
         )
 
     def _add_gradient(self, batch: TrainingBatch, num_views: int, *, last: bool) -> Tensor:
@@ -123,6 +178,17 @@ class Stepper:
             context: contextlib.AbstractContextManager[Any] = self._net.no_sync()
             return context
         return contextlib.nullcontext()
+
+
+def _report(figures: Sequence[float]) -> StepReport:
+    loss, l1, shown, wanted, grad_norm, applied, _ = figures
+    return StepReport(
+        loss=loss,
+        l1=l1,
+        brightness=shown / wanted if wanted > 0 else 1.0,
+        grad_norm=grad_norm,
+        applied=bool(applied),
+    )
 
 
 def predicted(

@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,7 +22,7 @@ from train.loop.interrupts import Stopped, ValidationLeft, deferred_interrupts
 from train.loop.recorder import Recorder
 from train.loop.schedule import decay_begins, learning_rate
 from train.loop.state import TrainState
-from train.loop.step import Stepper, StepReport
+from train.loop.step import Stepper, StepReport, Unread
 from train.loop.window import Window, device_peak
 from train.loss.objective import Objective
 from train.progress import TrainProgress
@@ -48,17 +49,23 @@ class StartWatch:
     def __init__(self, settings: TrainSettings) -> None:
         self.due = settings.warmup_steps + WATCHED_STEPS
         self._reports: deque[StepReport] = deque(maxlen=WATCHED_STEPS)
+        self._is_judged = False
 
-    def add(self, report: StepReport) -> None:
-        """Look at one step."""
-        self._reports.append(report)
+    def add(self, step: int, report: StepReport) -> None:
+        """Look at one step, from 1, when it is known what it did."""
+        if step <= self.due:
+            self._reports.append(report)
 
     def verdict(self, step: int) -> TrilightError | None:
         """Return the error if the start is dead, looked at once, after `due` steps; else None.
 
-        A run that is resumed after that step is not looked at again.
+        A run that is resumed after that step is not looked at again. `step` is the last one of
+        which it is known what it did.
         """
-        if step != self.due or len(self._reports) < WATCHED_STEPS:
+        if step < self.due or self._is_judged:
+            return None
+        self._is_judged = True
+        if len(self._reports) < WATCHED_STEPS:
             return None
         brightest = max(report.brightness for report in self._reports)
         if not brightest < DEAD_BRIGHTNESS:
@@ -74,6 +81,22 @@ PRODUCTS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 """Types of the network's products, by `precision`."""
 MOST_SKIPPED_IN_A_ROW = 10
 """A few steps may overflow; this many in a row mean that the weights themselves are lost."""
+
+
+MOST_UNREAD = 100
+"""Steps after which a card is waited for, however rare the rows of the log are."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Taken:
+    """A step that was taken, and of which the host does not know yet what it did."""
+
+    step: int
+    """Its number, from 1."""
+    keys: Sequence[str]
+    """Of this process's scenes."""
+    unread: Unread
+    """What will be read."""
 
 
 def scene_flops(settings: TrainSettings, num_triangles: int) -> int:
@@ -112,6 +135,8 @@ class Trainer:
         self.copies = CopyStream(crew.device)
         self.start_watch = StartWatch(settings)
         self.window = Window(state.reports)
+        self.taken: list[_Taken] = []
+        self.asked_to_stop = False
         self.num_noted = 0
         self.saved_step: int | None = None
         self.writing = Background()
@@ -141,12 +166,12 @@ class Trainer:
         ):
             self._catch_up(asked_to_stop)
             while self.state.step < self.settings.num_steps:
-                report = self._step(steps)
-                self._after_step(report, asked_to_stop)
-                self._leave_if_asked(asked_to_stop)
+                self._step(steps, asked_to_stop)
+                waited = self._after_step(asked_to_stop)
+                self._leave_if_asked(asked_to_stop, together=waited)
                 if self.state.step == self.settings.num_steps:
                     return
-                if verdict := self.start_watch.verdict(self.state.step):
+                if not self.taken and (verdict := self.start_watch.verdict(self.state.step)):
                     self._leave(verdict)
 
     def _catch_up(self, asked_to_stop: Callable[[], bool]) -> None:
@@ -156,12 +181,18 @@ class Trainer:
         missing = self.recorder is not None and not self.recorder.has_validated(self.state.step)
         if self.crew.any(missing):
             self._validate(asked_to_stop)
-            self._leave_if_asked(asked_to_stop)
+            self._leave_if_asked(asked_to_stop, together=True)
 
-    def _leave_if_asked(self, asked_to_stop: Callable[[], bool]) -> None:
-        # one process may be signalled before another; all stop at the same step
-        with self.watch.exchange():
-            stopping = self.crew.any(asked_to_stop())
+    def _leave_if_asked(self, asked_to_stop: Callable[[], bool], *, together: bool) -> None:
+        """Leave where a process was asked to; all stop at the same step.
+
+        One may be signalled before another. Several are told with what a step did, when that is
+        read; `together` they tell each other now, which waits.
+        """
+        stopping = self.asked_to_stop
+        if together or self.crew.world_size == 1:
+            with self.watch.exchange():
+                stopping = self.crew.any(asked_to_stop())
         if stopping:
             self._leave(Stopped(self.state.step))
 
@@ -174,7 +205,7 @@ class Trainer:
             self.crew.any(False)
         raise reason
 
-    def _step(self, steps: Iterator[StepScenes]) -> StepReport:
+    def _step(self, steps: Iterator[StepScenes], asked_to_stop: Callable[[], bool]) -> None:
         self.watch.begins(self.state.step + 1)
         self.stepper.activity.begin("data")
         asked = time.monotonic()
@@ -183,23 +214,42 @@ class Trainer:
         self.stepper.activity.begin("other")
         settings, step = self.settings, self.state.step
         with enough_memory(settings, step):
-            batches = self.copies.send(drawn.batches)
-            report = self.stepper.step(batches, learning_rate(step, settings))
+            batches, rate = self.copies.send(drawn.batches), learning_rate(step, settings)
+            unread = self.stepper.take(batches, rate, asked_to_stop=asked_to_stop())
         self._note_unusable()
-        self.window.add(
-            report,
+        self.window.spend(
             views=settings.scenes_per_step * settings.views_per_scene,
             waited_s=waited_s,
             flops=sum(scene_flops(settings, count) for count in drawn.num_triangles),
         )
-        self.start_watch.add(report)
         self.state.step += 1
-        self.watch.ends(report, drawn.keys)
-        if report.applied:
-            self.state.skipped_in_a_row = 0
-        else:
-            self._skip(drawn.keys)
-        return report
+        self.watch.ends()
+        self.taken.append(_Taken(step=self.state.step, keys=drawn.keys, unread=unread))
+        known = not self.stepper.is_late or self.watch.ends_window(self.state.step)
+        if known or len(self.taken) == MOST_UNREAD:
+            self._read()
+
+    def _read(self) -> None:
+        """Learn what the steps did that were taken since the last time; waits for them."""
+        taken, self.taken = self.taken, []
+        if not taken:
+            return
+        read = self.stepper.read([each.unread for each in taken])
+        self.asked_to_stop = read.asked_to_stop
+        for each, report in zip(taken, read.reports, strict=True):
+            self.window.add(report)
+            self.start_watch.add(each.step, report)
+            self.watch.read(each.step, report, each.keys)
+            if report.applied:
+                self.state.skipped_in_a_row = 0
+            else:
+                self._skip(each)
+        self.progress.advance(
+            step=self.state.step,
+            loss=read.reports[-1].loss,
+            learning_rate=learning_rate(self.state.step - 1, self.settings),
+            views_per_s=self.window.views_per_s,
+        )
 
     def _note_unusable(self) -> None:
         """Name each damaged sample or shard once, when it has been left out."""
@@ -208,17 +258,18 @@ class Trainer:
             self._note(f"left out: {message.rstrip('.')}")
         self.num_noted = len(messages)
 
-    def _skip(self, keys: Sequence[str]) -> None:
+    def _skip(self, taken: _Taken) -> None:
         """Count a skipped step, and name this process's scenes."""
         self.state.skipped_steps += 1
         self._note(
-            f"step {self.state.step} was skipped, since its loss or gradient was not finite; "
-            f"its scenes were {', '.join(keys)}"
+            f"step {taken.step} was skipped, since its loss or gradient was not finite; "
+            f"its scenes were {', '.join(taken.keys)}",
+            taken.step,
         )
         self.state.skipped_in_a_row += 1
         if self.state.skipped_in_a_row == MOST_SKIPPED_IN_A_ROW:
             raise TrilightError(
-                f"training: {MOST_SKIPPED_IN_A_ROW} steps in a row up to step {self.state.step} "
+                f"training: {MOST_SKIPPED_IN_A_ROW} steps in a row up to step {taken.step} "
                 "had a loss or gradient that was not finite; the weights are unchanged by them. "
                 "Resumed as it is, it would come here again. Go on with --resume --change "
                 f"learning_rate={self.settings.learning_rate / 2:g}, or with another order of the "
@@ -240,22 +291,20 @@ class Trainer:
             if self.recorder is not None:
                 self.recorder.validate(self.state, between)
 
-    def _after_step(self, report: StepReport, asked_to_stop: Callable[[], bool]) -> None:
+    def _after_step(self, asked_to_stop: Callable[[], bool]) -> bool:
+        """Do what is due after a step; return whether the processes waited for each other."""
         settings, step = self.settings, self.state.step
-        last = step == settings.num_steps
-        self.progress.advance(
-            step=step,
-            loss=report.loss,
-            learning_rate=learning_rate(step - 1, settings),
-            views_per_s=self.window.views_per_s,
-        )
         if self.watch.ends_window(step):
             self._end_window()
-        if self._validates():
+        validates = self._validates()
+        if validates:
             self._validate(asked_to_stop)
-        if last or step % settings.checkpoint_every == 0 or step == decay_begins(settings):
+        last = step == settings.num_steps
+        saves = last or step % settings.checkpoint_every == 0 or step == decay_begins(settings)
+        if saves:
             with self.window.pause(), self.watch.pause("saving"):
                 self._save()
+        return validates or saves
 
     def _end_window(self) -> None:
         """Exchange what was seen since the last window, and write the row."""
@@ -280,12 +329,13 @@ class Trainer:
         assert all(value is None or math.isfinite(value) for value in row.values())
         recorder.row({**row, **seen})
 
-    def _note(self, text: str) -> None:
-        """Tell the user, in the first process."""
+    def _note(self, text: str, step: int | None = None) -> None:
+        """Tell the user, in the first process; of the last step, unless said."""
         if self.recorder is not None:
-            self.recorder.note(self.state.step, text)
+            self.recorder.note(self.state.step if step is None else step, text)
 
     def _save(self) -> None:
+        self._read()
         self.saved_step = self.state.step
         if self.crew.is_first:
             keep_checkpoint(

@@ -26,16 +26,18 @@ class Window:
         self._waited_s = 0.0
         self._flops = 0.0
 
-    def add(self, report: StepReport, *, views: int, waited_s: float, flops: float) -> None:
-        """Count one step.
+    def add(self, report: StepReport) -> None:
+        """Count what one step did, when it is known."""
+        self._reports.append(report)
+
+    def spend(self, *, views: int, waited_s: float, flops: float) -> None:
+        """Count what one step took.
 
         Args:
-            report: what it did.
             views: of all processes.
             waited_s: time in which the network waited for data.
             flops: what this process's scenes need, without padding.
         """
-        self._reports.append(report)
         self._views += views
         self._waited_s += waited_s
         self._flops += flops

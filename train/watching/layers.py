@@ -15,21 +15,22 @@ class LayerNorms:
     """Looks at one update when it is told to; at all others it does nothing.
 
     The weights are copied while one update is made, after the activations are gone, so the peak of
-    memory stays where it was. The figures leave the device together, in one transfer.
+    memory stays where it was. The figures leave the device with those of the steps (loop.step).
     """
 
     def __init__(self, model: nn.Module) -> None:
         self._groups: dict[str, list[nn.Parameter]] = {}
         for name, weight in model.named_parameters():
             self._groups.setdefault(layer_of(name), []).append(weight)
-        self._due = False
-        self._grads: list[Tensor] = []
-        self._before: list[list[Tensor]] = []
+        self.expect(False)
 
     def expect(self, due: bool) -> None:
         """Say whether the next update is to be looked at."""
         self._due = due
-        self._grads, self._before = [], []
+        self._grads: list[Tensor] = []
+        self._before: list[list[Tensor]] = []
+        self._unread: Tensor | None = None
+        self._row: dict[str, list[float | None]] = {}
 
     @torch.no_grad()
     def gradients(self) -> None:
@@ -41,11 +42,8 @@ class LayerNorms:
             self._before.append([weight.clone() for weight in weights])
 
     @torch.no_grad()
-    def row(self) -> dict[str, list[float | None]]:
-        """Return LAYER_COLUMNS by layer after the update; empty where none was looked at.
-
-        A figure that is not finite is None.
-        """
+    def updated(self) -> None:
+        """Look at the weights; call after the update. Nobody waits."""
         columns = []
         for grad, weights, before in zip(
             self._grads, self._groups.values(), self._before, strict=False
@@ -54,14 +52,31 @@ class LayerNorms:
             moved = [weight - old for weight, old in zip(weights, before, strict=True)]
             ratio = _length(moved, weights) / length.clamp(min=torch.finfo(length.dtype).tiny)
             columns.append(torch.stack([grad, length, ratio]))
+        if columns:
+            self.expect(False)
+            self._unread = torch.stack(columns)
+
+    def unread(self) -> Tensor | None:
+        """Return what was seen, [layers, LAYER_COLUMNS] on the device; None: nothing new."""
+        return self._unread
+
+    def read(self, values: Sequence[float]) -> None:
+        """Take the numbers of `unread`, one layer after the other."""
+        width = len(values) // len(self._groups)
+        rows = [values[width * row : width * (row + 1)] for row in range(len(self._groups))]
         self.expect(False)
-        if not columns:
-            return {}
-        values = torch.stack(columns).tolist()
-        return {
+        self._row = {
             layer: [_rounded(value) for value in row]
-            for layer, row in zip(self._groups, values, strict=True)
+            for layer, row in zip(self._groups, rows, strict=True)
         }
+
+    def row(self) -> dict[str, list[float | None]]:
+        """Return LAYER_COLUMNS by layer of the update that was read; empty where none was.
+
+        A figure that is not finite is None.
+        """
+        row, self._row = self._row, {}
+        return row
 
 
 def layer_of(parameter: str) -> str:

@@ -60,11 +60,14 @@ class Watch:
         self._profiler.begins(step)
         self._layers.expect(self._crew.is_first and self.ends_window(step))
 
-    def ends(self, report: StepReport, keys: Sequence[str]) -> None:
-        """End the step; `keys` are those of this process's scenes."""
+    def ends(self) -> None:
+        """End the step, as far as the host has to do with it."""
         self._steps += 1
-        self._found += self._spikes.add(self._step, report, keys)
         self._profiler.ends(self._step)
+
+    def read(self, step: int, report: StepReport, keys: Sequence[str]) -> None:
+        """Hear what a step did; `keys` are those of this process's scenes."""
+        self._found += self._spikes.add(step, report, keys)
 
     def ends_window(self, step: int) -> bool:
         """Return whether a row of the log follows a step."""

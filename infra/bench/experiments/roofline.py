@@ -34,6 +34,8 @@ def _points(effort: Effort) -> Sequence[Point]:
             other = not settings.recompute_activations
             how = "recomputed" if other else "not recomputed"
             cases.append((f"{run}, compiled, {how}", Case(run=run, recomputes=other)))
+            half = Case(run=run, lpips_precision="float16")
+            cases.append((f"{run}, compiled, LPIPS in float16", half))
     for run in () if quick else WIDE_RUNS:
         own = named_run(run).model
         cases += [
@@ -66,6 +68,7 @@ def _figures(row: Any) -> Figures:
         "pointwise_share": row.pointwise_share,
         "peak_share": row.peak_share,
         "waits": row.waits,
+        "window_waits": row.window_waits,
         "scenes": row.scenes,
         "peak_gib": row.peak_gib,
         **{f"fit {name}": count for name, count in row.scenes_that_fit.items()},
@@ -88,7 +91,8 @@ EXPERIMENTS = (
             Column(name="products, ms", figure="products_ms"),
             Column(name="casts and elementwise, %", figure="pointwise_share", then=percent),
             Column(name="share of peak, %", figure="peak_share", then=percent),
-            Column(name="waits", figure="waits"),
+            Column(name="waits a step", figure="waits"),
+            Column(name="a window", figure="window_waits"),
             Column(name="scenes", figure="scenes"),
             Column(name="peak GiB", figure="peak_gib"),
             Column(name="scenes that fit 40 GB", figure="fit A100-40"),
@@ -98,6 +102,7 @@ EXPERIMENTS = (
         points=_points,
         turns=lambda effort: ["counted"],
         measure=_measure,
+        by_point=True,
         because="A prediction, and nothing here has run on a card. A kernel takes the longest of "
         "its launch (4 us), its bytes (80 % of 3.35 TB/s) and its products (65 % of 989 TFLOP/s in "
         "bfloat16, 50 % of 494 in TF32; flash attention 40 % forth and 30 % back, on packed "

@@ -227,4 +227,4 @@ def _with_memory(
             last = traced.died.get(copy)
             died[original] = len(kept) if last is None else max(died[original], places[last])
     born = {s: (places[i], size) for s, (i, size) in traced.born.items() if s not in inner}
-    return Traced(kernels=kept, born=born, died=died, waits=traced.waits)
+    return replace(traced, kernels=kept, born=born, died=died)

@@ -46,7 +46,9 @@ class Prediction:
     peak_gib: float
     """Most memory that is held at once, GiB; workspaces of libraries are not in it."""
     waits: int
-    """How often the host waits for the card."""
+    """How often the host waits for the card in a step."""
+    window_waits: int
+    """How often it does once a window of steps, to learn what they did."""
 
 
 def predicted(traced: Traced, card: Card) -> Prediction:
@@ -69,6 +71,7 @@ def predicted(traced: Traced, card: Card) -> Prediction:
         peak_share=flops / total_s / card.bfloat16,
         peak_gib=peak_bytes(traced) / 2**30,
         waits=traced.waits,
+        window_waits=traced.window_waits,
     )
 
 

@@ -49,9 +49,11 @@ def traced_step(settings: TrainSettings, scenes: int) -> Traced:
             for _ in range(2):
                 tracer.begin_again()
                 batch = _batch(settings, scenes)
-                stepper.step([batch], settings.learning_rate)
+                taken = stepper.take([batch], settings.learning_rate)
                 state.step += 1
-    return tracer.traced
+            traced, tracer.traced = tracer.traced, Traced()
+            stepper.read([taken])
+    return dataclasses.replace(traced, window_waits=tracer.traced.waits)
 
 
 def parts_of(model: RenderFormer, objective: Objective) -> Iterator[tuple[str, nn.Module, str]]:

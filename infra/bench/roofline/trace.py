@@ -97,6 +97,8 @@ class Traced:
     """By storage: number of kernels before it was given back; of those that were."""
     waits: int = 0
     """How often the host waited for a number from the card."""
+    window_waits: int = 0
+    """How often it waits to learn what a window of such steps did."""
 
 
 class Tracer(TorchDispatchMode):
@@ -185,7 +187,7 @@ class Tracer(TorchDispatchMode):
         floating = next((each for each in read if each.is_floating_point()), None)
         many = _tensors(out) or read
         launches = 1
-        if "_foreach_" in name or "_fused_adam" in name:
+        if "_foreach_" in name or "_fused_adam" in name or "_fused_sgd" in name:
             listed = [each for each in tree_leaves(args[0]) if isinstance(each, Tensor)]
             launches = math.ceil(sum(each.numel() for each in listed) / FOREACH_ELEMENTS)
         part, is_backward = self._part_now()
@@ -246,8 +248,12 @@ def _tensors(tree: Any) -> list[Tensor]:
 
 
 def _written(func: Any, args: Any) -> list[Tensor]:
-    """Return what an operation without results on the card writes in place."""
-    places = zip(func._schema.arguments, args, strict=False)
+    """Return what an operation without results on the card writes in place.
+
+    Fused updates write gradients only where they also divide them by a scale, which none does here.
+    """
+    given = zip(func._schema.arguments, args, strict=False)
+    places = [(place, arg) for place, arg in given if place.name != "grads"]
     written = [arg for place, arg in places if place.alias_info and place.alias_info.is_write]
     return [tensor for tensor in _tensors(written) if tensor.device.type == "cuda"]
 

@@ -5,6 +5,8 @@ import { ask, askJson, element, say, sleep } from "./ask.js";
 const SETTLED_MS = 250;
 const JUDGES = ["target", "traced"];
 const isPass = (name) => name.startsWith("pass-");
+const SAMPLES = "samples-";
+const FIRST_RUNGS = ["samples-4", "samples-16"];
 
 export class Pictures {
   // `wanted` returns the request without its engine; `look` the exposure and tone map.
@@ -18,6 +20,7 @@ export class Pictures {
     this.engine = engines.some((each) => each.name === "hits") ? "hits" : engines[0].name;
     this.#fill("ways", engines.filter((each) => !isPass(each.name)));
     this.#fill("passes", engines.filter((each) => isPass(each.name)));
+    this.#fillRungs(engines.filter((each) => each.name.startsWith(SAMPLES)));
     document.addEventListener("visibilitychange", () => this.#hidden());
   }
 
@@ -53,8 +56,9 @@ export class Pictures {
 
   async #makeAll(mine) {
     const all = document.getElementById("all").checked;
-    const others = ["target", "hits", "network", "tokens", "direct", "traced"]
-      .filter((name) => all && this.cards.has(name) && name !== this.engine);
+    const rungs = [...this.cards.keys()].filter((name) => name.startsWith(SAMPLES));
+    const others = ["target", "hits", "network", "tokens", "direct", ...rungs, "traced"]
+      .filter((name) => all && this.#isShown(name) && name !== this.engine);
     try {
       for (const name of [this.engine, ...others]) {
         const before = this.told.get(name);
@@ -159,12 +163,36 @@ export class Pictures {
     if (isPass(engines[0].name)) group.firstChild.tabIndex = 0;
   }
 
+  // A box for each rung of few samples: only those that are ticked are shown and made.
+  #fillRungs(engines) {
+    const group = document.getElementById("rungs");
+    group.hidden = !engines.length;
+    for (const { name } of engines) {
+      const spp = name.slice(SAMPLES.length);
+      const box = element("input", { type: "checkbox", checked: FIRST_RUNGS.includes(name) });
+      box.dataset.rung = name;
+      box.addEventListener("change", () => this.#filter(name, box.checked));
+      this.cards.get(name).hidden = !box.checked;
+      group.append(element("label", { className: "check" }, box, ` ${spp}`));
+    }
+  }
+
+  #filter(name, shown) {
+    this.cards.get(name).hidden = !shown;
+    if (!shown && this.engine === name) this.choose("traced");
+    this.resume();
+  }
+
+  #isShown(name) {
+    return this.cards.has(name) && !this.cards.get(name).hidden;
+  }
+
   #step(event, engines, name) {
     const steps = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 };
     if (!(event.key in steps)) return;
     event.preventDefault();
-    const at = engines.findIndex((each) => each.name === name) + steps[event.key];
-    const next = engines[(at + engines.length) % engines.length].name;
+    const names = engines.map((each) => each.name).filter((each) => this.#isShown(each));
+    const next = names[(names.indexOf(name) + steps[event.key] + names.length) % names.length];
     this.choose(next);
     this.cards.get(next).focus();
   }

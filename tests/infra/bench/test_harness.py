@@ -18,7 +18,8 @@ from infra.bench.curve import COST_NOISE, PricedLevel, at_error, on_front, rows,
 from infra.bench.effort import Asked
 from infra.bench.experiment import Column, Experiment, Point, points_of
 from infra.bench.machine import machine, revision
-from infra.bench.run import newest_run, run
+from infra.bench.run import newest_run, run, run_share
+from infra.bench.shares import share_of
 from infra.bench.store import Run, Store
 from infra.bench.table import markdown, printed, shown
 from storage.errors import TrilightError
@@ -111,6 +112,36 @@ def test_where_points_stand_alone_only_what_a_turn_lacks_is_measured_again(tmp_p
     with pytest.raises(KeyboardInterrupt):
         measured(tmp_path, one)
     assert calls == [("killed", "waste")]
+
+
+def test_shares_together_are_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every row once, by calls on several machines; a share goes on, and what is lost is found."""
+    one = dataclasses.replace(experiment("a", "b", "c"), by_point=True)
+    with pytest.raises(TrilightError, match="expected an experiment whose points stand alone"):
+        run_share(experiment("a"), TINY, Asked(), share_of("1/2"), folder=tmp_path)
+    for number in (1, 2, 3, 4):
+        here = {**machine(), "processor": f"chip {number}"}
+        monkeypatch.setattr(running, "machine", lambda here=here: here)
+        share = share_of(f"{number}/4")
+        store = run_share(one, TINY, Asked(), share, folder=tmp_path)
+        rows_now = store.path.read_bytes()
+        assert run_share(one, TINY, Asked(), share, folder=tmp_path).path.read_bytes() == rows_now
+    assert sorted(calls) == sorted((t, p.name) for t in "abc" for p in one.points(TINY))
+    share_of("4/4").path(tmp_path / "made-up-quick.jsonl").unlink()
+    calls.clear()
+    found = measured(tmp_path, one)
+    assert len(calls) == 2 and found.whole_turns() == ["a", "b", "c"]
+    assert "3 rows are of chip 1" in found.notes
+    monkeypatch.setattr(running, "machine", lambda: {**here, "revision": "another"})
+    calls.clear()
+    measured(tmp_path, one)
+    assert len(calls) == 9, "rows of another revision are not taken"
+
+
+@pytest.mark.parametrize("text", ["0/4", "5/4", "4", "a/b", "1/0"])
+def test_a_share_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(TrilightError, match="expected K/N"):
+        share_of(text)
 
 
 @settings(max_examples=30, deadline=None)  # each writes a dozen lines to the disk

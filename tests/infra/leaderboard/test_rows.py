@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from infra.leaderboard.rows import BoardRow, BoardRows, RowKey
+from infra.leaderboard.rows import UNKNOWN_MACHINE, BoardRow, BoardRows, RowKey
 from storage.errors import TrilightError
 
 KEY = RowKey(width=64, scene="000000001", view=0, name="somebody", digest="d")
@@ -22,6 +22,8 @@ def test_rows_come_back_and_the_later_of_two_counts(tmp_path: Path) -> None:
         again.get(RowKey(width=64, scene="000000001", view=0, name="somebody", digest="e")) is None
     )
     assert len(path.read_text().splitlines()) == 3
+    # written before rows named their machine: a price of nowhere
+    assert rows.price(KEY, "somewhere") is None and again.machines() == {UNKNOWN_MACHINE}
 
 
 def test_a_line_that_a_kill_cut_short_is_judged_again(tmp_path: Path) -> None:

@@ -13,13 +13,11 @@ from infra.bench.experiments.rungs import LAMPS, PHYSICS
 from infra.leaderboard import contest as contest_module
 from infra.leaderboard import run as run_module
 from infra.leaderboard.contest import NOISE
-from infra.leaderboard.contestants import TRACER
 from infra.leaderboard.order import LeaderboardOrder
 from infra.leaderboard.run import (
     NEAREST_OTHER,
     NEAREST_TRAINED,
     Leaderboard,
-    _nearest,
     make_leaderboard,
     widths_of,
 )
@@ -63,9 +61,7 @@ def order(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Leader
 def short(order: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch) -> LeaderboardOrder:
     """Return an order of one network beside the nearest picture, without a chart."""
     monkeypatch.setattr(run_module, "SHIPPED", ("builtin:tokens",))
-    monkeypatch.setattr(
-        run_module, "_never_lacking", lambda order, opened, stack: [_nearest(order, opened)]
-    )
+    monkeypatch.setattr(run_module, "_never_lacking", lambda stack: [])
     monkeypatch.setattr(run_module, "plot_leaderboard", lambda *words: None)
     return order
 
@@ -175,6 +171,54 @@ def test_a_scene_that_somebody_cannot_show_is_left_out_for_all(
     assert board_of(short).widths[0].num_scenes == 2, "and asked again"
 
 
+def test_one_scene_has_its_table_without_intervals(short: LeaderboardOrder, tmp_path: Path) -> None:
+    write_toy_dataset(tmp_path / "one", train=0, validation=1, per_shard=1, resolution=PX)
+    one = dataclasses.replace(short, source=str(tmp_path / "one"), checkpoint=("builtin:",))
+    board = board_of(one)
+    names = {each.name for each in board.widths[0].standings}
+    assert names == {NOISE, *SHIPPED}, "there is no other scene to look up"
+    for said in ("no scene beside", "there are no intervals"):
+        assert said in str(board.notes)
+    (row,) = [row for row in tables(one.out, "leaderboard.csv") if row["lead_mean_db"]]
+    assert (row["lead_low_db"], row["lead_high_db"]) == ("", "")
+    page = (one.out / "leaderboard.md").read_text()
+    assert f"| {float(row['lead_mean_db']):+.2f} | n/a |" in page
+    words = ["leaderboard", one.source, "--split", "validation", "--checkpoint", "builtin:"]
+    words += ["--scenes", "2", "--timed-scenes", "1", "--out", str(one.out)]
+    shown, told = trilight(words), trilight([*words, "--json"])
+    assert shown.exit_code == 0 and "None" not in shown.stdout
+    (plain,) = json.loads(told.stdout)["widths"]
+    assert plain["scenes"] == 1
+    leads = [each["lead"] for each in plain["standings"] if each["lead"]]
+    assert leads and all(lead["low"] is lead["high"] is None for lead in leads)
+
+
+def test_prices_of_two_machines_do_not_mix(
+    short: LeaderboardOrder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def prices(machine: str, measured_s: float) -> tuple[dict[str, str], Leaderboard]:
+        def shown(self: Any, sample: Any, width: int, *, timed: bool) -> Any:
+            made = real(self, sample, width, timed=False)
+            first_s, further_s = (measured_s, measured_s / 2) if timed else (None, None)
+            return dataclasses.replace(made, first_s=first_s, further_s=further_s)
+
+        monkeypatch.setattr(run_module, "processor", lambda: machine)
+        monkeypatch.setattr(run_module.NetworkContestant, "shown", shown)
+        board = board_of(short)
+        rows = tables(short.out, "leaderboard.csv")
+        (row,) = [row for row in rows if row["name"] == "network builtin:tokens"]
+        return row, board
+
+    real = run_module.NetworkContestant.shown
+    first, _ = prices("Slow 1", 8.0)
+    assert (first["first_core_s"], first["processor"]) == ("8.0", "Slow 1")
+    second, board = prices("Quick 2", 2.0)
+    assert (second["first_core_s"], second["processor"]) == ("2.0", "Quick 2"), "no price is old"
+    assert any("core-seconds of Slow 1, which are not in the table" in say for say in board.notes)
+    again, _ = prices("Slow 1", 99.0)
+    assert again["first_core_s"] == "8.0", "what was measured here before is still there"
+
+
 def test_widths_are_those_that_the_set_has() -> None:
     assert widths_of((), 256) == [64, 256] and widths_of((), 512) == [64, 256, 512]
     assert widths_of((), 96) == [96] and widths_of((128, 64), 256) == [64, 128]
@@ -191,17 +235,3 @@ def test_mistakes_are_one_line(order: LeaderboardOrder, root: Path) -> None:
         board_of(lacks)
     with pytest.raises(TrilightError, match="the test split holds no scene"):
         board_of(dataclasses.replace(order, split="test"))
-
-
-@pytest.mark.slow
-def test_the_path_tracer_stands_on_it_too(root: Path, tmp_path: Path) -> None:
-    words = ["leaderboard", str(root / "toy"), "--split", "validation", "--scenes", "1", "--json"]
-    result = trilight([*words, "--out", str(tmp_path / "out")])
-    assert result.exit_code == 0, result.exception
-    (one,) = json.loads(result.stdout)["widths"]
-    found = {each["name"]: each for each in one["standings"]}
-    traced = [found[name] for name in ("1 sample, fast", "4 samples, fast", "16 samples, fast")]
-    assert all(each["first_s"] > 0 < each["further_s"] for each in traced)
-    assert all(each["kind"] == TRACER and each["timed_scenes"] == 1 for each in traced)
-    # the toy's pictures are no path tracer's: what is traced has their shapes, not their light
-    assert len({each["scores"]["psnr_log_db"]["median"] for each in traced}) == 3

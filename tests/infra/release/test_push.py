@@ -1,7 +1,6 @@
 """`trilight push`: what is uploaded, what is refused, and that a hub receives every byte."""
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -10,15 +9,16 @@ from pathlib import Path
 import pytest
 
 from infra.release import hub_limits
-from infra.release.hub_limits import require_within_limits, uploaded_files
+from infra.release.hub_limits import require_within_limits
 from infra.release.push import kind_of, planned_upload
+from pipeline.documents.sums import published_files
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.verify import verify_dataset
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from tests.command_line import trilight
 from tests.conftest import ROOT
-from tests.infra.release.hub_upload_server import hub_for_uploads
+from tests.infra.release.hub_upload_server import hub_for_uploads, settings_of
 from tests.pipeline.documents.dataset_by_hand import edit_manifest, five_scenes
 
 TOKEN = "hf_mine"
@@ -36,14 +36,8 @@ def dataset(tmp_path: Path) -> Dataset:
     return made
 
 
-def pushed(words: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
+def pushed(words: list[str], settings: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
     """Run `trilight push` in a process of its own: the package reads where the hub is at import."""
-    settings: Mapping[str, str] = {
-        **{name: value for name, value in os.environ.items() if not name.startswith("HF_")},
-        "HF_HUB_DISABLE_XET": "1",
-        "HF_HUB_DISABLE_PROGRESS_BARS": "1",
-        **environment,
-    }
     command = [sys.executable, "-m", "infra.cli.app", "push", *words]
     return subprocess.run(
         command, cwd=ROOT, env=settings, capture_output=True, text=True, timeout=300, check=False
@@ -54,12 +48,12 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
     there = tmp_path / "hub"
     there.mkdir()
     with hub_for_uploads(there, TOKEN) as (url, made):
-        home = {"HF_ENDPOINT": url, "HF_HOME": str(tmp_path / "home")}
+        mine, other = (settings_of(url, name, tmp_path / "home") for name in (TOKEN, "hf_other"))
         words = [str(dataset.folder.root), "ada/set", "--json"]
-        refused = pushed(words, HF_TOKEN="hf_other", **home)
-        public = pushed([*words, "--private"], HF_TOKEN=TOKEN, **home)
+        refused = pushed(words, other)
+        public = pushed([*words, "--private"], mine)
         assert list(there.iterdir()) == []
-        result = pushed(words, HF_TOKEN=TOKEN, **home)
+        result = pushed(words, mine)
     assert refused.returncode == 1 and "set HF_TOKEN" in refused.stderr + refused.stdout
     assert public.returncode == 1 and "already and public" in public.stderr + public.stdout
     assert result.returncode == 0, result.stderr
@@ -67,7 +61,7 @@ def test_the_hub_gets_every_file_and_reads_as_it_was(dataset: Dataset, tmp_path:
     assert said["address"] == f"{url}/datasets/ada/set"
     assert made[-1]["type"] == "dataset" and made[-1]["name"] == "set"
     root = dataset.folder.root
-    sent = {path.relative_to(root) for path in uploaded_files(root)}
+    sent = {path.relative_to(root) for path in published_files(root)}
     assert said["files"] == len(sent)
     assert not any(path.parts[0] == "logs" for path in sent)
     for path in sent:

@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from infra.release.__main__ import SUMS, _sum_and_say, _write_network
+from infra.release.__main__ import _sum_and_say, _write_network
 from infra.release.page import write_page
 from infra.release.pictures import NETWORK, Beside, chosen_scenes
 from infra.release.push import planned_upload
 from model.open import open_network
+from pipeline.documents.sums import SUMS
 from storage.errors import TrilightError
+from tests.command_line import trilight
 from tests.pipeline.documents.dataset_by_hand import (
     five_scenes,
     furnished,
@@ -75,9 +77,16 @@ def test_sums_are_of_what_is_uploaded(tmp_path: Path, capsys: pytest.CaptureFixt
     write_page(tmp_path / "gallery", [beside("000000001", 31.0)], about=[])
     _sum_and_say(tmp_path)
     assert "trilight push" in capsys.readouterr().out
-    lines = (dataset.folder.root / SUMS).read_text().splitlines()
+    root = dataset.folder.root
+    lines = (root / SUMS).read_text().splitlines()
+    assert {line.split("  ")[1] for line in lines} >= {"manifest.json", "train-000000.tar"}
+    assert not (root / "report.html").exists()
+    assert trilight(["inspect", str(root), "--scenes", "1"]).exit_code == 0
+    lines = (root / SUMS).read_text().splitlines()
+    assert "report.html" in {line.split("  ")[1] for line in lines}, "sums went stale"
     for line in lines:
         digest, _, name = line.partition("  ")
-        found = hashlib.sha256((dataset.folder.root / name).read_bytes()).hexdigest()
-        assert found == digest, name
-    assert {line.split("  ")[1] for line in lines} >= {"manifest.json", "train-000000.tar"}
+        assert hashlib.sha256((root / name).read_bytes()).hexdigest() == digest, name
+    (tmp_path / "network" / "README.md").write_text("a card by hand")
+    with pytest.raises(TrilightError, match=r"SHA256SUMS: README.md is not as it says"):
+        planned_upload(tmp_path / "network", "ada/network")

@@ -95,6 +95,18 @@ def test_a_failure_is_a_sentence_and_the_next_picture_comes() -> None:
     easel.close()
 
 
+def test_the_end_waits_for_the_picture_at_hand() -> None:
+    slow = GreyPainter(0.1, waits=True)
+    room = SceneRoom(
+        name="tiny", scene=tiny_scene(), notes=(), painters={"traced": slow}, target_px=None
+    )
+    job = room.easel.ask(wanted())
+    while job.state != "working":
+        room.easel.news(job.id, job.version)
+    room.close()
+    assert room.easel._thread is not None and not room.easel._thread.is_alive()
+
+
 def test_pictures_of_one_place_are_judged_by_the_target_and_else_by_the_traced_one() -> None:
     painters: dict[str, Painter] = {
         "traced": GreyPainter(0.4, floor_db=40.0),

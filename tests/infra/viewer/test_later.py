@@ -15,8 +15,10 @@ from tests.infra.viewer.test_server import EchoRoom
 def test_the_page_of_a_source(tmp_path: Path) -> None:
     write_run(tmp_path / "run")
     (tmp_path / "set").mkdir()
-    with pytest.raises(TrilightError, match="neither a dataset nor a run"):
+    with pytest.raises(TrilightError, match="neither a dataset nor a run, and holds no scene"):
         page_of(str(tmp_path / "set"))
+    (tmp_path / "set" / "room.glb").touch()
+    assert page_of(str(tmp_path / "set")) == "folder.html"
     (tmp_path / "set" / "manifest.json").write_text("{}")
     (tmp_path / "a.tar").touch()
     assert page_of(str(tmp_path / "run")) == "run.html"

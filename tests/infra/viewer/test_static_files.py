@@ -46,6 +46,7 @@ def test_every_element_that_a_script_asks_for_is_in_its_page() -> None:
         "scene.html": ("scene.js", "pictures.js", "edits.js", "ask.js"),
         "dataset.html": ("dataset.js", "ask.js"),
         "run.html": ("run.js", "ask.js"),
+        "folder.html": ("folder.js", "ask.js"),
     }
     for page, names in scripts.items():
         there = set(re.findall(r'id="([\w-]+)"', (STATIC / page).read_text()))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from model.config import ModelConfig
+from model.hits import decoder
 from model.hits.decoder import _around, _in_parts, _whole
 from model.hits.traced import INPUTS
 from model.hits.tracing import with_traced
@@ -59,7 +60,7 @@ def test_parts_of_a_picture_come_together_again() -> None:
     parts = _in_parts(values, 4)
     assert parts.shape == (2, 16, 36, 3)
     assert torch.equal(parts[1, 5], values[1, 6:12, 6:12].reshape(36, 3))
-    assert torch.equal(_whole(parts[1], 4), values[1])
+    assert torch.equal(_whole(parts, 4), values)
 
 
 def test_anchors_around_a_part_are_those_beside_it() -> None:
@@ -67,6 +68,22 @@ def test_anchors_around_a_part_are_those_beside_it() -> None:
     around = _around(numbers, 4)[0, ..., 0]
     assert around[5].tolist() == [0, 1, 2, 4, 5, 6, 8, 9, 10]
     assert around[0].tolist() == [0, 0, 1, 0, 0, 1, 4, 4, 5], "at the rim the nearest stand again"
+
+
+def test_all_views_at_once_are_the_views_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While learning on a card; pictures and gradients."""
+    model, batch = network(), batch_scenes([tensors(corner()), tensors(corner())])
+    results = []
+    for _ in range(2):
+        model.zero_grad()
+        shown = model(batch, PX)
+        shown.square().sum().backward()
+        grads = [weight.grad for weight in model.parameters() if weight.grad is not None]
+        results.append([shown.detach(), *(grad.clone() for grad in grads)])
+        monkeypatch.setattr(decoder, "_blocks", lambda *_: [slice(None)])
+    for one_by_one, at_once in zip(*results, strict=True):
+        scale = one_by_one.abs().max()
+        assert scale > 0 and (at_once - one_by_one).abs().max() <= 2e-5 * scale  # float32 sums
 
 
 def test_before_any_training_what_was_traced_is_passed_on() -> None:

@@ -129,3 +129,23 @@ def test_extremes_stay_finite(factor: float) -> None:
     assert not mixed[:, :8].any(), "no specular albedo: nothing is mirrored"
     assert (factor == 0) == (not mixed.any())
     assert _MOST_DOUBT < 80, "e^-80 is near the smallest float"
+
+
+@pytest.mark.slow  # torch traces nine taps forth and back
+def test_a_level_may_be_compiled() -> None:
+    """As on a card; here by tracing alone, without a compiler."""
+    torch._dynamo.reset()
+    generator = torch.Generator().manual_seed(0)
+    one = LightFilter(10, 8)
+    given = [torch.randn(2, size, 16, 16, generator=generator) for size in (_ALIKE + 1, 6)]
+    alike, both = (each.requires_grad_() for each in given)
+    near = torch.randn(9, generator=generator)
+    results: list[tuple[Tensor, ...]] = []
+    for mixed in (one.mixed, torch.compile(one.mixed, backend="aot_eager")):
+        alike.grad = both.grad = None
+        shown = mixed(alike, near, both, 2)
+        shown.square().mean().backward()
+        assert alike.grad is not None and both.grad is not None
+        results.append((shown.detach(), alike.grad, both.grad))
+    for plain, compiled in zip(*results, strict=True):
+        torch.testing.assert_close(compiled, plain, rtol=1e-4, atol=1e-6 * float(plain.abs().max()))

@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.making import progressive_tracer as module
 from pipeline.making.progressive_tracer import ProgressiveTracer
+from pipeline.renders.preview import PreviewRenderer, PreviewSettings, usual_filter
 from pipeline.renders.progressive import FIRST_LOOKS_SPP, ProgressiveRenderer
 from pipeline.renders.renderer import SceneRenderer, finished
 from pipeline.renders.results import GrowingPicture, Sampling
@@ -51,6 +52,20 @@ def test_the_last_look_is_the_picture_and_the_others_come_nearer() -> None:
     assert spent == sorted(spent) and all(look.core_s > 0 for look in seen)
 
 
+def test_a_preview_of_the_same_scene_is_the_one_that_render_makes() -> None:
+    scene = tiny_scene()
+    renderer = ProgressiveRenderer(scene, GROWING)
+    for spp in (4, 64):
+        steps = renderer.preview_steps(scene.c2w[0], 45.0, 7, spp)
+        first = next(steps)
+        look = finished(steps)
+        assert not isinstance(first, GrowingPicture) and first.expected_spp == spp
+        assert (look.spp, look.floor) == (spp, None) and look.core_s > 0
+        asked = PreviewSettings(resolution=32, spp=spp, denoiser=usual_filter(spp))
+        alone = finished(PreviewRenderer(scene, asked).view_steps(scene.c2w[0], 45.0, 7))
+        np.testing.assert_array_equal(look.radiance_rgb, alone.radiance_rgb)
+
+
 def test_the_child_keeps_the_scene_and_ends_where_it_is_told_to() -> None:
     class Enough(Exception):
         pass
@@ -70,6 +85,9 @@ def test_the_child_keeps_the_scene_and_ends_where_it_is_told_to() -> None:
         assert isinstance(last, GrowingPicture)
         expected = looks(scene)[-1].radiance_rgb
         assert psnr_log_db(last.radiance_rgb, expected) > 30
+        tracer.paint(scene, "a", camera, GROWING, told.append, preview_spp=4)
+        assert isinstance(told[-1], GrowingPicture) and told[-1].spp == 4
+        assert tracer._child.call(_num_loaded) == 1, "a preview loads no scene anew"
         dark = tiny_scene(faces=tiny_scene().faces[2:], material_index=np.array([1], np.uint16),
                           object_index=np.array([1], np.uint16))  # fmt: skip
         with pytest.raises(TrilightError, match="no_surfaces"):

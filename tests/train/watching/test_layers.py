@@ -64,6 +64,10 @@ def test_a_gradient_that_is_not_finite_is_none_and_a_missing_one_is_nothing() ->
     layers.expect(True)
     model[0].weight.grad = torch.full((1, 2), math.inf)
     layers.gradients()
+    layers.updated()
+    seen = layers.unread()
+    assert seen is not None
+    layers.read(seen.flatten().tolist())
     row = layers.row()
     assert row["0.weight"][0] is None
     assert row["1.weight"][0] == 0 == row["1.weight"][2]

@@ -1,0 +1,86 @@
+"""`SHA256SUMS` of a folder that is published: as `sha256sum -c` reads it, and never stale.
+
+Whoever rewrites documents beside it renews their lines. Lines of shards stay: a shard that is
+damaged later must not be summed as if it were right.
+"""
+
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+
+from storage.atomic import write_atomically
+from storage.digests import sha256_of_file
+from storage.errors import TrilightError
+
+SUMS = "SHA256SUMS"
+
+UNPUBLISHED = ("logs/*", ".staging/*", ".cache/*", "*.part", "*.tmp")
+"""Never published: how the files came to be, and what is not finished."""
+
+_SHARD = ".tar"
+
+
+def published_files(folder: Path) -> Iterator[Path]:
+    """Yield the files of a folder that are published, in order."""
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and not any(fnmatch(name, pattern) for pattern in UNPUBLISHED):
+            yield path
+
+
+def write_sums(folder: Path) -> None:
+    """Write the sums of all published files; TrilightError where they cannot be written."""
+    _write(folder, known={})
+
+
+def renew_sums(folder: Path) -> None:
+    """Write the sums anew where they are, but for those of shards, which stay as they are.
+
+    Raises:
+        TrilightError: they cannot be written, or are no sums.
+    """
+    if (folder / SUMS).is_file():
+        known = _read(folder)
+        _write(folder, {name: sha256 for name, sha256 in known.items() if name.endswith(_SHARD)})
+
+
+def stale_sums(folder: Path) -> list[str]:
+    """Return the files, shards aside, that are not as the sums say; none where there are no sums.
+
+    Raises:
+        TrilightError: the sums are none.
+    """
+    if not (folder / SUMS).is_file():
+        return []
+    known = _read(folder)
+    there = {path.relative_to(folder).as_posix(): path for path in published_files(folder)}
+    del there[SUMS]
+    return sorted(
+        name
+        for name in known.keys() | there.keys()
+        if name not in known
+        or name not in there
+        or (not name.endswith(_SHARD) and sha256_of_file(there[name]) != known[name])
+    )
+
+
+def _write(folder: Path, known: dict[str, str]) -> None:
+    lines = []
+    for path in published_files(folder):
+        name = path.relative_to(folder).as_posix()
+        if name != SUMS:
+            lines.append(f"{known.get(name) or sha256_of_file(path)}  {name}\n")
+    write_atomically(folder / SUMS, "".join(lines).encode())
+
+
+def _read(folder: Path) -> dict[str, str]:
+    found = {}
+    for line in (folder / SUMS).read_text(errors="replace").splitlines():
+        sha256, separator, name = line.partition("  ")
+        if not separator or len(sha256) != 64:
+            raise TrilightError(
+                f"{folder / SUMS}: {line:.40} is no sum; expected lines of `sha256sum`. Delete the "
+                "file, and write it again with make release."
+            )
+        found[name] = sha256
+    return found
