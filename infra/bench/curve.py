@@ -135,7 +135,7 @@ def _values(experiment: Experiment, run: Run, point: str) -> dict[str, float]:
     found = dict(run.columns.get(point, {}))
     for column in columns_of(experiment):
         figures = (
-            _differences(column, run, point)
+            _differences(column, run, point)[0]
             if column.over == "pair"
             else [turn[column.figure] for turn in turns if column.figure in turn]
         )
@@ -145,22 +145,28 @@ def _values(experiment: Experiment, run: Run, point: str) -> dict[str, float]:
     return found
 
 
-def _differences(column: Column, run: Run, point: str) -> list[float]:
-    """Return a point's figures less the rival's, turn by turn; none of the rival itself."""
-    rival = run.plan.get("rival", point)
+def _differences(column: Column, run: Run, point: str) -> tuple[list[float], list[str]]:
+    """Return a point's figures less the rival's, with the turns that have both.
+
+    There are none of the rival itself.
+    """
+    rival, name = run.plan.get("rival", point), column.figure
     if rival == point:
-        return []
-    turns = [run.turns[turn] for turn in run.whole_turns()]
-    return [turn[point][column.figure] - turn[rival][column.figure] for turn in turns]
+        return [], []
+    turns = {turn: run.turns[turn] for turn in run.whole_turns()}
+    both = [turn for turn, of in turns.items() if name in of[point] and name in of[rival]]
+    return [turns[turn][point][name] - turns[turn][rival][name] for turn in both], both
 
 
 def _intervals(experiment: Experiment, run: Run, point: str) -> dict[str, tuple[float, float]]:
-    clusters = [experiment.cluster(turn) for turn in run.whole_turns()]
-    return {
-        column.name: mean_interval(differences, clusters)
-        for column in columns_of(experiment)
-        if column.over == "pair" and (differences := _differences(column, run, point))
-    }
+    found = {}
+    for column in columns_of(experiment):
+        if column.over == "pair":
+            differences, turns = _differences(column, run, point)
+            if differences:
+                clusters = [experiment.cluster(turn) for turn in turns]
+                found[column.name] = mean_interval(differences, clusters)
+    return found
 
 
 def _over(column: Column, figures: Sequence[float], clusters: Sequence[str]) -> float:

@@ -47,6 +47,8 @@ COMMANDS = {
     "train": "Train a model; writes checkpoints, curves and pictures on one page, and a sheet."
     "\n\nTo train with processes on several machines, run torchrun -m trilight train ...",
     "evaluate": "Evaluate a network; writes evaluation.json, evaluation.md and sheets of pictures.",
+    "improve": "Generate, train and judge in rounds, and generate next where a core-second teaches "
+    "most; goes on where it stopped.",
     "leaderboard": "Judge every engine, rung and network on one set, with what each costs; writes "
     "table, chart and rows, and goes on where it stopped.",
     "bench": "Measure cost against error; an interrupted run resumes. Without a name, list all.",

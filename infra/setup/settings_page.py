@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
+from infra.improve.order import ImproveOrder
 from infra.leaderboard.order import LeaderboardOrder
 from infra.rendering.request import Asked
 from infra.serving.train_model import TrainOrder
@@ -32,6 +33,7 @@ ROOTS: dict[str, tuple[type, ...]] = {
     "Render": (Asked,),
     "Plan": (CorePrice,),
     "Train": (TrainOrder, TrainSettings, WatchSettings),
+    "Improve": (ImproveOrder,),
     "Evaluate": (EvaluationOrder,),
     "Leaderboard": (LeaderboardOrder,),
 }

@@ -33,6 +33,8 @@ class SceneLog:
     """Cores that the worker used for it."""
     finished_unix_s: float
     """Time of completion by the worker's clock."""
+    scene_index: int | None = None
+    """Which scene; None where the row does not say."""
 
 
 def log_scene(
@@ -87,6 +89,7 @@ def decode_scene_log(text: str) -> Iterator[SceneLog]:
                 seconds=float(row["seconds"]),
                 cores=int(row.get("cores", 1)),  # earlier versions did not say
                 finished_unix_s=float(row["finished_unix_s"]),
+                scene_index=int(row["scene"]) if "scene" in row else None,
             )
         except (ValueError, KeyError, TypeError, AttributeError):
             continue

@@ -223,6 +223,20 @@ def test_pairs_are_taken_turn_by_turn_with_their_interval(tmp_path: Path) -> Non
     assert cells == ["-9.0 (-12.0 to -5.0)", "", "-5.0 (-5.0 to -5.0)"]
 
 
+def test_pairs_are_of_the_turns_that_have_the_figure(tmp_path: Path) -> None:
+    one = dataclasses.replace(
+        paired("a", "b", "c"), columns=(Column(name="of some", figure="part", over="pair"),)
+    )
+    one = dataclasses.replace(one, also_cost=(), kind=None)
+    found = measured(tmp_path, one)
+    for turn, part in (("a", 3.0), ("c", 5.0)):
+        for point, more in (("cheap", part), ("default", 1.0)):
+            found.turns[turn][point] = {**found.turns[turn][point], "part": more}
+    cheap, *_ = rows(one, found)
+    assert cheap.values["of some"] == 3.0
+    assert cheap.intervals["of some"] == mean_interval([2.0, 4.0], ["a", "c"])
+
+
 def test_a_figure_of_kinds_shows_every_cost(tmp_path: Path) -> None:
     measured(tmp_path, paired("a", "c"))
     with Image.open(tmp_path / "made-up-quick.png") as picture:

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from prefect.exceptions import ParameterTypeError
 
+from infra.serving.improve_loop import improve_loop
 from infra.serving.train_model import train_model
 from pipeline.builds.settings import BuildSettings
 from pipeline.flows.dataset_flows import build_dataset, generate_scenes, prepare_assets
@@ -21,6 +22,7 @@ FLOWS = {
     "generate-scenes": generate_scenes,
     "build-dataset": build_dataset,
     "train-model": train_model,
+    "improve": improve_loop,
 }
 
 
