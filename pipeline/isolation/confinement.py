@@ -82,7 +82,7 @@ def wanted_confinement() -> Wanted:
     text = os.environ.get(VARIABLE, "auto")
     for known in get_args(Wanted):
         if text == known:
-            return known  # type: ignore[no-any-return]
+            return known
     raise TrilightError(f"{VARIABLE} is {text!r}; {expected_one_of(text, get_args(Wanted))}.")
 
 
