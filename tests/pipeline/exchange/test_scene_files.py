@@ -14,7 +14,7 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles, build_scene
 from pipeline.exchange.scene_folder import find_scene_files
-from pipeline.isolation import IsolatedChild
+from pipeline.isolation import IsolatedChild, reach
 from pipeline.making.accept_scene_files import (
     accept_scene_files,
     build_once,
@@ -168,6 +168,7 @@ def test_a_broken_mesh_is_named(folder: Path, data: bytes, reason: str) -> None:
 def test_remesh_keeps_the_place_and_the_number(folder: Path, child: IsolatedChild) -> None:
     plain = _build(folder)
     _change(folder, "a.json", remesh=True, remesh_target_face_num=60)
+    child.may(reach(files=[folder]))
     scene = child.call(_build, folder)
     mine, theirs = scene.object_index == 0, plain.object_index == 0
     assert 30 < mine.sum() <= 60
