@@ -34,7 +34,8 @@ from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT
 
 _PROBE_S = (180, 360)
-"""Wall time of a probe, and of the second try of one that gave no answer: many may start at once."""
+"""Wall time of a probe, and of a second try where the first gave no answer: many may start at once,
+on a machine that is busy."""
 _REMEMBERED_TRIES = 32
 
 _RAYS_LEFT_OUT = "Disabling this ray tracing operation"
