@@ -31,6 +31,7 @@ _SYSTEM = (
     "/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache", "/etc/localtime", "/etc/fonts",
     "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/sys/vm",
     "/sys/devices/system", "/sys/kernel/mm", "/sys/fs/cgroup", "/dev/urandom", "/dev/random",
+    "/nix/store", "/gnu/store",
 )  # fmt: skip
 _SINKS = ("/dev/null", "/dev/zero")
 
@@ -149,6 +150,8 @@ def _libraries() -> list[Path]:
     python = {sys.prefix, sys.base_prefix, sys.exec_prefix, *site.getsitepackages()}
     if site.ENABLE_USER_SITE and site.USER_SITE:
         python.add(site.USER_SITE)
+    # of PYTHONPATH, as clusters' modules set it: but not all of it, which may hold anything
+    python |= {name for name in sys.path if Path(name).name in ("site-packages", "dist-packages")}
     more = [name for name in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if name]
     return [Path(name) for name in (*python, *_SYSTEM, *more, *mimetypes.knownfiles)]
 

@@ -16,9 +16,15 @@ from pipeline.making.publication import Publication
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import part_of_object, part_of_shard
+from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.lock_rows import LockRows
-from storage.records.objects import LockedObject, read_objects_lock, write_objects_lock
+from storage.records.objects import (
+    LockedObject,
+    encode_objects_lock,
+    read_objects_lock,
+    write_objects_lock,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,13 +66,19 @@ class LockPart:
             return None
         rows = read_objects_lock(self.folder.objects_lock)
         here = {entry.uid: entry for entry in rows if self.holds(entry.uid)}
-        return here if here or self.number is None else None
+        if self.number is None:
+            return here
+        others = encode_objects_lock(entry for entry in rows if entry.uid not in here)
+        if sha256_hex(others) == publication.manifest.objects_lock_sha256:
+            return None  # a kill came between the lock and the manifest, or nothing is there yet
+        return here or None
 
     def freeze(self, publication: Publication, locked: Sequence[LockedObject]) -> None:
         """Freeze the objects of this part, beside those of others."""
         others: list[LockedObject] = []
         if self.number is not None and publication.manifest.objects_lock_sha256:
-            others = read_objects_lock(self.folder.objects_lock)
+            rows = read_objects_lock(self.folder.objects_lock)
+            others = [entry for entry in rows if not self.holds(entry.uid)]
         publication.lock_objects([*others, *locked])
 
     def write_rows(self, locked: Sequence[LockedObject]) -> None:

@@ -183,7 +183,8 @@ def prepare_in_parts(
     def make(number: int) -> bool:
         return not enough() and parts[number].make(work, lambda: done(1))
 
-    with MeshWork(settings, workers) as work, ThreadPoolExecutor(_AT_ONCE) as threads:
+    # children end first: after Ctrl-C no thread waits for the objects that it has in hand
+    with ThreadPoolExecutor(_AT_ONCE) as threads, MeshWork(settings, workers) as work:
         pause_s = _PAUSES_S[0]
         while True:
             for number, part in enumerate(parts):

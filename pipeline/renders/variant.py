@@ -30,10 +30,12 @@ from pipeline.renders.llvm_libraries import llvm_libraries
 from storage.atomic import write_atomically
 from storage.cache import cache_folder
 from storage.digests import canonical_json, sha256_hex
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
 from storage.installation import IMPORT_ROOT
 
-_PROBE_S = 180
+_PROBE_S = (180, 360)
+"""Wall time of a probe, and of a second try where the first gave no answer: many may start at once,
+on a machine that is busy."""
 _REMEMBERED_TRIES = 32
 
 _RAYS_LEFT_OUT = "Disabling this ray tracing operation"
@@ -66,6 +68,8 @@ def choose_variant() -> Variant:
 
     Raises:
         TrilightError: TRILIGHT_VARIANT names none, or one that cannot render here.
+        EnvironmentFailure: a probe gave no answer, which says nothing about its library: with
+            another one, the same dataset would be of other bytes.
     """
     asked = os.environ.get(_ASK, "")
     if asked not in ("", *get_args(VariantName)):
@@ -132,13 +136,24 @@ def _works(library: Path) -> bool:
     """Return whether Mitsuba renders with a library, from memory or by a probe.
 
     Only success is remembered: the cause of a failure may have been mended since.
+
+    Raises:
+        EnvironmentFailure: the probe gave no answer.
     """
     memory = cache_folder("llvm_probes.json")
     identity = sha256_hex(canonical_json([_identity(library), probe_picture.TABLE]))
     known = _remembered(memory)
     if identity in known:
         return True
-    if _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note="")).problem:
+    found = _probe(Variant(name="llvm_ad_rgb", libllvm=str(library), note=""))
+    if found.is_silent:
+        raise EnvironmentFailure(
+            f"{library}: the probe of this LLVM library gave {found.problem}, at {len(_PROBE_S)} "
+            "tries; expected a small picture within seconds. Run again when the machine is less "
+            "busy; if the library hangs, name another one by DRJIT_LIBLLVM_PATH, or set "
+            f"{_ASK}=scalar_rgb."
+        )
+    if found.problem:
         return False
     with contextlib.suppress(TrilightError):  # remembered next time, or probed again
         recent = [*known, identity][-_REMEMBERED_TRIES:]
@@ -167,11 +182,22 @@ class _Probed:
 
     problem: str = ""
     """Why the variant cannot be used; empty where it can."""
+    is_silent: bool = False
+    """Whether the problem is that there was no answer in time, which a busy machine may cause."""
     denoiser_problem: str = ""
     """Why its card cannot denoise; empty where it can, or where there is no card."""
 
 
 def _probe(variant: Variant) -> _Probed:
+    """Render a small picture in a child, and once more where it gave no answer."""
+    found = _probe_within(variant, _PROBE_S[0])
+    for wall_s in _PROBE_S[1:]:
+        if found.is_silent:
+            found = _probe_within(variant, wall_s)
+    return found
+
+
+def _probe_within(variant: Variant, wall_s: float) -> _Probed:
     """Render a small picture in a child; an abort, a hang or a wrong picture is a problem."""
     with tempfile.TemporaryDirectory() as kernels:
         environment = {**os.environ, "DRJIT_CACHE_DIR": kernels}
@@ -185,11 +211,11 @@ def _probe(variant: Variant) -> _Probed:
                 capture_output=True,
                 text=True,
                 errors="replace",
-                timeout=_PROBE_S,
+                timeout=wall_s,
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            return _Probed(problem=f"no answer within {_PROBE_S} s")
+            return _Probed(problem=f"no answer within {wall_s:g} s", is_silent=True)
     if _RAYS_LEFT_OUT in result.stderr:
         return _Probed(problem="Dr.Jit left out some of the rays")
     if result.returncode == 0:

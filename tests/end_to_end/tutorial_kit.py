@@ -58,14 +58,11 @@ def viewed(command: Sequence[str], folder: Path) -> Iterator[str]:
     assert run.stdout is not None
     try:
         assert run.stdout.readline().startswith("Opening")
-        address = ""
-        while not (found := re.search(r"http://\S+", address)):
-            address = run.stdout.readline()
+        while not (found := re.search(r"http://\S+", line := run.stdout.readline())):
+            assert line, "it has ended before it said an address"
         yield found[0]
         with contextlib.suppress(urllib.error.HTTPError):
-            answer_of(
-                found[0], "api/none"
-            )  # comes once the source is open, and Ctrl-C is waited for
+            answer_of(found[0], "api/none")  # comes once the source is open: Ctrl-C is waited for
         run.send_signal(signal.SIGINT)
         out, errors = run.communicate(timeout=60)
         assert (run.returncode, errors) == (0, ""), errors

@@ -297,10 +297,12 @@ class Trainer:
         if self.watch.ends_window(step):
             self._end_window()
         validates = self._validates()
-        if validates:
-            self._validate(asked_to_stop)
         last = step == settings.num_steps
         saves = last or step % settings.checkpoint_every == 0 or step == decay_begins(settings)
+        if validates or saves:
+            self._read()  # a card's work on steps counts as such, and not as a pause
+        if validates:
+            self._validate(asked_to_stop)
         if saves:
             with self.window.pause(), self.watch.pause("saving"):
                 self._save()

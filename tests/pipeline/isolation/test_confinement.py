@@ -145,6 +145,23 @@ def test_another_folder_costs_a_fresh_child_and_the_same_one_none(place: Path) -
         child.close()
 
 
+@needs_landlock
+def test_packages_that_a_path_of_pythons_names_are_read_and_its_other_folders_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packages, other = tmp_path / "a module" / "site-packages", tmp_path / "other"
+    for folder in (packages, other):
+        folder.mkdir(parents=True)
+        (folder / "file").write_text("found")
+        monkeypatch.syspath_prepend(str(folder))
+    child = IsolatedChild(limits=LIMITS, setup=_nothing, confined_to=reach())
+    try:
+        assert child.call(read, packages / "file") == "found"
+        _refused(child, read, other / "file")
+    finally:
+        child.close()
+
+
 def test_off_confines_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(confinement.VARIABLE, "off")
     child = IsolatedChild(limits=LIMITS, setup=_nothing, confined_to=reach(files=[place / "in"]))

@@ -12,11 +12,13 @@ from pipeline.making import object_parts, pipeline
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.lock_parts import LockPart, lock_parts
 from pipeline.making.pipeline import make_dataset
+from pipeline.making.publication import Publication
 from pipeline.objects.sources import FoundObjects
 from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.settings import SplitSettings
 from storage.dataset.splits import part_of_object, part_of_shard, split_of_shard
+from storage.digests import sha256_of_file
 from storage.errors import TrilightError
 from storage.records.lock_rows import LockRows
 from storage.records.objects import read_objects_lock
@@ -122,6 +124,30 @@ def test_scenes_begin_with_the_first_part(tmp_path: Path, made_in_order: list[ob
     assert make_dataset(_order(out, 28), Undocumented()).digest == outcome.digest
     assert made_in_order == [0, 1, 2, 3]
     assert read_objects_lock(out / "objects.lock.jsonl") == later
+
+
+def test_a_kill_between_lock_and_manifest_leaves_a_part_to_be_frozen(
+    tmp_path: Path, made_in_order: list[object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "set"
+    make_dataset(_order(out, 8), Undocumented())
+    before = (out / "objects.lock.jsonl").read_bytes()
+
+    def killed(publication: Publication, **changes: object) -> None:
+        if "objects_lock_sha256" in changes:
+            raise KeyboardInterrupt
+        write(publication, **changes)
+
+    write = Publication._write
+    monkeypatch.setattr(Publication, "_write", killed)
+    with pytest.raises(KeyboardInterrupt):
+        make_dataset(_order(out, 28), Undocumented())
+    assert (out / "objects.lock.jsonl").read_bytes() != before
+    monkeypatch.setattr(Publication, "_write", write)
+    make_dataset(_order(out, 28), Undocumented())
+    frozen = open_dataset(str(out)).manifest.objects_lock_sha256
+    assert frozen == sha256_of_file(out / "objects.lock.jsonl")
+    assert len(read_objects_lock(out / "objects.lock.jsonl")) == 60
 
 
 def _splits(out: Path) -> SplitSettings:

@@ -15,7 +15,7 @@ from pipeline.renders import variant as variant_module
 from pipeline.renders.facts import render_facts
 from pipeline.renders.llvm_libraries import llvm_libraries
 from pipeline.renders.variant import Variant, _Probed, activate, choose_variant
-from storage.errors import TrilightError
+from storage.errors import EnvironmentFailure, TrilightError
 from tests.conftest import ROOT
 
 
@@ -70,6 +70,32 @@ def test_where_no_library_works_the_fallback_says_so(monkeypatch: pytest.MonkeyP
     assert "none works with Mitsuba" in fallback.note
     monkeypatch.setattr(variant_module, "llvm_libraries", list)
     assert choose_variant().note.startswith("no LLVM library found")
+
+
+@pytest.mark.parametrize("silent", [1, 2])
+def test_a_probe_without_an_answer_is_tried_again_and_leads_to_no_other_library(
+    monkeypatch: pytest.MonkeyPatch, silent: int
+) -> None:
+    limits_s: list[float] = []
+
+    def run(*_: object, timeout: float, **__: object) -> subprocess.CompletedProcess[str]:
+        limits_s.append(timeout)
+        if len(limits_s) <= silent:
+            raise subprocess.TimeoutExpired("probe", timeout)
+        return subprocess.CompletedProcess([], 0, stdout="", stderr="")
+
+    libraries = [Path("/usr/lib/libLLVM-1.so"), Path("/usr/lib/libLLVM-2.so")]
+    monkeypatch.setattr(variant_module, "llvm_libraries", lambda: libraries)
+    monkeypatch.setattr(variant_module, "_identity", str)
+    monkeypatch.setattr(variant_module, "_remembered", lambda memory: [])
+    monkeypatch.setattr(variant_module, "write_atomically", lambda path, data: None)
+    monkeypatch.setattr(variant_module.subprocess, "run", run)
+    if silent == 1:
+        assert choose_variant().libllvm == str(libraries[0])
+    else:
+        with pytest.raises(EnvironmentFailure, match=r"libLLVM-1.so: .* no answer within 360 s"):
+            choose_variant()
+    assert limits_s == [180, 360]
 
 
 def test_the_user_may_name_the_variant(monkeypatch: pytest.MonkeyPatch, variant: Variant) -> None:
