@@ -25,7 +25,8 @@ def card_process(folder: Path) -> Iterator[ProcessPoolExecutor]:
         folder: for the compiled library, which only this process loads.
 
     Raises:
-        TrilightError: torch lacks it and there is no C++ compiler, or it fails.
+        TrilightError: torch lacks it and there is no C++ compiler, or it fails; or torch has it
+            and no driver.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         with mock.patch.dict(os.environ, _preloaded(folder)):
@@ -35,6 +36,12 @@ def card_process(folder: Path) -> Iterator[ProcessPoolExecutor]:
 
 def _preloaded(folder: Path) -> dict[str, str]:
     if torch.version.cuda is not None:
+        if not torch.cuda.is_available():  # its own guard and hooks ask the driver
+            raise TrilightError(
+                f"a card that is not there: torch {torch.__version__} is built for CUDA, and this "
+                "machine has no driver; expected a driver, or torch's CPU build, which "
+                "docs/how-to/install.md says how to install."
+            )
         return {}
     others = os.environ.get("LD_PRELOAD", "").split()
     return {"LD_PRELOAD": " ".join([str(_compiled(folder)), *others])}

@@ -20,7 +20,9 @@ install() {
 install_torch_alone() {
     alone=$(mktemp)
     awk '/^torch==/ { on = 1 } on { print } on && !/\\$/ { exit }' all.txt >"$alone"
-    install --requirement "$alone"
+    # pip takes a file of an index before one of a folder (`--find-links`), which alone states no
+    # digest: a build that somebody has put into a folder is meant, so that is looked at first
+    install --no-index --requirement "$alone" 2>/dev/null || install --requirement "$alone"
     rm "$alone"
 }
 needs_cuda() {

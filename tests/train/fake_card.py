@@ -16,7 +16,7 @@ __all__ = ["CARD", "card_process", "fake_card"]
 
 @contextmanager
 def card_process(folder: Path) -> Iterator[ProcessPoolExecutor]:
-    """Yield a process that may use `fake_card`; skip the test where it lacks a compiler."""
+    """Yield a process that may use `fake_card`; skip the test where there can be none."""
     with ExitStack() as stack:
         try:
             process = stack.enter_context(process_with_card(folder))

@@ -22,8 +22,8 @@ class ArrayMachines:
     Google Batch the address of a service account. By default that of the machines, and on
     Kubernetes the secret trilight-bucket."""
     machine_type: str | None = None
-    """Type of the machines: all must be of one kind of processor. On AWS Batch the queue
-    decides."""
+    """Type of the machines: all must be of one kind of processor. By default the scheduler
+    chooses; on AWS Batch the queue decides."""
     cores: Annotated[int, Within(1, 1024, unit="cores")] = 8
     """Cores of a task."""
     memory_gib: Annotated[int, Within(1, 24576, unit="GiB")] = 16

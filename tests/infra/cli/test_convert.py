@@ -1,8 +1,6 @@
 """`trilight convert`: every form to every form, shards, budgets, and one line for a mistake."""
 
 import json
-import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from storage.records.sample import encode_sample
 from storage.records.scene import Scene
 from storage.records.scene_file import encode_scene
 from tests.command_line import trilight
+from tests.crash import crash
 from tests.pipeline.exchange.strangers_stage import write_stage
 from tests.scenes_by_hand import tiny_sample, tiny_scene
 
@@ -150,15 +149,11 @@ def test_mistakes(
     assert not (tmp_path / "a.json").exists()
 
 
-def _crash(*arguments: object) -> None:
-    os.kill(os.getpid(), signal.SIGSEGV)
-
-
 def test_a_crash_in_native_code_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = write_stage(tmp_path)
-    monkeypatch.setattr(convert_scene, "source_keys", _crash)
+    monkeypatch.setattr(convert_scene, "source_keys", crash)
     told = refused(stage, tmp_path / "a.json")
     assert told.startswith("stage.usda: could not be converted (crashed_signal_11")
 
