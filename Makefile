@@ -82,7 +82,7 @@ $(VENV)/.dataset-ready: requirements/dataset.txt requirements/build.txt pyprojec
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
-$(VENV)/.all-ready: requirements/all.txt $(VENV)/.dataset-ready
+$(VENV)/.all-ready: requirements/all.txt requirements/cuda.txt $(VENV)/.dataset-ready
 	infra/setup/install.sh $(BIN)/python all
 	$(if $(WITHOUT_GPL),infra/setup/without_gpl.sh $(BIN)/python)
 	touch $@

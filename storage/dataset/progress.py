@@ -106,12 +106,14 @@ def read_progress(folder: DatasetFolder) -> Progress:
     except (TrilightError, OSError):
         scenes_planned = num_views = scenes_done = 0
     plan, downloads = folder.staged_plan, folder.staged_downloads
+    objects = json.loads(plan.read_bytes())["objects"] if plan.exists() else 0
+    counted = folder.staged_done.stat().st_size if folder.staged_done.exists() else 0
     done, total = json.loads(downloads.read_bytes()) if downloads.exists() else (0, 0)
     return Progress(
         downloads_done=done,
         downloads_planned=total,
-        objects_done=folder.staged_done.stat().st_size if folder.staged_done.exists() else 0,
-        objects_planned=json.loads(plan.read_bytes())["objects"] if plan.exists() else 0,
+        objects_done=min(counted, objects),  # several makers count what all of them found done
+        objects_planned=objects,
         scenes_done=scenes_done,
         scenes_planned=scenes_planned,
         num_views=num_views,

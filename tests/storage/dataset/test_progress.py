@@ -40,6 +40,8 @@ def test_downloads_and_objects_are_counted(tmp_path: Path) -> None:
     now = read_progress(folder)
     assert (now.downloads_done, now.downloads_planned) == (2, 5)
     assert (now.objects_done, now.objects_planned) == (3, 4)
+    count_object(folder, 4)  # another maker found them done
+    assert read_progress(folder).objects_done == 4
 
 
 def test_a_new_run_counts_from_the_start(tmp_path: Path) -> None:
