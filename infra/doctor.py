@@ -19,6 +19,7 @@ from pipeline.isolation.seccomp import seccomp_works
 from pipeline.renders.facts import render_facts
 from pipeline.renders.variant import choose_variant
 from storage.cache import cache_folder
+from storage.errors import TrilightError
 from storage.installation import IMPORT_ROOT, module_name
 
 State = Literal["ok", "slower", "missing"]
@@ -52,7 +53,10 @@ def examine(looking_at: Callable[[str], None] = lambda name: None) -> Iterator[F
     """
     for name, check in CHECKS.items():
         looking_at(name)
-        yield check()
+        try:
+            yield check()
+        except TrilightError as error:  # of what it asked, which says the next step itself
+            yield Finding(name=name, state="missing", found=str(error), consequence="", mend="")
 
 
 def _machine() -> Finding:
