@@ -83,10 +83,10 @@ def accept_objects(
     if trusted := trusted_objects(source, licence, settings, publication, workers, own, part):
         return trusted
     folder, frozen = publication.folder, part.frozen(publication)
-    found = found or _found(source, licence, settings, folder)
+    shared, found = found is not None, found or _found(source, licence, settings, folder)
     maps = accept_maps(own, settings, workers=workers)
     if frozen is None:
-        prepared, rejected = _proofs(found, settings, part, workers)
+        prepared, rejected = _proofs(found, settings, part, workers, again=not shared)
     else:
         wanted = [record for record in found.records if record.uid in frozen]
         announce_objects(folder, len(wanted))
@@ -121,6 +121,7 @@ def _proofs(
     part: LockPart,
     workers: int,
     enough: Callable[[], bool] = lambda: False,
+    again: bool = True,
 ) -> Proof:
     return prepare_in_parts(
         [record for record in found.records if part.holds(record.uid)],
@@ -129,6 +130,7 @@ def _proofs(
         workers=workers,
         done=lambda count: count_object(part.folder, count),
         enough=enough,
+        again=again,
     )
 
 

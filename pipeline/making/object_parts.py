@@ -156,6 +156,7 @@ def prepare_in_parts(
     workers: int,
     done: Callable[[int], None],
     enough: Callable[[], bool] = lambda: False,
+    again: bool = True,
 ) -> Proof:
     """Prepare objects together with all who do so at the same time; returns when all are done.
 
@@ -166,6 +167,7 @@ def prepare_in_parts(
         workers: objects at a time here.
         done: called with the number of objects that were prepared, or found so; from any thread.
         enough: whether to return with what is known, since nobody needs the rest any more.
+        again: try again what the environment has kept from an earlier call.
 
     Returns:
         The accepted objects and the rejected ones, both in the order of `records`.
@@ -175,8 +177,9 @@ def prepare_in_parts(
     """
     looks: Looks = {}
     parts = [ObjectPart(part, settings, shared, looks) for part in cut_objects(records)]
-    for part in parts:
-        part.forget_passing()
+    if again:
+        for part in parts:
+            part.forget_passing()
     proofs: dict[int, Proof] = {}
     ours: set[int] = set()
 

@@ -34,11 +34,11 @@ def prepare_or_crash(source: Path, settings: AssetSettings, method: str) -> "Ass
 
 
 def prepare_or_die(source: Path, settings: AssetSettings, method: str) -> "AssetAttempt":
-    """Be killed as often as the file DEATHS beside the source says, or prepare the object.
+    """Be killed as often as the file DEATHS above the source says, or prepare the object.
 
     The file counts down.
     """
-    deaths = source.parent / DEATHS
+    deaths = source.parent.parent / DEATHS  # beside the objects it would count as of theirs
     if source.name == VICTIM and (left := int(deaths.read_text())):
         deaths.write_text(str(left - 1))
         os.kill(os.getpid(), signal.SIGKILL)

@@ -86,16 +86,17 @@ def cold(workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ite
     """A folder with a cache in which no mesh is; the children of one object are killed."""
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_die)
-    (workshop / "objects" / poison.DEATHS).write_text("0")
+    monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # they count their deaths in a file
+    (workshop / poison.DEATHS).write_text("0")
     yield tmp_path
-    (workshop / "objects" / poison.DEATHS).unlink()
+    (workshop / poison.DEATHS).unlink()
 
 
 def test_a_mesh_child_that_is_killed_twice_changes_no_object(workshop: Path, cold: Path) -> None:
     """The lock holds the digest of every mesh, and all pictures follow from it."""
-    (workshop / "objects" / poison.DEATHS).write_text("2")
+    (workshop / poison.DEATHS).write_text("2")
     begun = prepare_dataset(order(workshop, cold / "set"))
-    assert (workshop / "objects" / poison.DEATHS).read_text() == "0"
+    assert (workshop / poison.DEATHS).read_text() == "0"
     undisturbed = open_dataset(str(workshop / "plain")).manifest
     assert begun.publication.manifest.objects_lock_sha256 == undisturbed.objects_lock_sha256
 
@@ -104,7 +105,7 @@ def test_an_object_whose_children_are_all_killed_is_tried_again_by_the_next_run(
     workshop: Path, cold: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A dataset begun without it says so; one that was begun with it waits for it."""
-    deaths, small = workshop / "objects" / poison.DEATHS, {"scenes": 4}
+    deaths, small = workshop / poison.DEATHS, {"scenes": 4}
     deaths.write_text("3")
     begun = prepare_dataset(order(workshop, cold / "without", **small))
     assert begun.accepted.num_objects == 7
@@ -132,7 +133,8 @@ def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
     begun = prepare_dataset(order(workshop, tmp_path / "set"))
     monkeypatch.setenv("TRILIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("pipeline.assets.stage.attempt_in_child", poison.prepare_or_die)
-    (workshop / "objects" / poison.DEATHS).write_text("1000")
+    monkeypatch.setenv("TRILIGHT_CONFINE", "off")  # they count their deaths in a file
+    (workshop / poison.DEATHS).write_text("1000")
     drawn = {
         row.uid
         for sample in open_dataset(str(workshop / "plain")).samples()
@@ -145,12 +147,12 @@ def test_meshes_that_are_away_are_made_again_where_a_scene_draws_them(
     mesh = workshop / "objects" / "knot0.obj"
     was = mesh.read_bytes()
     write_obj(mesh, knot(segments=40))
-    (workshop / "objects" / poison.DEATHS).write_text("0")
+    (workshop / poison.DEATHS).write_text("0")
     with pytest.raises(TrilightError, match="'knot0' has changed; expected the objects that"):
         make(workshop, tmp_path / "set")
     mesh.write_bytes(was)
     outcome = make(workshop, tmp_path / "set")
-    (workshop / "objects" / poison.DEATHS).unlink()
+    (workshop / poison.DEATHS).unlink()
     assert outcome.digest == expected(workshop)
     assert len(list((tmp_path / "cache").glob("assets/??/*.safetensors"))) <= len(drawn) + 1
 
