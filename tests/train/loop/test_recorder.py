@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer import event_file_writer
 
 from storage.dataset.dataset import Dataset
 from tests.train.kit import tiny_run, trained
@@ -27,7 +28,11 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return write_toy_dataset(tmp_path_factory.mktemp("toy"), train=7, validation=2, per_shard=3)
 
 
-def test_curves_and_sheets_survive_a_resume(dataset: Dataset, tmp_path: Path) -> None:
+def test_curves_and_sheets_survive_a_resume(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # TensorBoard reads files of one second by the number of their writer: 10 before 9
+    monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(0))
     data = [str(dataset.folder.root)]
     with pytest.raises(Stop):
         trained(tiny_run(), data, tmp_path, progress=StopAt())

@@ -16,7 +16,7 @@ from infra.bench.card.effort import PROCESSOR
 from infra.bench.card.report import measured_card, read_report, write_report
 from infra.bench.card.step_profile import REST
 from infra.bench.card.table import RUN_NAMES, facts, markdown_of, run_rows
-from infra.doctor import Finding
+from infra.doctor import CHECKS, Finding
 from storage.errors import TrilightError
 from tests.command_line import trilight
 from tests.train.toy import write_toy_dataset
@@ -95,7 +95,7 @@ def test_the_command_measures_all_on_a_processor(
     assert all("failed" not in row for row in found["runs"])
     assert found["rendering"]["views_an_hour"] > 0
     assert all(row["samples_per_s"] > 0 for row in found["reading"])
-    assert len(found["doctor"]) == 10 and "failed" not in found["pictures"]
+    assert len(found["doctor"]) == len(CHECKS) and "failed" not in found["pictures"]
 
 
 class Two(list[str]):
