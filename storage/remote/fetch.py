@@ -104,6 +104,11 @@ class _Expected:
         before, self.version = self.version, dict(version)
         return before in (None, self.version)
 
+    def came(self, reached: int, whole: int | None) -> None:
+        """Give up a file that comes too slowly; one that has come whole is not given up."""
+        if reached != whole:
+            self.pace.require()
+
     def require_all(self, reached: int) -> None:
         """Notice an end that came early."""
         if self.exact is not None and reached != self.exact:
@@ -127,7 +132,7 @@ def _fill_bucket(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: _Expec
         if len(piece) != end - start:
             raise Interrupted from EOFError(f"got {len(piece)} of {end - start} bytes")
         stream.write(piece)
-        expected.pace.require()
+        expected.came(stream.tell(), num_bytes)
     if num_bytes > PIECE_BYTES and not expected.is_same(version_of(_fresh_info(driver, url))):
         _start_over(stream)
         raise Interrupted from EOFError("the file changed while it was read")
@@ -160,12 +165,13 @@ async def _stream_http(driver: Any, url: RemoteUrl, stream: BinaryIO, expected: 
         if not expected.is_same(version_of(answer.headers)) and stream.tell():
             _start_over(stream)
             raise Interrupted from EOFError("the file changed while it was read")
+        whole = None
         if answer.content_length is not None:
-            expected.require(stream.tell() + answer.content_length)
+            expected.require(whole := stream.tell() + answer.content_length)
         async for chunk in answer.content.iter_chunked(_CHUNK_BYTES):
             expected.bound(stream.tell() + len(chunk))
             stream.write(chunk)
-            expected.pace.require()
+            expected.came(stream.tell(), whole)
     expected.require_all(stream.tell())
 
 

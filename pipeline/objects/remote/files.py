@@ -181,12 +181,14 @@ class _Limit(Callback):
         self._pace = Pace(lambda: self.value)
 
     def set_size(self, size: int | None) -> None:
+        super().set_size(size)
         self._check(size or 0)
 
     def relative_update(self, inc: int = 1) -> None:
         super().relative_update(inc)
         self._check(self.value)
-        self._pace.require()
+        if self.value != self.size:  # what has come whole is not too slow
+            self._pace.require()
         if self._stop.is_set():
             raise TransferFailed("download_failed", "the run was ended")
 
