@@ -13,12 +13,13 @@ from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
 from pipeline.making.frozen_pool import FrozenPool
 from pipeline.making.lock_parts import LockPart
 from pipeline.making.object_parts import ProvedObject
+from pipeline.making.objects_order import ObjectsOrder
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.objects.sources import FoundObjects
 from storage.conventions import SPLITS
 from storage.dataset.splits import require_objects, split_of_object, split_of_shard
-from storage.digests import canonical_json, sha256_hex, sha256_of_file
+from storage.digests import sha256_of_file
 from storage.errors import EnvironmentFailure, TrilightError
 from storage.records.object_index import IndexedObject, write_object_index
 from storage.records.objects import (
@@ -52,25 +53,19 @@ class AcceptedObjects:
 
 
 def freeze_objects(
-    source: str,
-    licence: str | None,
+    order: ObjectsOrder,
     found: FoundObjects,
     prepared: list[ProvedObject],
     rejected: list[Failure],
-    settings: BuildSettings,
-    publication: Publication,
     maps: AcceptedMaps = NO_MAPS,
     part: LockPart | None = None,
 ) -> AcceptedObjects:
     """Freeze the objects at the first time, and later require that they are the same.
 
     Args:
-        source: where the objects come from.
-        licence: of files without a statement, as the user states it.
+        order: what is asked for.
         found: what the source has.
         prepared, rejected: what the mesh stage made of it, or later of what is frozen.
-        settings: the build, which says how objects are dealt to splits.
-        publication: the dataset.
         maps: textures and maps of the user's own, which are frozen with the objects.
         part: of the lock that `prepared` is; by default the whole.
 
@@ -79,8 +74,9 @@ def freeze_objects(
             the dataset was begun with.
         EnvironmentFailure: one of those could not be prepared this time.
     """
-    part = part or LockPart(folder=publication.folder, splits=settings.splits)
-    shown, frozen = safe_url(source), part.frozen(publication)
+    publication, settings = order.publication, order.settings
+    part = part or order.whole
+    shown, frozen = safe_url(order.source), part.frozen(publication)
     passing = [failure for failure in rejected if is_passing(failure.reason)]
     if frozen is not None:
         for failure in passing:
@@ -96,18 +92,13 @@ def freeze_objects(
     else:
         _require_same_objects(shown, frozen, locked)
     part.write_rows(locked)
-    _index(publication, part, locked, prepared, asked_digest(source, licence), found.num_found)
+    _index(publication, part, locked, prepared, order.digest, found.num_found)
     return AcceptedObjects(
         num_objects=len(objects),
         num_found=found.num_found,
-        pool=FrozenPool(lock=part.lock, index=part.index, source=source, licence=licence),
+        pool=order.pool(part),
         maps=maps.rows,
     )
-
-
-def asked_digest(source: str, licence: str | None) -> str:
-    """Return the digest of what a source is asked for, which may hold a secret."""
-    return sha256_hex(canonical_json([source, licence]))
 
 
 def _index(

@@ -43,6 +43,7 @@ from pipeline.making.dataset_order import DatasetOrder, generate_words
 from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.lock_parts import LockPart, lock_parts
 from pipeline.making.machine import cores_owned
+from pipeline.making.objects_order import ObjectsOrder
 from pipeline.making.publication import Publication
 from pipeline.making.render_children import close_children, cores_of_child, render_child
 from pipeline.making.restore_object import restore_object
@@ -165,14 +166,20 @@ def accept_part(
     part: LockPart,
 ) -> AcceptedObjects:
     """Return the frozen objects of a part: at once where they are known, else made with others."""
-    source, workers = object_source(settings, order.objects), cores_owned()
-    asked = (source, order.licence, settings, publication, workers)
-    if trusted := trusted_objects(*asked, own, part):
+    asked = ObjectsOrder(
+        source=object_source(settings, order.objects),
+        licence=order.licence,
+        settings=settings,
+        publication=publication,
+        workers=cores_owned(),
+        own=own,
+    )
+    if trusted := trusted_objects(asked, part):
         return trusted
-    found = share_mesh_work(*asked, part)
+    found = share_mesh_work(asked, part)
     with publication.folder.turn("objects"):  # one maker freezes, and the others find it done
         publication.refresh()
-        return accept_objects(*asked, own, part, found)
+        return accept_objects(asked, part, found)
 
 
 def make_shards(run: Run, runner: Runner, watch: Watcher) -> None:

@@ -11,6 +11,7 @@ from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
 from pipeline.making.object_parts import proved
+from pipeline.making.objects_order import ObjectsOrder
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication, begin
 from pipeline.objects.sources import FoundObjects
@@ -60,8 +61,17 @@ def begun(root: Path) -> Publication:
     return begin(DatasetFolder(root), build(), ENVIRONMENT, 4, accept_environment=False)
 
 
+def asked(
+    publication: Publication, source: str = SOURCE, licence: str | None = None
+) -> ObjectsOrder:
+    """Return what is asked for of objects."""
+    return ObjectsOrder(
+        source=source, licence=licence, settings=build(), publication=publication, workers=1
+    )
+
+
 def frozen(publication: Publication, objects: Sequence[PreparedAsset]) -> AcceptedObjects:
     """Freeze objects, as after the mesh stage."""
     found = FoundObjects(records=tuple(asset.record for asset in objects), failures=())
     proofs = [*map(proved, objects)]
-    return freeze_objects(SOURCE, None, found, proofs, [], build(), publication)
+    return freeze_objects(asked(publication), found, proofs, [])

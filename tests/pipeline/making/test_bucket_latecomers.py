@@ -19,7 +19,7 @@ from storage.errors import TrilightError
 from storage.records.objects import Failure, decode_failures
 from storage.records.sample import sample_key
 from tests.pipeline.making.bucket_kit import OUT, Machines
-from tests.pipeline.making.frozen_kit import SOURCE, build, frozen, prepared
+from tests.pipeline.making.frozen_kit import asked, frozen, prepared
 from tests.pipeline.making.test_publication import _dataset, _locked, make_tiny_shard
 from tests.scenes_by_hand import tiny_sample
 
@@ -120,7 +120,7 @@ def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Ma
         accepted = frozen(first, [prepared(number) for number in range(30)])
         assert accepted.num_objects == 30
     with machines.maker("b") as later:
-        trusted = trusted_objects(SOURCE, None, build(), later, 1)
+        trusted = trusted_objects(asked(later))
         assert trusted is not None and trusted.pool is not None
         assert trusted.num_objects == 30
         with pytest.raises(AssetAway):

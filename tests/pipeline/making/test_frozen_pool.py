@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.making import accept_objects as accepting
-from pipeline.making import frozen_pool, pipeline
+from pipeline.making import frozen_pool, objects_order, pipeline
 from pipeline.making.accept_objects import accept_objects, trusted_objects
 from pipeline.making.attempt_scene import SceneAttempt
 from pipeline.making.freeze_objects import AcceptedObjects
@@ -20,7 +19,7 @@ from storage.errors import TrilightError
 from storage.records.asset import Asset, decode_asset
 from storage.records.object_index import ObjectIndex
 from storage.records.objects import read_objects_lock
-from tests.pipeline.making.frozen_kit import SOURCE, begun, build, frozen, prepared
+from tests.pipeline.making.frozen_kit import SOURCE, asked, begun, build, frozen, prepared
 from tests.pipeline.scenes.small_pool import first_scene
 
 NUM_OBJECTS = 30
@@ -105,20 +104,20 @@ def test_a_second_start_looks_at_no_object(
     def look(source: str, **more: object) -> None:
         raise LookupError(source)
 
-    monkeypatch.setattr(accepting, "find_objects", look)
-    assert accept_objects(SOURCE, None, build(), publication, 1) == accepted
+    monkeypatch.setattr(objects_order, "find_objects", look)
+    assert accept_objects(asked(publication)) == accepted
     for source, licence in (("another", None), (SOURCE, "MIT")):
         with pytest.raises(LookupError):
-            accept_objects(source, licence, build(), publication, 1)
+            accept_objects(asked(publication, source, licence))
     index, lock = publication.folder.staged_index, publication.folder.objects_lock
     for path in (index, lock):
         was = path.read_bytes()
         for damaged in (b"", was[:40], was + b" "):
             path.write_bytes(damaged)
             if (path, damaged) != (index, was + b" "):  # which tells nothing about the lock
-                assert trusted_objects(SOURCE, None, build(), publication, 1) is None
+                assert trusted_objects(asked(publication)) is None
         path.write_bytes(was)
-    assert trusted_objects(SOURCE, None, build(), publication, 1) == accepted
+    assert trusted_objects(asked(publication)) == accepted
 
 
 def test_a_file_that_is_not_the_locked_one_is_away(

@@ -9,7 +9,7 @@ import pytest
 from pipeline.executors.threads import ThreadRunner
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.publication import Publication
+from pipeline.making.objects_order import ObjectsOrder
 from storage.dataset.statistics import Statistics
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
@@ -33,11 +33,9 @@ def without_rendering(
     """
     scenes: list[tuple[str, int]] = []
 
-    def accept(
-        source: str, licence: str | None, settings: Any, publication: Publication, *more: Any
-    ) -> AcceptedObjects:
-        if not publication.manifest.objects_lock_sha256:
-            publication.lock_objects([_locked()])
+    def accept(order: ObjectsOrder, *more: Any) -> AcceptedObjects:
+        if not order.publication.manifest.objects_lock_sha256:
+            order.publication.lock_objects([_locked()])
         return AcceptedObjects(num_objects=0, num_found=1)
 
     def make(split: str, scene: int, *more: Any) -> tuple[Sample, list[Failure]]:

@@ -1,0 +1,57 @@
+"""What is asked for where the objects of a dataset are frozen."""
+
+from dataclasses import dataclass
+
+from pipeline.builds.settings import BuildSettings
+from pipeline.making.accept_maps import NO_FOLDERS, MapFolders
+from pipeline.making.frozen_pool import FrozenPool
+from pipeline.making.lock_parts import LockPart
+from pipeline.making.publication import Publication
+from pipeline.objects.sources import FoundObjects, find_objects
+from storage.dataset.progress import announce_downloads
+from storage.digests import canonical_json, sha256_hex
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectsOrder:
+    """The objects of a dataset, as they are asked for."""
+
+    source: str
+    """Where they come from, as `find_objects` takes it; may hold a secret."""
+    licence: str | None
+    """Of files without a statement, as the user states it."""
+    settings: BuildSettings
+    """The build, which says how objects are prepared and dealt to splits."""
+    publication: Publication
+    """The dataset."""
+    workers: int
+    """Objects at a time."""
+    own: MapFolders = NO_FOLDERS
+    """Folders of textures and maps, which are frozen with the objects."""
+
+    @property
+    def digest(self) -> str:
+        """Of what the source is asked for: another source is looked at again."""
+        return sha256_hex(canonical_json([self.source, self.licence]))
+
+    @property
+    def whole(self) -> LockPart:
+        """All objects, frozen at once."""
+        return LockPart(folder=self.publication.folder, splits=self.settings.splits)
+
+    def pool(self, part: LockPart) -> FrozenPool:
+        """Return where the scenes of a part, once it is frozen, have their objects from."""
+        return FrozenPool(
+            lock=part.lock, index=part.index, source=self.source, licence=self.licence
+        )
+
+    def found(self) -> FoundObjects:
+        """List the source, and download what is not here; raises as `find_objects`."""
+        folder = self.publication.folder
+        return find_objects(
+            self.source,
+            work_dir=folder.staged_objects,
+            allowed_licences=self.settings.allowed_licences,
+            licence=self.licence,
+            downloaded=lambda done, total: announce_downloads(folder, done, total),
+        )
