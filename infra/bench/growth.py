@@ -27,6 +27,12 @@ def fitted_exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
     return float(min(_STEPS, key=lambda power: _misfit(size / size[-1], cost, power)))
 
 
+def is_steady(costs: Sequence[float]) -> bool:
+    """Return whether costs only grow or only fall: of others no exponent says anything."""
+    steps = np.diff(np.asarray(costs, np.float64))
+    return bool((steps >= 0).all() or (steps <= 0).all())
+
+
 def _misfit(size: np.ndarray, cost: np.ndarray, power: float) -> float:
     rows = np.stack([np.ones_like(size), size**power], axis=1) / cost[:, None]
     best, *_ = np.linalg.lstsq(rows, np.ones_like(cost), rcond=None)

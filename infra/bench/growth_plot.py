@@ -7,7 +7,7 @@ from typing import Any
 
 from infra.bench.curve import Row
 from infra.bench.experiment import Experiment, Point
-from infra.bench.growth import fitted_exponent
+from infra.bench.growth import fitted_exponent, is_steady
 from infra.bench.labels import plain_log
 
 _WIDE, _HIGH, _DPI = 4.6, 4.2, 100
@@ -19,7 +19,7 @@ SizeOf = Callable[[Point], tuple[str, float]]
 
 
 def plot_growth(experiment: Experiment, size_of: SizeOf, points: Sequence[Row], path: Path) -> None:
-    """Draw the points of a run into a PNG file, with the exponent of every line beside its name."""
+    """Draw the points of a run into a PNG file, with the exponent of every steady line."""
     import matplotlib.pyplot as plt
 
     names = (experiment.cost.name, *experiment.also_cost)
@@ -43,7 +43,8 @@ def _panel(axes: Any, name: str, size_of: SizeOf, points: Sequence[Row]) -> None
             lines[line].append((size, row.values[name]))
     for number, (line, places) in enumerate(lines.items()):
         sizes, costs = zip(*sorted(places), strict=True)
-        power = f" ~ n^{fitted_exponent(sizes, costs):.1f}" if len(sizes) > 1 else ""
+        fits = len(sizes) > 1 and is_steady(costs)
+        power = f" ~ n^{fitted_exponent(sizes, costs):.1f}" if fits else ""
         style = {"color": f"C{number % 10}", "linestyle": ("-", "--", ":")[number // 4 % 3]}
         axes.plot(sizes, costs, marker="o", markersize=3, label=f"{line}{power}", **style)
     axes.set_title(name, fontsize=_FONT)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from infra.bench.curve import Row, rows
+from infra.bench.curve import COST_NOISE, Row, rows
 from infra.bench.experiment import Experiment
 from infra.bench.growth_plot import plot_growth
 from infra.bench.labels import place_labels, plain_log
@@ -19,6 +19,8 @@ from infra.bench.store import Run
 
 _WIDE, _HIGH, _DPI = 6.0, 4.0, 90
 """Inches of the figure, and its resolution."""
+_LEAST_SPAN = 0.02
+"""Share of its values that an axis spans at least: what hardly differs must not look far apart."""
 
 
 def plot(experiment: Experiment, run: Run, path: Path) -> None:
@@ -82,7 +84,8 @@ def _points(
     front = sorted((one.cost_ratio, one.values[name]) for one in points if one.on_front)
     if front and not experiment.also_cost:  # with more costs than this axis a front is no line
         axes.plot(*zip(*front, strict=True), "-", color="C0", linewidth=1)
-    lowest, highest = axes.get_ylim()
+    axes.set_xlim(_widened(axes.get_xlim(), 2 * COST_NOISE))
+    lowest, highest = _widened(axes.get_ylim(), _LEAST_SPAN)
     for one in points:
         if name not in one.values:  # its cost is known, and stands at the lower edge
             _mark(axes, one, lowest, "^")
@@ -102,6 +105,14 @@ def _scale(axes: Any, ratios: Sequence[float], errors: Sequence[float]) -> None:
     if errors and max(errors) > 30 * min(errors) > 0:
         axes.set_yscale("log")
     axes.margins(0.18)
+
+
+def _widened(ends: tuple[float, float], share: float) -> tuple[float, float]:
+    """Return ends with the same middle that are at least a share of it apart."""
+    low, high = ends
+    middle = (low + high) / 2
+    half = max((high - low) / 2, share * abs(middle) / 2)
+    return middle - half, middle + half
 
 
 def _mark(axes: Any, one: Row, height: float, style: str) -> None:
