@@ -84,12 +84,12 @@ def _points(
     front = sorted((one.cost_ratio, one.values[name]) for one in points if one.on_front)
     if front and not experiment.also_cost:  # with more costs than this axis a front is no line
         axes.plot(*zip(*front, strict=True), "-", color="C0", linewidth=1)
-    axes.set_xlim(_widened(axes.get_xlim(), 2 * COST_NOISE))
     lowest, highest = _widened(axes.get_ylim(), _LEAST_SPAN)
     for one in points:
         if name not in one.values:  # its cost is known, and stands at the lower edge
             _mark(axes, one, lowest, "^")
     axes.set_ylim(lowest, highest)
+    axes.set_xlim(_widened(axes.get_xlim(), 2 * COST_NOISE))
     base = "that of the default" if any(one.point.default for one in points) else "the first"
     axes.set_xlabel(f"{experiment.cost.name}, divided by {base}", fontsize=7)
     axes.set_ylabel(f"{name}\n{experiment.better} is better", fontsize=7)
