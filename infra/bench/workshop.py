@@ -28,9 +28,9 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.builds.training import smoke
 from pipeline.isolation import ChildFailed, ChildLimits, IsolatedChild
 from pipeline.making.accept_objects import accept_objects
+from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.attempt_scene import SceneRecipe, set_up_child
 from pipeline.making.environment import environment
-from pipeline.making.objects_order import ObjectsOrder
 from pipeline.making.prepare_isolated import preload_mesh_libraries
 from pipeline.making.publication import begin
 from pipeline.renders.variant import choose_variant
@@ -131,7 +131,7 @@ class Workshop:
         variant, workers = choose_variant(), threads or os.cpu_count() or 1
         folder = DatasetFolder(self.folder())  # keeps the record of the objects
         publication = begin(folder, build, environment(variant), 1, accept_environment=False)
-        asked = ObjectsOrder(
+        asked = AskedObjects(
             source=objects, licence=None, settings=build, publication=publication, workers=workers
         )
         accepted = accept_objects(asked)

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from pipeline.making.accept_maps import accept_maps
+from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
 from pipeline.making.lock_parts import LockPart
 from pipeline.making.object_parts import Proof, prepare_in_parts, proved
-from pipeline.making.objects_order import ObjectsOrder
 from pipeline.making.prepare_isolated import prepare_isolated
 from pipeline.objects.sources import FoundObjects
 from storage.dataset.progress import announce_objects, count_object
@@ -17,7 +17,7 @@ from storage.records.lock_rows import LockRows
 from storage.records.object_index import ObjectIndex
 
 
-def share_mesh_work(order: ObjectsOrder, part: LockPart) -> FoundObjects | None:
+def share_mesh_work(order: AskedObjects, part: LockPart) -> FoundObjects | None:
     """Prepare the objects of a part that is not frozen yet, with all who make it; in no turn.
 
     Returns:
@@ -38,7 +38,7 @@ def share_mesh_work(order: ObjectsOrder, part: LockPart) -> FoundObjects | None:
 
 
 def accept_objects(
-    order: ObjectsOrder, part: LockPart | None = None, found: FoundObjects | None = None
+    order: AskedObjects, part: LockPart | None = None, found: FoundObjects | None = None
 ) -> AcceptedObjects:
     """Turn a source into frozen meshes: of all its objects, or of those that were frozen before.
 
@@ -80,7 +80,7 @@ def accept_objects(
 
 def _proofs(
     found: FoundObjects,
-    order: ObjectsOrder,
+    order: AskedObjects,
     part: LockPart,
     enough: Callable[[], bool] = lambda: False,
     again: bool = True,
@@ -96,7 +96,7 @@ def _proofs(
     )
 
 
-def trusted_objects(order: ObjectsOrder, part: LockPart | None = None) -> AcceptedObjects | None:
+def trusted_objects(order: AskedObjects, part: LockPart | None = None) -> AcceptedObjects | None:
     """Return the frozen objects by their index, without a look at any of them.
 
     The lock has their digests, by which each is checked where a scene draws it. None where nothing

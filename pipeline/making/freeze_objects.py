@@ -10,10 +10,10 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.exchange.scene_files import SceneFiles
 from pipeline.isolation import is_passing
 from pipeline.making.accept_maps import NO_MAPS, AcceptedMaps
+from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.frozen_pool import FrozenPool
 from pipeline.making.lock_parts import LockPart
 from pipeline.making.object_parts import ProvedObject
-from pipeline.making.objects_order import ObjectsOrder
 from pipeline.making.publication import Publication
 from pipeline.making.revisited_scenes import RevisitedScenes
 from pipeline.objects.sources import FoundObjects
@@ -53,7 +53,7 @@ class AcceptedObjects:
 
 
 def freeze_objects(
-    order: ObjectsOrder,
+    order: AskedObjects,
     found: FoundObjects,
     prepared: list[ProvedObject],
     rejected: list[Failure],

@@ -37,13 +37,13 @@ from pipeline.making.accept_maps import MapFolders, map_folders
 from pipeline.making.accept_objects import accept_objects, share_mesh_work, trusted_objects
 from pipeline.making.accept_revisited import accept_revisited
 from pipeline.making.accept_scene_files import accept_scene_files
+from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.attempt_scene import MAX_ATTEMPTS, attempt_scene
 from pipeline.making.bucket_publication import joined
 from pipeline.making.dataset_order import DatasetOrder, generate_words
 from pipeline.making.freeze_objects import AcceptedObjects
 from pipeline.making.lock_parts import LockPart, lock_parts
 from pipeline.making.machine import cores_owned
-from pipeline.making.objects_order import ObjectsOrder
 from pipeline.making.publication import Publication
 from pipeline.making.render_children import close_children, cores_of_child, render_child
 from pipeline.making.restore_object import restore_object
@@ -166,7 +166,7 @@ def accept_part(
     part: LockPart,
 ) -> AcceptedObjects:
     """Return the frozen objects of a part: at once where they are known, else made with others."""
-    asked = ObjectsOrder(
+    asked = AskedObjects(
         source=object_source(settings, order.objects),
         licence=order.licence,
         settings=settings,

@@ -9,9 +9,9 @@ from pathlib import Path
 from pipeline.assets.stage import PreparedAsset
 from pipeline.builds.named import named_build
 from pipeline.builds.settings import BuildSettings
+from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.freeze_objects import AcceptedObjects, freeze_objects
 from pipeline.making.object_parts import proved
-from pipeline.making.objects_order import ObjectsOrder
 from pipeline.making.prepare_isolated import asset_store
 from pipeline.making.publication import Publication, begin
 from pipeline.objects.sources import FoundObjects
@@ -63,9 +63,9 @@ def begun(root: Path) -> Publication:
 
 def asked(
     publication: Publication, source: str = SOURCE, licence: str | None = None
-) -> ObjectsOrder:
+) -> AskedObjects:
     """Return what is asked for of objects."""
-    return ObjectsOrder(
+    return AskedObjects(
         source=source, licence=licence, settings=build(), publication=publication, workers=1
     )
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.making import frozen_pool, objects_order, pipeline
+from pipeline.making import frozen_pool, pipeline
 from pipeline.making.accept_objects import accept_objects, trusted_objects
 from pipeline.making.attempt_scene import SceneAttempt
 from pipeline.making.freeze_objects import AcceptedObjects
@@ -104,7 +104,7 @@ def test_a_second_start_looks_at_no_object(
     def look(source: str, **more: object) -> None:
         raise LookupError(source)
 
-    monkeypatch.setattr(objects_order, "find_objects", look)
+    monkeypatch.setattr(asked_objects, "find_objects", look)
     assert accept_objects(asked(publication)) == accepted
     for source, licence in (("another", None), (SOURCE, "MIT")):
         with pytest.raises(LookupError):

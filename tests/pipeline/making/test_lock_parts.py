@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.builds.named import named_build
 from pipeline.making import accept_objects as accepting
-from pipeline.making import object_parts, objects_order, pipeline
+from pipeline.making import asked_objects, object_parts, pipeline
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.lock_parts import LockPart, lock_parts
 from pipeline.making.pipeline import make_dataset
@@ -73,7 +73,7 @@ def made_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[objec
     monkeypatch.setattr(object_parts, "MeshWork", lambda settings, workers: mesher)
     records = _records(tmp_path / "objects", 60)
     found = FoundObjects(records=tuple(records), failures=())
-    monkeypatch.setattr(objects_order, "find_objects", lambda *asked, **more: found)
+    monkeypatch.setattr(asked_objects, "find_objects", lambda *asked, **more: found)
     prepare = mesher.prepare
 
     def noted(records, done):  # type: ignore[no-untyped-def]

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from pipeline.executors.threads import ThreadRunner
+from pipeline.making.asked_objects import AskedObjects
 from pipeline.making.dataset_order import DatasetOrder
 from pipeline.making.freeze_objects import AcceptedObjects
-from pipeline.making.objects_order import ObjectsOrder
 from storage.dataset.statistics import Statistics
 from storage.records.objects import Failure
 from storage.records.sample import Sample, sample_key
@@ -33,7 +33,7 @@ def without_rendering(
     """
     scenes: list[tuple[str, int]] = []
 
-    def accept(order: ObjectsOrder, *more: Any) -> AcceptedObjects:
+    def accept(order: AskedObjects, *more: Any) -> AcceptedObjects:
         if not order.publication.manifest.objects_lock_sha256:
             order.publication.lock_objects([_locked()])
         return AcceptedObjects(num_objects=0, num_found=1)

@@ -13,7 +13,7 @@ from storage.digests import canonical_json, sha256_hex
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectsOrder:
+class AskedObjects:
     """The objects of a dataset, as they are asked for."""
 
     source: str
