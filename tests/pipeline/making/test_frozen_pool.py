@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.making import frozen_pool, pipeline
+from pipeline.making import asked_objects, frozen_pool, pipeline
 from pipeline.making.accept_objects import accept_objects, trusted_objects
 from pipeline.making.attempt_scene import SceneAttempt
 from pipeline.making.freeze_objects import AcceptedObjects
