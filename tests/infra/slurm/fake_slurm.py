@@ -101,15 +101,13 @@ def srun(words: list[str]) -> int:
     if "cpus-per-task" in options:
         own["SLURM_CPUS_PER_TASK"] = options["cpus-per-task"]
     nodes, each = int(own["SLURM_NNODES"]), int(own["SLURM_NTASKS_PER_NODE"])
-    tasks = []
-    for rank in range(nodes * each):
-        ranks = {"SLURM_PROCID": rank, "SLURM_NODEID": rank // each, "SLURM_LOCALID": rank % each}
-        named = {name: str(number) for name, number in ranks.items()}
-        environment = own | named | {"SLURMD_NODENAME": "localhost"}
-        tasks.append(subprocess.Popen(command, env=environment, start_new_session=True))
-    (PLACE / "steps").write_text(" ".join(str(task.pid) for task in tasks))
+    tasks: list[subprocess.Popen[bytes]] = []
+    early: list[int] = []
 
-    def pass_on(number: int, _: object) -> None:
+    def pass_on(number: int, _: object = None) -> None:
+        if len(tasks) < nodes * each:  # a task that is not there yet gets it as well
+            early.append(number)
+            return
         for task in tasks:
             task.send_signal(number)
         if number == signal.SIGTERM:
@@ -117,8 +115,16 @@ def srun(words: list[str]) -> int:
             for task in tasks:
                 task.kill()
 
-    for number in (signal.SIGUSR1, signal.SIGTERM):
+    for number in (signal.SIGUSR1, signal.SIGTERM):  # before the first task, whom srun must outlive
         signal.signal(number, pass_on)
+    for rank in range(nodes * each):
+        ranks = {"SLURM_PROCID": rank, "SLURM_NODEID": rank // each, "SLURM_LOCALID": rank % each}
+        named = {name: str(number) for name, number in ranks.items()}
+        environment = own | named | {"SLURMD_NODENAME": "localhost"}
+        tasks.append(subprocess.Popen(command, env=environment, start_new_session=True))
+    (PLACE / "steps").write_text(" ".join(str(task.pid) for task in tasks))
+    for late in early:
+        pass_on(late)
     return max(task.wait() % 256 for task in tasks)
 
 
