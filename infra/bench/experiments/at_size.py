@@ -21,6 +21,8 @@ SIZES: Mapping[str, tuple[int, ...]] = {
     "careful": (100, 1_000, 10_000, 250_000),
 }
 """Shards."""
+_MOST_WHOLE = 10_000
+"""Shards of the largest dataset of whole ones: a quarter of a million would take hours."""
 _SMALL, _OTHER = 10, 1_000_000
 """Shards of the dataset that a process warms up on; number of the first scene of another one."""
 _WRITERS: Mapping[str, Callable[[Path, int], None]] = {
@@ -35,15 +37,16 @@ def _points(effort: Effort) -> list[Point]:
         Point(name=f"{command}, {size:,} shards", settings=(command, size))
         for command in COMMANDS
         for size in SIZES[effort.name]
+        if COMMANDS[command].of != "whole" or size <= _MOST_WHOLE
     ]
 
 
 def _growth(workshop: Workshop, points: Sequence[Point], turn: str) -> TurnFigures:
     """Measure command by command; the largest size of each also has the exponents."""
-    sizes = {point.settings[1] for point in points}
     for command, sized in COMMANDS.items():
+        sizes = sorted(point.settings[1] for point in points if point.settings[0] == command)
         found: dict[int, Figures] = {}
-        for size in sorted(sizes):
+        for size in sizes:
             root, small = _set(workshop, sized.of, size), _set(workshop, sized.of, _SMALL)
             found[size] = measured(command, root, small)
         exponents = {
