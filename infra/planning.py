@@ -22,7 +22,7 @@ from pipeline.making.pipeline import make_task, prepare_dataset
 from pipeline.making.render_children import close_children
 from pipeline.making.tasks import MOST_TASKS, TASK_S, Piece
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import index_shard
+from storage.dataset.shard import contents_of
 from storage.dataset.splits import planned_scenes, shard_name, shards_for
 from storage.dataset.staging import read_staged_scene
 from storage.records.sample import sample_key
@@ -201,8 +201,9 @@ def _scene_bytes(folder: DatasetFolder, shard: str, scene: int) -> int:
     The last scene of a shard is packed already, and the others wait for it.
     """
     if folder.shard(shard).exists():
-        members = index_shard(folder.shard(shard)).index.get(sample_key(scene), {})
-        sizes = [num_bytes for _, num_bytes in members.values()]
+        with folder.shard(shard).open("rb") as stream:
+            members = contents_of(stream, shard).samples.get(sample_key(scene), {})
+        sizes = [member.num_bytes for member in members.values()]
     else:
         staged = read_staged_scene(folder.staged_shard(shard), scene)
         sizes = [len(member) for member in staged.members.values()]

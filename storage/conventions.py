@@ -12,6 +12,8 @@ Environment maps: latitude-longitude, linear radiance, +Z up; row 0 is the top (
 picture. The centre of the picture is +X, u = 0.25 is +Y, u = 0.75 is -Y, both borders are -X.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,16 +29,25 @@ MAPS_VERSION = 4
 READABLE_VERSIONS = (2, 3, 4)
 """What this code reads. Version 2 is version 3 with the profile `lossless` alone."""
 
+MANIFEST_VERSION = 5
+"""Version of the manifest of a dataset, which does not index the members of its shards; those of
+versions 2 to 4 do."""
+
+READABLE_MANIFESTS = (*READABLE_VERSIONS, MANIFEST_VERSION)
+"""What this code reads."""
+
 SPLITS = ("train", "validation", "test")
 
 HALF_FLOAT_MAX = 65504.0
 """The largest finite value of a stored picture."""
 
 
-def require_readable(version: object, where: str) -> None:
-    """Raise TrilightError unless `version` is among READABLE_VERSIONS; `where` names the file."""
-    if version not in READABLE_VERSIONS:
-        *others, last = map(str, READABLE_VERSIONS)
+def require_readable(
+    version: object, where: str, versions: Sequence[int] = READABLE_VERSIONS
+) -> None:
+    """Raise TrilightError unless `version` is among `versions`; `where` names the file."""
+    if version not in versions:
+        *others, last = map(str, versions)
         readable = f"{', '.join(others)} and {last}"
         raise TrilightError(
             f"{where}: schema version {version}; this Trilight reads {readable}. Use the release "

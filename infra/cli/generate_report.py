@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from infra.cli.console import next_step, note, print_json, print_rows
 from pipeline.objects.licences import USER_PROVIDED
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, read_manifest
+from storage.dataset.manifest import Manifest, read_head
 from storage.dataset.statistics import Statistics
 from storage.records.objects import count_by_reason, read_failures, read_objects_lock
 
@@ -24,7 +24,7 @@ _RUN = "smoke"
 
 def report(folder: DatasetFolder, outcome: "Outcome", seconds: float, *, as_json: bool) -> None:
     """Print the outcome, and what to do next."""
-    rejected = count_by_reason(read_failures(folder.failures))
+    rejected = count_by_reason([*read_failures(folder.failures), *outcome.failures])
     if as_json:
         _print_json(folder, outcome, rejected, seconds)
         return
@@ -58,7 +58,7 @@ def _next_steps(folder: DatasetFolder, statistics: Statistics) -> Iterator[Seque
     """Yield what can be done with a finished dataset; training only where it is for training."""
     yield ("verify", folder.shown)
     yield ("inspect", folder.shown)
-    if statistics.scenes_by_split.get("train") and _fits_training(read_manifest(folder.manifest)):
+    if statistics.scenes_by_split.get("train") and _fits_training(read_head(folder.manifest)):
         yield ("train", _RUN, "--data", folder.shown)
 
 

@@ -13,6 +13,7 @@ from model.weights import MAX_LIGHTS
 from pipeline.documents.chosen import Chosen, choose_scenes, read_chosen
 from pipeline.renders.preview import PreviewSettings
 from pipeline.renders.variant import choose_variant
+from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.errors import TrilightError
 from storage.metrics import psnr_log_db
@@ -50,15 +51,14 @@ def chosen_scenes(dataset: Dataset, count: int) -> list[Chosen]:
     Raises:
         TrilightError: none is asked for, or the dataset holds none.
     """
-    everything = choose_scenes(dataset.manifest, dataset.manifest.num_samples)
-    held = [entry for entry in everything if entry.split == "test"] or everything
-    if count < 1 or not held:
+    judged = any(shard.num_samples for shard in dataset.shards_of("test"))
+    splits = ("test",) if judged else SPLITS
+    if count < 1 or not (chosen := choose_scenes(dataset, count, splits)):
         raise TrilightError(
-            f"--pictures is {count}, of a dataset of {len(everything)} scenes; expected at least "
-            "one scene to show."
+            f"--pictures is {count}, of a dataset of {dataset.manifest.num_samples} scenes; "
+            "expected at least one scene to show."
         )
-    rows = np.linspace(0, len(held) - 1, min(count, len(held))).round().astype(int)
-    return [held[row] for row in rows]
+    return chosen
 
 
 def pictures_beside(

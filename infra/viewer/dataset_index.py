@@ -18,6 +18,7 @@ import numpy as np
 
 from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.shard import Member, contents_of, read_member
 from storage.errors import TrilightError
 from storage.records.profiles import PACKED, PLAIN
 
@@ -112,7 +113,9 @@ class DatasetIndex:
     def _read_shard(self, number: int, shard: ShardEntry) -> None:
         dataset = self._dataset
         with dataset.files.open(shard, checked=False) as stream:
-            for key, members in shard.index.items():
+            with reading(dataset.shown, shard.name):
+                samples = contents_of(stream, shard.name).samples
+            for key, members in samples.items():
                 if self._closed:
                     return
                 with reading(dataset.shown, shard.name):
@@ -122,9 +125,9 @@ class DatasetIndex:
 
 
 def _row(
-    stream: BinaryIO, key: str, members: Mapping[str, tuple[int, int]], shard: int, split: str
+    stream: BinaryIO, key: str, members: Mapping[str, Member], shard: int, split: str
 ) -> SceneRow:
-    record = json.loads(_bytes_at(stream, members["json"]))
+    record = json.loads(read_member(stream, members["json"]))
     views = record["views"]
     return SceneRow(
         key=key,
@@ -140,21 +143,15 @@ def _row(
     )
 
 
-def _num_triangles(stream: BinaryIO, members: Mapping[str, tuple[int, int]]) -> int:
+def _num_triangles(stream: BinaryIO, members: Mapping[str, Member]) -> int:
     suffix = PLAIN if PLAIN in members else PACKED
-    offset, num_bytes = members[suffix]
-    stream.seek(offset)
-    head = stream.read(min(num_bytes, _MOST_HEADER))
+    stream.seek(members[suffix].offset)
+    head = stream.read(min(members[suffix].num_bytes, _MOST_HEADER))
     if suffix == PACKED:
         head = zlib.decompressobj(31).decompress(head, _MOST_HEADER)
     (length,) = struct.unpack("<Q", head[:8])
     shapes = json.loads(head[8 : 8 + length])
     return int(shapes["faces"]["shape"][0])
-
-
-def _bytes_at(stream: BinaryIO, place: tuple[int, int]) -> bytes:
-    stream.seek(place[0])
-    return stream.read(place[1])
 
 
 def _single(value: Any) -> float:

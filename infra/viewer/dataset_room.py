@@ -15,6 +15,7 @@ from pipeline.documents.png import encode_png
 from pipeline.documents.scene_page import preview
 from pipeline.making.progressive_tracer import ProgressiveTracer
 from storage.dataset.dataset import Dataset, LocalFiles, reading
+from storage.dataset.shard import read_member, scan_samples
 from storage.errors import TrilightError
 from storage.records.exr import decode_exr
 from storage.remote.safe_url import safe_url
@@ -124,9 +125,9 @@ class DatasetRoom:
             self._dataset.files.open(shard, checked=False) as stream,
             reading(self._dataset.shown, shard.name),
         ):
-            offset, num_bytes = shard.index[row.key][f"{view}.exr"]
-            stream.seek(offset)
-            radiance_rgb = decode_exr(stream.read(num_bytes))
+            samples = scan_samples(stream, shard.name)
+            members = next(members for key, members in samples if key == row.key)
+            radiance_rgb = decode_exr(read_member(stream, members[f"{view}.exr"]))
         return encode_png(preview(radiance_rgb, width))
 
     def _opened(self, key: str) -> SceneRoom:

@@ -3,7 +3,7 @@
 It tells nothing of the clock, the machine or the order of work: equal datasets give equal cards.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from pipeline.documents.distributions import MEASURED, Distributions
@@ -14,7 +14,7 @@ from storage.dataset.derived import Derivation, derivation_of
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest
 from storage.records.objects import SKY, TEXTURE
-from storage.records.profiles import PACKED, PLAIN
+from storage.records.profiles import PLAIN
 from storage.records.quantities import summary
 
 _TAGS = (
@@ -64,7 +64,7 @@ def encode_card(
         "## Licences",
         rights_markdown(rights),
         "## How to read it",
-        _reading(manifest),
+        _reading(manifest, found.packings),
         "## How to check it",
         _CHECK.format(digest=manifest.dataset_digest),
     ]
@@ -87,7 +87,7 @@ _CHECK = """The dataset digest covers shards, objects and settings:
     {digest}
 
 `trilight verify .` checks every hash, member and law. Without Trilight, `manifest.json` has size
-and sha256 of each shard, and offset and size of each file in it."""
+and sha256 of each shard."""
 
 
 def _front(folder: DatasetFolder, manifest: Manifest, rights: Rights, title: str) -> dict[str, Any]:
@@ -222,11 +222,11 @@ def _derived(derivation: Derivation) -> str:
     return f"{command}{of}.\n\n{table(head, rows)}"
 
 
-def _reading(manifest: Manifest) -> str:
+def _reading(manifest: Manifest, packings: Collection[str]) -> str:
     if not manifest.shards:
         return "There is no shard yet."
     split = manifest.shards[0].split
-    arrays = " or ".join(_arrays(manifest))
+    arrays = " or ".join(_arrays(packings))
     return f"""Any WebDataset reader opens the shards:
 
 ```python
@@ -244,15 +244,8 @@ floor. Lengths are metres, +Z is up, colours are linear Rec.709 radiance, camera
 `trilight train RUN --data .` trains on it."""
 
 
-def _arrays(manifest: Manifest) -> list[str]:
+def _arrays(packings: Collection[str]) -> list[str]:
     """Return how a sample's arrays are got; a merged dataset may have them in both packings."""
-    packings = {
-        packing
-        for shard in manifest.shards
-        for name, _, _ in shard.members
-        for packing in (PLAIN, PACKED)
-        if name.endswith(f".{packing}")
-    }
     *others, last = sorted(packings) or [PLAIN]
     return [*(f'sample.get("{packing}")' for packing in others), f'sample["{last}"]']
 

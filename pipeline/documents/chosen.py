@@ -7,7 +7,7 @@ import numpy as np
 
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
-from storage.dataset.manifest import Manifest, ShardEntry
+from storage.dataset.manifest import ShardEntry
 from storage.records.sample import Sample
 
 _LEAST_SHARE = 8
@@ -27,26 +27,32 @@ class Chosen:
         return self.shard.split
 
 
-def choose_scenes(manifest: Manifest, max_scenes: int) -> list[Chosen]:
-    """Choose up to `max_scenes` scenes.
+def choose_scenes(
+    dataset: Dataset, max_scenes: int, splits: Sequence[str] = SPLITS
+) -> list[Chosen]:
+    """Choose up to `max_scenes` scenes; only shards of which some are chosen are opened.
 
     Every split has its share of them, at least an eighth where it holds so many. Within a split
     they are spread evenly over its shards. The order is that of splits, then shards.
+
+    Raises:
+        TrilightError: a shard is missing or damaged.
     """
-    scenes = {
-        split: [
-            Chosen(key=key, shard=shard)
-            for shard in manifest.shards
-            if shard.split == split
-            for key in shard.index
-        ]
-        for split in SPLITS
-    }
-    places = _places([len(scenes[split]) for split in SPLITS], max_scenes)
+    shards = [dataset.shards_of(split) for split in splits]
+    ends = [np.cumsum([shard.num_samples for shard in each], dtype=int) for each in shards]
+    counts = [int(each[-1]) if len(each) else 0 for each in ends]
     chosen = []
-    for split, count in zip(SPLITS, places, strict=True):
-        rows = np.linspace(0, len(scenes[split]) - 1, count).round().astype(int)
-        chosen += [scenes[split][row] for row in rows]
+    for each, end, count, places in zip(
+        shards, ends, counts, _places(counts, max_scenes), strict=True
+    ):
+        rows = np.linspace(0, count - 1, places).round().astype(int)
+        holding = np.searchsorted(end, rows, side="right")
+        for number in dict.fromkeys(holding.tolist()):
+            shard = each[number]
+            keys = dataset.keys(shard)
+            first = int(end[number]) - shard.num_samples
+            inside = rows[holding == number] - first
+            chosen += [Chosen(key=keys[row], shard=shard) for row in inside]
     return chosen
 
 

@@ -1,7 +1,7 @@
 """What a dataset holds, as distributions: read scene by scene, without the pictures."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,7 @@ from storage.dataset.manifest import Manifest
 from storage.errors import TrilightError
 from storage.records.map_facts import texture_families
 from storage.records.objects import OBJECT, Failure, LockedObject, locked_uids
+from storage.records.profiles import PACKED, PLAIN
 from storage.records.quantities import QUANTITIES, summary
 from storage.records.sample import SceneRecord
 from storage.records.scene_facts import Values, scene_values, surfaces
@@ -37,6 +38,8 @@ class Distributions:
     """Scenes by (texture or sky; its family, or what its map is called)."""
     views_at_cap: Mapping[str, int]
     """Views whose sampling ended at the cap, by split."""
+    packings: Collection[str]
+    """Suffixes under which samples have their arrays (storage.records.profiles)."""
     objects: Sequence[LockedObject]
     """The objects that scenes may draw from."""
     own_maps: Sequence[LockedObject]
@@ -149,6 +152,7 @@ class _Tally:
     surfaces: Counter[tuple[str, str]] = field(default_factory=Counter)
     maps: Counter[tuple[str, str]] = field(default_factory=Counter)
     views_at_cap: Counter[str] = field(default_factory=Counter)
+    packings: set[str] = field(default_factory=set)
 
     def add(self, record: SceneRecord, split: str) -> Mapping[str, Values]:
         """Count one scene and return its values."""
@@ -185,6 +189,7 @@ def dataset_distributions(
     tally = _Tally()
     for shard in dataset.manifest.shards:
         rows = []
+        tally.packings |= dataset.suffixes(shard) & {PLAIN, PACKED}
         for record in dataset.read_scenes(shard):
             try:
                 rows.append(tally.add(record, shard.split))
@@ -205,6 +210,7 @@ def dataset_distributions(
         surfaces=tally.surfaces,
         maps=tally.maps,
         views_at_cap=tally.views_at_cap,
+        packings=tally.packings,
         objects=[entry for entry in locked if entry.kind == OBJECT],
         own_maps=[entry for entry in locked if entry.kind != OBJECT],
         failures=dataset.failures(),

@@ -45,7 +45,7 @@ def write_gallery(
         raise TrilightError(
             f"gallery: {max_scenes} scenes; expected 0 to {MOST_SCENES}, one page each."
         )
-    chosen = choose_scenes(dataset.manifest, max_scenes)
+    chosen = choose_scenes(dataset, max_scenes)
     rejected = _by_scene(failures, chosen)
     names = [f"{entry.key}.html" for entry in chosen]
     cards: list[tuple[Markup, str]] = []

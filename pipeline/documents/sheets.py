@@ -41,7 +41,7 @@ def write_contact_sheet(
     Raises:
         TrilightError: a shard is missing, a sample unreadable, or the folder cannot be written.
     """
-    chosen = choose_scenes(dataset.manifest, max_scenes)
+    chosen = choose_scenes(dataset, max_scenes)
     if not chosen:
         return
     views = dataset.manifest.num_views

@@ -34,7 +34,7 @@ def chosen_samples(
     for shard in dataset.manifest.shards:
         if split not in (None, shard.split):
             continue
-        keys = [key for key in shard.index if wanted in (None, key)]
+        keys = [key for key in dataset.keys(shard) if wanted in (None, key)]
         found = found or bool(keys)
         for sample in dataset.read_samples(shard, keys):
             yield shard.split, sample

@@ -121,15 +121,15 @@ class Watched:
 
     def _tell(self, run: Run) -> None:
         publication = run.publication
-        done = publication.num_scenes_finished()
-        planned = publication.manifest.num_scenes
+        of = publication.done
+        done, planned = of.scenes, of.scenes_asked
         per_s = self.scenes_per_s()
         left = "unknown" if per_s == 0 else f"{(planned - done) / per_s / 60:.0f} minutes"
         self._percent(100.0 * done / planned)
         self._table(
             "progress",
             [
-                ("shards", f"{publication.num_shards_finished()} of {publication.num_shards}"),
+                ("shards", f"{of.shards} of {of.shards_asked}"),
                 ("scenes in shards", f"{done} of {planned}"),
                 ("views an hour", f"{3600 * per_s * publication.manifest.num_views:.0f}"),
                 ("left, if nobody else helps", left),

@@ -9,9 +9,10 @@ from pipeline.builds.settings import BuildSettings
 from pipeline.making.publication import Publication, begin, require_free
 from pipeline.shards.mirror import Mirror
 from storage.dataset.dataset import Dataset
-from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, read_manifest
+from storage.dataset.layout import DatasetFolder, parts_of, shard_names_in, shard_names_in_part
+from storage.dataset.manifest import Manifest, read_head, read_manifest
 from storage.dataset.settings import SplitSettings
+from storage.dataset.shard_notes import ShardNote, note_shard, noted_names
 from storage.dataset.splits import shard_name
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, encode_objects_lock
@@ -22,9 +23,8 @@ from storage.remote.url import RemoteUrl, parse_url
 class BucketPublication(Publication):
     """What is public of a dataset in a bucket: as in a folder, and then brought there.
 
-    The folder's manifest is published first, among the makers on this machine; what other machines
-    have finished is taken up before. Two may bring their manifests at the same time, so each looks
-    again afterwards and brings a newer one where somebody else's shard is not in it.
+    A shard is finished when it and its note are in the bucket. Its files here say what is known of
+    the bucket: those of the parts that this maker has asked for.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class BucketPublication(Publication):
         self._mirror = mirror
 
     def dataset(self) -> Dataset:
-        return self._mirror.dataset(self.manifest)
+        return self._mirror.dataset(read_manifest(self.folder.manifest))
 
     def send_documents(self) -> None:
         self._mirror.send_documents()
@@ -46,45 +46,61 @@ class BucketPublication(Publication):
         self.add_failures(())  # where nothing was rejected, there is a file that says so
         self._mirror.freeze(encode_objects_lock(objects))
         super().lock_objects(objects)
-        self.publish()  # somebody may have frozen the same before, and made shards
-
-    def add_shard(self, shard: ShardEntry) -> None:
-        self._require_here(shard.name)
-        if sent := self._mirror.send(shard.name, shard):
-            super().add_shard(sent)
-
-    def publish(self) -> None:
-        self.learn()
-        super().publish()
         self._mirror.send_manifest()
-        while self.learn():
-            super().publish()
-            self._mirror.send_manifest()
 
-    def missing_shards(self) -> list[int]:
-        names = [shard_name(index, self._splits) for index in range(self.num_shards)]
-        for name in names:
-            if self.folder.shard(name).exists():  # a kill, or another maker here, has left it
-                self._mirror.send(name)
-        self.learn()
-        return super().missing_shards()
+    def _note(self, note: ShardNote) -> None:
+        if self.folder.shard(note.shard.name).exists():  # else another machine has sent it
+            note_shard(self.folder, note)
+        if sent := self._mirror.send(note.shard.name):
+            self._count(sent)
 
-    def _is_there(self, name: str) -> bool:
-        return self.folder.is_sent(name)
+    def missing_shards(self, wanted: range | None = None) -> list[int]:
+        for name in shard_names_in(self.folder.root):  # a kill, or another maker here, has left it
+            self._mirror.send(name)
+        self.learn_plan()
+        return super().missing_shards(wanted)
+
+    def _shards_there(self, shards: range) -> set[str]:
+        for part in parts_of(shards):
+            self._mirror.look_at(part)
+        sent = self.folder.staged_sent
+        return {name for part in parts_of(shards) for name in shard_names_in_part(sent, part)}
+
+    def num_shards_there(self) -> int:
+        return sum(1 for _ in shard_names_in(self.folder.staged_sent))
+
+    def finish(self) -> Manifest | None:
+        listed, news = None, True
+        while news:  # somebody may have planned more, and listed that, before our list arrived
+            self.learn_plan()
+            if not self._are_all_there():
+                return None
+            with self._turn():
+                self._mirror.take_listed(self.manifest)
+            if listed := super().finish():
+                self._mirror.send_manifest()
+            news = self.learn_plan()
+        return listed
+
+    def _unlisted(self, listed: Manifest) -> list[ShardNote]:
+        known = {entry.name for entry in listed.shards} - set(noted_names(self.folder))
+        every = (shard_name(index, self._splits) for index in range(self.num_shards))
+        return self._mirror.notes([name for name in every if name not in known])
 
     def _has(self, name: str) -> bool:
         if not self.folder.has_shard(name):
-            self.learn()
+            number = int(name.removesuffix(".tar").rpartition("-")[2])
+            self._shards_there(range(number, number + 1))
         return self.folder.has_shard(name)
 
-    def learn(self) -> bool:
-        """Take notice of what others have finished and planned; say whether there was news."""
-        news, planned = self._mirror.receive({entry.name for entry in self.manifest.shards})
-        grown = planned > self.manifest.num_scenes
-        if grown:
-            with self._turn():
-                self._write(num_scenes=max(planned, self.manifest.num_scenes))
-        return news > 0 or grown
+    def learn_plan(self) -> bool:
+        """Take notice of how many scenes others have planned; say whether there are more."""
+        planned = self._mirror.planned()
+        if planned <= self.manifest.num_scenes:
+            return False
+        with self._turn():
+            self.extend(max(planned, self.manifest.num_scenes))
+        return True
 
 
 def begin_dataset(
@@ -112,20 +128,20 @@ def begin_dataset(
     if not folder.bucket:
         return begun()
     mirror = Mirror(folder)
-    names = mirror.names()
-    if "manifest.json" not in names:
-        require_free(folder, names)
+    is_new = not mirror.is_begun()
+    if is_new:
+        require_free(folder, mirror.names())
         url = parse_url(folder.bucket, what="out")
         assert isinstance(url, RemoteUrl)
         Bucket(url).require_create()
     publication = begun()
-    if "manifest.json" not in names and not mirror.begin():  # another machine was first
+    if is_new and not mirror.begin():  # another machine was first
         mirror.adopt()
         publication = begun()
     mirror.plan(publication.manifest.num_scenes)
-    publication = BucketPublication(folder, publication.manifest, settings.splits, mirror)
-    publication.learn()
-    return publication
+    in_bucket = BucketPublication(folder, publication.manifest, settings.splits, mirror)
+    in_bucket.learn_plan()
+    return in_bucket
 
 
 def joined(folder: DatasetFolder) -> contextlib.AbstractContextManager[None]:
@@ -146,7 +162,6 @@ def forget_empty(folder: DatasetFolder) -> None:
     while alone in the folder; whoever was at it all the same finds out (`Publication.refresh`).
     """
     with contextlib.suppress(TrilightError):  # an unreadable one is told of by whoever needs it
-        manifest = read_manifest(folder.manifest)
-        made = manifest.objects_lock_sha256 or manifest.shards or folder.shard_files()
-        if not made and not any(folder.staged_samples.rglob("*.tar")):
+        frozen = read_head(folder.manifest).objects_lock_sha256
+        if not (frozen or folder.shard_files()) and not any(folder.staged_samples.rglob("*.tar")):
             folder.manifest.unlink()

@@ -84,12 +84,12 @@ def make_dataset(
     with _begun(order) as run:  # objects, meshes
         for part in _by_parts(run):
             make_shards(part, runner, watch)  # scenes, renders, shards
+        finished = run.publication.finish()
         run.require_within_budget()
-        run.publication.publish()
         statistics = None
-        if not run.publication.missing_shards():
+        if finished:
             statistics = runner.finish(lambda: make_documents(run.publication))
-    return run.outcome(statistics)
+    return run.outcome(finished, statistics)
 
 
 def prepare_dataset(order: DatasetOrder) -> Run:
@@ -138,8 +138,7 @@ def _wanted_shards(
     if settings.splits.object_parts == 1:
         return []
     wanted = order.shard_range() or range(publication.num_shards)
-    missing = [index for index in publication.missing_shards() if index in wanted]
-    return [*missing, *wanted]
+    return [*publication.missing_shards(wanted), *wanted]
 
 
 def _by_parts(run: Run) -> Iterator[Run]:

@@ -1,18 +1,39 @@
-"""The manifest of a dataset in the making: begun, compared, and extended shard by shard."""
+"""The manifest of a dataset that is made: begun, compared, and listed when all shards are there."""
 
 import contextlib
 import dataclasses
+import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from pipeline.builds.settings import BuildSettings, differences
-from pipeline.shards.pack import forget_note, note_shard, noted_shard, rejections_of_shard
 from storage.dataset.dataset import Dataset, open_dataset
 from storage.dataset.derived import derivation_of
-from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, read_manifest, write_manifest
+from storage.dataset.layout import (
+    DatasetFolder,
+    in_parts,
+    parts_of,
+    shard_names_in,
+    shard_names_in_part,
+)
+from storage.dataset.manifest import (
+    Manifest,
+    ShardEntry,
+    number_of_shard,
+    read_head,
+    read_manifest,
+    write_manifest,
+)
 from storage.dataset.settings import SplitSettings
+from storage.dataset.shard_notes import (
+    ShardNote,
+    note_shard,
+    noted_names,
+    noted_shard,
+    rejections_of_shard,
+)
 from storage.dataset.splits import planned_scenes, scenes_of_shard, shard_name, shards_for
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -31,20 +52,40 @@ _LOOKS = 7
 """For a shard that a worker says it has packed; network file systems may show it a minute later."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Done:
+    """What is finished of the shards that were asked for."""
+
+    shards: int = 0
+    """Shards that are there."""
+    scenes: int = 0
+    """Scenes for which they stand, given-up ones included."""
+    shards_asked: int = 0
+    """Shards that were asked for."""
+    scenes_asked: int = 0
+    """Their scenes."""
+    given_up: int = 0
+    """Scenes of this run that could not be made; of all runs once the dataset is finished."""
+
+
 class Publication:
     """What is public of a dataset, shared by all who make it.
 
-    Every change of the manifest is made in turn, to what is on the disk then, and reaches the disk
-    before the call returns. A finished shard is noted beside the staged scenes, and the manifest
-    takes such notes up whenever they are a tenth of what it lists: its size times the number of
-    shards would otherwise be written in all.
+    Until all shards are there the manifest is a head of a few kilobytes, and each shard has a note:
+    a maker writes what it has made, and reads no more than it asks for. Every change of the
+    manifest is made in turn, to what is on the disk then, and reaches the disk before the call
+    returns.
     """
 
     def __init__(self, folder: DatasetFolder, manifest: Manifest, splits: SplitSettings) -> None:
         self.folder = folder
         self.manifest = manifest
+        """What the dataset is; its shards are listed once it is finished."""
+        self.done = Done()
+        """What is finished of what was asked for, as far as this maker has looked."""
+        self.failures: list[Failure] = []
+        """What was rejected on the way to the shards of this run, until the manifest lists them."""
         self._splits = splits
-        self._noted: dict[str, ShardEntry] = {}
 
     def dataset(self) -> Dataset:
         """Return what is public, for whoever reads it."""
@@ -69,65 +110,114 @@ class Publication:
             self._write(objects_lock_sha256=digest)
 
     def add_shard(self, shard: ShardEntry) -> None:
-        """Note a finished shard; the manifest lists it soon, at the latest after `publish`.
+        """Note a finished shard.
 
         Raises:
             TrilightError: it is not here, so that its maker works in another folder.
         """
         self._require_here(shard.name)
-        note_shard(self.folder, shard)
-        self._noted[shard.name] = shard
-        if 10 * len(self._noted) >= len(self.manifest.shards):
-            self.publish()
+        failures = read_failures(rejections_of_shard(self.folder, shard.name))
+        self._note(ShardNote(shard=shard, failures=tuple(failures)))
 
-    def publish(self) -> None:
-        """List every shard that is there, whoever made it, and its rejections."""
-        with self._turn():
-            listed = {entry.name: entry for entry in self.manifest.shards}
-            names = [shard_name(index, self._splits) for index in range(self.num_shards)]
-            found = {
-                name: noted_shard(self.folder, name)
-                for name in names
-                if name not in listed and self._is_there(name)
-            }
-            found |= self._noted
-            if found:  # writing the manifest costs the whole set
-                self._add_failures(
-                    failure
-                    for name in found
-                    for failure in read_failures(rejections_of_shard(self.folder, name))
-                )
-                entries = sorted((listed | found).values(), key=_number)
-                self._write(shards=tuple(entries))
-            self._noted.clear()
-        for name in found:
-            forget_note(self.folder, name)
+    def _note(self, note: ShardNote) -> None:
+        note_shard(self.folder, note)
+        self._count(note)
+
+    def _count(self, note: ShardNote) -> None:
+        num_scenes = len(scenes_of_shard(number_of_shard(note.shard), self._splits))
+        self.failures += note.failures
+        self.done = dataclasses.replace(
+            self.done,
+            shards=self.done.shards + 1,
+            scenes=self.done.scenes + num_scenes,
+            given_up=self.done.given_up + num_scenes - note.shard.num_samples,
+        )
+
+    def missing_shards(self, wanted: range | None = None) -> list[int]:
+        """Return which of the wanted shards are still to make; of all by default.
+
+        What that costs depends on what is wanted alone.
+        """
+        every = range(self.num_shards)
+        asked = every if wanted is None else every[wanted.start : wanted.stop]
+        missing = self._missing(asked)
+        self.done = dataclasses.replace(
+            self.done,
+            shards=len(asked) - len(missing),
+            scenes=self._num_scenes(asked) - self._num_scenes(missing),
+            shards_asked=len(asked),
+            scenes_asked=self._num_scenes(asked),
+        )
+        return missing
+
+    def _missing(self, shards: range) -> list[int]:
+        there = self._shards_there(shards)
+        return [index for index in shards if shard_name(index, self._splits) not in there]
+
+    def _num_scenes(self, shards: Iterable[int]) -> int:
+        return sum(len(scenes_of_shard(index, self._splits)) for index in shards)
+
+    def _shards_there(self, shards: range) -> set[str]:
+        """Return names of shards that are where the dataset is, at least those that are asked."""
+        return {
+            name
+            for part in parts_of(shards)
+            for name in shard_names_in_part(self.folder.root, part)
+        }
+
+    def num_shards_there(self) -> int:
+        """Return how many shards are there, as far as is known here."""
+        return sum(1 for _ in shard_names_in(self.folder.root))
+
+    def _are_all_there(self) -> bool:
+        """Return whether every shard is there; looks part by part, up to the first that is not."""
+        return not any(map(self._missing, in_parts(range(self.num_shards))))
+
+    def finish(self) -> Manifest | None:
+        """List all shards in the manifest, and their rejections, if all are there; return it.
+
+        Raises:
+            TrilightError: a shard is damaged, or the folder cannot be written.
+        """
+        if not self._are_all_there():
+            return None
+        with self._turn():  # somebody may have planned more
+            if not self._are_all_there():
+                return None
+            listed = read_manifest(self.folder.manifest)
+            if notes := self._unlisted(listed):
+                shards = {entry.name: entry for entry in listed.shards}
+                shards |= {note.shard.name: note.shard for note in notes}
+                every = tuple(sorted(shards.values(), key=number_of_shard))
+                self._add_failures(failure for note in notes for failure in note.failures)
+                listed = dataclasses.replace(listed, shards=every)
+                write_manifest(self.folder.manifest, listed)
+            for staged in (self.folder.staged_entries, self.folder.staged_failures):
+                shutil.rmtree(staged, ignore_errors=True)
+        num_scenes, self.failures = self._num_scenes(range(self.num_shards)), []
+        given_up = num_scenes - listed.num_samples
+        self.manifest = listed
+        self.done = dataclasses.replace(self.done, given_up=given_up)
+        return listed
+
+    def _unlisted(self, listed: Manifest) -> list[ShardNote]:
+        """Return what is known of every shard that is not in a manifest, or has been made anew."""
+        known = {entry.name for entry in listed.shards} - set(noted_names(self.folder))
+        every = (shard_name(index, self._splits) for index in range(self.num_shards))
+        return [noted_shard(self.folder, name) for name in every if name not in known]
+
+    def extend(self, num_scenes: int) -> None:
+        """Plan more scenes; call in the turn of the manifest."""
+        self._write(num_scenes=num_scenes)
 
     def add_failures(self, failures: Iterable[Failure]) -> None:
         """Add rows to `failures.jsonl`; a row that is there already stays single."""
         with self._turn():
             self._add_failures(failures)
 
-    def missing_shards(self) -> list[int]:
-        """Return the shards still to make, publishing those that are whole but not yet listed.
-
-        Other makers leave such shards, and so does a kill between a shard's last rename and the
-        manifest's.
-        """
-        listed = {entry.name for entry in self.manifest.shards}
-        names = [shard_name(index, self._splits) for index in range(self.num_shards)]
-        there = [self._is_there(name) for name in names]
-        if any(exists and name not in listed for name, exists in zip(names, there, strict=True)):
-            self.publish()
-        return [index for index, exists in enumerate(there) if not exists]
-
-    def _is_there(self, name: str) -> bool:
-        """Return whether a shard is where the dataset is."""
-        return self.folder.shard(name).exists()
-
     def _has(self, name: str) -> bool:
         """Return whether a shard that somebody has packed can be seen."""
-        return self._is_there(name)
+        return self.folder.has_shard(name)
 
     def _require_here(self, name: str) -> None:
         for look in range(_LOOKS):
@@ -140,28 +230,13 @@ class Publication:
             "(for a bucket, the same TRILIGHT_CACHE); share it, and run the same command again."
         )
 
-    def num_shards_finished(self) -> int:
-        """Return how many shards are there, as far as this maker knows."""
-        return len(self._known())
-
-    def num_scenes_finished(self) -> int:
-        """Return for how many scenes the finished shards stand, given-up ones included."""
-        return sum(len(scenes_of_shard(_number(entry), self._splits)) for entry in self._known())
-
-    def num_given_up(self) -> int:
-        """Return how many scenes of the finished shards could not be made."""
-        return self.num_scenes_finished() - sum(entry.num_samples for entry in self._known())
-
-    def _known(self) -> list[ShardEntry]:
-        return list(({entry.name: entry for entry in self.manifest.shards} | self._noted).values())
-
     def refresh(self) -> None:
-        """Read what other makers have written.
+        """Read what other makers have written of the dataset as such.
 
         Raises:
             TrilightError: another dataset has been begun in the folder since.
         """
-        found = read_manifest(self.folder.manifest)
+        found = read_head(self.folder.manifest)
         if found.settings != self.manifest.settings:
             raise TrilightError(
                 f"{self.folder.shown}: another dataset has been begun here in the meantime; choose "
@@ -180,12 +255,9 @@ class Publication:
         write_failures(self.folder.failures, [*known, *failures])
 
     def _write(self, **changes: Any) -> None:
+        whole = read_manifest(self.folder.manifest)  # a finished set that grows has shards
+        write_manifest(self.folder.manifest, dataclasses.replace(whole, **changes))
         self.manifest = dataclasses.replace(self.manifest, **changes)
-        write_manifest(self.folder.manifest, self.manifest)
-
-
-def _number(entry: ShardEntry) -> int:
-    return int(entry.name.removesuffix(".tar").rpartition("-")[2])
 
 
 def begin(
@@ -209,7 +281,7 @@ def begin(
     whole = planned_scenes(num_scenes, settings.splits)
     with folder.turn("manifest"):
         if folder.manifest.exists():
-            manifest = read_manifest(folder.manifest)
+            manifest = read_head(folder.manifest)
             _require_same_dataset(folder, manifest, settings, environment, accept_environment)
             whole = max(whole, manifest.num_scenes)
         else:
@@ -224,10 +296,11 @@ def begin(
                 shards=(),
                 extensions=recorded("data"),
             )
-        if not folder.manifest.exists() or whole != manifest.num_scenes:
-            manifest = dataclasses.replace(manifest, num_scenes=whole)
             write_manifest(folder.manifest, manifest)
-    return Publication(folder, manifest, settings.splits)
+        publication = Publication(folder, manifest, settings.splits)
+        if whole != manifest.num_scenes:
+            publication.extend(whole)
+    return publication
 
 
 def _require_same_dataset(

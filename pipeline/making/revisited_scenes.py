@@ -81,7 +81,8 @@ class RevisitedScenes:
         if shard.name not in self._checked:
             require_whole(self._source, shard)
             self._checked.add(shard.name)
-        return shard, shard.keys[index - starts[row]]
+        with contextlib.closing(SampleReader(self._source)) as reader:
+            return shard, reader.keys(shard)[index - starts[row]]
 
     def _origin(
         self, scene: Scene, key: str, asked: RevisitSettings, seed: int, attempt: int

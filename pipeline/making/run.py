@@ -19,9 +19,10 @@ from pipeline.making.publication import Publication
 from pipeline.objects.sources import look_at_source
 from pipeline.renders.variant import choose_variant
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import ShardEntry
+from storage.dataset.manifest import Manifest, ShardEntry
 from storage.dataset.statistics import Statistics
 from storage.errors import TrilightError
+from storage.records.objects import Failure
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,12 +44,8 @@ class Run:
 
     def missing_shards(self) -> list[int]:
         """Return the numbers of the shards that were asked for and are not there."""
-        wanted, missing = self.order.shard_range(), self.publication.missing_shards()
-        return [index for index in missing if self._is_ours(index, wanted)]
-
-    def _is_ours(self, index: int, wanted: range | None) -> bool:
-        in_part = self.part is None or self.part.has_shard(index)
-        return in_part and (wanted is None or index in wanted)
+        missing = self.publication.missing_shards(self.order.shard_range())
+        return [index for index in missing if self.part is None or self.part.has_shard(index)]
 
     def num_workers(self) -> int:
         """Return how many tasks run at a time in one process, where the executor does not say."""
@@ -69,8 +66,8 @@ class Run:
             extensions=manifest.extensions,
         )
 
-    def outcome(self, statistics: Statistics | None) -> "Outcome":
-        """Return what the run leaves behind; `statistics` where the dataset is finished."""
+    def outcome(self, finished: Manifest | None, statistics: Statistics | None) -> "Outcome":
+        """Return what the run leaves behind, of a finished dataset with what it holds."""
         publication, listed = self.publication, self.listed
         num_objects, part = self.accepted.num_objects, self.part
         if part is not None and part.number is not None:
@@ -81,24 +78,25 @@ class Run:
         elif statistics and self.order.revisits is None:
             notes = frozen_note(self.order.build, statistics)
         return Outcome(
-            digest=publication.manifest.dataset_digest,
+            digest=finished.dataset_digest if finished else "",
             num_objects_found=self.accepted.num_found,
             num_objects_used=num_objects,
-            num_scenes_given_up=publication.num_given_up(),
-            num_shards=len(publication.manifest.shards),
+            num_scenes_given_up=publication.done.given_up,
+            failures=tuple(publication.failures),
+            num_shards=len(finished.shards) if finished else publication.num_shards_there(),
             num_shards_planned=publication.num_shards,
             statistics=statistics,
             notes=notes,
         )
 
     def require_within_budget(self) -> None:
-        """Raise TrilightError where too many scenes failed, in this run and earlier ones.
+        """Raise TrilightError where too many scenes failed: in this run, in the end in all.
 
         Scene files of which nothing can be made do not count.
         """
         publication, files = self.publication, self.accepted.files
         num_scenes, budget = publication.manifest.num_scenes, self.order.failure_budget
-        given_up = publication.num_given_up()
+        given_up = publication.done.given_up
         if given_up > budget * num_scenes + (len(files.unusable) if files else 0):
             raise TrilightError(
                 f"{publication.folder.shown}: {given_up} of {num_scenes} scenes could not be made, "
@@ -146,15 +144,17 @@ class Outcome:
     """What a run leaves behind."""
 
     digest: str
-    """The dataset digest, of the shards that are there."""
+    """The dataset digest; empty where the dataset is not finished."""
     num_objects_found: int
     """Objects in the source, or the files that scenes are made of."""
     num_objects_used: int
     """Objects that scenes may draw from."""
     num_scenes_given_up: int
-    """Scenes that no attempt could save."""
+    """Scenes that no attempt could save; of this run alone where the dataset is not finished."""
+    failures: tuple[Failure, ...]
+    """What was rejected in this run and is not in `failures.jsonl` yet."""
     num_shards: int
-    """Shards that are there."""
+    """Shards that are there, as far as is known here."""
     num_shards_planned: int
     """Shards of the finished dataset."""
     statistics: Statistics | None

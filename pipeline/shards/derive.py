@@ -22,7 +22,7 @@ from pipeline.shards.plans import (
     taken_scenes,
     used_objects,
 )
-from storage.conventions import MAPS_VERSION, SCHEMA_VERSION
+from storage.conventions import MANIFEST_VERSION
 from storage.dataset.derived import Derivation, common, derived_settings, source_record
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, write_manifest
@@ -157,7 +157,7 @@ def _manifest(
         environment=_environment(manifests),
         extensions=_extensions(manifests),
         num_scenes=sum(shard.num_samples for shard in shards),
-        schema_version=_without_maps(manifests[0]),
+        schema_version=MANIFEST_VERSION,
         objects_lock_sha256=sha256_hex(encode_objects_lock(objects)),
         shards=shards,
     )
@@ -204,7 +204,6 @@ def _require_alike(sources: Sequence[FinishedDataset]) -> None:
     first = sources[0]
     for other in sources[1:]:
         pairs = [
-            ("schema version", _without_maps(first.manifest), _without_maps(other.manifest)),
             ("number of views", first.manifest.num_views, other.manifest.num_views),
             *((name, _setting(first, name), _setting(other, name)) for name in _SAME),
         ]
@@ -214,15 +213,6 @@ def _require_alike(sources: Sequence[FinishedDataset]) -> None:
                     f"{other.folder.root}: its {name} is {now}; expected {before}, as "
                     f"{first.folder.root} has it. Generate one of them anew."
                 )
-
-
-def _without_maps(manifest: Manifest) -> int:
-    """Return the version of a dataset, or of one without textures and maps that is like it.
-
-    Both may be together in one dataset, whose version follows from what is in it.
-    """
-    version = manifest.schema_version
-    return SCHEMA_VERSION if version == MAPS_VERSION else version
 
 
 def _setting(dataset: FinishedDataset, name: str) -> Any:

@@ -10,8 +10,8 @@ from typing import Any, BinaryIO
 from pipeline.shards.scene_values import asked_values
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import Manifest, ShardEntry, index_shard, read_manifest
-from storage.dataset.progress import planned_shards
-from storage.dataset.shard import with_maps
+from storage.dataset.planned import num_planned
+from storage.dataset.shard import ShardContents, contents_of
 from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject, locked_uids, read_objects_lock
@@ -54,7 +54,7 @@ def open_finished(place: str) -> FinishedDataset:
         raise TrilightError(f"{safe_url(place)}: expected the folder of a dataset on this machine.")
     folder = DatasetFolder(Path(place))
     manifest = read_manifest(folder.manifest)
-    planned = len(planned_shards(manifest))
+    planned = num_planned(manifest)
     if len(manifest.shards) < planned:
         raise TrilightError(
             f"{place}: {len(manifest.shards)} of {planned} shards are there; expected a finished "
@@ -87,7 +87,7 @@ def read_facts(
     for shard in dataset.manifest.shards:
         require_whole(dataset, shard)
         with contextlib.closing(SampleReader(dataset)) as reader:
-            for key in shard.index:
+            for key in reader.keys(shard):
                 yield _facts(shard, key, reader.members(shard, key, ("json", PLAIN, PACKED)), asked)
         shard_done()
 
@@ -108,9 +108,13 @@ class SampleReader:
     def __init__(self, dataset: FinishedDataset) -> None:
         self._folder = dataset.folder
         self._shard: ShardEntry | None = None
-        self._index: Mapping[str, Mapping[str, tuple[int, int]]] = {}
-        self._maps: Mapping[str, tuple[int, int]] = {}
+        self._contents = ShardContents(samples={}, maps={})
         self._stream: BinaryIO | None = None
+
+    def keys(self, shard: ShardEntry) -> list[str]:
+        """Return the keys of a shard's samples in the order of the file; the shard was checked."""
+        self._open(shard)
+        return list(self._contents.samples)
 
     def members(
         self, shard: ShardEntry, key: str, suffixes: tuple[str, ...] | None = None
@@ -119,22 +123,15 @@ class SampleReader:
 
         With its record come the maps that this names.
         """
+        stream = self._open(shard)
+        return self._contents.read(stream, key, lambda name: suffixes is None or name in suffixes)
+
+    def _open(self, shard: ShardEntry) -> BinaryIO:
         if shard is not self._shard or self._stream is None:
             self.close()
             self._stream = self._folder.shard(shard.name).open("rb")
-            self._shard, self._index, self._maps = shard, shard.index, shard.maps
-        members = {
-            suffix: self._read(place)
-            for suffix, place in self._index[key].items()
-            if suffixes is None or suffix in suffixes
-        }
-        return with_maps(members, self._maps, self._read)
-
-    def _read(self, place: tuple[int, int]) -> bytes:
-        offset, num_bytes = place
-        assert self._stream is not None
-        self._stream.seek(offset)
-        return self._stream.read(num_bytes)
+            self._shard, self._contents = shard, contents_of(self._stream, shard.name)
+        return self._stream
 
     def close(self) -> None:
         if self._stream is not None:

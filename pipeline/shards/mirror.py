@@ -2,37 +2,47 @@
 
 The bucket holds what a folder would hold. The manifest is begun once, the objects are frozen once,
 and each shard is put there once: the server refuses a second writer, who takes what is there.
-Below `.staging` stand for each shard the rejections of its scenes and a note with its manifest
-entry. A shard is finished when it and its note are there, or the manifest lists it. The manifest
-follows from what it was begun with and from the notes, so any worker may write it at any time.
+Below `.staging` stands for each shard a note with its manifest entry and the rejections of its
+scenes. A shard is finished when it and its note are there, or the manifest lists it. The list in
+the manifest follows from the notes, so whoever finds all shards there may write it.
+
+A folder here has the manifest without that list; what it notes as sent is what its makers have
+looked at: the parts of the dataset that they were asked for.
 
 Claims do not reach from one machine to another: two machines with the same shards make scenes
 twice, and the first writer of a shard wins. That is wasted work, never wrong.
 """
 
 import dataclasses
-import json
+import io
 import shutil
-from collections.abc import Collection
+from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.shards.pack import note_of, note_shard, noted_shard, rejections_of_shard
 from storage.atomic import write_atomically
 from storage.claims import claimed
-from storage.dataset.dataset import Dataset, RemoteDatasetFiles
-from storage.dataset.layout import DatasetFolder
+from storage.dataset.dataset import Dataset, RemoteDatasetFiles, read_beside
+from storage.dataset.layout import DatasetFolder, place_of_part
 from storage.dataset.manifest import (
     SHARD_NAME,
     Manifest,
     ShardEntry,
+    decode_head,
     decode_manifest,
     index_stream,
-    read_manifest,
-    shard_of_row,
+    read_head,
     write_manifest,
 )
 from storage.dataset.scene_logs import log_name
-from storage.digests import sha256_hex
+from storage.dataset.shard_notes import (
+    ShardNote,
+    encode_note,
+    fetched_notes,
+    note_of,
+    note_shard,
+    noted_shard,
+)
+from storage.digests import sha256_hex, sha256_of_file
 from storage.errors import TrilightError
 from storage.records.objects import decode_failures, read_failures, write_failures
 from storage.remote.bucket import Bucket
@@ -41,6 +51,8 @@ from storage.remote.url import RemoteUrl, parse_url
 
 _PLANNED = ".staging/planned/"
 """Folder with one file for each requested number of scenes; the largest counts."""
+_HEAD_BYTES = 1 << 18
+"""What is read of a manifest to know its head, which takes about 6 kB."""
 
 
 class Mirror:
@@ -52,10 +64,15 @@ class Mirror:
         self._folder = folder
         self._bucket = Bucket(url)
         self._files = RemoteDatasetFiles(url)
+        self._names_listed: set[str] | None = None
 
     def names(self) -> set[str]:
         """Return the names of all files of the dataset."""
         return self._bucket.names()
+
+    def is_begun(self) -> bool:
+        """Return whether there is a manifest."""
+        return self._head() is not None
 
     def dataset(self, manifest: Manifest) -> Dataset:
         """Return the dataset of a manifest, to be read from the bucket."""
@@ -70,19 +87,25 @@ class Mirror:
         Raises:
             TrilightError: the bucket cannot be read.
         """
-        folder, theirs = self._folder, self._manifest()
-        if theirs is None or _identity(self._own_manifest()) != _identity(theirs):
+        folder, theirs = self._folder, self._head()
+        if theirs is None or _identity(self._own_head()) != _identity(theirs):
             _clear(folder)
-        shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `receive` looks again
+        shutil.rmtree(folder.staged_sent, ignore_errors=True)  # `look_at` looks again
         if theirs is None:
             return
-        if (lock := self._files.read("objects.lock.jsonl")) is not None:
-            write_atomically(folder.objects_lock, lock)
-            index = self._files.read(self._name(folder.staged_index))
-            if index is not None:
-                write_atomically(folder.staged_index, index)
-        self._take_failures()
+        self._take_lock(theirs.objects_lock_sha256)
+        if not theirs.objects_lock_sha256:
+            self._take_failures()
         write_manifest(folder.manifest, theirs)
+
+    def _take_lock(self, sha256: str) -> None:
+        """Bring the frozen objects here, and their index, unless they are here."""
+        lock, index = self._folder.objects_lock, self._folder.staged_index
+        if not sha256 or (lock.exists() and sha256_of_file(lock) == sha256):
+            return
+        for path in (lock, index):
+            if (data := self._files.read(self._name(path))) is not None:
+                write_atomically(path, data)
 
     def begin(self) -> bool:
         """Create the bucket's manifest from the folder's; return whether ours came first."""
@@ -114,74 +137,84 @@ class Mirror:
                 "expected the same --objects everywhere. Give that, or choose another --out."
             )
 
-    def receive(self, listed: Collection[str]) -> tuple[int, int]:
-        """Read what other workers have finished and planned.
+    def planned(self) -> int:
+        """Return how many scenes somebody has planned at most."""
+        names = (name.removeprefix(_PLANNED) for name in self._bucket.names_in(_PLANNED))
+        return max((int(text) for text in names if text.isdecimal()), default=0)
 
-        Args:
-            listed: names of the shards that the folder's manifest lists.
+    def look_at(self, part: int) -> None:
+        """Note which shards of a part of the dataset are finished in the bucket."""
+        place = place_of_part(part)
+        notes = self._bucket.names_in(f"{self._name(self._folder.staged_entries)}/{place}")
+        for name in filter(SHARD_NAME.fullmatch, self._bucket.names_in(place)):
+            noted = self._name(note_of(self._folder, name)) in notes
+            if not self._folder.is_sent(name) and (noted or name in self._listed()):
+                self._mark(name)
 
-        Returns:
-            The number of new shards, and of the scenes of the dataset.
-        """
-        names, new = self.names(), 0
-        for name in sorted(filter(SHARD_NAME.fullmatch, names)):
-            note = self._name(note_of(self._folder, name))
-            if self._folder.is_sent(name) or not (name in listed or note in names):
-                continue
-            if name not in listed:
-                self._take_note(name, note)
-                new += 1
-            self._mark(name)
-        planned = [name.removeprefix(_PLANNED) for name in names if name.startswith(_PLANNED)]
-        return new, max((int(text) for text in planned if text.isdecimal()), default=0)
+    def _listed(self) -> set[str]:
+        """Return the shards that the manifest lists: those of a set that grows, or was copied."""
+        if self._names_listed is None:
+            self._names_listed = {shard.name for shard in self._manifest().shards}
+        return self._names_listed
 
-    def send(self, name: str, made: ShardEntry | None = None) -> ShardEntry | None:
+    def take_listed(self, head: Manifest) -> None:
+        """Bring what the bucket lists already into the folder's manifest, whose head that is."""
+        self._take_failures()
+        listed = dataclasses.replace(head, shards=self._manifest().shards)
+        write_manifest(self._folder.manifest, listed)
+
+    def notes(self, names: Sequence[str]) -> list[ShardNote]:
+        """Return the notes on finished shards: from here, or else from the bucket."""
+        folder = self._folder
+        here = {name for name in names if note_of(folder, name).exists()}
+        there = (self._name(note_of(folder, name)) for name in names if name not in here)
+        own = [noted_shard(folder, name) for name in names if name in here]
+        return own + fetched_notes(self._files.read, there, folder.shown)
+
+    def send(self, name: str) -> ShardNote | None:
         """Bring a shard of the folder into the bucket; the cache keeps its bytes.
 
-        Args:
-            name: of the shard.
-            made: its entry, where that is known.
-
         Returns:
-            The entry of the shard that is in the bucket then, ours or that of the first writer;
+            The note on the shard that is in the bucket then, ours or that of the first writer;
             None where another process of this machine sends it, or has sent it.
         """
         folder, path = self._folder, self._folder.shard(name)
         with claimed(folder.staging / "sending" / f"{name}.claim") as ours:
             if not ours or not path.exists():
                 return None
-            entry = made = made or noted_shard(folder, name)
+            note = made = noted_shard(folder, name)
             if not folder.is_sent(name):
-                entry = self._put(made)
+                note = self._put(made)
                 self._mark(name)
-            if entry == made:
-                shard_cache().keep(path, self._files.url.child(name), entry.sha256)
+            if note.shard == made.shard:
+                shard_cache().keep(path, self._files.url.child(name), made.shard.sha256)
             path.unlink(missing_ok=True)
-        return entry
+        return note
 
-    def _put(self, made: ShardEntry) -> ShardEntry:
-        """Put a shard and what stands beside it into the bucket; return the entry of what is there.
+    def _put(self, made: ShardNote) -> ShardNote:
+        """Put a shard and what stands beside it into the bucket; return the note that is there.
 
-        A worker that was not first takes over the first writer's rejections. Where those are
-        missing, the first writer was killed, and ours are stored instead.
+        A worker that was not first takes over the first writer's note. Where that is missing, the
+        first writer was killed, and ours says what was rejected instead.
         """
-        folder, name = self._folder, made.name
-        log, rejections = folder.root / log_name(name), rejections_of_shard(folder, name)
-        if self._bucket.create(name, folder.shard(name)):
+        name, here = made.shard.name, self._folder
+        log, note = here.root / log_name(name), self._name(note_of(here, name))
+        if self._bucket.create(name, here.shard(name)):
             if log.exists():
                 self._bucket.write(self._name(log), log)
-            entry = made
-            self._bucket.write(self._name(rejections), rejections)
-        else:
-            url = self._files.url.child(name)
-            with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
-                entry = index_stream(stream, Path(name).name)
-            if not self._bucket.create(self._name(rejections), rejections):
-                self._take_rejections(name)
-        note_shard(folder, entry)
-        note = note_of(folder, name)
-        self._bucket.write(self._name(note), note)
-        return entry
+            self._bucket.write(note, encode_note(made))
+            return made
+        found = dataclasses.replace(made, shard=self._indexed(name))
+        if not self._bucket.create(note, encode_note(found)):
+            (found,) = fetched_notes(self._files.read, [note], here.shown)
+        note_shard(here, found)
+        return found
+
+    def _indexed(self, name: str) -> ShardEntry:
+        """Return the entry of a shard of the bucket by reading it."""
+        url = self._files.url.child(name)
+        with shard_cache().open(url, num_bytes=None, sha256=None) as stream:
+            return index_stream(stream, Path(name).name)
 
     def send_index(self) -> None:
         """Put the index of the frozen objects into the bucket: others trust the lock by it."""
@@ -204,15 +237,23 @@ class Mirror:
         for path in documents:
             self._bucket.write(self._name(path), path)
 
-    def _manifest(self) -> Manifest | None:
-        """Return the manifest of the bucket with the digest of the objects that are there."""
-        stream = self._files.open_beside("manifest.json") if self.names() else None
-        if stream is None:
+    def _head(self) -> Manifest | None:
+        """Return the bucket's manifest without its list, with the digest of the objects there."""
+        place = f"{self._folder.shown}/manifest.json"
+        start = self._bucket.read_start("manifest.json", _HEAD_BYTES)
+        if start is None:
             return None
-        with stream:
-            manifest = decode_manifest(stream, f"{self._folder.shown}/manifest.json")
+        try:
+            head = decode_head(io.BytesIO(start), place)
+        except TrilightError:  # a longer head; or it is none, which reading it all says
+            head = self._manifest()
+        if head.objects_lock_sha256:
+            return head
         lock = self._files.read(self._folder.objects_lock.name)
-        return dataclasses.replace(manifest, objects_lock_sha256=sha256_hex(lock) if lock else "")
+        return dataclasses.replace(head, objects_lock_sha256=sha256_hex(lock) if lock else "")
+
+    def _manifest(self) -> Manifest:
+        return read_beside(self._files, decode_manifest)
 
     def _take_failures(self) -> None:
         """Merge the bucket's rejections into the folder's."""
@@ -220,34 +261,17 @@ class Mirror:
         known = read_failures(self._folder.failures)
         write_failures(self._folder.failures, [*known, *theirs])
 
-    def _own_manifest(self) -> Manifest | None:
+    def _own_head(self) -> Manifest | None:
         try:
-            return read_manifest(self._folder.manifest)
+            return read_head(self._folder.manifest)
         except TrilightError:
             return None
 
-    def _take_note(self, name: str, note: str) -> None:
-        """Copy another worker's note on a shard into the folder."""
-        try:
-            entry = shard_of_row(json.loads(self._files.read(note) or b""))
-            if entry.name != name:
-                raise ValueError(entry.name)
-        except (ValueError, KeyError, TypeError) as error:
-            raise TrilightError(
-                f"{self._folder.shown}/{note}: not a note on {name} ({error}); delete both, and "
-                "the shard is made again."
-            ) from error
-        self._take_rejections(name)
-        note_shard(self._folder, entry)
-
-    def _take_rejections(self, name: str) -> None:
-        rejections = rejections_of_shard(self._folder, name)
-        failures = self._files.read(self._name(rejections))
-        write_failures(rejections, decode_failures(failures or b""))
-
     def _mark(self, name: str) -> None:
-        """Note that a shard is in the bucket."""
-        write_atomically(self._folder.staged_sent / name, b"")
+        """Note that a shard is in the bucket; what is lost of that is looked at again."""
+        path = self._folder.staged_sent / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self._folder.root).as_posix()

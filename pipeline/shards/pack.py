@@ -1,14 +1,12 @@
-"""Stage "shards": the staged scenes of a shard become its tar file, and a note for the manifest."""
+"""Stage "shards": the staged scenes of a shard become its tar file."""
 
-import contextlib
-import json
 import shutil
 from pathlib import Path
 
-from storage.atomic import write_atomically
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import ShardEntry, index_shard, shard_of_row, shard_row
+from storage.dataset.manifest import ShardEntry, index_shard
 from storage.dataset.shard import write_shard
+from storage.dataset.shard_notes import rejections_of_shard
 from storage.dataset.staging import read_staged_scene
 from storage.records.map_references import MAP_NAME
 from storage.records.objects import Failure, write_failures
@@ -54,47 +52,6 @@ def pack_shard(folder: DatasetFolder, name: str, scene_indices: range) -> ShardE
     return index_shard(path)
 
 
-def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
-    """Return the file with the rejections of a packed shard."""
-    return folder.staged_failures / f"{name}.jsonl"
-
-
 def remove_staged(staged_folder: Path) -> None:
     """Delete the staged scenes of a shard that is packed."""
     shutil.rmtree(staged_folder, ignore_errors=True)  # leftovers are never read
-
-
-def note_shard(folder: DatasetFolder, shard: ShardEntry) -> None:
-    """Write down what the manifest will say of a shard; safe to repeat."""
-    write_atomically(note_of(folder, shard.name), json.dumps(shard_row(shard)).encode())
-
-
-def note_of(folder: DatasetFolder, name: str) -> Path:
-    """Return the file of the note on a shard."""
-    return folder.staged_entries / f"{name}.json"
-
-
-def noted_shard(folder: DatasetFolder, name: str) -> ShardEntry:
-    """Return the entry of a shard that is there: its note, or else by reading the shard.
-
-    A note that is older than the shard, or of another size, was of a shard before it. Of a shard
-    in a bucket the note alone is here.
-
-    Raises:
-        TrilightError: the file is not a whole shard.
-    """
-    path, shard = note_of(folder, name), folder.shard(name)
-    # a kill before the note leaves none; then, and where it is no note, the shard itself is read
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        entry = shard_of_row(json.loads(path.read_bytes()))
-        if folder.is_sent(name):
-            return entry
-        facts = shard.stat()
-        if entry.num_bytes == facts.st_size and path.stat().st_mtime_ns >= facts.st_mtime_ns:
-            return entry
-    return index_shard(shard)
-
-
-def forget_note(folder: DatasetFolder, name: str) -> None:
-    """Delete the note of a shard that the manifest lists."""
-    note_of(folder, name).unlink(missing_ok=True)

@@ -4,12 +4,14 @@ The keys of the first source stay; each following source's are raised by one num
 manifest states: `key_offset`. So every scene can be found in its source, and no two share a key.
 """
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from pipeline.shards.expression import Condition, condition
-from pipeline.shards.finished import FinishedDataset, SceneFacts, read_facts
+from pipeline.shards.finished import FinishedDataset, SampleReader, SceneFacts, read_facts
 from storage.conventions import SPLITS
+from storage.dataset.derived import derivation_of
 from storage.errors import TrilightError
 from storage.records.objects import LockedObject
 from storage.records.sample import sample_key
@@ -99,10 +101,17 @@ def key_offsets(sources: Sequence[FinishedDataset]) -> list[int]:
     offsets, following = [], 0
     for source in sources:
         offsets.append(following)
-        keys = [key for shard in source.manifest.shards for key in shard.index]
-        last = max((int(key) for key in keys if key.isdecimal()), default=-1)
-        following += max(last + 1, source.manifest.num_scenes)
+        following += max(_last_key(source) + 1, source.manifest.num_scenes)
     return offsets
+
+
+def _last_key(source: FinishedDataset) -> int:
+    """Return the largest key of a dataset that was made of others; else -1: keys number scenes."""
+    if not derivation_of(source.manifest.settings):
+        return -1
+    with contextlib.closing(SampleReader(source)) as reader:
+        keys = (key for shard in source.manifest.shards for key in reader.keys(shard))
+        return max((int(key) for key in keys if key.isdecimal()), default=-1)
 
 
 def raised_key(key: str, offset: int) -> str:

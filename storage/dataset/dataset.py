@@ -5,28 +5,33 @@ import os
 import shlex
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
 
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, ShardEntry, decode_manifest
-from storage.dataset.shard import samples_of, with_maps
+from storage.dataset.manifest import (
+    Manifest,
+    ShardEntry,
+    decode_manifest,
+)
+from storage.dataset.shard import ShardContents, contents_of, samples_of
 from storage.digests import sha256_of_stream
 from storage.errors import TrilightError
 from storage.records.held_maps import HeldMaps
 from storage.records.objects import Failure, LockedObject, decode_failures, decode_objects_lock
 from storage.records.safe_read import open_plain
 from storage.records.sample import Sample, SceneRecord, decode_sample, decode_scene
+from storage.remote.bucket import WRITABLE
 from storage.remote.cache import shard_cache
 from storage.remote.fetch import download, facts_of, unreadable
 from storage.remote.tries import TransferFailed, is_missing
 from storage.remote.url import RemoteUrl, parse_url
 
 MAX_BESIDE_BYTES = 1 << 30
-"""Largest file beside the shards: a manifest takes about 200 bytes a member."""
+"""Largest file beside the shards: a manifest takes 230 bytes a shard, a lock 400 an object."""
 
 
 class _Files(ABC):
@@ -190,9 +195,25 @@ def reading(dataset: str, shard: str) -> Iterator[None]:
 class Dataset:
     """The shards of one dataset, checked by digest as they are read."""
 
-    def __init__(self, files: DatasetFiles, manifest: Manifest) -> None:
+    def __init__(
+        self,
+        files: DatasetFiles,
+        manifest: Manifest,
+        num_listed: int | None = None,
+        noted: Sequence[Failure] = (),
+    ) -> None:
+        """Name what is read.
+
+        Args:
+            files: where it is.
+            manifest: what it is, with every shard that may be read.
+            num_listed: how many of the shards the manifest on the disk lists; all by default.
+            noted: what was rejected on the way to the others.
+        """
         self.files = files
         self.manifest = manifest
+        self.num_listed = len(manifest.shards) if num_listed is None else num_listed
+        self._noted = noted
 
     @property
     def shown(self) -> str:
@@ -248,35 +269,56 @@ class Dataset:
                 yield decode_sample(key, members, held)
 
     def read_scenes(self, shard: ShardEntry) -> Iterator[SceneRecord]:
-        """Yield the samples of a shard without their pictures, through the manifest's index.
+        """Yield the samples of a shard without their pictures, through its headers.
 
         Only what is needed is read, so that a large dataset can be browsed; the digest of the
         shard is therefore not checked (`read_shard` and `trilight verify` do that).
 
         Raises:
-            TrilightError: the shard is missing or shorter than its index, or a scene in it is
-                unreadable or breaks a law.
+            TrilightError: the shard is missing or damaged, or a scene in it is unreadable or breaks
+                a law.
         """
-        maps, held = shard.maps, HeldMaps()
+        held = HeldMaps()
         with self.files.open(shard, checked=False) as stream:
-            for key, members in shard.index.items():
-                scene_members = [suffix for suffix in members if not suffix.endswith("exr")]
+            contents = self._contents(stream, shard)
+            for key in contents.samples:
                 with reading(self.shown, shard.name):
-                    found = _read(stream, members, scene_members, maps)
+                    found = contents.read(stream, key, lambda name: not name.endswith("exr"))
                     record = decode_scene(key, found, held)
                     _require_lawful(record)
                 yield record
 
     def read_samples(self, shard: ShardEntry, keys: Iterable[str]) -> Iterator[Sample]:
         """Yield some samples of a shard with their pictures; otherwise as `read_scenes`."""
-        index, maps, held = shard.index, shard.maps, HeldMaps()
+        held = HeldMaps()
         with self.files.open(shard, checked=False) as stream:
+            contents = self._contents(stream, shard)
             for key in keys:
                 with reading(self.shown, shard.name):
-                    found = _read(stream, index[key], index[key], maps)
-                    sample = decode_sample(key, found, held)
+                    sample = decode_sample(key, contents.read(stream, key), held)
                     _require_lawful(sample)
                 yield sample
+
+    def keys(self, shard: ShardEntry) -> list[str]:
+        """Return the keys of a shard's samples in the order of the file; as `read_scenes`."""
+        with self.files.open(shard, checked=False) as stream:
+            keys = list(self._contents(stream, shard).samples)
+        if len(keys) != shard.num_samples:
+            raise TrilightError(
+                f"{shard.name}: {len(keys)} samples; expected {shard.num_samples}, as the manifest "
+                f"says. Run `trilight verify {shlex.quote(self.shown)} --repair`."
+            )
+        return keys
+
+    def suffixes(self, shard: ShardEntry) -> set[str]:
+        """Return the suffixes of all members of a shard's samples; as `read_scenes`."""
+        with self.files.open(shard, checked=False) as stream:
+            samples = self._contents(stream, shard).samples
+        return {suffix for members in samples.values() for suffix in members}
+
+    def _contents(self, stream: BinaryIO, shard: ShardEntry) -> ShardContents:
+        with reading(self.shown, shard.name):
+            return contents_of(stream, shard.name)
 
     def objects_lock(self) -> list[LockedObject]:
         """Return the objects that were used; none where the dataset has no lock."""
@@ -285,26 +327,7 @@ class Dataset:
 
     def failures(self) -> list[Failure]:
         """Return what was rejected; none where the dataset does not say."""
-        return decode_failures(self.files.read("failures.jsonl") or b"")
-
-
-def _read(
-    stream: BinaryIO,
-    index: Mapping[str, tuple[int, int]],
-    suffixes: Iterable[str],
-    maps: Mapping[str, tuple[int, int]],
-) -> dict[str, bytes]:
-    members = {suffix: _read_at(stream, index[suffix]) for suffix in suffixes}
-    return with_maps(members, maps, lambda place: _read_at(stream, place))
-
-
-def _read_at(stream: BinaryIO, place: tuple[int, int]) -> bytes:
-    offset, num_bytes = place
-    stream.seek(offset)
-    data = stream.read(num_bytes)
-    if len(data) != num_bytes:
-        raise TrilightError("shorter than the manifest says")
-    return data
+        return [*decode_failures(self.files.read("failures.jsonl") or b""), *self._noted]
 
 
 def _require_lawful(record: SceneRecord | Sample) -> None:
@@ -319,20 +342,40 @@ def _require_lawful(record: SceneRecord | Sample) -> None:
         )
 
 
-def open_dataset(
-    url: str, *, shard_read: Callable[[ShardEntry], ShardEntry] = lambda shard: shard
-) -> Dataset:
+def open_dataset(url: str) -> Dataset:
     """Open the dataset in a local folder, or below a URL of http, https, s3, gs or hf.
 
-    Args:
-        url: where it is.
-        shard_read: returns what is kept of each shard of the manifest (storage.dataset.manifest).
+    Of one that is still made, the shards that are noted so far count too, where the folder or
+    bucket can be listed.
 
     Raises:
         TrilightError: there is no readable manifest, the URL is refused, or the driver for it is
             not installed.
     """
+    dataset = open_listed(url)
+    if not _may_be_growing(dataset.files):
+        return dataset
+    from storage.dataset.unlisted import (
+        with_unlisted,  # slow: whoever streams a whole set needs none
+    )
+
+    return with_unlisted(dataset)
+
+
+def _may_be_growing(files: DatasetFiles) -> bool:
+    if isinstance(files, LocalFiles):
+        return DatasetFolder(files.root).staged_entries.exists()
+    return files.url.scheme in WRITABLE
+
+
+def open_listed(url: str) -> Dataset:
+    """Open what the manifest lists of a dataset: nothing while it is made; as `open_dataset`."""
     files = dataset_files(url)
+    return Dataset(files, read_beside(files, decode_manifest))
+
+
+def read_beside(files: DatasetFiles, decode: Callable[[BinaryIO, str], Manifest]) -> Manifest:
+    """Return what `decode` finds in the manifest; raises as `open_dataset`."""
     stream = files.open_beside("manifest.json")
     if stream is None:
         raise TrilightError(
@@ -340,5 +383,4 @@ def open_dataset(
             "--out` makes it."
         )
     with stream:
-        place = f"{files.shown}/manifest.json"
-        return Dataset(files, decode_manifest(stream, place, shard_read))
+        return decode(stream, f"{files.shown}/manifest.json")

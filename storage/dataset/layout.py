@@ -12,6 +12,7 @@ folder of this machine before it.
 import contextlib
 import fcntl
 import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,20 +34,59 @@ FILES_PER_FOLDER = 4096
 """Numbered files of one folder; with their sub-folders and what else lies there, below 5,000."""
 
 
+_PART = re.compile(r"part-(\d{4,6})")
+
+
 def numbered(number: int, name: str) -> str:
     """Return the relative path of the file `name`, which is the `number`-th of its folder."""
     part = number // FILES_PER_FOLDER
     return f"part-{part:04d}/{name}" if part else name
 
 
-def shard_names_in(root: Path) -> Iterator[str]:
-    """Yield the names of the files in a folder and its parts that are called like a shard."""
-    with contextlib.suppress(FileNotFoundError), os.scandir(root) as entries:
+def shard_names_in(root: Path, suffix: str = "") -> Iterator[str]:
+    """Yield the names of the shards of which a folder or its parts has a file.
+
+    Args:
+        root: the folder.
+        suffix: what such files have after the name of their shard.
+    """
+    for part in _parts_in(root):
+        yield from shard_names_in_part(root, part, suffix)
+
+
+def shard_names_in_part(root: Path, part: int, suffix: str = "") -> Iterator[str]:
+    """Yield as `shard_names_in`, of one part alone."""
+    place = place_of_part(part)
+    with contextlib.suppress(FileNotFoundError), os.scandir(root / place) as entries:
         for entry in entries:
-            if entry.name.endswith(".tar"):
-                yield entry.name
-            elif entry.name.startswith("part-") and entry.is_dir():
-                yield from (f"{entry.name}/{name}" for name in shard_names_in(Path(entry.path)))
+            if entry.name.endswith(f".tar{suffix}"):
+                yield f"{place}{entry.name.removesuffix(suffix)}"
+
+
+def parts_of(numbers: range) -> range:
+    """Return the parts of a folder in which numbered files stand."""
+    if not numbers:
+        return range(0)
+    return range(numbers.start // FILES_PER_FOLDER, numbers[-1] // FILES_PER_FOLDER + 1)
+
+
+def in_parts(numbers: range) -> Iterator[range]:
+    """Yield ranges of numbers, each of those in one part of a folder."""
+    for part in parts_of(numbers):
+        first = max(numbers.start, part * FILES_PER_FOLDER)
+        yield range(first, min(numbers.stop, (part + 1) * FILES_PER_FOLDER))
+
+
+def place_of_part(part: int) -> str:
+    """Return the relative path of a part of a folder, with its slash; empty for the first."""
+    return numbered(part * FILES_PER_FOLDER, "")
+
+
+def _parts_in(root: Path) -> list[int]:
+    with contextlib.suppress(FileNotFoundError):
+        found = (_PART.fullmatch(name) for name in os.listdir(root))
+        return [0, *sorted(int(match[1]) for match in found if match)]
+    return []
 
 
 class _Below:
@@ -92,9 +132,9 @@ class DatasetFolder:
     staged_parts = _Below(".staging/object_parts")
     """What came of parts of the objects, until they are frozen."""
     staged_failures = _Below(".staging/failures")
-    """Rejections of shards that are packed but not yet in the manifest."""
+    """Rejections of shards that are packed and not yet noted."""
     staged_entries = _Below(".staging/entries")
-    """What the manifest will say of shards that are packed but not yet in it."""
+    """Notes on shards that the manifest does not list yet (storage.dataset.shard_notes)."""
     staged_samples = _Below(".staging/samples")
     """Finished samples of unfinished shards, in a folder for each shard."""
     staged_sent = _Below(".staging/sent")

@@ -1,84 +1,34 @@
 """The manifest: what a dataset is, in one file that only ever appears whole.
 
 It names the settings in full, what the pictures depend on (Mitsuba variant, processor, library
-versions), and each shard with its digest and an index of its members. The dataset digest is taken
-over the shards, the object lock and the settings; "the same bytes" always means this digest.
+versions), and each shard with its digest; where a member stands in a shard, its own headers say.
+The dataset digest is taken over the shards, the object lock and the settings; "the same bytes"
+always means this digest.
+
+While a dataset is made, its manifest is the head alone, a few kilobytes, and each finished shard
+has a note (storage.dataset.shard_notes): no maker reads or writes what the others have made. Who
+finds all shards there lists them, once.
 """
 
+import contextlib
 import dataclasses
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, overload
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, BinaryIO
 
 from storage.atomic import atomic_writer
-from storage.conventions import MAPS_VERSION, SCHEMA_VERSION, SPLITS, require_readable
+from storage.conventions import MANIFEST_VERSION, READABLE_MANIFESTS, SPLITS, require_readable
 from storage.dataset.json_pieces import entries
 from storage.dataset.layout import numbered
-from storage.dataset.shard import MAX_MEMBER_BYTES, MEMBER_NAME, Member, scan_samples
+from storage.dataset.shard import scan_samples
 from storage.digests import canonical_json, sha256_hex, sha256_of_stream
 from storage.errors import TrilightError
-from storage.records.map_references import MAP_NAME
-
-Row = tuple[str, int, int]
-"""Name, offset of the first byte, number of bytes."""
-
-
-_A_MAP = re.compile(rb"(?m)^" + MAP_NAME.pattern.encode() + rb"$")
-
-
-class MemberTable(Sequence[Row]):
-    """Rows that are unpacked when they are asked for: ask for all of them at once."""
-
-    __slots__ = ("_names", "_places", "has_maps")
-
-    def __init__(self, rows: Iterable[Row] = ()) -> None:
-        """Pack rows; names hold no line break, numbers are whole ones from 0 to below 2^63."""
-        held = list(rows)
-        self._names = "\n".join(name for name, _, _ in held).encode()
-        self.has_maps = _A_MAP.search(self._names) is not None
-        self._places: NDArray[np.int64] = np.array(
-            [(offset, num_bytes) for _, offset, num_bytes in held], np.int64
-        ).reshape(-1, 2)
-
-    def __iter__(self) -> Iterator[Row]:
-        names = self._names.decode().split("\n") if len(self) else []
-        return zip(names, *self._places.T.tolist(), strict=True)
-
-    def __len__(self) -> int:
-        return len(self._places)
-
-    @overload
-    def __getitem__(self, at: int) -> Row: ...
-
-    @overload
-    def __getitem__(self, at: slice) -> Sequence[Row]: ...
-
-    def __getitem__(self, at: int | slice) -> Row | Sequence[Row]:
-        return list(self)[at]
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, MemberTable):
-            return NotImplemented
-        return self._names == other._names and np.array_equal(self._places, other._places)
-
-    def __hash__(self) -> int:
-        return hash((self._names, self._places.tobytes()))
-
-    def __repr__(self) -> str:
-        return f"MemberTable({list(self)!r})"
-
 
 SHARD_NAME = re.compile(rf"(?:part-\d{{4,6}}/)?({'|'.join(SPLITS)})-(\d{{6}})\.tar")
 """Names are relative to the manifest and cannot leave its folder."""
-
-_MOST_BYTES = 1 << 62
-"""Maximum size of a shard, which fits into a MemberTable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,32 +46,6 @@ class ShardEntry:
     """Size of the file."""
     sha256: str
     """Digest of the file."""
-    members: MemberTable
-    """Name, offset of the first byte, and number of bytes of each member."""
-
-    @property
-    def keys(self) -> Sequence[str]:
-        """The keys of its samples, in the order of the file."""
-        names = (name.partition(".") for name, _, _ in self.members)
-        return list(dict.fromkeys(key for key, point, _ in names if point))  # maps have no point
-
-    @property
-    def index(self) -> Mapping[str, Mapping[str, tuple[int, int]]]:
-        """Offset and number of bytes of each member, by key and suffix."""
-        index: dict[str, dict[str, tuple[int, int]]] = {}
-        for name, offset, num_bytes in self.members:
-            key, point, suffix = name.partition(".")
-            if point:  # a map has none
-                index.setdefault(key, {})[suffix] = (offset, num_bytes)
-        return index
-
-    @property
-    def maps(self) -> Mapping[str, tuple[int, int]]:
-        """Offset and number of bytes of each texture and environment map, by its name."""
-        if not self.members.has_maps:
-            return {}
-        rows = self.members
-        return {name: (offset, num) for name, offset, num in rows if MAP_NAME.fullmatch(name)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,17 +65,12 @@ class Manifest:
     objects_lock_sha256: str
     """Digest of `objects.lock.jsonl`; empty until the objects are prepared."""
     shards: tuple[ShardEntry, ...]
-    """The finished shards, by name."""
-    schema_version: int = SCHEMA_VERSION
-    """Version of the formats; with a map in a shard, that of maps, whatever was given."""
+    """The finished shards by number; none while they are made."""
+    schema_version: int = MANIFEST_VERSION
+    """Version that was read; what is written has MANIFEST_VERSION."""
     extensions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """The sha256 of each extension that took part in making it, by its file name; nothing that is
     named here is ever imported (storage.extensions)."""
-
-    def __post_init__(self) -> None:
-        """Note that a dataset with textures or environment maps needs readers that know them."""
-        if any(shard.members.has_maps for shard in self.shards):
-            object.__setattr__(self, "schema_version", MAPS_VERSION)
 
     @property
     def num_samples(self) -> int:
@@ -166,6 +85,11 @@ class Manifest:
         """sha256 over the sorted shard digests, the object lock and the settings."""
         shards = sorted([shard.name, shard.sha256] for shard in self.shards)
         return sha256_hex(canonical_json([shards, self.objects_lock_sha256, dict(self.settings)]))
+
+
+def number_of_shard(shard: ShardEntry) -> int:
+    """Return the number of a shard, by which shards are listed."""
+    return int(shard.name.removesuffix(".tar").rpartition("-")[2])
 
 
 def index_shard(path: Path) -> ShardEntry:
@@ -183,27 +107,21 @@ def index_stream(stream: BinaryIO, name: str) -> ShardEntry:
     match = SHARD_NAME.fullmatch(name)
     if match is None:
         raise TrilightError(f"{name}: not a shard; expected a name like train-000003.tar.")
-    maps: dict[str, Member] = {}
-    samples = list(scan_samples(stream, name, maps))
-    every = [*maps.values(), *(member for _, members in samples for member in members.values())]
+    num_samples = sum(1 for _ in scan_samples(stream, name))
     num_bytes = stream.seek(0, 2)
     stream.seek(0)
     return ShardEntry(
         name=numbered(int(match[2]), PurePosixPath(name).name),
         split=match[1],
-        num_samples=len(samples),
+        num_samples=num_samples,
         num_bytes=num_bytes,
         sha256=sha256_of_stream(stream),
-        members=MemberTable(
-            (member.name, member.offset, member.num_bytes)
-            for member in sorted(every, key=lambda member: member.offset)
-        ),
     )
 
 
 def write_manifest(path: Path, manifest: Manifest) -> None:
     """Write the manifest atomically, a shard a line; equal manifests give equal bytes."""
-    record = _fields(manifest)
+    record = _fields(manifest) | {"schema_version": MANIFEST_VERSION}
     record["totals"] = {"samples": manifest.num_samples, "bytes": manifest.num_bytes}
     record["dataset_digest"] = manifest.dataset_digest
     if not manifest.extensions:  # as manifests are that were written before there were any
@@ -212,7 +130,7 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
     head, mark, tail = json.dumps(record, indent=1, sort_keys=True).partition(
         '\n "shards": ['
     )  # no text of JSON holds a line break
-    with atomic_writer(path) as stream:  # row by row: the whole has a million members
+    with atomic_writer(path) as stream:  # row by row: there may be a million
         stream.write(f"{head}{mark}".encode())
         for number, shard in enumerate(manifest.shards):
             row = json.dumps(shard_row(shard), sort_keys=True)
@@ -222,7 +140,7 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
 
 def shard_row(shard: ShardEntry) -> dict[str, Any]:
     """Return the JSON values of an entry."""
-    return {**_fields(shard), "members": list(shard.members)}
+    return _fields(shard)
 
 
 def _fields(record: Manifest | ShardEntry) -> dict[str, Any]:
@@ -230,14 +148,23 @@ def _fields(record: Manifest | ShardEntry) -> dict[str, Any]:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Return the manifest of a file.
+    """Return the manifest of a file, as far as it is listed.
 
     Raises:
         TrilightError: missing, not JSON, another schema version, or a shard name that is none.
     """
+    return _read(path, decode_manifest)
+
+
+def read_head(path: Path) -> Manifest:
+    """Return the manifest of a file without its shards, which are not read; otherwise as it."""
+    return _read(path, decode_head)
+
+
+def _read(path: Path, decode: Callable[[BinaryIO, str], Manifest]) -> Manifest:
     try:
         with path.open("rb") as stream:
-            return decode_manifest(stream, str(path))
+            return decode(stream, str(path))
     except FileNotFoundError as error:
         raise TrilightError(
             f"{path.parent}: no manifest.json here; expected the folder of a dataset, as "
@@ -247,41 +174,59 @@ def read_manifest(path: Path) -> Manifest:
         raise TrilightError(f"{path}: not a readable manifest ({error}).") from error
 
 
-def decode_manifest(
-    stream: BinaryIO, place: str, shard_read: Callable[[ShardEntry], ShardEntry] = lambda s: s
-) -> Manifest:
-    """Return the manifest of an open file.
-
-    One shard at a time is held as JSON: the index of a million samples then takes the 200 bytes for
-    each that it needs, and not ten times as many on the way.
+def decode_manifest(stream: BinaryIO, place: str) -> Manifest:
+    """Return the manifest of an open file; one shard at a time is held as JSON.
 
     Args:
         stream: the file.
         place: where it is, for messages.
-        shard_read: returns what is kept of each shard; may leave its members out.
 
     Raises:
-        TrilightError: as `read_manifest`, or as `shard_read`.
+        TrilightError: as `read_manifest`.
     """
-    record: dict[str, Any] = {}
-    shards: list[ShardEntry] = []
-    try:
+    with _decoding(place):
+        return _manifest(entries(stream), place)
+
+
+def decode_head(stream: BinaryIO, place: str) -> Manifest:
+    """Return the manifest of an open file without its shards; otherwise as `decode_manifest`."""
+
+    def up_to_shards() -> Iterator[tuple[str, Any]]:
         for name, value in entries(stream):
-            if name == "shards":
-                shards.append(shard_read(shard_of_row(value)))
-                continue
-            if name == "schema_version":  # it comes before the shards, which it explains
-                require_readable(value, place)
-            record[name] = value
-        require_readable(record.get("schema_version"), place)
-        del record["totals"], record["dataset_digest"]
-        if not all(isinstance(sha256, str) for sha256 in record.get("extensions", {}).values()):
-            raise ValueError("extensions without digests")
-        return Manifest(shards=tuple(shards), **record)
+            if name in ("shards", "totals"):  # they come last: names are sorted
+                return
+            yield name, value
+
+    with _decoding(place):
+        return _manifest(up_to_shards(), place)
+
+
+@contextlib.contextmanager
+def _decoding(place: str) -> Iterator[None]:
+    try:
+        yield
     except TrilightError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise TrilightError(f"{place}: not a readable manifest ({error}).") from error
+
+
+def _manifest(found: Iterable[tuple[str, Any]], place: str) -> Manifest:
+    record: dict[str, Any] = {}
+    shards: list[ShardEntry] = []
+    for name, value in found:
+        if name == "shards":
+            shards.append(shard_of_row(value))
+            continue
+        if name == "schema_version":  # it comes before the shards, which it explains
+            require_readable(value, place, READABLE_MANIFESTS)
+        record[name] = value
+    require_readable(record.get("schema_version"), place, READABLE_MANIFESTS)
+    del record["dataset_digest"]
+    record.pop("totals", None)
+    if not all(isinstance(sha256, str) for sha256 in record.get("extensions", {}).values()):
+        raise ValueError("extensions without digests")
+    return Manifest(shards=tuple(shards), **record)
 
 
 def shard_of_row(row: dict[str, Any]) -> ShardEntry:
@@ -292,9 +237,6 @@ def shard_of_row(row: dict[str, Any]) -> ShardEntry:
     """
     if not SHARD_NAME.fullmatch(row["name"]):
         raise ValueError(f"shard name {row['name']!r}")
-    members = [(str(name), int(at), int(size)) for name, at, size in row["members"]]
-    for name, at, size in members:
-        placed = 0 <= at < _MOST_BYTES and 0 <= size <= MAX_MEMBER_BYTES
-        if not ((MEMBER_NAME.fullmatch(name) or MAP_NAME.fullmatch(name)) and placed):
-            raise ValueError(f"member {name!r} of {size} bytes at {at}")
-    return ShardEntry(**{**row, "members": MemberTable(members)})
+    return ShardEntry(
+        **{name: value for name, value in row.items() if name != "members"}
+    )  # before version 5, rows had an index of their members

@@ -7,16 +7,16 @@ import contextlib
 import functools
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from storage.atomic import write_atomically, write_error
 from storage.dataset.asked import read_asked
-from storage.dataset.dataset import Dataset, LocalFiles, open_dataset
-from storage.dataset.derived import derivation_of
+from storage.dataset.dataset import Dataset, LocalFiles, open_listed
 from storage.dataset.layout import DatasetFolder, numbered, shard_names_in
 from storage.dataset.manifest import Manifest, read_manifest
+from storage.dataset.planned import num_planned, planned_shards
 from storage.dataset.scene_logs import (
     LookedAt,
     SceneLog,
@@ -24,12 +24,10 @@ from storage.dataset.scene_logs import (
     log_name,
     look_at_logs,
 )
-from storage.dataset.settings import SplitSettings
-from storage.dataset.splits import scenes_of_shard, shard_name, shards_for
+from storage.dataset.shard_notes import note_of, noted_names, noted_shard
 from storage.errors import TrilightError
-from storage.records.objects import count_by_reason, decode_failures
+from storage.records.objects import Failure, count_by_reason
 from storage.remote.bucket import WRITABLE, Bucket
-from storage.settings.described import from_record
 
 _AT_WORK_S = 600.0
 """Older notes on unfinished views were left by a kill: a pass of samples takes less time."""
@@ -139,48 +137,27 @@ def _plan_of(manifest: Path, mtime_ns: int, num_bytes: int) -> tuple[int, int, M
     return found.num_scenes, found.num_views, planned_shards(found)
 
 
-def planned_shards(manifest: Manifest) -> dict[str, int]:
-    """Return the names of the shards of the finished dataset, with their numbers of scenes.
-
-    Raises:
-        TrilightError: the settings in the manifest do not say how the dataset is divided.
-    """
-    if derivation_of(manifest.settings):  # it only ever appears whole
-        return {entry.name: entry.num_samples for entry in manifest.shards}
-    try:
-        splits = from_record(SplitSettings, manifest.settings["splits"])
-    except (KeyError, TrilightError) as error:
-        raise TrilightError(f"manifest: settings.splits is not readable ({error!r}).") from error
-    return {
-        shard_name(index, splits): len(scenes_of_shard(index, splits))
-        for index in range(shards_for(manifest.num_scenes, splits))
-    }
-
-
 def shards_there(folder: DatasetFolder) -> set[str]:
     """Return the names of the shards that are there under their final names, listed or not."""
     here = set(shard_names_in(folder.root))
     return here | set(shard_names_in(folder.staged_sent)) if folder.bucket else here
 
 
-def _finished_names(dataset: Dataset) -> set[str]:
-    """Return the names of the shards that are there, listed or not.
+def _finished_names(dataset: Dataset, planned: Collection[str]) -> set[str]:
+    """Return the names of the planned shards that are there, listed or not.
 
     A bucket is asked what it holds, where it may be asked and something is not listed yet: a shard
     is finished there when it and the note on it have come (pipeline.shards.mirror).
     """
     if isinstance(dataset.files, LocalFiles):
-        return shards_there(DatasetFolder(dataset.files.root))
-    listed = {entry.name for entry in dataset.manifest.shards}
-    unlisted = planned_shards(dataset.manifest).keys() - listed
+        return shards_there(DatasetFolder(dataset.files.root)) & set(planned)
+    listed = {entry.name for entry in dataset.manifest.shards} & set(planned)
+    unlisted = set(planned) - listed
     if not unlisted or dataset.files.url.scheme not in WRITABLE:
         return listed
     with contextlib.suppress(TrilightError):  # it may be read and not listed
-        names = Bucket(dataset.files.url).names()
-        notes = DatasetFolder(Path()).staged_entries
-        listed |= {
-            name for name in unlisted & names if (notes / f"{name}.json").as_posix() in names
-        }
+        names, here = Bucket(dataset.files.url).names(), DatasetFolder(Path())
+        listed |= {name for name in unlisted & names if note_of(here, name).as_posix() in names}
     return listed
 
 
@@ -193,16 +170,17 @@ def missing_shards(url: str) -> list[int]:
     Raises:
         TrilightError: there is no readable manifest, or the URL is refused.
     """
-    dataset = open_dataset(url)
+    dataset = open_listed(url)
     planned = list(planned_shards(dataset.manifest))
-    there = _finished_names(dataset)
+    there = _finished_names(dataset, planned)
     missing = [index for index, name in enumerate(planned) if name not in there]
-    return missing or ([] if _is_finished(dataset, len(planned)) else [0])
+    return missing or ([] if _is_finished(dataset) else [0])
 
 
-def _is_finished(dataset: Dataset, planned: int) -> bool:
+def _is_finished(dataset: Dataset) -> bool:
     """Return whether every shard is listed, and the documents are there."""
-    return len(dataset.manifest.shards) >= planned and dataset.files.read("README.md") is not None
+    listed = len(dataset.manifest.shards) >= num_planned(dataset.manifest)
+    return listed and dataset.files.read("README.md") is not None
 
 
 def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
@@ -213,8 +191,11 @@ def num_scenes_done(folder: DatasetFolder, planned: Mapping[str, int]) -> int:
         planned: what `planned_shards` says of it.
     """
     there = shards_there(folder) & planned.keys()
-    unpacked = sum(path.is_file() for path in folder.staged_samples.rglob("*.tar"))
-    return sum(planned[name] for name in there) + unpacked
+    return sum(planned[name] for name in there) + _num_waiting(folder)
+
+
+def _num_waiting(folder: DatasetFolder) -> int:
+    return sum(path.is_file() for path in folder.staged_samples.rglob("*.tar"))
 
 
 _LOGS_READ = 64
@@ -252,9 +233,10 @@ class DatasetStatus:
     last_scene_unix_s: float | None
     """When the last scene was made."""
     failures: Sequence[tuple[str, str, int]]
-    """Stage, reason and number of rejections, the most frequent first."""
+    """Stage, reason and number of rejections, the most frequent first. While a dataset is made,
+    those of a folder's last shards alone where there are very many (MOST_NOTES)."""
     digest: str
-    """The dataset digest, of the listed shards."""
+    """The dataset digest; empty while it is made."""
 
     asked: Sequence[str] | None
     """Words of the command that makes it, without its place; None where they were not recorded."""
@@ -273,12 +255,12 @@ def read_status(url: str) -> DatasetStatus:
     Raises:
         TrilightError: there is no readable manifest, or the URL is refused.
     """
-    dataset = open_dataset(url)
+    dataset = open_listed(url)
     manifest = dataset.manifest
     local = DatasetFolder(dataset.files.root) if isinstance(dataset.files, LocalFiles) else None
     planned = planned_shards(manifest)
-    names = _finished_names(dataset) & planned.keys()
-    done = num_scenes_done(local, planned) if local else sum(planned[name] for name in names)
+    names = _finished_names(dataset, planned)
+    done = sum(planned[name] for name in names) + (_num_waiting(local) if local else 0)
     looked, share = (look_at_logs(local), 1.0) if local else _sampled_logs(dataset)
     last, core_s = looked.last, looked.core_s
     views_per_hour, remaining_s = _rate(last, share, manifest, manifest.num_scenes - done)
@@ -290,15 +272,26 @@ def read_status(url: str) -> DatasetStatus:
         scenes_done=done,
         scenes_planned=manifest.num_scenes,
         num_views=manifest.num_views,
-        finished=_is_finished(dataset, len(planned)),
+        finished=_is_finished(dataset),
         views_per_hour=views_per_hour,
         remaining_s=remaining_s,
         core_hours=None if core_s is None else core_s / 3600,
         last_scene_unix_s=last[-1].finished_unix_s if last else None,
-        failures=count_by_reason(decode_failures(dataset.files.read("failures.jsonl") or b"")),
-        digest=dataset.digest,
+        failures=count_by_reason([*dataset.failures(), *(_noted_failures(local) if local else ())]),
+        digest=dataset.digest if _is_finished(dataset) else "",
         asked=read_asked(dataset),
     )
+
+
+MOST_NOTES = 4096
+"""Maximum number of notes that are read for the rejections of a dataset that is made."""
+
+
+def _noted_failures(folder: DatasetFolder) -> list[Failure]:
+    """Return what was rejected on the way to shards that are not listed yet."""
+    names = sorted(noted_names(folder))[-MOST_NOTES:]
+    notes = (noted_shard(folder, name) for name in names if folder.shard(name).exists())
+    return [failure for note in notes for failure in note.failures]
 
 
 def _sampled_logs(dataset: Dataset) -> tuple[LookedAt, float]:

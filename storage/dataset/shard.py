@@ -148,6 +148,43 @@ def scan_samples(
         yield current, members
 
 
+@dataclass(frozen=True, kw_only=True)
+class ShardContents:
+    """Where everything in a shard stands, as its headers say."""
+
+    samples: Mapping[str, Mapping[str, Member]]
+    """Members by suffix of each sample by key, in the order of the file."""
+    maps: Mapping[str, Member]
+    """Textures and environment maps by the names of their members."""
+
+    def read(
+        self, stream: BinaryIO, key: str, wanted: Callable[[str], bool] = lambda suffix: True
+    ) -> dict[str, bytes]:
+        """Return members of a sample by suffix, and the maps that its record names.
+
+        Args:
+            stream: the shard.
+            key: of the sample.
+            wanted: says of a suffix whether it is read.
+
+        Raises:
+            TrilightError: the shard has become shorter.
+        """
+        own = {
+            suffix: read_member(stream, member)
+            for suffix, member in self.samples[key].items()
+            if wanted(suffix)
+        }
+        return with_maps(own, self.maps, lambda member: read_member(stream, member))
+
+
+def contents_of(stream: BinaryIO, name: str) -> ShardContents:
+    """Return what an open shard holds, reading headers only; raises as `scan_samples`."""
+    maps: dict[str, Member] = {}
+    samples = dict(scan_samples(stream, name, maps))
+    return ShardContents(samples=samples, maps=maps)
+
+
 def samples_of(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, bytes]]]:
     """Yield (key, bytes of the members by suffix) of each sample of an open shard.
 
@@ -156,8 +193,8 @@ def samples_of(stream: BinaryIO, name: str) -> Iterator[tuple[str, dict[str, byt
     """
     maps: dict[str, Member] = {}
     for key, members in scan_samples(stream, name, maps):
-        own = {suffix: _read(stream, member) for suffix, member in members.items()}
-        yield key, with_maps(own, maps, lambda member: _read(stream, member))
+        own = {suffix: read_member(stream, member) for suffix, member in members.items()}
+        yield key, with_maps(own, maps, lambda member: read_member(stream, member))
 
 
 def with_maps(
@@ -196,22 +233,13 @@ def read_members(path: Path, key: str, suffixes: Collection[str]) -> dict[str, b
     Raises:
         TrilightError: as `scan_samples`, the file cannot be read, or there is no such sample.
     """
-    keys: list[str] = []
-    found: dict[str, bytes] | None = None
-    maps: dict[str, Member] = {}
     with _opened(path) as stream:
-        for this, members in scan_samples(stream, path.name, maps):
-            keys.append(this)
-            if this == key:
-                chosen = {suffix: members[suffix] for suffix in suffixes if suffix in members}
-                own = {suffix: _read(stream, member) for suffix, member in chosen.items()}
-                found = with_maps(own, maps, lambda member: _read(stream, member))
-    if found is None:
-        held = f"{keys[0]} to {keys[-1]}" if keys else "none"
-        raise TrilightError(
-            f"{path.name}: no sample {key}; expected one of its {len(keys)}: {held}."
-        )
-    return found
+        contents = contents_of(stream, path.name)
+        if key in contents.samples:
+            return contents.read(stream, key, lambda suffix: suffix in suffixes)
+    keys = list(contents.samples)
+    held = f"{keys[0]} to {keys[-1]}" if keys else "none"
+    raise TrilightError(f"{path.name}: no sample {key}; expected one of its {len(keys)}: {held}.")
 
 
 def _opened(path: Path) -> BinaryIO:
@@ -221,9 +249,13 @@ def _opened(path: Path) -> BinaryIO:
         raise TrilightError(f"{path.name}: not a readable shard ({error.strerror}).") from error
 
 
-def _read(stream: BinaryIO, member: Member) -> bytes:
+def read_member(stream: BinaryIO, member: Member) -> bytes:
+    """Return the bytes of a member; raises TrilightError where the shard has become shorter."""
     stream.seek(member.offset)
-    return stream.read(member.num_bytes)
+    data = stream.read(member.num_bytes)
+    if len(data) != member.num_bytes:
+        raise TrilightError("became shorter while it was read")
+    return data
 
 
 def _checked(name: str, block: bytes, offset: int) -> Member:

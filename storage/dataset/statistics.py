@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.shard import read_member, scan_members
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.profiles import PACKED, PLAIN, unpack_arrays
@@ -81,7 +82,7 @@ class Statistics:
 
 
 def dataset_statistics(dataset: Dataset) -> Statistics:
-    """Read every sample but its pictures through the manifest's index.
+    """Read every sample but its pictures, through the headers of the shards.
 
     Raises:
         TrilightError: a shard is missing or damaged.
@@ -140,16 +141,15 @@ class _Tally:
 
 
 def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
-    for name, offset, num_bytes in shard.members:
-        key, _, suffix = name.partition(".")
-        if suffix not in ("json", PLAIN, PACKED):
+    for member in scan_members(stream, shard.name):
+        if member.suffix not in ("json", PLAIN, PACKED):
             continue
-        stream.seek(offset)
-        member = stream.read(num_bytes)
-        if suffix != "json":
-            tally.scene_members[f"{key}.{PLAIN}"] = sha256_hex(unpack_arrays({suffix: member}))
+        data = read_member(stream, member)
+        if member.suffix != "json":
+            scene = f"{member.key}.{PLAIN}"
+            tally.scene_members[scene] = sha256_hex(unpack_arrays({member.suffix: data}))
             continue
-        record = json.loads(member)
+        record = json.loads(data)
         tally.splits[shard.split] += 1
         tally.templates[record["provenance"]["template"]] += 1
         if excursion := record["provenance"].get("excursion"):

@@ -1,25 +1,13 @@
 """What `--data` means: a dataset by its root, or shards by a list."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NoReturn
-
-import numpy as np
-from numpy.typing import NDArray
 
 from storage.conventions import SPLITS
 from storage.dataset.dataset import open_dataset
-from storage.dataset.manifest import Manifest, MemberTable, ShardEntry
+from storage.dataset.manifest import Manifest
 from storage.dataset.shard_places import listed_shards
-from storage.dataset.shard_set import (
-    KeysSeen,
-    ListedShards,
-    ManifestShards,
-    ShardSet,
-    hashes_of,
-    key_twice,
-)
+from storage.dataset.shard_set import KeysSeen, ListedShards, ManifestShards, ShardSet
 from storage.digests import canonical_json, sha256_hex
 from storage.errors import TrilightError
 
@@ -80,8 +68,8 @@ def open_training_data(data: Sequence[str]) -> TrainingData:
             `.tar`.
 
     Raises:
-        TrilightError: nothing is named, roots and shards are mixed, a URL is refused, there is no
-            readable manifest, or a key is in two shards of it.
+        TrilightError: nothing is named, roots and shards are mixed, a URL is refused, or there is
+            no readable manifest. That no key is in two shards of a dataset, `trilight verify` says.
     """
     shards = [text for text in data if is_shards(text)]
     if shards and len(shards) == len(data):
@@ -100,16 +88,7 @@ def is_shards(text: str) -> bool:
 
 
 def _of_dataset(root: str) -> TrainingData:
-    hashes: list[NDArray[np.uint64]] = []
-
-    def without_members(shard: ShardEntry) -> ShardEntry:
-        hashes.append(_hashes_of_keys(shard))
-        return dataclasses.replace(shard, members=MemberTable())
-
-    # without the members, a set takes the same few bytes a shard however large shards are
-    dataset = open_dataset(root, shard_read=without_members)
-    if twice := _found_twice(hashes):
-        _name_key_twice(open_dataset(root).manifest, twice)
+    dataset = open_dataset(root)
     splits: dict[str, ShardSet] = {}
     for split in SPLITS:
         entries = [shard for shard in dataset.shards_of(split) if shard.num_samples]
@@ -151,26 +130,3 @@ def _of_list(patterns: Sequence[str]) -> TrainingData:
         sources=(DataSource(name=shown, digest=digest, num_views=None),),
         notes=(NO_MANIFEST,),
     )
-
-
-def _hashes_of_keys(shard: ShardEntry) -> NDArray[np.uint64]:
-    keys = shard.keys
-    if len(keys) != shard.num_samples:
-        raise TrilightError(
-            f"{shard.name}: the manifest counts {shard.num_samples} samples and names "
-            f"{len(keys)}; expected the same. Run `trilight verify`."
-        )
-    return hashes_of(keys)
-
-
-def _found_twice(hashes: Sequence[NDArray[np.uint64]]) -> set[int]:
-    every = np.concatenate([np.zeros(0, np.uint64), *hashes])
-    every.sort()
-    return set(every[1:][every[1:] == every[:-1]].tolist())
-
-
-def _name_key_twice(manifest: Manifest, twice: set[int]) -> NoReturn:
-    shards = ((shard.name, shard.keys) for shard in manifest.shards)
-    every = ((name, key) for name, keys in shards for key in keys)
-    name, key = next(at for at in every if int(hashes_of([at[1]])[0]) in twice)
-    raise key_twice(name, key)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, LocalFiles, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, MemberTable, ShardEntry, index_stream
-from storage.dataset.progress import planned_shards
-from storage.dataset.shard import samples_of, scan_members
+from storage.dataset.manifest import Manifest, ShardEntry, index_stream
+from storage.dataset.planned import num_planned
+from storage.dataset.shard import contents_of, samples_of
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.licences import mixed_share_alike
@@ -55,11 +55,8 @@ class Verification:
     """Names of the shards that are missing or not what they should be."""
     num_shards_planned: int
     """Shards of the finished dataset."""
-
-    @property
-    def is_finished(self) -> bool:
-        """Whether every shard is listed."""
-        return len(self.manifest.shards) >= self.num_shards_planned
+    is_finished: bool
+    """Whether the manifest lists every shard."""
 
 
 @dataclass(kw_only=True)
@@ -83,7 +80,7 @@ def verify_dataset(
 
     Args:
         root: the dataset, opened, or its path or URL.
-        fast: compare only sizes, and in a folder also the members' names and places; reads no
+        fast: compare only sizes, and in a folder also the headers of the members; reads no
             picture. A changed byte is not seen.
         shard_done: called with the name of each checked shard.
 
@@ -94,7 +91,7 @@ def verify_dataset(
     dataset = root if isinstance(root, Dataset) else open_dataset(str(root))
     manifest = dataset.manifest
     lock = dataset.files.read("objects.lock.jsonl")
-    problems = list(_check_lock(lock, manifest))
+    problems = list(_check_lock(lock, dataset))
     locked = {} if problems or lock is None else _by_uid(lock)
     problems += [f"{name}: not in the manifest" for name in _unlisted(dataset)]
     where: dict[str, str] = {}
@@ -120,7 +117,8 @@ def verify_dataset(
         problems=problems,
         num_samples=manifest.num_samples,
         bad_shards=bad,
-        num_shards_planned=_num_planned(manifest),
+        num_shards_planned=num_planned(manifest),
+        is_finished=dataset.num_listed >= num_planned(manifest),
     )
 
 
@@ -137,14 +135,6 @@ def _ahead(
             running.append(pool.submit(check, shards[row + _AHEAD]))
 
 
-def _num_planned(manifest: Manifest) -> int:
-    """Return how many shards there will be; of settings that do not say, those that are there."""
-    try:
-        return len(planned_shards(manifest))
-    except TrilightError:
-        return len(manifest.shards)
-
-
 def _unlisted(dataset: Dataset) -> list[str]:
     """Return shard files that the manifest does not list; of a remote dataset, none."""
     if isinstance(dataset.files, RemoteDatasetFiles):
@@ -159,9 +149,10 @@ def _by_uid(lock: bytes) -> dict[str, LockedObject]:
     return {entry.uid: entry for entry in decode_objects_lock(lock, "objects.lock.jsonl")}
 
 
-def _check_lock(lock: bytes | None, manifest: Manifest) -> Iterator[str]:
-    if not manifest.objects_lock_sha256:
-        if manifest.shards:
+def _check_lock(lock: bytes | None, dataset: Dataset) -> Iterator[str]:
+    manifest = dataset.manifest
+    if not manifest.objects_lock_sha256:  # a kill may leave it out until the shards are listed
+        if dataset.num_listed or (manifest.shards and lock is None):
             yield "objects.lock.jsonl: the manifest has shards but no digest of the lock"
     elif lock is None:
         yield "objects.lock.jsonl: missing"
@@ -185,7 +176,7 @@ def _check_shard(
             return found
         with _opened(dataset, shard) as stream:
             if fast:
-                found.faults += _check_members(stream, shard)
+                _check_members(stream, shard, found)
             else:
                 _check_content(stream, shard, dataset.manifest, locked, found)
     except TrilightError as error:
@@ -201,8 +192,6 @@ def _check_size(dataset: Dataset, shard: ShardEntry) -> Iterator[str]:
         yield "missing"
     elif num_bytes != shard.num_bytes:
         yield f"{num_bytes} bytes; expected {shard.num_bytes}"
-    if len(shard.index) != shard.num_samples:
-        yield f"the manifest counts {shard.num_samples} samples and names {len(shard.index)}"
 
 
 def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
@@ -218,13 +207,10 @@ def _opened(dataset: Dataset, shard: ShardEntry) -> BinaryIO:
     return stream
 
 
-def _check_members(stream: BinaryIO, shard: ShardEntry) -> Iterator[str]:
-    found = MemberTable(
-        (member.name, member.offset, member.num_bytes)
-        for member in scan_members(stream, shard.name)
-    )
-    if found != shard.members:
-        yield "the member index differs from the manifest"
+def _check_members(stream: BinaryIO, shard: ShardEntry, found: _Found) -> None:
+    found.keys += contents_of(stream, shard.name).samples
+    if len(found.keys) != shard.num_samples:
+        found.faults.append(f"{len(found.keys)} samples; expected {shard.num_samples}")
 
 
 def _check_content(
@@ -235,8 +221,8 @@ def _check_content(
     found: _Found,
 ) -> None:
     if index_stream(stream, shard.name) != shard:
-        found.faults.append("sha256 or member index differs from the manifest")
-    unused, held = set(shard.maps), HeldMaps()
+        found.faults.append("sha256 or number of samples differs from the manifest")
+    unused, held = set(contents_of(stream, shard.name).maps), HeldMaps()
     for key, members in samples_of(stream, shard.name):
         found.keys.append(key)
         unused -= members.keys()

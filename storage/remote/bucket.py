@@ -5,6 +5,7 @@ written; parts of an upload that was cut off are invisible, and a rule of the bu
 (AbortIncompleteMultipartUpload). "Only once" is a condition that the server itself checks.
 """
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,22 +29,53 @@ class Bucket:
     def __init__(self, url: RemoteUrl) -> None:
         self.url = url
 
-    def names(self) -> set[str]:
-        """Return the names of all files below the folder, relative to it.
+    def names(self, below: str = "") -> set[str]:
+        """Return the names of all files below the folder, or a folder in it, relative to it.
+
+        A thousand names are a request.
 
         Raises:
             TrilightError: the bucket does not exist or may not be listed, or the server gives no
                 answer (an EnvironmentFailure where that may pass).
         """
-        root = self.url.root
+        return self._listed(below, lambda driver, place: driver.find(place))
 
-        def find() -> list[str]:
+    def names_in(self, folder: str = "") -> set[str]:
+        """Return the names of the files in one folder alone, relative to the bucket's folder."""
+
+        def listed(driver: Any, place: str) -> list[str]:
+            with contextlib.suppress(FileNotFoundError):
+                rows = driver.ls(place, detail=True)
+                return [row["name"] for row in rows if row["type"] == "file"]
+            return []
+
+        return self._listed(folder, listed)
+
+    def _listed(self, folder: str, find: Callable[[Any, str], list[str]]) -> set[str]:
+        root = self.url.root
+        place = f"{root}/{folder}".rstrip("/")
+
+        def listed() -> list[str]:
             driver = shared_driver(self.url)
             driver.invalidate_cache()
-            return list(driver.find(root))
+            return list(find(driver, place))
 
-        found = self._tried(find, "listed")
+        found = self._tried(listed, "listed")
         return {path.removeprefix(f"{root}/") for path in found if path.startswith(f"{root}/")}
+
+    def read_start(self, name: str, num_bytes: int) -> bytes | None:
+        """Return the first bytes of a file, or None where there is none; raises as `names`."""
+        target = self.url.child(name).root
+
+        def read() -> bytes | None:
+            try:
+                found: bytes = shared_driver(self.url).cat_file(target, start=0, end=num_bytes)
+            except FileNotFoundError:
+                return None
+            return found
+
+        start: bytes | None = self._tried(read, "read")
+        return start
 
     def write(self, name: str, content: Path | bytes) -> None:
         """Write a file, or replace it.

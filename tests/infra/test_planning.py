@@ -11,6 +11,7 @@ from pipeline.making.machine import cores_owned
 from pipeline.making.pipeline import make_dataset
 from pipeline.making.tasks import MOST_TASKS
 from storage.dataset.dataset import open_dataset
+from storage.dataset.shard import scan_members
 from tests.pipeline.making.tiny_scenes_kit import Undocumented, tiny_order, without_rendering
 
 
@@ -90,12 +91,13 @@ def test_what_is_measured_are_the_first_scenes_of_the_dataset_in_order(
     scenes.clear()
     make_dataset(order, Undocumented())
     assert sampled == scenes[:10]
-    members = [shard.index for shard in open_dataset(str(tmp_path / "set")).manifest.shards]
-    by_key = {key: row for index in members for key, row in index.items()}
-    expected = [
-        sum(512 + -(-num_bytes // 512) * 512 for _, num_bytes in by_key[key].values())
-        for key in sorted(by_key)
-    ]
+    by_key: dict[str, int] = {}
+    for shard in open_dataset(str(tmp_path / "set")).manifest.shards:
+        with (tmp_path / "set" / shard.name).open("rb") as stream:
+            for member in scan_members(stream, shard.name):
+                size = 512 + -(-member.num_bytes // 512) * 512
+                by_key[member.key] = by_key.get(member.key, 0) + size
+    expected = [size for _, size in sorted(by_key.items())]
     assert measured.num_bytes == tuple(expected[:10])
     found = predict(measured, order, cores=1, usd_per_core_hour=1)
     assert found.core_hours.value == pytest.approx(24 * cores * 5 / 3600)  # floating point only

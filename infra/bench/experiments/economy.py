@@ -18,6 +18,7 @@ from infra.bench.workshop import Workshop
 from pipeline.exchange.renderformer_h5 import CELLS, CHANNELS, write_renderformer_h5
 from storage.cache import cache_folder
 from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.shard import contents_of
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
 from storage.records.asset import Asset, decode_asset
@@ -77,9 +78,11 @@ def scene_costs(dataset: Dataset) -> Iterator[SceneCosts]:
     assets = {locked.uid: known[locked.asset_sha256] for locked in objects}
     resolution = int(dataset.manifest.settings["renders"]["resolution"])
     for shard in dataset.manifest.shards:
-        index = shard.index
+        with dataset.files.open(shard, checked=False) as stream:
+            index = contents_of(stream, shard.name).samples
         for record in dataset.read_scenes(shard):
-            sizes = {suffix: size for suffix, (_, size) in index[record.key].items()}
+            members = index[record.key].items()
+            sizes = {suffix: member.num_bytes for suffix, member in members}
             yield _costs(record, sizes, assets, resolution)
 
 

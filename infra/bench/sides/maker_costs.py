@@ -25,7 +25,6 @@ from infra.bench.subjects.simulated_set import (
 from pipeline.making.bucket_publication import begin_dataset, joined
 from pipeline.making.environment import environment
 from pipeline.renders.variant import choose_variant
-from pipeline.shards.pack import note_of, rejections_of_shard
 from storage.dataset.layout import DatasetFolder, dataset_folder
 from storage.installation import IMPORT_ROOT
 from storage.remote.bucket import Bucket
@@ -94,13 +93,9 @@ def main(words: list[str]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
         os.truncate(path, entry.num_bytes)
-        rejections = rejections_of_shard(folder, entry.name)
-        rejections.parent.mkdir(parents=True, exist_ok=True)
-        rejections.touch()
         publication.add_shard(entry)
         marks.append(_mark(log))
-        publication.publish()
-        publication.missing_shards()
+        publication.finish()
         marks.append(_mark(log))
     figures = {
         step: [late - early for early, late in zip(before, after, strict=True)]
@@ -124,9 +119,7 @@ def upload_outline(root: Path, server: BucketServer, name: str) -> str:
         named = path.relative_to(root).as_posix()
         if path.suffix == ".tar":
             bucket.write(named, b"")
-            for beside in (note_of(folder, named), rejections_of_shard(folder, named)):
-                bucket.write(beside.relative_to(root).as_posix(), b"")
-        elif not named.startswith(".staging/"):
+        elif not named.startswith(".staging/") or folder.staged_entries in path.parents:
             bucket.write(named, path)
     return url
 

@@ -158,8 +158,7 @@ def one_stint(stint: Stint) -> StintTimes:
         times.append(_now())
         make_shards(run, StandIns(stint.scene_s), lambda run, outcome: None)
         times.append(_now())
-        publication.publish()
-        publication.missing_shards()
+        publication.finish()
     times.append(_now())
     steps = [(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(times)]
     (begin, begin_core), (made, made_core), (end, end_core) = steps

@@ -108,8 +108,7 @@ def _end(root: Path) -> None:
         path.touch()
         os.truncate(path, entry.num_bytes)
         publication.add_shard(entry)
-        publication.publish()
-        publication.missing_shards()
+        publication.finish()
 
 
 @contextlib.contextmanager

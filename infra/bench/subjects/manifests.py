@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, MemberTable, ShardEntry, index_shard, write_manifest
+from storage.dataset.manifest import Manifest, ShardEntry, index_shard, write_manifest
 from storage.dataset.shard import write_shard
+from storage.dataset.splits import named_shard
 from storage.installation import IMPORT_ROOT, module_name
 from storage.records.sample import sample_key
 
@@ -55,15 +56,12 @@ def _write_manifest(folder: DatasetFolder, num_samples: int, shards: list[ShardE
 
 
 def _shard(number: int, indices: range) -> ShardEntry:
-    names = [f"{sample_key(index)}.{suffix}" for index in indices for suffix in SUFFIXES]
-    rows = ((name, 512 + at * MEMBER_BYTES, MEMBER_BYTES - 512) for at, name in enumerate(names))
     return ShardEntry(
-        name=f"train-{number:06d}.tar",
+        name=named_shard(number, "train"),
         split="train",
         num_samples=len(indices),
-        num_bytes=len(names) * MEMBER_BYTES + 10_240,
+        num_bytes=len(indices) * len(SUFFIXES) * MEMBER_BYTES + 10_240,
         sha256=f"{number:064x}",
-        members=MemberTable(rows),
     )
 
 

@@ -1,6 +1,6 @@
 """Datasets as large as one likes, for what reads or extends them: everything real but the pictures.
 
-An outline has shards of which only the size is there (holes in the file system), with manifest,
+An outline has shards of which only the size is there (holes in the file system), with head, notes,
 lock and logs of the full size: eight scenes a shard, four views each, so that 250,000 shards stand
 for two million scenes. All but the last shard are made. A small set has whole shards of one scene
 each, all of the same pictures, under keys of their own.
@@ -10,7 +10,6 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 from infra.bench.subjects.stand_in import RESOLUTION, stand_in_members, stand_in_objects
@@ -20,9 +19,10 @@ from pipeline.making.environment import environment
 from pipeline.renders.variant import choose_variant
 from storage.conventions import SPLITS
 from storage.dataset.layout import DatasetFolder
-from storage.dataset.manifest import Manifest, MemberTable, ShardEntry, write_manifest
+from storage.dataset.manifest import Manifest, ShardEntry, write_manifest
 from storage.dataset.scene_logs import log_name
 from storage.dataset.shard import scan_members, write_tar
+from storage.dataset.shard_notes import ShardNote, encode_note, note_of
 from storage.dataset.splits import shard_name, split_of_shard
 from storage.digests import sha256_hex
 from storage.records.objects import encode_objects_lock, write_failures, write_objects_lock
@@ -55,14 +55,8 @@ class ShardTemplate:
         self._members = list(scan_members(packed, split))
         self.num_bytes = len(self._data)
 
-    def rows(self, first_scene: int) -> Iterator[tuple[str, int, int]]:
-        """Yield name, offset and size of each member of the shard that begins with a scene."""
-        for member in self._members:
-            key = sample_key(first_scene + int(member.key))
-            yield f"{key}.{member.suffix}", member.offset, member.num_bytes
-
     def stamped(self, first_scene: int) -> bytes:
-        """Return the bytes of that shard: as if it were packed, but for the index in records."""
+        """Return the bytes of the shard that begins with a scene: as if it were packed."""
         data = bytearray(self._data)
         for member in self._members:
             header = memoryview(data)[member.offset - _BLOCK : member.offset]
@@ -81,12 +75,14 @@ def write_outline(root: Path, num_shards: int, *, made: int | None = None) -> No
     entries = [outlined(index, build, template) for index in range(made)]
     for index, entry in enumerate(entries):
         path, log = folder.shard(entry.name), root / log_name(entry.name)
-        for place in (path, log):
+        note = note_of(folder, entry.name)
+        for place in (path, log, note):
             place.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
         os.truncate(path, entry.num_bytes)
         log.write_text(_log(index * SCENES_OF_OUTLINE))
-    _finish(folder, build, entries, num_shards)
+        note.write_bytes(encode_note(ShardNote(shard=entry, failures=())))
+    _finish(folder, build, [], num_shards)
 
 
 def write_whole(root: Path, num_shards: int, *, first: int = 0) -> None:
@@ -108,7 +104,6 @@ def write_whole(root: Path, num_shards: int, *, first: int = 0) -> None:
                 num_samples=SCENES_OF_WHOLE,
                 num_bytes=len(data),
                 sha256=hashlib.sha256(data).hexdigest(),
-                members=MemberTable(templates[split].rows(scene)),
             )
         )
     _finish(folder, build, entries, num_shards)
@@ -117,14 +112,12 @@ def write_whole(root: Path, num_shards: int, *, first: int = 0) -> None:
 
 def outlined(index: int, build: BuildSettings, template: ShardTemplate) -> ShardEntry:
     """Return the entry of a shard of an outline."""
-    first = index * SCENES_OF_OUTLINE
     return ShardEntry(
         name=shard_name(index, build.splits),
         split=split_of_shard(index, build.splits),
         num_samples=SCENES_OF_OUTLINE,
         num_bytes=template.num_bytes,
         sha256=f"{index:064x}",
-        members=MemberTable(template.rows(first)),
     )
 
 

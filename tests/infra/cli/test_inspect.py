@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from storage.dataset.shard import scan_members
 from storage.errors import TrilightError
 from storage.records.sample import PartFloor
 from tests.command_line import trilight
@@ -121,9 +122,10 @@ def test_wrong_bytes_are_one_sentence_with_what_mends_it(suffix: str, tmp_path: 
     dataset = five_scenes(tmp_path)
     shard = dataset.manifest.shards[0]
     path = dataset.folder.shard(shard.name)
-    _, offset, num_bytes = next(
-        row for row in shard.members if row[0].partition(".")[2].startswith(suffix)
-    )
+    with path.open("rb") as stream:
+        members = scan_members(stream, shard.name)
+        found = next(member for member in members if member.suffix.startswith(suffix))
+    offset, num_bytes = found.offset, found.num_bytes
     data = bytearray(path.read_bytes())
     data[offset : offset + num_bytes] = bytes(255 - byte for byte in data[offset:][:num_bytes])
     path.write_bytes(data)

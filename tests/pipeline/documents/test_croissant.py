@@ -39,11 +39,12 @@ def test_the_validator_has_no_error_and_misses_only_what_knows_the_clock(tmp_pat
 
 def test_it_leads_to_every_shard_and_scene(tmp_path: Path) -> None:
     read = mlcroissant.Dataset(jsonld=str(_write(tmp_path)))
-    manifest = open_dataset(str(tmp_path)).manifest
+    dataset = open_dataset(str(tmp_path))
+    manifest = dataset.manifest
     files = {entry.id: entry.sha256 for entry in read.metadata.file_objects}
     assert files == {shard.name: shard.sha256 for shard in manifest.shards}
     scenes = {row["scenes/key"].decode(): row["scenes/json"] for row in read.records("scenes")}
-    assert sorted(scenes) == sorted(key for shard in manifest.shards for key in shard.index)
+    assert sorted(scenes) == sorted(key for shard in manifest.shards for key in dataset.keys(shard))
     assert json.loads(scenes["000000020"])["provenance"]["template"] == "wall"
     assert [row["splits/name"] for row in read.records("splits")] == ["train", "test"]
 

@@ -38,14 +38,13 @@ def test_who_freezes_late_takes_nothing_back(bucket: Any, machines: Machines) ->
         first.add_failures([Failure(stage="assets", item="c", reason="no_faces", message="x")])
         first.lock_objects([_locked()])
         make_tiny_shard(first, 0)
-        first.publish()
-        rejected = _failures(bucket, "failures.jsonl")
+        rejected = open_dataset(OUT).failures()
         assert len(rejected) == 5
         machines.use("b")
         late.add_failures([Failure(stage="assets", item="b", reason="no_faces", message="x")])
         late.lock_objects([_locked()])
         assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]
-        assert set(rejected) < set(_failures(bucket, "failures.jsonl"))
+        assert set(rejected) < set(open_dataset(OUT).failures())
 
 
 def _other_shard(publication: Publication) -> Any:
@@ -71,9 +70,10 @@ def test_the_rejections_are_those_of_the_shard_that_is_there(
         make_tiny_shard(first, 0)
         machines.use("b")
         second.add_shard(other)
-        second.publish()
-    for name in (f".staging/failures/{FIRST}.jsonl", "failures.jsonl"):
-        assert {row.reason for row in _failures(bucket, name)} == {"no_camera"}, name
+        assert {row.reason for row in open_dataset(OUT).failures()} == {"no_camera"}
+        make_tiny_shard(second, 1)
+        second.finish()
+    assert {row.reason for row in _failures(bucket, "failures.jsonl")} == {"no_camera"}
     assert verify_dataset(OUT).problems == []
 
 
@@ -85,8 +85,7 @@ def test_a_shard_whose_maker_died_at_once_gets_the_rejections_of_the_next(
         other = _other_shard(publication)
         bucket.pipe_file(f"shards/set/{FIRST}", publication.folder.shard(FIRST).read_bytes())
         publication.add_shard(other)
-        publication.publish()
-    assert {row.reason for row in _failures(bucket, "failures.jsonl")} == {"other"}
+    assert {row.reason for row in open_dataset(OUT).failures()} == {"other"}
 
 
 def test_a_worker_with_another_cache_is_named(
@@ -107,11 +106,13 @@ def test_a_shard_that_another_machine_has_sent_is_listed(bucket: Any, machines: 
         publication.lock_objects([_locked()])
         with machines.maker("b") as worker:
             make_tiny_shard(worker, 0)
-            entry = worker.manifest.shards[0]
+            (entry,) = open_dataset(OUT).manifest.shards
         machines.use("a")
         publication.add_shard(entry)
-        publication.publish()
-        assert publication.manifest.shards == (entry,)
+        make_tiny_shard(publication, 1)
+        listed = publication.finish()
+        assert listed is not None and listed.shards[0] == entry
+    assert len(_failures(bucket, "failures.jsonl")) == 8
 
 
 def test_who_comes_later_trusts_the_index_of_the_first(bucket: Any, machines: Machines) -> None:

@@ -34,12 +34,12 @@ class Killed(BaseException):
 
 
 def make(publication: Publication, *shards: int) -> None:
-    """Freeze the objects where nobody has, make shards that are missing, and publish."""
+    """Freeze the objects where nobody has, make shards that are missing, and list all, if so."""
     if not publication.manifest.objects_lock_sha256:
         publication.lock_objects([_locked()])
     for index in set(shards) & set(publication.missing_shards()):
         make_tiny_shard(publication, index)
-    publication.publish()
+    publication.finish()
 
 
 def names(bucket: Any) -> set[str]:
@@ -47,26 +47,19 @@ def names(bucket: Any) -> set[str]:
     return {path.removeprefix("shards/set/") for path in bucket.find("shards/set")}
 
 
-def test_an_array_is_of_what_a_bucket_lacks(
-    bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def killed(mirror: Mirror) -> None:
-        raise Killed
-
+def test_an_array_is_of_what_a_bucket_lacks(bucket: Any, machines: Machines) -> None:
     machines.use("a")
     splits = {f"splits.{name}": value for name, value in vars(_build().splits).items()}
     order = DatasetOrder(build="smoke", out=OUT, scenes=8, changes=splits)
     assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
     with machines.maker("a") as publication:
-        publication.lock_objects([_locked()])
-        with monkeypatch.context() as patch, pytest.raises(Killed):
-            patch.setattr(Mirror, "send_manifest", killed)
-            make_tiny_shard(publication, 0)
-        assert open_dataset(OUT).manifest.shards == ()
+        make(publication, 0)
         assert FIRST in names(bucket)
         assert array_job(order, per_task=None, at_once=None).tasks == [1]
         assert read_status(OUT).shards_done == 1
-        bucket.rm_file(f"shards/set/.staging/entries/{FIRST}.json")
+        assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]
+        bucket.rm_file(f"shards/set/.staging/entries/{FIRST}.json")  # as a kill before it leaves it
+        assert open_dataset(OUT).manifest.shards == ()
         assert array_job(order, per_task=None, at_once=None).tasks == [0, 1]
 
 
@@ -135,37 +128,37 @@ def test_the_first_writer_of_a_shard_wins(bucket: Any, machines: Machines) -> No
             make(first, 0)
             machines.use("b")
             second.add_shard(other)
-            second.publish()
-        (listed,) = open_dataset(OUT).manifest.shards
-        assert listed == first.manifest.shards[0] != other
+            make(second, 1)
+        machines.use("a")
+        (listed,) = (entry for entry in open_dataset(OUT).manifest.shards if entry.name == FIRST)
+        assert listed != other
         assert listed in second.manifest.shards
     assert verify_dataset(OUT).problems == []
 
 
-def test_an_old_manifest_that_arrives_late_is_mended(
+def test_an_old_list_that_arrives_late_is_mended(
     bucket: Any, machines: Machines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between two requests of the first maker the second one finishes the dataset."""
+    """Between two requests of the first maker the second one plans more, and finishes it."""
     send_manifest = Mirror.send_manifest
-    with machines.maker("a") as first:
-        make(first, 0)
-        with machines.maker("b") as second:
-            held = first.folder.manifest.read_bytes()
 
-            def late(self: Mirror) -> None:
-                monkeypatch.setattr(Mirror, "send_manifest", send_manifest)
-                machines.use("b")
-                make(second, 1)
-                machines.use("a")
-                assert len(open_dataset(OUT).manifest.shards) == 2
-                assert first.folder.manifest.read_bytes() == held
-                send_manifest(self)
-                assert len(open_dataset(OUT).manifest.shards) == 1
+    def late(self: Mirror) -> None:
+        monkeypatch.setattr(Mirror, "send_manifest", send_manifest)
+        with machines.maker("b", 8) as second:
+            make(second, 1)
+        machines.use("a")
+        assert len(open_dataset(OUT).manifest.shards) == 2
+        send_manifest(self)
+        assert open_dataset(OUT).manifest.num_scenes == 4
 
-            monkeypatch.setattr(Mirror, "send_manifest", late)
-            machines.use("a")
-            first.publish()
-    assert len(open_dataset(OUT).manifest.shards) == 2
+    with machines.maker("a", 4) as first:
+        first.lock_objects([_locked()])
+        make_tiny_shard(first, 0)
+        monkeypatch.setattr(Mirror, "send_manifest", late)
+        listed = first.finish()
+    assert listed is not None and len(listed.shards) == 2
+    assert open_dataset(OUT).manifest == listed
+    assert verify_dataset(OUT).problems == []
 
 
 def test_other_objects_and_other_settings_are_refused(bucket: Any, machines: Machines) -> None:
@@ -218,7 +211,7 @@ def test_a_shard_is_listed_only_when_it_is_in_the_bucket(bucket: Any, machines: 
             sample = dataclasses.replace(tiny_sample(seed=index), key=sample_key(index))
             stage_scene(folder.staged_shard(SECOND), index, sample, [], profile)
         pack_shard(folder, SECOND, range(4, 8))
-        publication.publish()
+        publication.finish()
         assert [entry.name for entry in open_dataset(OUT).manifest.shards] == [FIRST]
         assert verify_dataset(OUT).problems == []
         assert publication.missing_shards() == []
@@ -247,7 +240,7 @@ def test_a_sent_shard_need_not_be_fetched(
             raise AssertionError("fetched")
 
         monkeypatch.setattr("storage.remote.cache.download", never)
-        dataset = publication.dataset()
+        dataset = open_dataset(OUT)
         assert len(list(dataset.read_shard(dataset.manifest.shards[0]))) == 4
 
 
@@ -269,6 +262,7 @@ def test_access_that_is_lost_in_the_middle_loses_nothing(
     assert "access that lets you list, read and write" in text and "s3cret" not in text
     with machines.maker("a") as publication:
         assert publication.missing_shards() == []
+        publication.finish()
     assert open_dataset(OUT).digest == expected
 
 

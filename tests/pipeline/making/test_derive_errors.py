@@ -94,10 +94,8 @@ def test_what_does_not_fit_together_is_named(
     assert name in refused(tmp_path / "c", MERGE, a, changed_settings(b, group, **values))
 
 
-def test_versions_and_views_must_be_the_same(tmp_path: Path) -> None:
+def test_numbers_of_views_must_be_the_same(tmp_path: Path) -> None:
     a = finished(tmp_path / "a", scenes(0))
-    old = finished(tmp_path / "old", scenes(1), schema_version=2)
-    assert "schema version is 2; expected 3" in refused(tmp_path / "c", MERGE, a, old)
     other = finished(tmp_path / "other", scenes(1), num_views=3)
     assert "number of views is 3; expected 2" in refused(tmp_path / "c", MERGE, a, other)
 

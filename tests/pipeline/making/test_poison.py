@@ -169,7 +169,7 @@ def test_scenes_that_abort_their_child_are_counted(
     assert outcome.num_scenes_given_up == 1
     dataset = open_dataset(str(tmp_path / "set"))
     assert verify_dataset(tmp_path / "set").problems == []
-    keys = [key for shard in dataset.manifest.shards for key in shard.keys]
+    keys = [key for shard in dataset.manifest.shards for key in dataset.keys(shard)]
     assert keys == [f"{index:09d}" for index in range(8) if index != poison.LOST_SCENE]
     skips = [row for row in dataset.failures() if row.reason == "environmental_skip"]
     assert [(int(row.item), row.attempt) for row in skips] == [(1, 0), (2, 0), (2, 1)]

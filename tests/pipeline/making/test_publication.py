@@ -11,8 +11,11 @@ from pipeline.builds.settings import BuildSettings, differences
 from pipeline.making import publication as publications
 from pipeline.making.publication import Publication, begin
 from pipeline.shards.pack import pack_shard
+from storage.dataset.dataset import open_dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import read_manifest
+from storage.dataset.shard import scan_members
+from storage.dataset.shard_notes import note_of
 from storage.dataset.splits import scenes_of_shard, shard_name
 from storage.dataset.staging import stage_scene
 from storage.dataset.verify import verify_dataset
@@ -74,6 +77,7 @@ def _dataset(root: Path, scenes: int = 8) -> Publication:
     publication.lock_objects([_locked()])
     for index in publication.missing_shards():
         make_tiny_shard(publication, index)
+    publication.finish()
     return publication
 
 
@@ -93,6 +97,7 @@ def test_the_digest_knows_nothing_of_place_or_order(tmp_path: Path) -> None:
     backwards.lock_objects([_locked()])
     for index in (1, 0):
         make_tiny_shard(backwards, index)
+    assert backwards.finish() == backwards.manifest
     assert backwards.manifest.dataset_digest == forwards.dataset_digest
     assert backwards.manifest == forwards
 
@@ -102,7 +107,9 @@ def test_growing_keeps_the_shards(tmp_path: Path) -> None:
     grown = _dataset(tmp_path, 12).manifest
     assert grown.shards[0] == before.shards[0]
     assert len(grown.shards) == 3
-    assert _begin(tmp_path, _build(), 4).manifest == grown  # asking for fewer takes nothing away
+    again = _begin(tmp_path, _build(), 4)  # asking for fewer takes nothing away
+    assert again.manifest == dataclasses.replace(grown, shards=())
+    assert again.finish() == grown
     assert verify_dataset(tmp_path).problems == []
 
 
@@ -127,13 +134,17 @@ def test_another_environment_is_refused_unless_accepted(tmp_path: Path) -> None:
 
 
 def test_a_shard_that_missed_the_manifest_is_found(tmp_path: Path) -> None:
-    """A kill between the shard's rename and the manifest's leaves it so."""
-    whole = _dataset(tmp_path).manifest
-    build = _build()
-    forgetful = _begin(tmp_path, build, 8)
-    forgetful.manifest = dataclasses.replace(forgetful.manifest, shards=whole.shards[:1])
-    assert forgetful.missing_shards() == []
-    assert forgetful.manifest == whole
+    """A kill between the shard's rename and its note's, or the manifest's, leaves it so."""
+    whole = _dataset(tmp_path / "a").manifest
+    publication = _begin(tmp_path / "b", _build(), 8)
+    publication.lock_objects([_locked()])
+    for index in range(2):
+        make_tiny_shard(publication, index)
+    note_of(publication.folder, whole.shards[0].name).unlink()
+    assert open_dataset(str(tmp_path / "b")).manifest.shards == whole.shards[1:]
+    later = _begin(tmp_path / "b", _build(), 8)
+    assert later.missing_shards() == []
+    assert later.finish() == whole == open_dataset(str(tmp_path / "b")).manifest
 
 
 def test_a_deleted_shard_is_made_again(tmp_path: Path) -> None:
@@ -147,9 +158,11 @@ def test_a_deleted_shard_is_made_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize("fast", [False, True])
 def test_damage_is_named(tmp_path: Path, fast: bool) -> None:
     shard = _dataset(tmp_path).manifest.shards[0]
-    name, (_, offset, num_bytes) = shard.name, shard.members[-1]
+    name = shard.name
+    with (tmp_path / name).open("rb") as stream:
+        *_, last = scan_members(stream, name)
     data = bytearray((tmp_path / name).read_bytes())
-    data[offset + num_bytes // 2] ^= 1
+    data[last.offset + last.num_bytes // 2] ^= 1
     (tmp_path / name).write_bytes(data)
     problems = verify_dataset(tmp_path, fast=fast).problems
     assert fast == (not problems)  # a changed byte is seen only by its hash
@@ -165,13 +178,14 @@ def test_an_object_of_another_split_is_named(tmp_path: Path) -> None:
     scene = tiny_scene()
     used = dataclasses.replace(scene.objects[0], kind="object", uid="a")
     sample = dataclasses.replace(_sample(0), scene=tiny_scene(objects=(used, *scene.objects[1:])))
-    name = publication.manifest.shards[0].name
+    name = shard_name(0, _build().splits)
     folder = publication.folder.staged_shard(name)
     for index in range(4):
         again = dataclasses.replace(sample, key=sample_key(index))
         stage_scene(folder, index, again, [], "lossless")
     publication.folder.shard(name).unlink()  # the first writer of a shard wins
     publication.add_shard(pack_shard(publication.folder, name, range(4)))
+    publication.finish()
     assert "belongs to split test" in verify_dataset(tmp_path).problems[0]
 
 
@@ -199,7 +213,7 @@ def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None
     publication.lock_objects(rows)
     scene = tiny_scene()
     floor = scene.objects[0]
-    name = publication.manifest.shards[0].name
+    name = shard_name(0, _build().splits)
     for index in range(4):
         used = [
             dataclasses.replace(floor, name=uid, kind="object", uid=uid, licence=licence)
@@ -210,6 +224,7 @@ def test_two_share_alike_licences_in_one_scene_are_named(tmp_path: Path) -> None
         stage_scene(publication.folder.staged_shard(name), index, sample, [], "lossless")
     publication.folder.shard(name).unlink()  # the first writer of a shard wins
     publication.add_shard(pack_shard(publication.folder, name, range(4)))
+    publication.finish()
     problems = [text for text in verify_dataset(tmp_path).problems if "share-alike" in text]
     assert [problem.split(":")[1] for problem in problems] == [
         " sample 000000000", " sample 000000002",
@@ -264,7 +279,8 @@ def test_the_profile_is_a_setting_and_stands_in_the_manifest(tmp_path: Path) -> 
 def test_a_shard_is_packed_as_the_settings_say(tmp_path: Path) -> None:
     assert _build().storage.profile == "compact"
     (shard, *_) = _dataset(tmp_path, 4).manifest.shards
-    assert set(shard.index["000000000"]) == {"scene.safetensors.gz", "json", "0.exr", "1.exr"}
+    found = open_dataset(str(tmp_path)).suffixes(shard)
+    assert found == {"scene.safetensors.gz", "json", "0.exr", "1.exr"}
 
 
 def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
@@ -286,4 +302,4 @@ def test_a_shard_in_the_folder_of_a_worker_alone_is_no_shard(
 
     monkeypatch.setattr(publications.time, "sleep", appear)
     publication.add_shard(elsewhere)
-    assert publication.manifest.shards == (elsewhere,)
+    assert open_dataset(str(tmp_path / "here")).manifest.shards == (elsewhere,)

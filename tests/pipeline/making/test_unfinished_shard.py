@@ -21,11 +21,11 @@ from pipeline.making.pipeline import make_piece
 from pipeline.making.run import ShardJob
 from pipeline.making.tasks import Piece
 from pipeline.making.unfinished_shard import UnfinishedShard
-from pipeline.shards.pack import note_shard, noted_shard
 from storage.claims import claimed
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry, index_shard
 from storage.dataset.shard import write_shard
+from storage.dataset.shard_notes import ShardNote, note_shard, noted_shard
 from storage.dataset.staging import is_staged, read_staged_scene
 from storage.records.sample import sample_key
 from tests.scenes_by_hand import tiny_sample
@@ -179,9 +179,9 @@ def test_a_scene_that_crashes_its_child_costs_an_attempt(tmp_path: Path) -> None
 def test_a_note_of_an_earlier_shard_is_not_believed(tmp_path: Path) -> None:
     folder = DatasetFolder(tmp_path)
     write_shard(tmp_path / NAME, [(sample_key(0), {"json": b"{}"})])
-    before = index_shard(tmp_path / NAME)
+    before = ShardNote(shard=index_shard(tmp_path / NAME), failures=())
     note_shard(folder, before)
     assert noted_shard(folder, NAME) == before
     (tmp_path / NAME).unlink()
     write_shard(tmp_path / NAME, [(sample_key(0), {"json": b"[]"})])  # of the same size
-    assert noted_shard(folder, NAME) == index_shard(tmp_path / NAME) != before
+    assert noted_shard(folder, NAME).shard == index_shard(tmp_path / NAME) != before.shard

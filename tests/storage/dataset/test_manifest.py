@@ -1,5 +1,6 @@
 """A manifest is read in pieces and kept small: the same for any cut, and few bytes a sample."""
 
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -9,18 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from infra.bench.subjects.manifests import memory_of_opening, write_manifest_of
+from infra.bench.subjects.manifests import (
+    SAMPLES_PER_SHARD,
+    memory_of_opening,
+    write_manifest_of,
+)
 from storage.dataset import json_pieces
 from storage.dataset.json_pieces import entries
-from storage.dataset.manifest import MemberTable
+from storage.dataset.manifest import decode_head, read_head, read_manifest, write_manifest
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
     max_leaves=12,
-)
-ROWS = st.lists(
-    st.tuples(st.from_regex(r"[0-9a-z]+\.[a-z.]+", fullmatch=True), *[st.integers(0, 2**62)] * 2)
 )
 
 
@@ -56,19 +58,36 @@ def test_what_is_no_object_is_refused(text: str) -> None:
         read(text)
 
 
-@settings(deadline=None)  # a busy machine is no failure
-@given(ROWS)
-def test_a_table_gives_its_rows_back(rows: list[tuple[str, int, int]]) -> None:
-    table = MemberTable(rows)
-    assert (list(table), len(table), table) == (rows, len(rows), MemberTable(iter(rows)))
-    assert table != MemberTable([*rows, ("a.b", 0, 1)])
-    assert hash(table) == hash(MemberTable(rows))
+def test_a_head_is_read_without_the_list_and_says_the_same(tmp_path: Path) -> None:
+    write_manifest_of(tmp_path, 5_000)
+    path = tmp_path / "manifest.json"
+    whole, head = read_manifest(path), read_head(path)
+    assert len(whole.shards) == 20 and head == dataclasses.replace(whole, shards=())
+    cut = path.read_bytes()[: path.read_bytes().index(b"train-000001")]  # as a maker fetches it
+    assert decode_head(io.BytesIO(cut), "here") == head
+
+
+def test_rows_with_an_index_of_members_are_read(tmp_path: Path) -> None:
+    """As manifests were before version 5."""
+    write_manifest_of(tmp_path, 300)
+    path = tmp_path / "manifest.json"
+    record = json.loads(path.read_bytes())
+    for row in record["shards"]:
+        row["members"] = [["000000000.json", 512, 9]]
+    older = tmp_path / "older.json"
+    older.write_text(json.dumps({**record, "schema_version": 4}, indent=1, sort_keys=True))
+    found = read_manifest(older)
+    assert found.schema_version == 4 and found.shards == read_manifest(path).shards
+    write_manifest(older, found)
+    assert older.read_bytes() == path.read_bytes()
+
+
+def test_a_shard_takes_200_bytes_of_a_manifest(tmp_path: Path) -> None:
+    write_manifest_of(tmp_path, 1_000 * SAMPLES_PER_SHARD)
+    assert (tmp_path / "manifest.json").stat().st_size < 1_000 * 220
 
 
 def test_opening_a_large_dataset_takes_few_bytes_a_sample(tmp_path: Path) -> None:
-    """As Python objects, the index alone took 1.9 kB a sample (measured), its text 0.4 kB more."""
-    write_manifest_of(tmp_path, 50_000)
+    write_manifest_of(tmp_path, 100_000)
     taken = memory_of_opening(tmp_path)["peak_bytes"]
-    # measured: 115 bytes, most of them one piece of the text, and 8 a hash, three times over while
-    # they are sorted; 307 where the index is kept
-    assert taken < 50_000 * 160
+    assert taken < 100_000 * 40  # 390 shards; measured: 17, nearly all of it a piece of the text

@@ -21,6 +21,7 @@ from storage.dataset.progress import (
     tell_views,
 )
 from storage.dataset.scene_logs import log_scene, read_scene_logs
+from storage.dataset.shard_notes import note_of
 from storage.errors import TrilightError
 from tests.pipeline.making.test_publication import begin_tiny, make_tiny_shard
 
@@ -68,7 +69,9 @@ def test_a_manifest_is_read_when_it_changes_and_not_twice_a_second(
     assert len(read) == 1
     make_tiny_shard(publication, 0)
     now = read_progress(publication.folder)
-    assert (now.scenes_done, now.scenes_planned, len(read)) == (4, 8, 2)
+    assert (now.scenes_done, now.scenes_planned, len(read)) == (4, 8, 1)
+    begin_tiny(tmp_path, 12)
+    assert (read_progress(publication.folder).scenes_planned, len(read)) == (12, 2)
 
 
 def test_scenes_at_work_count_in_part(tmp_path: Path) -> None:
@@ -109,9 +112,8 @@ def test_shards_scenes_and_what_to_do_next(tmp_path: Path) -> None:
     begun = ("generate", "smoke", "--scenes", "12", "--out", str(tmp_path))
     assert read_status(str(tmp_path)).next_words == begun
     assert found.failures == [("scenes", "no_camera", 4)]
-    # a shard that the manifest does not list yet, as a range of another process leaves it
-    manifest = read_manifest(publication.folder.manifest)
-    write_manifest(publication.folder.manifest, dataclasses.replace(manifest, shards=()))
+    # a shard without its note, as a kill leaves it
+    note_of(publication.folder, "train-000001.tar").unlink()
     assert read_status(str(tmp_path)).shards_done == 1
 
 

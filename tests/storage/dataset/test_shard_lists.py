@@ -236,9 +236,3 @@ def test_hostile_manifests_are_refused(tmp_path: Path) -> None:
         dataset.folder.manifest.write_text(content)
         with pytest.raises(TrilightError, match="manifest"):
             open_training_data([str(tmp_path)])
-
-
-def test_a_manifest_with_a_key_in_two_shards_is_refused(tmp_path: Path) -> None:
-    dataset = five_scenes(tmp_path)
-    with pytest.raises(TrilightError, match="sample 000000000 is in another shard too"):
-        open_training_data(edited(dataset, "000000002.", "000000000."))

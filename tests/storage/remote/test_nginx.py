@@ -1,5 +1,6 @@
 """The same dataset behind a real web server, which is made to fail, stall and die meanwhile."""
 
+import io
 import os
 import shutil
 import signal
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from storage.dataset.dataset import Dataset, open_dataset
+from storage.dataset.shard import scan_members
 from storage.dataset.verify import verify_dataset
 from storage.records.sample import encode_sample
 from storage.remote import tries
@@ -137,8 +139,8 @@ def test_changed_and_missing_shards_are_named(nginx: Nginx, local: Dataset) -> N
     assert verify_dataset(nginx.url, fast=True).problems == []
     assert verify_dataset(nginx.url).problems == []
     content = bytearray((local.folder.root / SHARD).read_bytes())
-    _, offset, num_bytes = local.shards_of("train")[0].members[0]
-    content[offset + num_bytes // 2] ^= 1
+    first = next(scan_members(io.BytesIO(content), SHARD))
+    content[first.offset + first.num_bytes // 2] ^= 1
     (local.folder.root / SHARD).write_bytes(content)
     (local.folder.root / "test-000005.tar").unlink()
     assert verify_dataset(nginx.url, fast=True).bad_shards == ["test-000005.tar"]

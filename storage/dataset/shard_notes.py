@@ -1,0 +1,127 @@
+"""Notes on finished shards that the manifest does not list yet: one small file for each.
+
+Whoever packs a shard writes its note, once, beside the staged scenes: what the manifest will say of
+the shard, and what was rejected on the way. So nobody's work grows with what others have made.
+"""
+
+import contextlib
+import json
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from storage.atomic import write_atomically
+from storage.dataset.layout import DatasetFolder, shard_names_in
+from storage.dataset.manifest import ShardEntry, index_shard, shard_of_row, shard_row
+from storage.digests import canonical_json
+from storage.errors import TrilightError
+from storage.records.objects import Failure, decode_failures, encode_failures, read_failures
+
+_SUFFIX = ".json"
+_AT_ONCE = 32
+"""Notes that are fetched at the same time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardNote:
+    """What is known of a finished shard."""
+
+    shard: ShardEntry
+    """What the manifest says of it."""
+    failures: tuple[Failure, ...]
+    """Its scenes that were given up, and attempts that were rejected."""
+
+
+def rejections_of_shard(folder: DatasetFolder, name: str) -> Path:
+    """Return the file with the rejections of a shard that is packed and not noted yet."""
+    return folder.staged_failures / f"{name}.jsonl"
+
+
+def note_of(folder: DatasetFolder, name: str) -> Path:
+    """Return the file of the note on a shard."""
+    return folder.staged_entries / f"{name}{_SUFFIX}"
+
+
+def note_shard(folder: DatasetFolder, note: ShardNote) -> None:
+    """Write the note on a shard that is there; safe to repeat."""
+    write_atomically(note_of(folder, note.shard.name), encode_note(note))
+    rejections_of_shard(folder, note.shard.name).unlink(missing_ok=True)
+
+
+def encode_note(note: ShardNote) -> bytes:
+    """Return the file of a note."""
+    failures = encode_failures(note.failures).decode()
+    return canonical_json({"shard": shard_row(note.shard), "failures": failures})
+
+
+def decode_note(data: bytes) -> ShardNote:
+    """Return the note of a file; one of before version 5 is a row without rejections.
+
+    Raises:
+        ValueError, KeyError, TypeError, AttributeError: it is none.
+    """
+    record = json.loads(data)
+    failures = decode_failures(record.get("failures", "").encode())
+    return ShardNote(shard=shard_of_row(record.get("shard", record)), failures=tuple(failures))
+
+
+NOT_A_NOTE = (OSError, ValueError, KeyError, TypeError, AttributeError)
+"""What `decode_note` raises, or reading its file."""
+
+
+def noted_shard(folder: DatasetFolder, name: str) -> ShardNote:
+    """Return what is known of a shard that is there: its note, or else by reading the shard.
+
+    A note that is older than the shard, or of another size, was of a shard before it. Of a shard
+    in a bucket the note alone is here.
+
+    Raises:
+        TrilightError: the file is not a whole shard.
+    """
+    path, shard = note_of(folder, name), folder.shard(name)
+    # a kill before the note leaves none; then, and where it is no note, the shard itself is read
+    with contextlib.suppress(*NOT_A_NOTE):
+        note = decode_note(path.read_bytes())
+        if folder.is_sent(name):
+            return note
+        facts = shard.stat()
+        if note.shard.num_bytes == facts.st_size and path.stat().st_mtime_ns >= facts.st_mtime_ns:
+            return note
+    failures = read_failures(rejections_of_shard(folder, name))
+    return ShardNote(shard=index_shard(shard), failures=tuple(failures))
+
+
+def noted_names(folder: DatasetFolder) -> Iterator[str]:
+    """Yield the names of the shards on which there are notes."""
+    return shard_names_in(folder.staged_entries, _SUFFIX)
+
+
+def fetched_notes(
+    read: Callable[[str], bytes | None], names: Iterable[str], shown: str
+) -> list[ShardNote]:
+    """Return notes that are on a server, many at a time.
+
+    Args:
+        read: returns a file of the dataset by its relative name; called in threads.
+        names: of the notes' files.
+        shown: the dataset, for messages.
+
+    Raises:
+        TrilightError: one of them is no note, or as `read`.
+    """
+
+    def fetched(name: str) -> ShardNote:
+        try:
+            note = decode_note(read(name) or b"")
+            if not name.endswith(f"/{note.shard.name}{_SUFFIX}"):
+                raise ValueError(note.shard.name)
+        except NOT_A_NOTE as error:
+            raise TrilightError(
+                f"{shown}/{name}: not a note on its shard ({error}); delete both, and the shard is "
+                "made again."
+            ) from error
+        return note
+
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        return list(pool.map(fetched, names))
