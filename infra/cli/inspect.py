@@ -22,6 +22,7 @@ from infra.run_page.page import write_run_page
 from infra.run_page.record import facts_of, is_run, read_record
 from storage.dataset.dataset import Dataset, RemoteDatasetFiles, open_dataset
 from storage.dataset.layout import DatasetFolder
+from storage.dataset.sampled import described_shards
 from storage.dataset.statistics import Statistics, dataset_statistics
 from storage.errors import TrilightError
 from storage.records.objects import count_by_reason
@@ -72,7 +73,7 @@ def inspect(asked: Inspected, shown: Shown) -> None:
     from pipeline.documents.distributions import dataset_distributions  # slow: matplotlib
 
     with progress_bars() as bars:
-        total = len(opened.manifest.shards)
+        total = len(described_shards(opened))
         task = bars.add_task("shards", total=total, note="", visible=not shown.json)
         statistics = dataset_statistics(opened)
         found = dataset_distributions(opened, shard_done=lambda _: bars.advance(task))

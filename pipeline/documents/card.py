@@ -56,6 +56,7 @@ def encode_card(
         _lead(manifest),
         f"![some of the scenes]({folder.contact_sheet.name})",
         "## What it holds",
+        f"Views, errors and contents are those {found.sample}." if found.sample else "",
         _by_split(manifest, found),
         _NOISE_FLOOR,
         _contents(manifest, found),

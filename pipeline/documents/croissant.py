@@ -6,7 +6,7 @@ publication in it: equal datasets give equal bytes.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pipeline.documents.rights import Rights
@@ -67,11 +67,29 @@ def encode_croissant(manifest: Manifest, rights: Rights) -> bytes:
         "identifier": f"sha256:{digest}",
         "keywords": ["neural rendering", "path tracing", "HDR", "WebDataset"],
         "license": [licence_url(name) or name for name in rights.licences],
-        "distribution": [*map(_shard, shards), *_file_sets(shards)],
+        "distribution": _distribution(shards),
         "recordSet": [_splits(shards), _scenes()] if shards else [],
     }
     text = json.dumps(document, indent=1, sort_keys=True, ensure_ascii=True)
     return text.encode() + b"\n"
+
+
+MOST_LISTED = 10_000
+"""Shards that are listed one by one; of more, `manifest.json` alone has sizes and digests."""
+
+
+def _distribution(shards: list[ShardEntry]) -> list[dict[str, Any]]:
+    if len(shards) <= MOST_LISTED:
+        return [*map(_shard, shards), *_file_sets([shard.name for shard in shards])]
+    every = {
+        "@type": "cr:FileSet",
+        "@id": "shards",
+        "name": "shards",
+        "description": "manifest.json has the size and sha256 of each",
+        "encodingFormat": "application/x-tar",
+        "includes": "**/*.tar",
+    }
+    return [every, *_file_sets(["shards"])]
 
 
 def _shard(shard: ShardEntry) -> dict[str, Any]:
@@ -86,8 +104,8 @@ def _shard(shard: ShardEntry) -> dict[str, Any]:
     }
 
 
-def _file_sets(shards: list[ShardEntry]) -> list[dict[str, Any]]:
-    """Return the kinds of members that all shards hold."""
+def _file_sets(archives: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the kinds of members that all shards hold; `archives` are the names of those."""
     kinds = (
         (_RECORDS, "objects, provenance and the record of each view", "application/json", "*.json"),
         (
@@ -104,12 +122,12 @@ def _file_sets(shards: list[ShardEntry]) -> list[dict[str, Any]]:
             "@id": name,
             "name": name,
             "description": description,
-            "containedIn": [{"@id": shard.name} for shard in shards],
+            "containedIn": [{"@id": name} for name in archives],
             "encodingFormat": encoding,
             "includes": pattern,
         }
         for name, description, encoding, pattern in kinds
-        if shards
+        if archives
     ]
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from storage.conventions import SPLITS
 from storage.dataset.dataset import Dataset
 from storage.dataset.manifest import Manifest
+from storage.dataset.sampled import described_shards, of_how_many
 from storage.errors import TrilightError
 from storage.records.map_facts import texture_families
 from storage.records.objects import OBJECT, Failure, LockedObject, locked_uids
@@ -26,6 +27,8 @@ class Distributions:
 
     values: Mapping[str, Mapping[str, Values]]
     """By split, then by name (storage.records.quantities): every value, float32."""
+    num_scenes: int
+    """Scenes of the dataset; where fewer were read, everything here is of those."""
     scenes: Mapping[tuple[str, str], int]
     """Scenes by (template, split)."""
     placements: Mapping[str, int]
@@ -95,6 +98,11 @@ class Distributions:
             here = self.placements.get(entry.uid, 0) + self.map_uses.get(entry.uid, 0)
             rows[entry.licence] = (count + 1, used + (here > 0), places + here)
         return dict(sorted(rows.items()))
+
+    @property
+    def sample(self) -> str:
+        """What people are told where a sample of the scenes was read; empty else."""
+        return of_how_many(sum(self.scenes.values()), self.num_scenes)
 
     def uses_per_object(self) -> list[int]:
         """Return how often each object is used, zeros included, the most used first."""
@@ -175,9 +183,10 @@ class _Tally:
 def dataset_distributions(
     dataset: Dataset, *, shard_done: Callable[[str], None] = lambda name: None
 ) -> Distributions:
-    """Read every scene of a dataset, one at a time and without its pictures.
+    """Read the scenes of a dataset, one at a time and without their pictures: all, or a sample.
 
-    What is kept is about 200 bytes a scene. The digests of the shards are not checked.
+    What is kept is about 200 bytes a scene (of the sample: storage.dataset.sampled). The digests of
+    the shards are not checked.
 
     Args:
         dataset: the dataset.
@@ -187,7 +196,7 @@ def dataset_distributions(
         TrilightError: a shard is missing, or a sample is unreadable or breaks a law.
     """
     tally = _Tally()
-    for shard in dataset.manifest.shards:
+    for shard in described_shards(dataset):
         rows = []
         tally.packings |= dataset.suffixes(shard) & {PLAIN, PACKED}
         for record in dataset.read_scenes(shard):
@@ -204,6 +213,7 @@ def dataset_distributions(
     locked = dataset.objects_lock()
     return Distributions(
         values={split: _concatenated(chunks) for split, chunks in tally.values.items()},
+        num_scenes=dataset.manifest.num_samples,
         scenes=tally.scenes,
         placements=tally.placements,
         map_uses=tally.map_uses,

@@ -108,6 +108,7 @@ def _overview(dataset: Dataset, found: Distributions) -> Markup:
         per_split[split] += count
     scenes = ", ".join(f"{count} {split}" for split, count in per_split.items())
     rows = [
+        *([("what follows is", found.sample)] if found.sample else []),
         ("scenes", f"{sum(per_split.values())} ({scenes or 'none'})"),
         ("views", f"{len(found.all('noise_floor_db'))}, {manifest.num_views} of each scene"),
     ]

@@ -13,6 +13,7 @@ from storage.conventions import preview_srgb8
 from storage.dataset.dataset import Dataset
 from storage.dataset.layout import DatasetFolder
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.sampled import described_shards
 from storage.dataset.statistics import Statistics
 from storage.records.sample import Sample
 
@@ -133,7 +134,7 @@ def _tile(radiance_rgb: NDArray[np.float32]) -> Image.Image:
 def _first_scenes(dataset: Dataset, per_template: int) -> Mapping[str, dict[str, ShardEntry]]:
     """Return the shard of each scene to show by key, by template."""
     rows: dict[str, dict[str, ShardEntry]] = {}
-    for shard in dataset.manifest.shards:
+    for shard in described_shards(dataset):
         for record in dataset.read_scenes(shard):
             places = rows.setdefault(str(record.scene.provenance["template"]), {})
             if len(places) < per_template:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from storage.dataset.dataset import Dataset, reading
 from storage.dataset.manifest import ShardEntry
+from storage.dataset.sampled import described_shards, of_how_many
 from storage.dataset.shard import read_member, scan_members
 from storage.digests import sha256_hex
 from storage.errors import TrilightError
@@ -27,12 +28,14 @@ class Statistics:
     scenes_by_split: Mapping[str, int]
     """Scenes per split."""
     scenes_by_template: Mapping[str, int]
-    """Scenes per layout template."""
+    """Scenes that were read per layout template."""
     scenes_by_excursion: Mapping[str, int]
-    """Scenes per axis along which they leave the usual range; empty where none does."""
+    """Likewise per axis along which they leave the usual range; empty where none does."""
+    num_scenes_read: int
+    """Scenes of which the views are: all, or a sample (storage.dataset.sampled)."""
     scene_digest: str
     """sha256 over the keys and arrays of all scenes, without pictures: equal for equal scenes,
-    whatever they were rendered and packed with."""
+    whatever they were rendered and packed with; empty where a sample was read."""
     num_bytes: int
     """Bytes of all shards."""
     spp: NDArray[np.int64]
@@ -58,10 +61,12 @@ class Statistics:
             return [("scenes", "0")]
         excursions = _counts(self.scenes_by_excursion)
         beyond = [("beyond the range", excursions)] if excursions else []
+        sample = of_how_many(self.num_scenes_read, self.num_scenes)
         return [
             ("scenes", f"{self.num_scenes} ({_counts(self.scenes_by_split)})"),
             ("templates", _counts(self.scenes_by_template)),
             *beyond,
+            *([("what follows is", sample)] if sample else []),
             ("views", f"{self.num_views}"),
             ("noise floor", _spread(self.noise_floor_db, "psnr_log_db")),
             ("linear noise floor", _spread(self.noise_floor_linear_db, "psnr_linear_db")),
@@ -72,7 +77,7 @@ class Statistics:
             ),
             ("views at the cap", f"{100 * self.at_cap.mean():.1f} %"),
             ("samples per pixel", f"median {np.median(self.spp):.0f}, most {self.spp.max()}"),
-            ("scene digest", self.scene_digest),
+            *([("scene digest", self.scene_digest)] if self.scene_digest else []),
             ("size", f"{self.num_bytes / 1e6:.1f} MB, {self.bytes_per_scene / 1e3:.0f} kB a scene"),
         ]
 
@@ -82,22 +87,24 @@ class Statistics:
 
 
 def dataset_statistics(dataset: Dataset) -> Statistics:
-    """Read every sample but its pictures, through the headers of the shards.
+    """Read samples but their pictures, through the headers of the shards: all, or a sample of them.
 
     Raises:
         TrilightError: a shard is missing or damaged.
     """
     tally = _Tally()
-    for shard in dataset.manifest.shards:
+    for shard in (read := described_shards(dataset)):
         with dataset.files.open(shard, checked=False) as stream, reading(dataset.shown, shard.name):
             _require_whole(dataset, shard)
             _count_shard(stream, shard, tally)
+    whole = len(read) == len(dataset.manifest.shards)
     return Statistics(
         num_scenes=dataset.manifest.num_samples,
-        scenes_by_split=tally.splits,
+        scenes_by_split=_by_split(dataset),
+        num_scenes_read=sum(shard.num_samples for shard in read),
         scenes_by_template=tally.templates,
         scenes_by_excursion=tally.excursions,
-        scene_digest=digest_of_scenes(tally.scene_members),
+        scene_digest=digest_of_scenes(tally.scene_members) if whole else "",
         num_bytes=dataset.manifest.num_bytes,
         spp=np.asarray(tally.views["spp"], np.int64),
         noise_floor_db=np.asarray(tally.views["noise_floor_db"]),
@@ -108,6 +115,13 @@ def dataset_statistics(dataset: Dataset) -> Statistics:
     )
 
 
+def _by_split(dataset: Dataset) -> Mapping[str, int]:
+    counts: Counter[str] = Counter()
+    for shard in dataset.manifest.shards:
+        counts[shard.split] += shard.num_samples
+    return {split: count for split, count in counts.items() if count}
+
+
 _OF_VIEWS = ("spp", "noise_floor_db", "noise_floor_linear_db", "object_noise_floor_db", "at_cap")
 
 
@@ -115,7 +129,6 @@ _OF_VIEWS = ("spp", "noise_floor_db", "noise_floor_linear_db", "object_noise_flo
 class _Tally:
     """Running counts: of each view eight bytes a column, however many there are."""
 
-    splits: Counter[str] = field(default_factory=Counter)
     templates: Counter[str] = field(default_factory=Counter)
     excursions: Counter[str] = field(default_factory=Counter)
     views: Mapping[str, "array[float]"] = field(
@@ -150,7 +163,6 @@ def _count_shard(stream: BinaryIO, shard: ShardEntry, tally: _Tally) -> None:
             tally.scene_members[scene] = sha256_hex(unpack_arrays({member.suffix: data}))
             continue
         record = json.loads(data)
-        tally.splits[shard.split] += 1
         tally.templates[record["provenance"]["template"]] += 1
         if excursion := record["provenance"].get("excursion"):
             tally.excursions[excursion["axis"]] += 1

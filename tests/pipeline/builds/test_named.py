@@ -229,6 +229,7 @@ def test_a_frozen_set_says_whether_it_is_the_published_one() -> None:
 def _statistics(*, num_scenes: int, scene_digest: str) -> Statistics:
     return Statistics(
         num_scenes=num_scenes,
+        num_scenes_read=num_scenes,
         scenes_by_split={},
         scenes_by_template={},
         scenes_by_excursion={},
