@@ -49,6 +49,12 @@ def test_wrong_orders_are_refused_before_anything_is_made(tmp_path: Path) -> Non
         Rounds(loop_order(tmp_path, steps=4)).begin()
 
 
+def test_numbers_of_forms_are_those_of_the_command_line(tmp_path: Path) -> None:
+    """A form makes 20.0 of what a command line calls 20: it is the same loop."""
+    Rounds(loop_order(tmp_path, changes={"renders.noise_floor_db": 20})).begin()
+    Rounds(loop_order(tmp_path, changes={"renders.noise_floor_db": 20.0})).begin()
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A loop that nothing stopped."""
